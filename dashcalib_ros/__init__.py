@@ -1,0 +1,1 @@
+"""Camera calibration that happens by itself while a car drives."""

@@ -1,0 +1,145 @@
+"""The one home of every default, each with the reason for its value.
+
+A setting's full name is SECTION.NAME ('turns.half_width'): the same in --set, in a configuration
+YAML and as a ROS parameter. Values are checked when a Config is made: a Config that exists is valid.
+"""
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from dashcalib_ros.errors import ConfigError
+
+T = TypeVar('T')
+
+
+def setting(default: T, reason: str, minimum: float | None = None, maximum: float | None = None,
+            choices: tuple[str, ...] = ()) -> T:
+    """Declare a setting: its default, why it has that value, and what else it may be."""
+    metadata = {'reason': reason, 'minimum': minimum, 'maximum': maximum, 'choices': choices}
+    value: T = field(default=default, metadata=metadata)
+    return value
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """frames -> tracks -> epipoles, for detection only (calibration tracks again, finer)."""
+
+    rate: float = setting(
+        10.0, 'Hz; faster cameras are thinned to it: the paper works at 10 fps', 1.0, 60.0)
+    width: int = setting(
+        640, 'px; wider images are halved until they fit: epipoles need no more', 64, 8192)
+    points: int = setting(
+        400, 'points tracked at a time, spread over a grid', 50, 5000)
+    forward_backward_px: float = setting(
+        0.5, 'px; a point that does not track back to within this is dropped', 0.05, 5.0)
+    standing_px: float = setting(
+        0.3, 'px at the working width; the car stands when the median point moves less', 0.0, 5.0)
+    epipolar_px: float = setting(
+        0.5, 'px at the working width; inlier threshold of the fundamental matrix', 0.05, 5.0)
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """The ego vehicle: what does not move while the rest of the picture does."""
+
+    enabled: bool = setting(True, 'bonnet, pillars and burnt-in text spoil the matches (paper, 3.2)')
+    cell: int = setting(16, 'px at the working width; resolution of the mask', 4, 64)
+
+
+@dataclass(frozen=True)
+class TurnsConfig:
+    """epipole distances -> turns -> the bank of the best."""
+
+    wanted: int = setting(
+        5, 'turns; the paper: focal lengths settle at 2, the centre at 4, distortion at 5', 1, 20)
+    half_width: float = setting(
+        3.0, "s kept on either side of a turn's centre; the paper's k = 30 frames at 10 fps",
+        0.5, 10.0)
+    min_prominence: float = setting(
+        0.006, 'of the image width; lower peaks are noise', 0.0, 1.0)
+    capacity: int = setting(10, 'turns kept at the most: twice those wanted', 1, 50)
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings. Raises ConfigError for a value of the wrong type, NaN or out of range."""
+
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    mask: MaskConfig = field(default_factory=MaskConfig)
+    turns: TurnsConfig = field(default_factory=TurnsConfig)
+    seed: int = setting(0, 'same input and seed: same result', 0, 2**31 - 1)
+    threads: int = setting(1, 'threads of one reconstruction; more than 1 is not reproducible',
+                           1, 256)
+
+    def __post_init__(self) -> None:
+        for name, spec, value in _settings(self):
+            _check(name, spec, value)
+
+    def flat(self) -> dict[str, Any]:
+        """Return every setting by its full name, in order."""
+        return {name: value for name, _, value in _settings(self)}
+
+    def replace(self, changes: Mapping[str, Any]) -> Config:
+        """Return a copy with settings changed by full name; raises ConfigError."""
+        known = self.flat()
+        top: dict[str, Any] = {}
+        nested: dict[str, dict[str, Any]] = {}
+        for name, value in changes.items():
+            if name not in known:
+                near = difflib.get_close_matches(name, known, 1)
+                hint = f': did you mean {near[0]}?' if near else f'; there are {", ".join(known)}'
+                raise ConfigError(f'unknown setting {name!r}{hint}')
+            section, _, key = name.rpartition('.')
+            # an integer is a fine float; everything else must fit as it is
+            if isinstance(known[name], float) and type(value) is int:
+                value = float(value)
+            (nested.setdefault(section, {}) if section else top)[key] = value
+        for section, values in nested.items():
+            top[section] = dataclasses.replace(getattr(self, section), **values)
+        return dataclasses.replace(self, **top)
+
+    @classmethod
+    def from_mapping(cls, data: Mapping[str, Any]) -> Config:
+        """Make a Config from nested or dotted names, as a YAML file gives them."""
+        flat: dict[str, Any] = {}
+        for key, value in data.items():
+            if isinstance(value, Mapping):
+                flat.update({f'{key}.{inner}': item for inner, item in value.items()})
+            else:
+                flat[str(key)] = value
+        return cls().replace(flat)
+
+
+def describe() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
+    """Yield (full name, field) of every setting; field.metadata has reason, minimum, maximum."""
+    for name, spec, _ in _settings(Config()):
+        yield name, spec
+
+
+def _settings(config: Config) -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
+    for outer in dataclasses.fields(config):
+        value = getattr(config, outer.name)
+        if dataclasses.is_dataclass(value):
+            for inner in dataclasses.fields(value):
+                yield f'{outer.name}.{inner.name}', inner, getattr(value, inner.name)
+        else:
+            yield outer.name, outer, value
+
+
+def _check(name: str, spec: dataclasses.Field[Any], value: Any) -> None:
+    expected = type(spec.default)
+    if type(value) is not expected:
+        raise ConfigError(f'{name} must be {expected.__name__}, not {value!r}')
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f'{name} must be a finite number, not {value!r}')
+    low, high = spec.metadata['minimum'], spec.metadata['maximum']
+    if low is not None and value < low or high is not None and value > high:
+        raise ConfigError(f'{name} must be between {low:g} and {high:g}, not {value!r}')
+    choices = spec.metadata['choices']
+    if choices and value not in choices:
+        raise ConfigError(f'{name} must be one of {", ".join(choices)}, not {value!r}')

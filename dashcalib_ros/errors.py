@@ -1,0 +1,24 @@
+"""Every error a user can cause. The core raises them; only the borders (cli, ros) catch them.
+
+Each message is one line that says what is wrong and names the cure.
+"""
+
+
+class DashcalibError(Exception):
+    """Root of all errors that this package raises on purpose."""
+
+
+class InputError(DashcalibError):
+    """The images cannot be read: missing, empty, corrupt, ambiguous, or of changing size."""
+
+
+class ConfigError(DashcalibError):
+    """A setting is unknown, of the wrong type, NaN, or out of its range."""
+
+
+class OutputError(DashcalibError):
+    """A result cannot be written."""
+
+
+class WorkerError(DashcalibError):
+    """The child process that reconstructs died, or could not be started."""

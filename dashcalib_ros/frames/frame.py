@@ -1,0 +1,26 @@
+"""The one thing that travels from any kind of input into the core."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of the drive.
+
+    index: position among the input's frames, counted from 0.
+    stamp_ns: time of exposure in nanoseconds (the message header's stamp, or index / rate).
+    image: (height, width) uint8, grey. Never written to after the Frame is made.
+    """
+
+    index: int
+    stamp_ns: int
+    image: npt.NDArray[np.uint8]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return (width, height) in pixels."""
+        return self.image.shape[1], self.image.shape[0]

@@ -1,0 +1,80 @@
+"""What a calibration says: six parameters, a sigma for each, and a verdict with its reasons.
+
+Pixel coordinates are ROS's and OpenCV's: the centre of the first pixel is (0, 0).
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.config import Config
+
+Level = Literal['accepted', 'weak', 'refused']
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole and two radial terms (paper, Eq. 1 and 2); also used for their six sigmas.
+
+    fx, fy, cx, cy in pixels; k1, k2 without unit (plumb_bob's first two).
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float
+    k2: float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """accepted: use it. weak: a look at the sigmas first. refused: there is no result."""
+
+    level: Level
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class TurnSummary:
+    """What became of one turn. center, first, last count the input's frames from 0."""
+
+    center: int
+    first: int
+    last: int
+    stamp_s: float
+    prominence: float
+    images: int
+    registered: int
+    used: bool
+    yaw_deg: float | None = None
+    reprojection_error_px: float | None = None
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The whole result. intrinsics and sigma are None when the verdict is refused.
+
+    timing: seconds, keys detect, calibrate, total. versions: package name -> version.
+    magnitudes: (n, 2) float64, columns stamp [s] and filtered turning magnitude [of the width].
+    mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
+    """
+
+    verdict: Verdict
+    image_size: tuple[int, int]
+    intrinsics: Intrinsics | None
+    sigma: Intrinsics | None
+    turns: tuple[TurnSummary, ...]
+    frames: int
+    reprojection_error_px: float | None
+    timing: dict[str, float]
+    versions: dict[str, str]
+    config: Config
+    input_name: str = ''
+    warnings: tuple[str, ...] = ()
+    magnitudes: npt.NDArray[np.float64] | None = None
+    mask: npt.NDArray[np.bool_] | None = None
+    details: dict[str, Any] = field(default_factory=dict)
