@@ -9,7 +9,7 @@ setup(
     version='0.1.0',
     description='Calibrates a dashcam from the turns the car takes anyway',
     maintainer='dashcalib_ros maintainers',
-    maintainer_email='maintainers@dashcalib.org',
+    maintainer_email='maintainers@example.com',
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={PACKAGE: ['py.typed']},

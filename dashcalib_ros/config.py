@@ -1,7 +1,7 @@
 """The one home of every default, each with the reason for its value.
 
 A setting's full name is SECTION.NAME ('turns.half_width'): the same in --set, in a configuration
-YAML and as a ROS parameter. Values are checked when a Config is made: a Config that exists is valid.
+YAML and as a ROS parameter. Values are checked when a Config is made: one that exists is valid.
 """
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class MotionConfig:
 class MaskConfig:
     """The ego vehicle: what does not move while the rest of the picture does."""
 
-    enabled: bool = setting(True, 'bonnet, pillars and burnt-in text spoil the matches (paper, 3.2)')
+    enabled: bool = setting(True, 'bonnet, pillars and burnt-in text spoil the matches (paper)')
     cell: int = setting(16, 'px at the working width; resolution of the mask', 4, 64)
 
 
@@ -138,7 +138,7 @@ def _check(name: str, spec: dataclasses.Field[Any], value: Any) -> None:
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f'{name} must be a finite number, not {value!r}')
     low, high = spec.metadata['minimum'], spec.metadata['maximum']
-    if low is not None and value < low or high is not None and value > high:
+    if (low is not None and value < low) or (high is not None and value > high):
         raise ConfigError(f'{name} must be between {low:g} and {high:g}, not {value!r}')
     choices = spec.metadata['choices']
     if choices and value not in choices:
