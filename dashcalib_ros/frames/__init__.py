@@ -1,4 +1,8 @@
-"""Images in: bags, videos and folders as iterables of Frame."""
-from dashcalib_ros.frames.frame import Frame
+"""Images in: bags, videos and folders as iterables of Frame.
 
-__all__ = ['Frame']
+Nothing here imports OpenCV or rosbags before a drive is opened: `--help` stays quick.
+"""
+from dashcalib_ros.frames.frame import Frame
+from dashcalib_ros.frames.source import FrameSource, open_frames
+
+__all__ = ['Frame', 'FrameSource', 'open_frames']

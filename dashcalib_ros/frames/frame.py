@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+GreyImage = npt.NDArray[np.uint8]
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -18,7 +20,7 @@ class Frame:
 
     index: int
     stamp_ns: int
-    image: npt.NDArray[np.uint8]
+    image: GreyImage
 
     @property
     def size(self) -> tuple[int, int]:
