@@ -1,0 +1,7 @@
+"""The command dashcalib: argument parsing, terminal output, exit codes.
+
+Only what --help needs is imported here; each command imports its own in its function.
+"""
+from dashcalib_ros.cli.program import main
+
+__all__ = ['main']

@@ -1,0 +1,144 @@
+"""The arguments of every command."""
+from __future__ import annotations
+
+import argparse
+import importlib
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+PROGRAM = 'dashcalib'
+INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, '
+              'or a folder of images')
+EXIT_HELP = ('exit codes: 0 accepted; 3 weak or refused (the input was fine, the evidence was '
+             'not enough); 2 bad input or usage')
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse's, with one line for a usage error."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit code 2 and one line that tells where to read on."""
+        self.exit(2, f'{PROGRAM}: error: {message}; see {self.prog} --help\n')
+
+
+class Version(argparse.Action):
+    """--version; looks the version up only when asked."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str) -> None:
+        super().__init__(option_strings, dest, nargs=0, help='print the version and exit')
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        """Print the installed package's version."""
+        from importlib.metadata import PackageNotFoundError, version
+        try:
+            found = version('dashcalib_ros')
+        except PackageNotFoundError:
+            found = 'not installed (running from its sources)'
+        print(f'{PROGRAM} {found}')
+        parser.exit()
+
+
+def make_parser() -> Parser:
+    """Return the parser; the parsed arguments' command is the function to call with them."""
+    parser = Parser(
+        prog=PROGRAM, epilog=EXIT_HELP,
+        description='Calibrates a dashcam from the turns the car takes anyway.')
+    parser.add_argument('--version', action=Version)
+    commands = parser.add_subparsers(metavar='COMMAND', required=True, parser_class=Parser)
+    _add_run(commands)
+    _add_turns(commands)
+    _add_demo(commands)
+    _add_compare(commands)
+    return parser
+
+
+def _add_run(commands: Any) -> None:
+    parser = _command(commands, 'run', 'calibrate a recorded drive',
+                      'Writes calibration.yaml (accepted), result.json and report.html to DIR.')
+    _add_drive_arguments(parser)
+    parser.add_argument('--threads', type=int, metavar='N',
+                        help='threads of one reconstruction; more than 1 is not reproducible')
+    _add_out(parser, 'calibration')
+
+
+def _add_turns(commands: Any) -> None:
+    parser = _command(commands, 'turns', 'find the turns of a drive, without calibrating',
+                      'Lists the turns a calibration would use, best first.')
+    _add_drive_arguments(parser)
+    parser.add_argument('--json', action='store_true', help='print JSON')
+
+
+def _add_demo(commands: Any) -> None:
+    parser = _command(commands, 'demo', 'render a drive, calibrate it, compare with the truth',
+                      'Renders a drive with a known lens into a ROS 2 bag and calibrates that.')
+    _add_seed(parser)
+    _add_verbose(parser)
+    _add_out(parser, 'demo')
+    parser.add_argument('--keep-bag', action='store_true', help='leave the bag in DIR/bag')
+
+
+def _add_compare(commands: Any) -> None:
+    parser = _command(commands, 'compare', 'compare two calibrations',
+                      'Per-parameter difference, and the RMS distance in pixels between the '
+                      'images of the same rays over the image, best common rotation removed.')
+    what = 'a result.json (or its folder), a camera_info YAML or a truth JSON'
+    parser.add_argument('a', metavar='A', type=Path, help=what)
+    parser.add_argument('b', metavar='B', type=Path, help=f'the reference: {what}')
+    parser.add_argument('--json', action='store_true', help='print JSON')
+
+
+def _command(commands: Any, name: str, summary: str, description: str) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=summary, description=description, epilog=EXIT_HELP)
+    parser.set_defaults(command=_lazily(name))
+    return parser
+
+
+def _lazily(name: str) -> Callable[[argparse.Namespace], int]:
+    """Return the command's function, which imports its module, and numpy's, only when called."""
+    def command(args: argparse.Namespace) -> int:
+        code: int = getattr(importlib.import_module(f'dashcalib_ros.cli.{name}'), name)(args)
+        return code
+    return command
+
+
+def _add_drive_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('input', metavar='INPUT', help=INPUT_HELP)
+    parser.add_argument('--topic', metavar='T', help="the bag's image topic")
+    parser.add_argument('--fps', type=_rate, metavar='F', help='rate of a video or image folder')
+    parser.add_argument('--turns', type=int, metavar='N', help='how many turns are wanted')
+    parser.add_argument('--mask', type=Path, metavar='PNG',
+                        help='black pixels are not used; as large as the images')
+    parser.add_argument('--config', type=Path, metavar='YAML', help='settings from a file')
+    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
+                        help='one setting, over those of --config; may be repeated')
+    _add_seed(parser)
+    _add_verbose(parser)
+
+
+def _add_seed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--seed', type=int, metavar='S', help='same input and seed: same result')
+
+
+def _add_verbose(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--verbose', action='store_true', help="show COLMAP's own log")
+
+
+def _add_out(parser: argparse.ArgumentParser, default: str) -> None:
+    parser.add_argument('--out', type=Path, default=Path(default), metavar='DIR',
+                        help=f'where the results go (default: ./{default})')
+
+
+def _rate(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f'must be a positive number, not {text!r}')
+    return value

@@ -1,0 +1,81 @@
+"""dashcalib demo: a rendered drive with a known lens, calibrated from a real ROS 2 bag."""
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+
+from rich.text import Text
+
+from dashcalib_ros.cli import exit_codes
+from dashcalib_ros.cli.drive import calibrate
+from dashcalib_ros.cli.run import now
+from dashcalib_ros.cli.settings import read_config
+from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
+from dashcalib_ros.demo import demo_drive, render_to_bag
+from dashcalib_ros.errors import OutputError
+from dashcalib_ros.frames import open_frames
+from dashcalib_ros.intrinsics import Calibration, Intrinsics
+from dashcalib_ros.report import (
+    Camera,
+    camera_of,
+    compare,
+    output_folder,
+    write_results,
+    write_text,
+)
+from dashcalib_ros.report.tables import against_truth, summary
+
+
+def demo(args: argparse.Namespace) -> int:
+    """Render, calibrate, compare with the truth; return the verdict's exit code."""
+    started = perf_counter()
+    config = read_config(args)
+    drive = demo_drive(config.seed)
+    with output_folder(args.out) as out:
+        with Stages() as stages, _bag_path(out, args.keep_bag) as bag:
+            stages.show('rendering the drive')
+            render_to_bag(drive, bag)
+            calibration = calibrate(open_frames(bag), config, None, args.verbose, stages)
+        calibration = dataclasses.replace(calibration, input_name=f'demo drive {config.seed}')
+        written = (*write_results(calibration, out, created=now()),
+                   _write_truth(out, drive.truth, calibration.image_size))
+    warn(calibration.warnings)
+    show(summary(calibration))
+    _show_errors(calibration, drive.truth)
+    show_text('written: ' + ', '.join(map(str, written))
+              + (f', {out / "bag"}' if args.keep_bag else ''))
+    show_text(f'rendered and calibrated in {perf_counter() - started:.0f} s')
+    return exit_codes.of_verdict(calibration.verdict.level)
+
+
+@contextmanager
+def _bag_path(out: Path, keep: bool) -> Iterator[Path]:
+    if keep:
+        if (out / 'bag').exists():
+            raise OutputError(f'{out / "bag"} exists; remove it or choose another --out')
+        yield out / 'bag'
+        return
+    with tempfile.TemporaryDirectory(prefix='dashcalib-demo-') as folder:
+        yield Path(folder) / 'bag'
+
+
+def _write_truth(out: Path, truth: Intrinsics, size: tuple[int, int]) -> Path:
+    path = out / 'truth.json'
+    values = {**dataclasses.asdict(truth), 'width': size[0], 'height': size[1]}
+    write_text(path, json.dumps(values, allow_nan=False) + '\n')
+    return path
+
+
+def _show_errors(calibration: Calibration, truth: Intrinsics) -> None:
+    if calibration.intrinsics is None:
+        show(Text('no estimate to compare with the truth'))
+        return
+    reference = Camera('truth', calibration.image_size, truth)
+    show(Text('\nagainst the truth'))
+    show(against_truth(compare(camera_of(calibration), reference)))

@@ -1,0 +1,12 @@
+"""What the command's exit code says."""
+from __future__ import annotations
+
+ACCEPTED = 0
+BAD_INPUT = 2  # or bad usage: one line on stderr says what and the cure
+NOT_ENOUGH = 3  # weak or refused: the input was fine, the evidence was not enough
+INTERRUPTED = 130  # Ctrl-C or SIGTERM, as shells have it
+
+
+def of_verdict(level: str) -> int:
+    """Return the exit code for a verdict."""
+    return ACCEPTED if level == 'accepted' else NOT_ENOUGH

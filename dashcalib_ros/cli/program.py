@@ -1,0 +1,67 @@
+"""main: from arguments to an exit code; the one place where known errors become one line."""
+from __future__ import annotations
+
+import errno
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from dashcalib_ros.cli.arguments import PROGRAM, make_parser
+from dashcalib_ros.cli.exit_codes import BAD_INPUT, INTERRUPTED
+from dashcalib_ros.errors import DashcalibError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code; argv: arguments without the program's name."""
+    try:
+        args = make_parser().parse_args(argv)
+    except SystemExit as end:  # argparse's way to end after --help, --version and usage errors
+        return end.code if isinstance(end.code, int) else BAD_INPUT
+    with _sigterm_like_ctrl_c():
+        try:
+            code: int = args.command(args)
+            return code
+        except DashcalibError as error:
+            return _fail(str(error))
+        except KeyboardInterrupt:
+            return _fail('interrupted', INTERRUPTED)
+        except ModuleNotFoundError as error:
+            if not error.name or error.name.startswith('dashcalib_ros'):
+                raise
+            return _fail(f'the Python package {error.name} is missing; install it with pip')
+        except MemoryError:
+            return _fail('out of memory; close other programs or lower turns.capacity')
+        except BrokenPipeError:
+            return _fail('the program that was to read the output has gone')
+        except OSError as error:
+            return _fail(_os_error(error))
+
+
+@contextmanager
+def _sigterm_like_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM unwind the program as Ctrl-C does, so that everything is closed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may set handlers
+        return
+    before: Any = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _fail(message: str, code: int = BAD_INPUT) -> int:
+    line = ' '.join(message.split())
+    with suppress(OSError, ValueError):  # stderr may be closed, too
+        print(f'{PROGRAM}: error: {line}', file=sys.stderr, flush=True)
+    return code
+
+
+def _os_error(error: OSError) -> str:
+    where = f' ({error.filename})' if error.filename else ''
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f'no space left on the disk{where}; free some, or set TMPDIR to another disk'
+    return f'{error.strerror or error}{where}; check the path and its permissions'

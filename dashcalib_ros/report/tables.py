@@ -1,0 +1,99 @@
+"""What a terminal shows of a calibration. Returns rich renderables; prints nothing."""
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from dashcalib_ros.intrinsics import Calibration, Verdict
+from dashcalib_ros.report.compare import Comparison, Difference
+from dashcalib_ros.report.wording import (
+    PARAMETER_NAMES,
+    TURN_COLUMNS,
+    number,
+    optional,
+    parameter_row,
+    turn_row,
+)
+
+COLOURS = {'accepted': 'bold green', 'weak': 'bold yellow', 'refused': 'bold red'}
+
+
+def summary(calibration: Calibration) -> RenderableType:
+    """Return the verdict with its reasons, estimate and sigma, and what became of each turn."""
+    c = calibration
+    parts: list[RenderableType] = [verdict_text(c.verdict)]
+    if c.intrinsics is not None:
+        parts.append(text_table(('', 'estimate', 'sigma', ''), [
+            parameter_row(name, c.intrinsics, c.sigma) for name in PARAMETER_NAMES]))
+    if c.turns:
+        parts.append(text_table(TURN_COLUMNS, [turn_row(turn) for turn in c.turns]))
+    parts.append(Text(_facts(c)))
+    return Group(*parts)
+
+
+def verdict_text(verdict: Verdict) -> Text:
+    """Return the verdict, coloured, and its reasons, one a line."""
+    text = Text(verdict.level, COLOURS[verdict.level])
+    for reason in verdict.reasons:
+        text.append(f'\n  {reason}', 'default')
+    return text
+
+
+def comparison(found: Comparison) -> RenderableType:
+    """Return two calibrations side by side, and the mapping error."""
+    known = any(d.z is not None for d in found.differences)
+    rows = [_difference_row(d)[:None if known else -1] for d in found.differences]
+    head = ('', 'A', 'B', 'A - B', 'of B', 'sigmas')[:None if known else -1]
+    sides = Text('\n'.join(
+        f'{side}: {camera.name}' + (f' ({camera.verdict})' if camera.verdict else '')
+        for side, camera in (('A', found.a), ('B', found.b))))
+    return Group(sides, text_table(head, rows), mapping_text(found))
+
+
+def against_truth(found: Comparison) -> RenderableType:
+    """Return an estimate with its sigma beside the truth, and the mapping error."""
+    rows = [(d.name, number(d.name, d.a),
+             '-' if d.sigma is None else '± ' + number(d.name, d.sigma), number(d.name, d.b),
+             *_difference_row(d)[-2:]) for d in found.differences]
+    head = ('', 'estimate', 'sigma', 'truth', 'error', 'in sigmas')
+    return Group(text_table(head, rows), mapping_text(found))
+
+
+def mapping_text(found: Comparison) -> Text:
+    """Return the line that tells the mapping error."""
+    if found.mapping_px is None or not math.isfinite(found.mapping_px):
+        return Text('mapping error: unknown, a lens model folds over inside the image')
+    return Text(f'mapping error: {found.mapping_px:.2f} px')
+
+
+def text_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """Return a plain table of literal text: the first column to the left, numbers to the right."""
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for i, title in enumerate(head):
+        table.add_column(Text(title), justify='left' if i == 0 else 'right', no_wrap=True)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    return table
+
+
+def _difference_row(d: Difference) -> tuple[str, ...]:
+    return (d.name, number(d.name, d.a), number(d.name, d.b), f'{d.difference:+.4f}',
+            '-' if d.percent is None else f'{d.percent:+.3f} %', optional(d.z, 1))
+
+
+def _facts(c: Calibration) -> str:
+    used = sum(turn.used for turn in c.turns)
+    facts = [f'{c.frames} frames', f'{used} of {len(c.turns)} turns used']
+    if c.reprojection_error_px is not None:
+        facts.append('reprojection error ' + optional(c.reprojection_error_px, 3, ' px'))
+    if c.mask is not None:
+        facts.append(f'{100 * (1 - float(np.mean(c.mask))):.0f} % masked as ego vehicle')
+    if 'total' in c.timing:
+        facts.append(f'{c.timing["total"]:.1f} s')
+    return ', '.join(facts)
