@@ -66,12 +66,27 @@ class TurnsConfig:
 
 
 @dataclass(frozen=True)
+class TracksConfig:
+    """A turn's images -> correspondences between its keyframes."""
+
+    points: int = setting(800, 'points tracked at a time', 100, 10000)
+    window: int = setting(21, 'px; side of the Lucas-Kanade window', 7, 61)
+    forward_backward_px: float = setting(
+        0.5, 'px; a point that does not track back to within this is dropped', 0.05, 5.0)
+    keyframe_motion: float = setting(
+        0.02, 'of the image width; the median point moves so far between keyframes', 0.0, 1.0)
+    keyframe_overlap: float = setting(
+        0.6, 'a keyframe comes at the latest when fewer of the last one\'s points live', 0.0, 1.0)
+
+
+@dataclass(frozen=True)
 class Config:
     """All settings. Raises ConfigError for a value of the wrong type, NaN or out of range."""
 
     motion: MotionConfig = field(default_factory=MotionConfig)
     mask: MaskConfig = field(default_factory=MaskConfig)
     turns: TurnsConfig = field(default_factory=TurnsConfig)
+    tracks: TracksConfig = field(default_factory=TracksConfig)
     seed: int = setting(0, 'same input and seed: same result', 0, 2**31 - 1)
     threads: int = setting(1, 'threads of one reconstruction; more than 1 is not reproducible',
                            1, 256)

@@ -1,0 +1,1 @@
+"""Turns -> tracks -> one scene per turn, and the adjustment of scenes with one shared camera."""

@@ -1,0 +1,122 @@
+"""Track positions registered once more, each against one reference patch, by affine Lucas-Kanade.
+
+Tracking from image to image drifts: small errors add up along a track, most where a surface comes
+closer and its picture grows. A first scene tells how much larger each patch appears than in its
+reference image; from there an affine registration (Baker and Matthews 2004, inverse compositional)
+brings every observation back to the same world point.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.reconstruction.chain import Structure
+from dashcalib_ros.reconstruction.tracks import Tracks
+
+Array = npt.NDArray[np.float64]
+ITERATIONS = 10
+MAX_SCALE = 3.0
+MIN_CORRELATION = 0.85
+
+
+def register_tracks(tracks: Tracks, structure: Structure, images: Sequence[npt.NDArray[np.uint8]],
+                    half_window: int, max_shift_px: float) -> Tracks:
+    """Return the tracks with every used observation registered against its track's reference.
+
+    images: the keyframes' pictures. half_window: px; patches are (2 half_window + 1) wide.
+    max_shift_px: an observation that moves farther than this, or whose patch does not look like
+    the reference, is dropped.
+    """
+    depth = _depths(structure)
+    reference = _reference_rows(structure.used, depth)
+    smooth = [cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32) for image in images]
+    step = np.arange(-half_window, half_window + 1, dtype=np.float32)
+    grid = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
+    template, descent, inverse = _templates(tracks, reference, smooth, grid)
+    xy = np.full_like(tracks.xy, np.nan)
+    every = np.arange(tracks.xy.shape[1])
+    for k, image in enumerate(smooth):
+        scale = depth[reference, every] / np.where(depth[k] > 0, depth[k], 1.0)
+        wanted = np.flatnonzero(
+            structure.used[k] & (scale < MAX_SCALE) & (scale > 1 / MAX_SCALE))
+        if len(wanted) == 0:
+            continue
+        found, good = _align(image, tracks.xy[k, wanted], scale[wanted], template[wanted],
+                             descent[wanted], inverse[wanted], grid)
+        shift = np.linalg.norm(found - tracks.xy[k, wanted], axis=1)
+        good &= (shift < max_shift_px) | (reference[wanted] == k)
+        xy[k, wanted[good]] = found[good]
+    return replace(tracks, xy=xy)
+
+
+def _depths(structure: Structure) -> Array:
+    """Return (k, t) depths of the points in each image; 0 where not registered or behind."""
+    depth = (np.einsum('kj,tj->kt', structure.rotations[:, 2], structure.points)
+             + structure.translations[:, 2:])
+    return np.asarray(np.where(structure.registered[:, None], np.maximum(depth, 0.0), 0.0))
+
+
+def _reference_rows(used: npt.NDArray[np.bool_], depth: Array) -> npt.NDArray[np.int64]:
+    """Return (t,) the image of each track where its depth is the median of its observations."""
+    order = np.argsort(np.where(used, depth, np.inf), axis=0, kind='stable')
+    middle = np.maximum(used.sum(axis=0) - 1, 0) // 2
+    return order[middle, np.arange(used.shape[1])]
+
+
+def _sample(image: npt.NDArray[np.float32], xy: Array) -> npt.NDArray[np.float32]:
+    """Return (n, p) intensities at (n, p, 2) positions."""
+    where = xy.astype(np.float32)
+    return cv2.remap(image, where[:, :, 0], where[:, :, 1], cv2.INTER_CUBIC,
+                     borderMode=cv2.BORDER_REPLICATE)
+
+
+def _templates(tracks: Tracks, reference: npt.NDArray[np.int64],
+               images: list[npt.NDArray[np.float32]], grid: npt.NDArray[np.float32]
+               ) -> tuple[Array, Array, Array]:
+    """Return normalised patches (t, p), steepest descent (t, p, 6), inverse Hessians (t, 6, 6)."""
+    count, pixels = len(reference), len(grid)
+    template = np.zeros((count, pixels), np.float32)
+    gradient = np.zeros((count, pixels, 2), np.float32)
+    for k in np.unique(reference):
+        rows = np.flatnonzero((reference == k) & np.isfinite(tracks.xy[k, :, 0]))
+        centre = tracks.xy[k, rows][:, None] + grid
+        template[rows] = _sample(images[k], centre)
+        for axis, kernel in enumerate(((1, 0), (0, 1))):
+            slope = cv2.Sobel(images[k], cv2.CV_32F, *kernel, ksize=3, scale=1 / 8)
+            gradient[rows, :, axis] = _sample(slope, centre)
+    contrast = np.maximum(template.std(axis=1, keepdims=True), 1e-3)
+    template = (template - template.mean(axis=1, keepdims=True)) / contrast
+    gradient /= contrast[:, :, None]
+    # d/dp of T(W(d; p)) at the identity, p = a11 a12 a21 a22 tx ty
+    descent = np.concatenate([
+        gradient[:, :, :1] * grid, gradient[:, :, 1:] * grid, gradient], axis=2)
+    hessian = np.einsum('tpi,tpj->tij', descent, descent)
+    damping = 1e-3 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9
+    return template, descent, np.linalg.inv(hessian + damping * np.eye(6))
+
+
+def _align(image: npt.NDArray[np.float32], start: Array, scale: Array, template: Array,
+           descent: Array, inverse: Array, grid: npt.NDArray[np.float32]
+           ) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Return (n, 2) positions where the patches match their templates, and (n,) if they do."""
+    linear = scale[:, None, None] * np.eye(2)
+    centre = start.copy()
+    for _ in range(ITERATIONS):
+        patch = _sample(image, np.einsum('nij,pj->npi', linear, grid) + centre[:, None])
+        contrast = np.maximum(patch.std(axis=1, keepdims=True), 1e-3)
+        patch = (patch - patch.mean(axis=1, keepdims=True)) / contrast
+        step = np.einsum('nij,npj,np->ni', inverse, descent, patch - template, optimize=True)
+        # keep single steps small: the patch is only a few pixels wide
+        step[:, :4] = np.clip(step[:, :4], -0.2, 0.2)
+        step[:, 4:] = np.clip(step[:, 4:], -1.5, 1.5)
+        linear = linear @ np.linalg.inv(np.eye(2) + step[:, :4].reshape(-1, 2, 2))
+        centre = centre - np.einsum('nij,nj->ni', linear, step[:, 4:])
+        if np.abs(step[:, 4:]).max() < 0.005:
+            break
+    correlation = np.mean(patch * template, axis=1)
+    settled = np.linalg.norm(step[:, 4:], axis=1) < 0.1
+    return centre, settled & (correlation > MIN_CORRELATION)
