@@ -1,0 +1,171 @@
+"""A drive through the town: frames by random access, and the truth about them."""
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cached_property
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.demo.lens import Lens
+from dashcalib_ros.demo.overlay import Overlay
+from dashcalib_ros.demo.parallel import render_parallel
+from dashcalib_ros.demo.path import Course, course_of
+from dashcalib_ros.demo.quads import QuadList, Quads
+from dashcalib_ros.demo.raycast import Raycaster
+from dashcalib_ros.demo.spec import DriveSpec
+from dashcalib_ros.demo.street import Town, build_town
+from dashcalib_ros.demo.traffic import Traffic
+from dashcalib_ros.demo.vehicle import MARGIN_S, Ride, ride_of
+from dashcalib_ros.frames import Frame
+from dashcalib_ros.intrinsics import Intrinsics
+
+Floats = npt.NDArray[np.float64]
+Grey = npt.NDArray[np.uint8]
+
+# 2026-01-05 12:00:00 UTC; the first frame's stamp
+START_NS = 1_767_614_400 * 10**9
+
+
+class Drive:
+    """A lens and a spec: every frame can be rendered on its own, in any process, the same."""
+
+    def __init__(self, lens: Lens, spec: DriveSpec) -> None:
+        self.lens = lens
+        self.spec = spec
+        self.course: Course = course_of(spec)
+        self.ride: Ride = ride_of(self.course, spec)
+        usable = self.ride.duration - 2.0 * MARGIN_S
+        self.times: Floats = np.arange(math.floor(usable * spec.rate) + 1) / spec.rate
+
+    def __len__(self) -> int:
+        return int(self.times.size)
+
+    @property
+    def truth(self) -> Intrinsics:
+        """Return the lens as a calibration should find it."""
+        return self.lens.intrinsics
+
+    @cached_property
+    def poses(self) -> Floats:
+        """Return (n, 4, 4): world from camera (x right, y down, z forward), metres.
+
+        With a rolling shutter these are the middle row's.
+        """
+        rotation, position = self.ride.camera_at(self.times + MARGIN_S)
+        poses = np.tile(np.eye(4), (len(self), 1, 1))
+        poses[:, :3, :3] = rotation
+        poses[:, :3, 3] = position
+        return poses
+
+    @cached_property
+    def yaw(self) -> Floats:
+        """Return the car's heading at each frame (n,) in rad, left positive, not wrapped."""
+        return self.ride.yaw_at(self.times + MARGIN_S)
+
+    @cached_property
+    def turn_centers(self) -> tuple[int, ...]:
+        """Return the frame nearest to the middle of each turn."""
+        if self.spec.kind != 'drive':
+            return ()
+        return tuple(round((self.ride.time_at(s) - MARGIN_S) * self.spec.rate)
+                     for s in self.course.turn_s)
+
+    @cached_property
+    def overlay(self) -> Overlay:
+        """Return what hides the world; its mask is the ego vehicle's truth."""
+        spec = self.spec
+        return Overlay(self.lens.width, self.lens.height, spec.bonnet, spec.pillar,
+                       spec.timestamp, spec.seed)
+
+    @cached_property
+    def town(self) -> Town:
+        """Return the static world (built on first use, about two seconds)."""
+        return build_town(self.course, self.spec.seed)
+
+    @cached_property
+    def traffic(self) -> Traffic:
+        """Return the cars that move."""
+        return Traffic(self.course, self.ride, self.spec)
+
+    @cached_property
+    def raycaster(self) -> Raycaster:
+        """Return the renderer of this lens and town."""
+        return Raycaster(self.lens, self.town.atlas)
+
+    def stamp_ns(self, index: int) -> int:
+        """Return a frame's time stamp in nanoseconds."""
+        return START_NS + round(index * 1e9 / self.spec.rate)
+
+    def row_poses(self, index: int) -> tuple[Floats, Floats]:
+        """Return the rotations (n, 3, 3) and positions (n, 3) m of a frame's rows.
+
+        World from camera; n is the picture's height, or 1 without a rolling shutter.
+        """
+        time = self.times[index] + MARGIN_S
+        rows = np.zeros(1)
+        if self.spec.rolling_shutter_ms > 0.0:
+            rows = np.arange(self.lens.height) / (self.lens.height - 1) - 0.5
+        return self.ride.camera_at(time + rows * self.spec.rolling_shutter_ms / 1000.0)
+
+    def frames(self, first: int = 0, last: int | None = None,
+               processes: int = 1) -> Iterator[Frame]:
+        """Yield frames first to last (not included), rendering them lazily.
+
+        processes: how many render; more than 1 are spawned, and change nothing but the speed.
+        """
+        end = len(self) if last is None else min(last, len(self))
+        if processes > 1:
+            yield from render_parallel(self.lens, self.spec, first, end, processes)
+            return
+        for index in range(first, end):
+            yield self.frame(index)
+
+    def frame(self, index: int) -> Frame:
+        """Render one frame; the same picture whatever was rendered before."""
+        if not 0 <= index < len(self):
+            raise IndexError(f'frame {index} of {len(self)}')
+        image = self.raycaster.render(self.scene(index), *self.row_poses(index))
+        return Frame(index, self.stamp_ns(index), self._expose(image, index))
+
+    def scene(self, index: int) -> Quads:
+        """Return the world's surfaces at a frame's time."""
+        cars = QuadList()
+        self.traffic.add_to(cars, self.times[index] + MARGIN_S, self.town.cars)
+        return Quads.join([self.town.quads, cars.quads()]) if cars.rows else self.town.quads
+
+    def _expose(self, image: npt.NDArray[np.float32], index: int) -> Grey:
+        """Turn light into grey levels as the camera's electronics would."""
+        spec = self.spec
+        rng = np.random.default_rng([spec.seed, 5, index])
+        if spec.blur > 0.0:
+            image = np.asarray(cv2.GaussianBlur(image, (0, 0), spec.blur), np.float32)
+        time = self.times[index]
+        # slow and smooth, as automatic exposure is
+        slow = math.sin(0.9 * time) + math.sin(2.3 * time + 1.0)
+        image *= np.float32(1.0 + spec.flicker * slow)
+        if spec.night:
+            image *= np.float32(0.11)
+            image += np.float32(5.0)
+        self.overlay.apply(image, self.stamp_ns(index))
+        sigma = max(spec.noise, 4.0) if spec.night else spec.noise
+        if sigma > 0.0:
+            image += np.float32(sigma) * rng.standard_normal(image.shape, np.float32)
+        grey: Grey = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
+        if spec.jpeg_quality is not None:
+            _, code = cv2.imencode('.jpg', grey, (cv2.IMWRITE_JPEG_QUALITY, spec.jpeg_quality))
+            grey = np.asarray(cv2.imdecode(code, cv2.IMREAD_GRAYSCALE), np.uint8)
+        return grey
+
+
+def render(lens: Lens, spec: DriveSpec, processes: int = 1) -> Iterator[Frame]:
+    """Yield all frames of a drive, rendered as they are asked for."""
+    return Drive(lens, spec).frames(processes=processes)
+
+
+def demo_drive(seed: int = 0) -> Drive:
+    """Return the standard demo: 960 x 540 at 10 Hz, five turns, a lens with faults."""
+    lens = Lens.of(960, 540, 75.0, -0.30, 0.10, offset=(14.0, -9.0), aspect=1.003)
+    return Drive(lens, DriveSpec(seed=seed, bonnet=True, timestamp=True))

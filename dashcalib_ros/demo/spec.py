@@ -1,0 +1,96 @@
+"""What kind of drive to render."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from dashcalib_ros.errors import ConfigError
+
+Kind = Literal['drive', 'parked', 'spin']
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One turn. angle_deg: positive to the left. radius_m: of the rear axle's path."""
+
+    angle_deg: float
+    radius_m: float = 10.0
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A red light. before_turn: the straight it is on (0 is the first); seconds standing."""
+
+    before_turn: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class DriveSpec:
+    """A drive; the same spec and lens give the same pictures.
+
+    rate: frames per second. turns: the turns, or how many to make up from the seed (left and
+    right alternate, 60 to 100 degrees, radius 8 to 14 m); 0 is a straight drive.
+    straight_m: between turns. lead_m: before the first and after the last turn.
+    speed_mps on straights, turn_speed_mps in turns, accel_mps2 between them.
+    height_m: of the camera. vibration_deg: RMS of pitch from the road; roll is 0.7 of it, and
+    the body also dives when it brakes and leans in turns. 0 switches all of these off.
+    noise: sigma in grey levels. blur: sigma in pixels. bonnet, pillar, timestamp: what dashcams
+    see of their own car, and burn in. rolling_shutter_ms: from the first row to the last; a
+    frame's time is its middle row's. moving_cars: oncoming, leading and crossing ones.
+    stops: red lights. night: dark and noisy. flicker: RMS of the exposure's relative variation.
+    jpeg_quality: compress as a dashcam would; None does not.
+    kind: 'parked' stands still and 'spin' turns on the spot, both for duration_s.
+    """
+
+    rate: float = 10.0
+    turns: int | tuple[Turn, ...] = 5
+    straight_m: float = 28.0
+    lead_m: float = 34.0
+    speed_mps: float = 11.0
+    turn_speed_mps: float = 5.0
+    accel_mps2: float = 2.5
+    height_m: float = 1.4
+    vibration_deg: float = 0.35
+    seed: int = 0
+    noise: float = 1.5
+    blur: float = 0.4
+    bonnet: bool = False
+    pillar: bool = False
+    timestamp: bool = False
+    rolling_shutter_ms: float = 0.0
+    moving_cars: int = 0
+    stops: tuple[Stop, ...] = ()
+    night: bool = False
+    flicker: float = 0.01
+    jpeg_quality: int | None = None
+    kind: Kind = 'drive'
+    duration_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        positive = ('rate', 'straight_m', 'lead_m', 'speed_mps', 'turn_speed_mps',
+                    'accel_mps2', 'height_m', 'duration_s')
+        for name in positive:
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f'a drive needs {name} > 0, not {getattr(self, name)!r}')
+        for name in ('vibration_deg', 'noise', 'blur', 'rolling_shutter_ms', 'moving_cars',
+                     'flicker', 'seed'):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f'a drive needs {name} >= 0, not {getattr(self, name)!r}')
+        if any(abs(turn.angle_deg) > 170.0 or turn.radius_m < 4.0 for turn in self.turn_list):
+            raise ConfigError('a turn needs at most 170 degrees and a radius of 4 m or more')
+        for stop in self.stops:
+            if not 0 <= stop.before_turn <= len(self.turn_list):
+                raise ConfigError(f'there is no straight {stop.before_turn} to stop on')
+
+    @property
+    def turn_list(self) -> tuple[Turn, ...]:
+        """Return the turns, made up from the seed if only their number was given."""
+        if not isinstance(self.turns, int):
+            return tuple(self.turns)
+        rng = np.random.default_rng([self.seed, 1])
+        side = 1.0 if rng.random() < 0.5 else -1.0
+        return tuple(Turn(side * (-1.0) ** i * float(rng.uniform(60.0, 100.0)),
+                          float(rng.uniform(8.0, 14.0))) for i in range(self.turns))
