@@ -74,9 +74,29 @@ class TracksConfig:
     forward_backward_px: float = setting(
         0.5, 'px; a point that does not track back to within this is dropped', 0.05, 5.0)
     keyframe_motion: float = setting(
-        0.02, 'of the image width; the median point moves so far between keyframes', 0.0, 1.0)
+        0.03, 'of the image width; the median point moves so far between keyframes', 0.0, 1.0)
     keyframe_overlap: float = setting(
         0.6, 'a keyframe comes at the latest when fewer of the last one\'s points live', 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Tracks -> one scene per turn."""
+
+    tracks: int = setting(700, 'longest tracks that are used of a turn', 50, 10000)
+    profile_tracks: int = setting(300, 'longest tracks used for the focal profile', 50, 5000)
+    min_tracks: int = setting(80, 'a turn with fewer tracks is not tried', 20, 1000)
+    min_images: int = setting(6, 'a turn with fewer keyframes is not tried', 4, 100)
+    error_px: float = setting(2.0, 'px; an observation farther off is not used', 0.2, 20.0)
+    chain_error: float = setting(
+        0.004, 'of the width; the same while the lens is still unknown', 0.0005, 0.05)
+    min_angle_deg: float = setting(
+        1.0, 'degrees; rays that meet at less give no point; COLMAP has 1.5', 0.1, 10.0)
+    loss_px: float = setting(0.5, 'px; scale of the Cauchy loss', 0.05, 10.0)
+    iterations: int = setting(20, 'of one adjustment', 5, 500)
+    patch_half_window: int = setting(7, 'px; of the affine registration', 3, 25)
+    max_shift_px: float = setting(
+        3.0, 'px; a registration that moves a point farther has lost it', 0.2, 20.0)
 
 
 @dataclass(frozen=True)
@@ -87,6 +107,7 @@ class Config:
     mask: MaskConfig = field(default_factory=MaskConfig)
     turns: TurnsConfig = field(default_factory=TurnsConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
     seed: int = setting(0, 'same input and seed: same result', 0, 2**31 - 1)
     threads: int = setting(1, 'threads of one reconstruction; more than 1 is not reproducible',
                            1, 256)

@@ -14,8 +14,7 @@ import pyceres  # its import makes the adjuster's problem a pyceres.Problem
 import pycolmap
 
 from dashcalib_ros.reconstruction.camera import Camera
-from dashcalib_ros.reconstruction.chain import Structure
-from dashcalib_ros.reconstruction.tracks import Tracks
+from dashcalib_ros.reconstruction.scene import Scene
 
 Array = npt.NDArray[np.float64]
 
@@ -23,14 +22,8 @@ HALF_PIXEL = 0.5
 # fx fy cx cy k1 k2 p1 p2 of COLMAP's OPENCV model: the last two stay 0
 OPENCV_HELD = [6, 7]
 OPENCV_SIZE = 8
-
-
-@dataclass(frozen=True)
-class Scene:
-    """One turn's tracks and the structure that explains them."""
-
-    tracks: Tracks
-    structure: Structure
+# k1 and k2 beyond this are no lens but a scene that runs away
+MAX_K = 1.0
 
 
 @dataclass(frozen=True)
@@ -52,21 +45,22 @@ class Solver:
 
 
 def adjust_step1(scenes: Sequence[Scene], camera: Camera, solver: Solver,
-                 hold_focal: bool = False, max_k: float = 1.0) -> tuple[list[Scene], Camera]:
+                 focal_range: tuple[float, float] | None) -> tuple[list[Scene], Camera]:
     """Adjust with one focal length, k1 and k2, the centre fixed (paper, 3.2, step 1).
 
-    hold_focal: keep the focal length and adjust only the distortion: one point of its profile.
+    focal_range: px, lowest and highest focal length; None holds it where it is: one point of its
+    profile.
     """
     params = [camera.fx, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL, camera.k1, camera.k2]
     colmap = _camera('RADIAL', camera, params)
     reconstruction = _reconstruction(scenes, colmap)
-    adjuster = _adjuster(reconstruction, solver, refine_focal=not hold_focal, refine_centre=False)
-    width = camera.image_size[0]
+    adjuster = _adjuster(reconstruction, solver, refine_focal=focal_range is not None,
+                         refine_centre=False)
     values = reconstruction.cameras[1].params
-    if not hold_focal:
-        _bound(adjuster.problem, values, 0, 0.2 * width, 5.0 * width)
+    if focal_range is not None:
+        _bound(adjuster.problem, values, 0, *focal_range)
     for index in (3, 4):
-        _bound(adjuster.problem, values, index, -max_k, max_k)
+        _bound(adjuster.problem, values, index, -MAX_K, MAX_K)
     adjuster.solve()
     focal, _, _, k1, k2 = reconstruction.cameras[1].params
     return (_updated(scenes, reconstruction),

@@ -21,6 +21,7 @@ Array = npt.NDArray[np.float64]
 ITERATIONS = 10
 MAX_SCALE = 3.0
 MIN_CORRELATION = 0.85
+SETTLED_PX = 0.01
 
 
 def register_tracks(tracks: Tracks, structure: Structure, images: Sequence[npt.NDArray[np.uint8]],
@@ -94,9 +95,10 @@ def _templates(tracks: Tracks, reference: npt.NDArray[np.int64],
     # d/dp of T(W(d; p)) at the identity, p = a11 a12 a21 a22 tx ty
     descent = np.concatenate([
         gradient[:, :, :1] * grid, gradient[:, :, 1:] * grid, gradient], axis=2)
-    hessian = np.einsum('tpi,tpj->tij', descent, descent)
+    hessian = (descent.transpose(0, 2, 1) @ descent).astype(np.float64)
     damping = 1e-3 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9
-    return template, descent, np.linalg.inv(hessian + damping * np.eye(6))
+    inverse = np.linalg.inv(hessian + damping * np.eye(6)).astype(np.float32)
+    return template, descent, inverse
 
 
 def _align(image: npt.NDArray[np.float32], start: Array, scale: Array, template: Array,
@@ -105,18 +107,23 @@ def _align(image: npt.NDArray[np.float32], start: Array, scale: Array, template:
     """Return (n, 2) positions where the patches match their templates, and (n,) if they do."""
     linear = scale[:, None, None] * np.eye(2)
     centre = start.copy()
+    shift = np.full(len(start), np.inf)
+    correlation = np.zeros(len(start))
+    moving = np.arange(len(start))
     for _ in range(ITERATIONS):
-        patch = _sample(image, np.einsum('nij,pj->npi', linear, grid) + centre[:, None])
-        contrast = np.maximum(patch.std(axis=1, keepdims=True), 1e-3)
-        patch = (patch - patch.mean(axis=1, keepdims=True)) / contrast
-        step = np.einsum('nij,npj,np->ni', inverse, descent, patch - template, optimize=True)
+        patch = _sample(image, grid @ linear[moving].transpose(0, 2, 1) + centre[moving, None])
+        patch -= patch.mean(axis=1, keepdims=True)
+        patch /= np.maximum(patch.std(axis=1, keepdims=True), 1e-3)
+        correlation[moving] = np.mean(patch * template[moving], axis=1)
+        error = (patch - template[moving])[:, None]
+        step = (inverse[moving] @ (error @ descent[moving]).transpose(0, 2, 1))[:, :, 0]
         # keep single steps small: the patch is only a few pixels wide
-        step[:, :4] = np.clip(step[:, :4], -0.2, 0.2)
-        step[:, 4:] = np.clip(step[:, 4:], -1.5, 1.5)
-        linear = linear @ np.linalg.inv(np.eye(2) + step[:, :4].reshape(-1, 2, 2))
-        centre = centre - np.einsum('nij,nj->ni', linear, step[:, 4:])
-        if np.abs(step[:, 4:]).max() < 0.005:
+        warp = np.eye(2) + np.clip(step[:, :4], -0.2, 0.2).reshape(-1, 2, 2)
+        linear[moving] = linear[moving] @ np.linalg.inv(warp)
+        move = linear[moving] @ np.clip(step[:, 4:], -1.5, 1.5)[:, :, None]
+        centre[moving] -= move[:, :, 0]
+        shift[moving] = np.linalg.norm(move[:, :, 0], axis=1)
+        moving = moving[shift[moving] > SETTLED_PX]
+        if len(moving) == 0:
             break
-    correlation = np.mean(patch * template, axis=1)
-    settled = np.linalg.norm(step[:, 4:], axis=1) < 0.1
-    return centre, settled & (correlation > MIN_CORRELATION)
+    return centre, (shift < 10 * SETTLED_PX) & (correlation > MIN_CORRELATION)

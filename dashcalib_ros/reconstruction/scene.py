@@ -1,0 +1,88 @@
+"""What a reconstructed turn is."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.reconstruction.camera import Camera
+from dashcalib_ros.reconstruction.chain import Structure, triangulate
+from dashcalib_ros.reconstruction.tracks import Tracks
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How well a turn can be explained at each focal length held fixed.
+
+    ratios: (n,) focal length over image width, ascending. costs: (n,) px^2 per observation, each
+    observation's squared error cut at a limit, so that nothing is gained by explaining fewer.
+    observations: how many there were.
+    """
+
+    ratios: Array
+    costs: Array
+    observations: int
+
+    @property
+    def best(self) -> float:
+        """Return the ratio with the least cost."""
+        return float(self.ratios[np.argmin(self.costs)])
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One turn, reconstructed: its tracks, the structure that explains them, and its profile."""
+
+    center: int
+    tracks: Tracks
+    structure: Structure
+    camera: Camera
+    profile: Profile
+
+    @property
+    def yaw_deg(self) -> float:
+        """Return the largest rotation between any two registered images, in degrees."""
+        rotations = self.structure.rotations[self.structure.registered]
+        traces = np.einsum('aij,bij->ab', rotations, rotations)
+        return float(np.degrees(np.arccos(np.clip((traces.min() - 1) / 2, -1, 1))))
+
+
+def errors_px(scene: Scene, camera: Camera) -> Array:
+    """Return (k, t) reprojection errors in px; inf where the scene does not explain a track."""
+    structure = scene.structure
+    residual = residuals_px(scene, camera)
+    explained = structure.registered[:, None] & structure.used.any(axis=0)
+    error = np.linalg.norm(residual, axis=2)
+    return np.asarray(np.where(explained & np.isfinite(error), error, np.inf))
+
+
+def residuals_px(scene: Scene, camera: Camera) -> Array:
+    """Return (k, t, 2) projected minus observed, px; NaN where unseen or behind the camera."""
+    structure = scene.structure
+    local = (np.einsum('kij,tj->kti', structure.rotations, structure.points)
+             + structure.translations[:, None])
+    local[local[:, :, 2] <= 1e-9] = np.nan
+    return np.asarray(camera.project(local) - scene.tracks.xy)
+
+
+def truncated_cost(scene: Scene, camera: Camera, limit_px: float) -> float:
+    """Return the mean squared error over every observation, px^2, each cut at the limit.
+
+    An observation that the scene leaves out costs the full limit: a scene that explains a few
+    tracks perfectly does not win over one that explains them all.
+    """
+    seen = scene.tracks.seen
+    errors = np.minimum(errors_px(scene, camera), limit_px)
+    return float(np.sum(errors[seen] ** 2) / max(int(seen.sum()), 1))
+
+
+def retriangulated(scene: Scene, camera: Camera, limit_px: float, min_angle_deg: float) -> Scene:
+    """Return the scene with every track triangulated anew: lost ones come back, bad ones go."""
+    structure = scene.structure
+    points, used = triangulate(
+        camera.rays(scene.tracks.xy), structure.rotations, structure.translations,
+        structure.registered, limit_px / camera.fx, min_angle_deg)
+    return replace(scene, structure=replace(structure, points=points, used=used), camera=camera)
