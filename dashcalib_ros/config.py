@@ -34,7 +34,8 @@ class MotionConfig:
     width: int = setting(
         640, 'px; wider images are halved until they fit: epipoles need no more', 64, 8192)
     points: int = setting(
-        400, 'points tracked at a time, spread over a grid', 50, 5000)
+        300, 'points tracked at a time; 400 find the same turns on kitti03 and cost 20 % more',
+        50, 5000)
     forward_backward_px: float = setting(
         0.5, 'px; a point that does not track back to within this is dropped', 0.05, 5.0)
     standing_px: float = setting(
@@ -61,7 +62,8 @@ class TurnsConfig:
         3.0, "s kept on either side of a turn's centre; the paper's k = 30 frames at 10 fps",
         0.5, 10.0)
     min_prominence: float = setting(
-        0.006, 'of the image width; lower peaks are noise', 0.0, 1.0)
+        0.0025, "of the image width; kitti03's sharp turn has 0.050, its bends of 0.4 to 0.6 deg "
+        'per frame 0.003 to 0.008; straight streets and highways stay below 0.0022', 0.0, 1.0)
     capacity: int = setting(10, 'turns kept at the most: twice those wanted', 1, 50)
 
 
@@ -85,6 +87,9 @@ class SceneConfig:
 
     tracks: int = setting(700, 'longest tracks that are used of a turn', 50, 10000)
     profile_tracks: int = setting(300, 'longest tracks used for the focal profile', 50, 5000)
+    keyframes: int = setting(
+        30, 'of a turn at the most; more cost time and change nothing', 5, 1000)
+    profile_keyframes: int = setting(16, 'of a turn at the most, for the focal profile', 5, 1000)
     min_tracks: int = setting(80, 'a turn with fewer tracks is not tried', 20, 1000)
     min_images: int = setting(6, 'a turn with fewer keyframes is not tried', 4, 100)
     error_px: float = setting(2.0, 'px; an observation farther off is not used', 0.2, 20.0)
@@ -100,6 +105,43 @@ class SceneConfig:
 
 
 @dataclass(frozen=True)
+class IntrinsicsConfig:
+    """Scenes -> the six parameters: how far each may move, and what is believed of it before."""
+
+    rounds: int = setting(2, 'adjustments of each step, with new triangulation between', 1, 10)
+    focal_reach: float = setting(
+        1.35, 'ratio; step 1 looks so far to either side of the profile\'s minimum', 1.0, 3.0)
+    focal_bound: float = setting(0.15, 'of step 1\'s; step 2 moves fx and fy no farther', 0.01, 0.5)
+    centre_bound: float = setting(0.1, 'of the size; AliceVision\'s bound', 0.01, 0.5)
+    k_bound: float = setting(1.0, 'k1 and k2 beyond are no lens', 0.1, 5.0)
+    aspect_sigma: float = setting(
+        0.003, 'fy / fx is 1 to within this: planar turns know fx but hardly fy', 1e-5, 1.0)
+    centre_sigma: float = setting(
+        0.02, 'of the width; how far lenses sit off the middle of their sensors', 1e-4, 1.0)
+
+
+@dataclass(frozen=True)
+class VerdictConfig:
+    """When a result is weak or refused."""
+
+    min_turns: int = setting(2, 'turns; fewer are weak: focal lengths settle at 2 (paper)', 1, 20)
+    min_yaw_deg: float = setting(
+        60.0, 'degrees over all turns; less is weak', 0.0, 1000.0)
+    refused_yaw_deg: float = setting(
+        10.0, 'degrees over all turns; with less there was no turn', 0.0, 1000.0)
+    min_contrast: float = setting(
+        0.05, 'relative rise of the error 25 % off the focal length; less is weak', 0.0, 10.0)
+    refused_contrast: float = setting(
+        0.01, 'the same; with less nothing can be known', 0.0, 10.0)
+    max_profile_gap: float = setting(
+        1.25, 'ratio between the result and the focal profile\'s minimum', 1.0, 3.0)
+    max_sigma: float = setting(0.015, 'of fx; more is weak', 0.0, 1.0)
+    refused_sigma: float = setting(0.1, 'of fx; more is no result', 0.0, 1.0)
+    max_disagreement: float = setting(
+        0.03, 'of fx; weighted scatter between the turns, more is weak', 0.0, 1.0)
+
+
+@dataclass(frozen=True)
 class Config:
     """All settings. Raises ConfigError for a value of the wrong type, NaN or out of range."""
 
@@ -108,9 +150,13 @@ class Config:
     turns: TurnsConfig = field(default_factory=TurnsConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
+    intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
+    verdict: VerdictConfig = field(default_factory=VerdictConfig)
     seed: int = setting(0, 'same input and seed: same result', 0, 2**31 - 1)
-    threads: int = setting(1, 'threads of one reconstruction; more than 1 is not reproducible',
-                           1, 256)
+    threads: int = setting(
+        2, 'processes that reconstruct turns side by side; the result is the same with any', 1, 64)
+    max_width: int = setting(
+        1440, 'px; wider images are halved until they fit: time and memory fall by four', 320, 16384)
 
     def __post_init__(self) -> None:
         for name, spec, value in _settings(self):

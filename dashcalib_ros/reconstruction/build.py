@@ -3,11 +3,11 @@
 Incremental reconstruction with a free focal length often runs away, and registers every image with
 small residuals on the way (FACTS: f = 157 for 1353, 26 of 26 images, 0.85 px). Held at a wrong
 focal length it cannot run away; it only explains fewer observations. So the turn is chained at
-several held focal lengths, and the cost over *all* its observations tells the good start from garbage.
+several held focal lengths, and the cost over *all* its observations tells a good start from
+garbage.
 """
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,14 +19,14 @@ from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.chain import chain
 from dashcalib_ros.reconstruction.register import register_tracks
 from dashcalib_ros.reconstruction.scene import Profile, Scene, retriangulated, truncated_cost
-from dashcalib_ros.reconstruction.tracks import Tracks, track_turn
+from dashcalib_ros.reconstruction.tracks import Tracks, thinned, track_turn
 from dashcalib_ros.turns.turn import Turn
 
 Mask = npt.NDArray[np.bool_]
 
-# focal length / width: 0.32 is 115 degrees across, 1.91 is 29
-RATIOS = tuple(0.32 * 1.25**n for n in range(9))
-COARSE = (0, 2, 4, 6, 8)
+# focal length / width: 0.256 is 126 degrees across, 1.91 is 29
+RATIOS = tuple(0.256 * 1.25**n for n in range(10))
+COARSE = (1, 3, 5, 7, 9)
 
 
 def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
@@ -38,12 +38,14 @@ def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
     tracks = track_turn(turn, tracks_config, valid)
     if tracks.xy.shape[1] < config.min_tracks or len(tracks.frames) < config.min_images:
         return None
-    trials = _profile_trials(_longest(tracks, config.profile_tracks), turn.center, config, seed)
+    sample = _longest(thinned(tracks, config.profile_keyframes), config.profile_tracks)
+    trials = _profile_trials(sample, turn.center, config, seed)
     if not trials:
         return None
     profile = _profile_of(trials)
     start = trials[profile.best].camera
-    scene = chain_scene(_longest(tracks, config.tracks), turn.center, start, profile, config, seed)
+    chosen = _longest(thinned(tracks, config.keyframes), config.tracks)
+    scene = chain_scene(chosen, turn.center, start, profile, config, seed)
     if scene is None:
         return None
     # the neighbours on the profile's grid bound the focal length: the evidence lies between
@@ -121,6 +123,3 @@ def _longest(tracks: Tracks, wanted: int) -> Tracks:
     length = tracks.seen.sum(axis=0)
     chosen = np.sort(np.argsort(-length, kind='stable')[:wanted])
     return replace(tracks, xy=tracks.xy[:, chosen])
-
-
-Progress = Callable[[str, float], None]

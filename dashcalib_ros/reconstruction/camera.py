@@ -7,6 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+# tangent of 85 degrees: no pinhole camera sees farther out
+WIDEST = 11.4
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,8 @@ class Camera:
     def rays(self, xy: Array) -> Array:
         """Return the normalised, undistorted coordinates (..., 2) of pixels (..., 2).
 
-        NaN stays NaN. Newton's method on the radius; beyond the radius where the model folds over,
-        the radius stays at the fold.
+        NaN stays NaN, and so does a pixel that the model cannot reach because it folds over before.
+        Newton's method on the radius.
         """
         distorted = (xy - [self.cx, self.cy]) / [self.fx, self.fy]
         target = np.linalg.norm(distorted, axis=-1)
@@ -50,8 +52,9 @@ class Camera:
             square = radius * radius
             value = radius * (1 + square * (self.k1 + square * self.k2)) - target
             slope = 1 + square * (3 * self.k1 + 5 * square * self.k2)
-            radius = np.maximum(radius - value / np.maximum(slope, 0.1), 0.0)
-        scale = np.where(target > 1e-12, radius / np.maximum(target, 1e-12), 1.0)
+            radius = np.clip(radius - value / np.maximum(slope, 0.1), 0.0, WIDEST)
+        reached = np.where(np.abs(value) < 1e-6, radius, np.nan)
+        scale = np.where(target > 1e-12, reached / np.maximum(target, 1e-12), 1.0)
         return np.asarray(distorted * scale[..., None])
 
     def project(self, points: Array) -> Array:

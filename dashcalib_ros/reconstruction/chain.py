@@ -1,4 +1,4 @@
-"""A first scene from tracks, at a given camera: one pair by its essential matrix, then image by image.
+"""A first scene from tracks, at a given camera: a pair by its essential matrix, then one by one.
 
 Images of a drive come in order and their tracks are known, so the general machinery of
 incremental mapping (match graph, next-best-view search, local adjustments) is not needed: resection
@@ -58,10 +58,15 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
     registered = np.zeros(count, bool)
     registered[[first, second]] = True
     failed = np.zeros(count, bool)
+    points = np.zeros((rays.shape[1], 3))
+    used = np.zeros(rays.shape[:2], bool)
+    newest = second
     while True:
-        points, used = triangulate(rays, rotations, translations, registered, tolerance,
-                                   min_angle_deg)
-        known = used.any(axis=0)
+        # only what the newest image sees can have changed
+        touched = tracks.seen[newest]
+        points[touched], used[:, touched] = triangulate(
+            rays[:, touched], rotations, translations, registered, tolerance, min_angle_deg)
+        known: Mask = np.asarray(used.any(axis=0), bool)
         support = np.where(registered | failed, -1, (tracks.seen & known).sum(axis=1))
         nearest = int(np.argmax(support))
         if support[nearest] < MIN_RESECTION:
@@ -74,6 +79,7 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
         rotations[nearest], translations[nearest] = pose
         registered[nearest] = True
         failed[:] = False
+        newest = nearest
 
 
 def triangulate(rays: Array, rotations: Array, translations: Array, registered: Mask,
@@ -101,7 +107,7 @@ def triangulate(rays: Array, rotations: Array, translations: Array, registered: 
 
 def ray_error(rays: Array, rotations: Array, translations: Array, points: Array) -> Array:
     """Return (k, t) reprojection errors in normalised units; inf behind the camera or unseen."""
-    local = np.einsum('kij,tj->kti', rotations, points) + translations[:, None]
+    local = points @ rotations.transpose(0, 2, 1) + translations[:, None]
     depth = local[:, :, 2]
     ahead = depth > 1e-9
     xy = local[:, :, :2] / np.where(ahead, depth, 1.0)[:, :, None]
@@ -131,7 +137,7 @@ def _initial_pair(rays: Array, tolerance: float) -> tuple[int, int, Array, Array
         ahead, rotation, translation, _ = cv2.recoverPose(
             essential, a, b, np.eye(3), mask=inliers.copy())[:4]
         if ahead >= 0.5 * both.sum():
-            return first, second, rotation, translation.ravel()
+            return first, second, np.asarray(rotation), np.asarray(translation).ravel()
     return None
 
 
@@ -151,18 +157,17 @@ def _resection(rays: Array, points: Array, known: Mask, rotations: Array, transl
     chosen = inliers.ravel()
     rotvec, translation = cv2.solvePnPRefineLM(
         points[common][chosen], rays[common][chosen], np.eye(3), None, rotvec, translation)
-    return cv2.Rodrigues(rotvec)[0], translation.ravel()
+    return np.asarray(cv2.Rodrigues(rotvec)[0]), np.asarray(translation).ravel()
 
 
 def _linear_points(rays: Array, rotations: Array, translations: Array, seen: Mask) -> Array:
     """Return (t, 3) points that minimise the algebraic error over their observations."""
     poses = np.concatenate([rotations, translations[:, :, None]], axis=2)
     xy = np.where(seen[:, :, None], rays, 0.0)
-    normal = np.zeros((rays.shape[1], 4, 4))
-    for axis in range(2):
-        rows = xy[:, :, axis, None] * poses[:, None, 2] - poses[:, None, axis]
-        rows *= seen[:, :, None]
-        normal += np.einsum('kti,ktj->tij', rows, rows)
+    rows = np.concatenate([
+        (xy[:, :, axis, None] * poses[:, None, 2] - poses[:, None, axis]) * seen[:, :, None]
+        for axis in range(2)]).transpose(1, 0, 2)
+    normal = rows.transpose(0, 2, 1) @ rows
     homogeneous = np.linalg.eigh(normal)[1][:, :, 0]
     scale = homogeneous[:, 3:]
     scale = np.where(np.abs(scale) < 1e-12, 1e-12, scale)
@@ -176,4 +181,5 @@ def _widest_angle(rotations: Array, translations: Array, points: Array, seen: Ma
     last = len(seen) - 1 - seen[::-1].argmax(axis=0)
     a, b = points - centres[first], points - centres[last]
     # atan2 of the cross product is exact for small angles, where arccos is not
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
+    return np.asarray(
+        np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1)))

@@ -18,6 +18,7 @@ from dashcalib_ros.reconstruction.chain import Structure
 from dashcalib_ros.reconstruction.tracks import Tracks
 
 Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
 ITERATIONS = 10
 MAX_SCALE = 3.0
 MIN_CORRELATION = 0.85
@@ -65,19 +66,19 @@ def _reference_rows(used: npt.NDArray[np.bool_], depth: Array) -> npt.NDArray[np
     """Return (t,) the image of each track where its depth is the median of its observations."""
     order = np.argsort(np.where(used, depth, np.inf), axis=0, kind='stable')
     middle = np.maximum(used.sum(axis=0) - 1, 0) // 2
-    return order[middle, np.arange(used.shape[1])]
+    return np.asarray(order[middle, np.arange(used.shape[1])], np.int64)
 
 
-def _sample(image: npt.NDArray[np.float32], xy: Array) -> npt.NDArray[np.float32]:
+def _sample(image: Floats, xy: Array) -> Floats:
     """Return (n, p) intensities at (n, p, 2) positions."""
     where = xy.astype(np.float32)
-    return cv2.remap(image, where[:, :, 0], where[:, :, 1], cv2.INTER_CUBIC,
-                     borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.remap(image, where[:, :, 0], where[:, :, 1], cv2.INTER_CUBIC,
+                                borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
 def _templates(tracks: Tracks, reference: npt.NDArray[np.int64],
-               images: list[npt.NDArray[np.float32]], grid: npt.NDArray[np.float32]
-               ) -> tuple[Array, Array, Array]:
+               images: list[Floats], grid: Floats
+               ) -> tuple[Floats, Floats, Floats]:
     """Return normalised patches (t, p), steepest descent (t, p, 6), inverse Hessians (t, 6, 6)."""
     count, pixels = len(reference), len(grid)
     template = np.zeros((count, pixels), np.float32)
@@ -101,8 +102,8 @@ def _templates(tracks: Tracks, reference: npt.NDArray[np.int64],
     return template, descent, inverse
 
 
-def _align(image: npt.NDArray[np.float32], start: Array, scale: Array, template: Array,
-           descent: Array, inverse: Array, grid: npt.NDArray[np.float32]
+def _align(image: Floats, start: Array, scale: Array, template: Floats,
+           descent: Floats, inverse: Floats, grid: Floats
            ) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Return (n, 2) positions where the patches match their templates, and (n,) if they do."""
     linear = scale[:, None, None] * np.eye(2)

@@ -62,7 +62,7 @@ def errors_px(scene: Scene, camera: Camera) -> Array:
 def residuals_px(scene: Scene, camera: Camera) -> Array:
     """Return (k, t, 2) projected minus observed, px; NaN where unseen or behind the camera."""
     structure = scene.structure
-    local = (np.einsum('kij,tj->kti', structure.rotations, structure.points)
+    local = (structure.points @ structure.rotations.transpose(0, 2, 1)
              + structure.translations[:, None])
     local[local[:, :, 2] <= 1e-9] = np.nan
     return np.asarray(camera.project(local) - scene.tracks.xy)

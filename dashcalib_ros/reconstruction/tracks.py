@@ -7,17 +7,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.config import TracksConfig
+from dashcalib_ros.motion.points import find_corners, follow_points
 from dashcalib_ros.turns.turn import Turn
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-# px; where the tracking window leaves the picture, positions drift
-BORDER = 8
 MIN_LENGTH = 3
 
 
@@ -57,58 +55,14 @@ def track_turn(turn: Turn, config: TracksConfig, valid: Mask | None = None) -> T
     return Tracks(indices, table, turn.frames[0].size)
 
 
-def find_corners(image: npt.NDArray[np.uint8], present: npt.NDArray[np.float32], wanted: int,
-                 valid: Mask | None = None) -> npt.NDArray[np.float32]:
-    """Return (n, 2) new corners that bring the picture up to `wanted`, spread over a grid.
-
-    present: (m, 2) points that are tracked already; no corner is put near them.
-    """
-    height, width = image.shape
-    columns = max(2, round(np.sqrt(wanted / 25 * width / height)))
-    rows = max(2, round(np.sqrt(wanted / 25 * height / width)))
-    spacing = max(4, width // 100)
-    free = np.full(image.shape, 255, np.uint8)
-    if valid is not None:
-        free[~valid] = 0
-    for x, y in present:
-        cv2.circle(free, (int(x), int(y)), spacing, 0, -1)
-    share = -(-wanted // (columns * rows))
-    cell = (np.clip(present[:, 1] * rows / height, 0, rows - 1).astype(int) * columns
-            + np.clip(present[:, 0] * columns / width, 0, columns - 1).astype(int))
-    held = np.bincount(cell, minlength=rows * columns).reshape(rows, columns)
-    found = [np.zeros((0, 2), np.float32)]
-    for row, column in np.argwhere(held < share):
-        top, bottom = row * height // rows, (row + 1) * height // rows
-        left, right = column * width // columns, (column + 1) * width // columns
-        window = np.s_[top:bottom, left:right]
-        corners = cv2.goodFeaturesToTrack(
-            image[window], int(share - held[row, column]), 0.02, spacing, mask=free[window],
-            blockSize=5)
-        if corners is not None:
-            found.append(corners.reshape(-1, 2) + np.float32([left, top]))
-    return np.concatenate(found)
-
-
-def follow_points(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8],
-                  points: npt.NDArray[np.float32], forward_backward_px: float, window: int = 21,
-                  levels: int = 4) -> tuple[npt.NDArray[np.float32], Mask]:
-    """Track points from one image to the next by pyramidal Lucas-Kanade, and back as a check.
-
-    Returns the (n, 2) positions in `after` and (n,) whether each can be trusted.
-    """
-    if len(points) == 0:
-        return points, np.zeros(0, bool)
-    height, width = after.shape
-    settings = {'winSize': (window, window), 'maxLevel': levels,
-                'criteria': (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)}
-    moved, ahead, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, **settings)
-    back, behind, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None, **settings)
-    x, y = moved[:, 0], moved[:, 1]
-    trusted = (
-        (ahead.ravel() > 0) & (behind.ravel() > 0)
-        & (np.linalg.norm(back - points, axis=1) < forward_backward_px)
-        & (x > BORDER) & (x < width - 1 - BORDER) & (y > BORDER) & (y < height - 1 - BORDER))
-    return moved, trusted
+def thinned(tracks: Tracks, keyframes: int) -> Tracks:
+    """Return the tracks at no more keyframes than asked for, evenly spread."""
+    count = len(tracks.frames)
+    if count <= keyframes:
+        return tracks
+    kept = np.round(np.linspace(0, count - 1, keyframes)).astype(int)
+    xy = tracks.xy[kept]
+    return Tracks(tracks.frames[kept], xy[:, _worth_keeping(xy)], tracks.image_size)
 
 
 def _follow(images: list[npt.NDArray[np.uint8]], config: TracksConfig, valid: Mask | None

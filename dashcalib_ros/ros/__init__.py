@@ -1,0 +1,29 @@
+"""The ROS 2 node; the only room that imports rclpy, and only when the node is started."""
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+INSTALL = ("calibrator: error: the Python package {name} is missing: source your ROS 2 installation "
+           "(. /opt/ros/jazzy/setup.sh), or pip install 'ros-jazzy-rclpy[fastrtps]' "
+           "ros-jazzy-common-interfaces")
+ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'rcl_interfaces', 'sensor_msgs',
+                'std_msgs', 'std_srvs')
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node until it is stopped; return its exit code. argv: without the program's name."""
+    # the handlers come first: Ctrl-C may be pressed while the imports still run
+    from dashcalib_ros.ros.stopping import Stopping
+    stopping = Stopping()
+    try:
+        from dashcalib_ros.ros.program import run
+        return run(argv, stopping)
+    except ModuleNotFoundError as error:
+        missing = (error.name or '').partition('.')[0]
+        if missing not in ROS_PACKAGES:
+            raise
+        print(INSTALL.format(name=missing), file=sys.stderr)
+        return 2
+    finally:
+        stopping.ignore_signals()

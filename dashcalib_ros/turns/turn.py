@@ -12,7 +12,8 @@ class Turn:
 
     center, first, last: indices of input frames; stamp_s: time of the centre in seconds.
     prominence: topographic prominence of the filtered turning magnitude, of the image width.
-    frames: the images from first to last, thinned to the detector's rate, in order.
+    frames: the images from first to last, thinned to the detector's rate, in order; empty once
+    released, when only their number, released_images, is remembered.
     """
 
     center: int
@@ -21,8 +22,9 @@ class Turn:
     stamp_s: float
     prominence: float
     frames: tuple[Frame, ...] = ()
+    released_images: int = 0
 
     @property
     def images(self) -> int:
         """Return how many images the turn has."""
-        return len(self.frames)
+        return len(self.frames) or self.released_images

@@ -1,0 +1,36 @@
+"""Pictures made smaller by a whole factor."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from dashcalib_ros.frames.frame import Frame, GreyImage
+
+
+def shrink_factor(size: tuple[int, int], max_width: int) -> int:
+    """Return the power of two that an image of this (width, height) is divided by to fit."""
+    factor = 1
+    while size[0] / factor > max_width:
+        factor *= 2
+    return factor
+
+
+def shrink_image(image: GreyImage, factor: int) -> GreyImage:
+    """Return the image averaged over blocks of factor x factor pixels.
+
+    What does not fill a block at the right and lower edge is cut off, so that pixel (x, y) of the
+    small image is exactly ((x + 0.5) factor - 0.5, (y + 0.5) factor - 0.5) of the large one.
+    """
+    if factor == 1:
+        return image
+    height, width = (side // factor * factor for side in image.shape)
+    small = cv2.resize(image[:height, :width], (width // factor, height // factor),
+                       interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
+
+
+def shrink(frame: Frame, factor: int) -> Frame:
+    """Return the frame with its image shrunk."""
+    return frame if factor == 1 else replace(frame, image=shrink_image(frame.image, factor))

@@ -1,0 +1,162 @@
+"""What each turn knows of the six parameters: information, score, and honest sigmas.
+
+At the adjusted solution the residuals are linearised, and the points and poses of a turn are
+eliminated (Schur complement). What is left of turn i is its information H_i (6, 6) and its score
+g_i (6,), the pull of its residuals on fx, fy, cx, cy, k1, k2. From these three estimates of the
+covariance follow:
+
+- H^-1 times the noise of the residuals: right if each were independent and the model exact;
+- H^-1 (sum over tracks s s') H^-1: residuals of one track may share an error (drift, a moving car);
+- H^-1 (sum over turns g g') H^-1: whatever makes turns disagree (rolling shutter, a bad scene).
+
+The last two are the sandwich estimator with clusters; over turns it is the first-order jackknife.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.reconstruction.camera import Camera
+from dashcalib_ros.reconstruction.scene import Scene
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Information:
+    """What one turn contributes, in units of its residuals' weight (px^-2).
+
+    hessian: (6, 6) reduced information of fx, fy, cx, cy, k1, k2; score: (6,) -> (6,) minus the
+    gradient; by_track: (6, 6) sum over tracks of the outer products of their scores.
+    squares: weighted sum of squared residuals, px^2; freedom: residuals minus parameters.
+    """
+
+    hessian: Array
+    score: Array
+    by_track: Array
+    squares: float
+    freedom: float
+
+
+def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
+    """Return what a scene knows of the camera, at the solution.
+
+    loss_px: scale of the Cauchy loss, whose weights 1 / (1 + e^2 / loss^2) apply.
+    """
+    structure = scene.structure
+    rows, columns = np.nonzero(structure.used)
+    rotation = structure.rotations[rows]
+    rotated = np.einsum('nij,nj->ni', rotation, structure.points[columns])
+    local = rotated + structure.translations[rows]
+    by_camera, by_local, projected = _derivatives(local, camera)
+    residual = scene.tracks.xy[rows, columns] - projected
+    root = 1 / np.sqrt(1 + np.sum(residual**2, axis=1) / loss_px**2)
+    by_camera, by_local = by_camera * root[:, None, None], by_local * root[:, None, None]
+    residual = residual * root[:, None]
+    # a small turn w of the camera moves the local point by w x (R X)
+    by_pose = np.concatenate([by_local @ -_cross(rotated), by_local], axis=2)
+    by_point = by_local @ rotation
+    _, pose = np.unique(rows, return_inverse=True)
+    _, point = np.unique(columns, return_inverse=True)
+    nuisance = 6 * (int(pose.max()) + 1)
+    points = int(point.max()) + 1
+
+    # global block: all poses of the turn, then the six parameters
+    size = nuisance + 6
+    normal = np.zeros((size, size))
+    mixed = np.zeros((points, size, 3))
+    own = np.zeros((points, 3, 3))
+    np.add.at(own, point, by_point.transpose(0, 2, 1) @ by_point)
+    slots = 6 * pose[:, None] + np.arange(6)
+    wide = np.concatenate([by_pose, by_camera], axis=2)
+    where = np.concatenate([slots, np.broadcast_to(np.arange(nuisance, size), slots.shape)], axis=1)
+    np.add.at(normal, (where[:, :, None], where[:, None, :]), wide.transpose(0, 2, 1) @ wide)
+    np.add.at(mixed, (point[:, None], where), wide.transpose(0, 2, 1) @ by_point)
+    # a point that its rays fix badly gets a little damping instead of a wild inverse
+    damping = 1e-9 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    inverse = np.linalg.inv(own + damping + 1e-12 * np.eye(3))
+    solved = mixed @ inverse
+    reduced = normal - np.tensordot(solved, mixed, axes=([0, 2], [0, 2]))
+
+    # seven directions of the poses (where, how large) are free: the pseudo-inverse leaves them out
+    poses = reduced[:nuisance, :nuisance]
+    scale = 1 / np.sqrt(np.maximum(np.diag(poses), 1e-12))
+    inner = np.linalg.pinv(poses * scale[:, None] * scale, rcond=1e-10, hermitian=True)
+    inner = inner * scale[:, None] * scale
+    follow = inner @ reduced[:nuisance, nuisance:]
+    hessian = reduced[nuisance:, nuisance:] - reduced[:nuisance, nuisance:].T @ follow
+
+    # each track's score, after its poses and its point have followed the six parameters
+    combine = np.concatenate([-follow, np.eye(6)])
+    point_follow = inverse @ (mixed.transpose(0, 2, 1) @ combine)
+    effective = (np.einsum('nij,njc->nic', wide, combine[where])
+                 - by_point @ point_follow[point])
+    scores = np.zeros((points, 6))
+    np.add.at(scores, point, np.einsum('nic,ni->nc', effective, residual))
+    freedom = max(2 * len(rows) - 3 * points - nuisance + 7 - 6, 1)
+    return Information(hessian, scores.sum(axis=0), scores.T @ scores,
+                       float(np.sum(residual**2)), float(freedom))
+
+
+def noise_of(parts: Sequence[Information]) -> float:
+    """Return the variance of a residual, px^2, from all turns."""
+    return sum(part.squares for part in parts) / sum(part.freedom for part in parts)
+
+
+def covariance(parts: Sequence[Information], prior: Array) -> Array:
+    """Return the (6, 6) covariance: the largest of the three estimates in each parameter.
+
+    prior: (6, 6) information of the priors, in the same units as the residuals (px^-2 at unit
+    noise). The correlations are those of the first estimate.
+    """
+    noise = noise_of(parts)
+    hessian = sum((part.hessian for part in parts), np.zeros((6, 6))) / noise + prior
+    inverse = np.linalg.inv(hessian)
+    by_track = sum((part.by_track for part in parts), np.zeros((6, 6))) / noise**2
+    estimates = [np.diag(inverse), np.diag(inverse @ by_track @ inverse)]
+    if len(parts) > 1:
+        scores = np.array([part.score for part in parts]) / noise
+        scores = scores - scores.mean(axis=0)
+        count = len(parts)
+        # few turns know their own scatter badly: Student's t instead of the normal's width
+        tails = (count - 1) / (count - 3) if count > 3 else 3.0
+        by_turn = scores.T @ scores * count / (count - 1) * tails
+        estimates.append(np.diag(inverse @ by_turn @ inverse))
+    sigma = np.sqrt(np.max(estimates, axis=0))
+    correlation = inverse / np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
+    return np.asarray(correlation * np.outer(sigma, sigma))
+
+
+def _cross(vectors: Array) -> Array:
+    """Return (n, 3, 3) matrices that take the cross product with each vector (n, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+
+
+def _derivatives(local: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    """Return d pixel / d camera (n, 2, 6), d pixel / d local point (n, 2, 3), pixels (n, 2)."""
+    x, y = (local[:, :2] / local[:, 2:]).T
+    square = x * x + y * y
+    factor = 1 + square * (camera.k1 + square * camera.k2)
+    slope = camera.k1 + 2 * camera.k2 * square
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    by_camera = np.stack([
+        np.stack([x * factor, zero, one, zero, camera.fx * x * square,
+                  camera.fx * x * square**2], axis=1),
+        np.stack([zero, y * factor, zero, one, camera.fy * y * square,
+                  camera.fy * y * square**2], axis=1)], axis=1)
+    by_normal = np.stack([
+        np.stack([factor + 2 * slope * x * x, 2 * slope * x * y], axis=1),
+        np.stack([2 * slope * x * y, factor + 2 * slope * y * y], axis=1)], axis=1)
+    by_normal *= np.array([[camera.fx], [camera.fy]])
+    depth = local[:, 2]
+    normal_by_local = np.stack([
+        np.stack([one / depth, zero, -x / depth], axis=1),
+        np.stack([zero, one / depth, -y / depth], axis=1)], axis=1)
+    pixels = np.stack([camera.fx * x * factor + camera.cx, camera.fy * y * factor + camera.cy],
+                      axis=1)
+    return by_camera, by_normal @ normal_by_local, pixels

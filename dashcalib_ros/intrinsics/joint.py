@@ -1,0 +1,114 @@
+"""Scenes -> one camera, in the paper's two steps (3.2), with what each turn knows of it."""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.config import IntrinsicsConfig, SceneConfig
+from dashcalib_ros.intrinsics.information import covariance, information, noise_of
+from dashcalib_ros.intrinsics.solution import Solution
+from dashcalib_ros.reconstruction.adjust import Prior, Solver, adjust_step1, adjust_step2
+from dashcalib_ros.reconstruction.build import chain_scene
+from dashcalib_ros.reconstruction.camera import Camera
+from dashcalib_ros.reconstruction.scene import Profile, Scene, retriangulated
+
+Array = npt.NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+
+def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: SceneConfig,
+          seed: int = 0, progress: Progress = lambda stage, done: None) -> Solution:
+    """Adjust all scenes with one shared camera.
+
+    scenes: at least one. The summed focal profile picks the start; a scene that was built far from
+    it is chained anew.
+    """
+    solver = Solver(scene_config.loss_px, scene_config.iterations)
+    profile = summed([scene.profile for scene in scenes])
+    start = _start(scenes, profile)
+    together = [_brought_to(scene, start, scene_config, seed) for scene in scenes]
+    reach = (start.fx / config.focal_reach, start.fx * config.focal_reach)
+    camera = start
+    for n in range(config.rounds):
+        progress('step 1: one focal length', n / config.rounds)
+        together, camera = adjust_step1(together, camera, solver, reach)
+        together = [_again(scene, camera, scene_config) for scene in together]
+    step1 = camera
+    known = [information(scene, camera, scene_config.loss_px) for scene in together]
+    prior = _prior(step1, config, noise_of(known))
+    bounds = _bounds(step1, config)
+    for n in range(config.rounds):
+        progress('step 2: all six', n / config.rounds)
+        together, camera = adjust_step2(together, camera, solver, prior, bounds)
+        together = [_again(scene, camera, scene_config) for scene in together]
+    progress('sigma', 0.0)
+    together, camera = adjust_step2(together, camera, solver, prior, bounds)
+    parts = tuple(information(scene, camera, scene_config.loss_px) for scene in together)
+    spread = covariance(parts, np.asarray(
+        np.linalg.inv(_prior(step1, config, 1.0).covariance), np.float64))
+    return Solution(camera, spread, step1, tuple(together), parts, profile, np.array(bounds))
+
+
+def summed(profiles: Sequence[Profile]) -> Profile:
+    """Return the profiles' sum, in squared error times observations, on a common fine grid."""
+    low = max(profile.ratios[0] for profile in profiles)
+    high = min(profile.ratios[-1] for profile in profiles)
+    if low >= high:
+        low, high = (min(profile.ratios[0] for profile in profiles),
+                     max(profile.ratios[-1] for profile in profiles))
+    ratios = np.geomspace(low, high, 81)
+    total = np.zeros(len(ratios))
+    for profile in profiles:
+        total += profile.observations * np.interp(
+            np.log(ratios), np.log(profile.ratios), profile.costs)
+    observations = sum(profile.observations for profile in profiles)
+    return Profile(ratios, total / observations, observations)
+
+
+def _start(scenes: Sequence[Scene], profile: Profile) -> Camera:
+    """Return the scene's own camera that lies nearest to the summed profile's minimum."""
+    wanted = np.log(profile.best * scenes[0].camera.image_size[0])
+    return min((scene.camera for scene in scenes),
+               key=lambda camera: abs(float(np.log(camera.fx)) - wanted))
+
+
+def _brought_to(scene: Scene, camera: Camera, config: SceneConfig, seed: int) -> Scene:
+    """Return the scene, chained anew if its own focal length is far from the common one."""
+    if abs(np.log(scene.camera.fx / camera.fx)) > np.log(1.08):
+        anew = chain_scene(scene.tracks, scene.center, camera, scene.profile, config, seed)
+        if anew is not None:
+            return anew
+    return _again(scene, camera, config)
+
+
+def _again(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
+    return retriangulated(scene, camera, config.error_px, config.min_angle_deg)
+
+
+def _prior(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
+    """Return square pixels and a centred principal point, as far as either is believed.
+
+    noise: variance of a residual, px^2. The adjustment takes residuals in px as if their sigma were
+    1: the prior must be weakened by as much as they are more exact.
+    """
+    width, height = camera.image_size
+    wide = (10 * camera.fx) ** 2
+    spread = np.diag([wide, wide, (config.centre_sigma * width) ** 2,
+                      (config.centre_sigma * width) ** 2, 1.0, 1.0])
+    # fx may be anything; fy is fx to within the aspect's sigma
+    spread[0, 1] = spread[1, 0] = wide
+    spread[1, 1] += (config.aspect_sigma * camera.fx) ** 2
+    mean = np.array([camera.fx, camera.fx, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0])
+    return Prior(mean, spread / noise)
+
+
+def _bounds(camera: Camera, config: IntrinsicsConfig) -> tuple[Array, Array]:
+    """Return the lowest and the highest values of step 2 (the paper: 'within bounds')."""
+    width, height = camera.image_size
+    middle = np.array([camera.fx, camera.fx, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0])
+    reach = np.array([camera.fx * config.focal_bound, camera.fx * config.focal_bound,
+                      width * config.centre_bound, height * config.centre_bound,
+                      config.k_bound, config.k_bound])
+    return middle - reach, middle + reach

@@ -1,0 +1,43 @@
+"""What the joint adjustment found."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.intrinsics.information import Information
+from dashcalib_ros.reconstruction.camera import Camera
+from dashcalib_ros.reconstruction.scene import Profile, Scene, errors_px
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """All turns adjusted together.
+
+    camera: the six parameters; covariance: (6, 6) of them; step1: the camera after the first step.
+    scenes: as adjusted, in the order given; parts: what each knows; profile: summed over the turns.
+    bounds: (2, 6) lowest and highest values that were allowed.
+    """
+
+    camera: Camera
+    covariance: Array
+    step1: Camera
+    scenes: tuple[Scene, ...]
+    parts: tuple[Information, ...]
+    profile: Profile
+    bounds: Array
+
+    @property
+    def sigma(self) -> Array:
+        """Return the six standard deviations (6,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def reprojection_error_px(self) -> float:
+        """Return the root mean square reprojection error of the used observations, px."""
+        squares = [errors_px(scene, self.camera)[scene.structure.used] ** 2
+                   for scene in self.scenes]
+        return float(np.sqrt(np.mean(np.concatenate(squares))))

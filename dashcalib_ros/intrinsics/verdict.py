@@ -1,0 +1,136 @@
+"""Scenes and solution -> verdict: every rule by which a result is refused or called weak.
+
+Registration and residuals do not tell garbage from a calibration; the focal profile, the yaw, the
+agreement of the turns and the sigmas do.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from dashcalib_ros.config import VerdictConfig
+from dashcalib_ros.intrinsics.calibration import Verdict
+from dashcalib_ros.intrinsics.information import noise_of
+from dashcalib_ros.intrinsics.solution import Solution
+
+NAMES = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')
+# a parameter this near to its bound, as a share of the range, lies on it
+ON_BOUND = 0.01
+
+
+def judge(solution: Solution, config: VerdictConfig) -> Verdict:
+    """Return the verdict on a solution, with every reason against it."""
+    rules: tuple[Callable[[Solution, VerdictConfig], tuple[list[str], list[str]]], ...] = (
+        _too_few_turns, _too_little_yaw, _flat_profile, _far_from_profile, _sigma_too_large,
+        _turns_disagree, _on_bound, _folds_over)
+    refused: list[str] = []
+    weak: list[str] = []
+    for rule in rules:
+        against, doubts = rule(solution, config)
+        refused += against
+        weak += doubts
+    if refused:
+        return Verdict('refused', tuple(refused + weak))
+    if weak:
+        return Verdict('weak', tuple(weak))
+    return Verdict('accepted')
+
+
+def _too_few_turns(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    count = len(solution.scenes)
+    if count < config.min_turns:
+        return [], [f'only {count} of at least {config.min_turns} turns could be used: '
+                    f'drive more turns']
+    return [], []
+
+
+def _too_little_yaw(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    yaw = sum(scene.yaw_deg for scene in solution.scenes)
+    message = f'the turns add up to {yaw:.0f} degrees of yaw only: drive sharper turns'
+    if yaw < config.refused_yaw_deg:
+        return [message], []
+    return [], [message] if yaw < config.min_yaw_deg else []
+
+
+def _flat_profile(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    """The cost must rise to both sides of its minimum, or the turns know nothing of the focal."""
+    contrast = profile_contrast(solution)
+    message = (f'the turns hardly tell one focal length from another (the error rises by '
+               f'{100 * contrast:.1f} % when it is 25 % off): drive sharper turns in daylight')
+    if contrast < config.refused_contrast:
+        return [message], []
+    return [], [message] if contrast < config.min_contrast else []
+
+
+def profile_contrast(solution: Solution) -> float:
+    """Return by how much the summed cost rises, relatively, 25 % to either side of the result."""
+    profile = solution.profile
+    ratio = solution.camera.fx / solution.camera.image_size[0]
+    costs = np.interp(np.log([ratio, ratio / 1.25, ratio * 1.25]), np.log(profile.ratios),
+                      profile.costs)
+    lowest = min(float(costs[0]), float(profile.costs.min()))
+    return float(min(costs[1], costs[2]) / lowest - 1)
+
+
+def _far_from_profile(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    width = solution.camera.image_size[0]
+    best = solution.profile.best
+    if not 1 / config.max_profile_gap < solution.camera.fx / width / best < config.max_profile_gap:
+        return [f'the focal length {solution.camera.fx:.0f} px contradicts the one that explains '
+                f'most observations, about {best * width:.0f} px'], []
+    return [], []
+
+
+def _sigma_too_large(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    relative = float(solution.sigma[0] / solution.camera.fx)
+    message = f'fx is uncertain by {100 * relative:.1f} %: more or sharper turns are needed'
+    if not np.isfinite(relative) or relative > config.refused_sigma:
+        return [message], []
+    return [], [message] if relative > config.max_sigma else []
+
+
+def _turns_disagree(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    """Each turn alone says what fx it would rather have: compare that with its own sigma."""
+    spread = focal_disagreement(solution)
+    if spread > config.max_disagreement:
+        return [], [f'the turns disagree about fx by {100 * spread:.1f} %: was the camera moved, '
+                    f'or is there much traffic?']
+    return [], []
+
+
+def focal_disagreement(solution: Solution) -> float:
+    """Return the weighted scatter between the turns' own fx, relative to fx."""
+    if len(solution.parts) < 2:
+        return 0.0
+    noise = noise_of(solution.parts)
+    weights, offsets = [], []
+    weak_prior = np.diag(1 / np.square([1e4, 1e4, 0.02 * solution.camera.image_size[0],
+                                        0.02 * solution.camera.image_size[0], 1.0, 1.0]))
+    # square pixels, so that one turn alone has a focal length at all
+    stiff = 1 / (0.003 * solution.camera.fx) ** 2
+    weak_prior[:2, :2] += stiff * np.array([[1, -1], [-1, 1]])
+    for part in solution.parts:
+        inverse = np.linalg.inv(part.hessian / noise + weak_prior)
+        offsets.append(float((inverse @ part.score)[0] / noise))
+        weights.append(1 / float(inverse[0, 0]))
+    mean = np.average(offsets, weights=weights)
+    scatter = np.average((np.array(offsets) - mean) ** 2, weights=weights)
+    return float(np.sqrt(scatter) / solution.camera.fx)
+
+
+def _on_bound(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    low, high = solution.bounds
+    share = (solution.camera.params - low) / (high - low)
+    names = [name for name, value in zip(NAMES, share, strict=True)
+             if not ON_BOUND < value < 1 - ON_BOUND]
+    if names:
+        return [], [f'{", ".join(names)} ran into the bound: the scene is not to be trusted']
+    return [], []
+
+
+def _folds_over(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    if not solution.camera.monotonic():
+        return [], ['the distortion folds over inside the picture: points near its corners are '
+                    'missing']
+    return [], []

@@ -1,0 +1,26 @@
+"""What one image tells about how the car moves."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion at one image, measured over the triplet of images that ends with it.
+
+    index, stamp_ns: of the image. center, center_ns: index and stamp of the triplet's middle
+    image, which the magnitude belongs to; None before there is a triplet.
+    magnitude: turning magnitude, of the image width; 0 when standing, NaN when no epipole can be
+    had (see epipoles.py for what is measured).
+    standing: the picture does not move. moved_px: how far the median point moved since the last
+    processed image, at full resolution. points: how many were followed.
+    """
+
+    index: int
+    stamp_ns: int
+    magnitude: float
+    standing: bool
+    moved_px: float
+    points: int = 0
+    center: int | None = None
+    center_ns: int | None = None

@@ -1,0 +1,178 @@
+"""A child process that does the heavy calls: COLMAP aborts its process when a check fails.
+
+The parent sends (function, arguments) and receives progress, then a result or an exception, pickled
+over pipes. The child is plain `python -m dashcalib_ros.reconstruction.child`, not multiprocessing:
+a spawned multiprocessing child would import the user's main script again.
+"""
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, BinaryIO
+
+from dashcalib_ros.errors import WorkerError
+
+HEADER = struct.Struct('>Q')
+# libraries that would otherwise start a thread for every core
+THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+LOW_PRIORITY = 10
+
+Progress = Callable[[str, float], None]
+
+
+class ChildDiedError(WorkerError):
+    """The child process ended in the middle of a call."""
+
+
+class Child:
+    """One child process; started at its first call, and again at the next call after it died.
+
+    Calls come from one thread at a time; kill() may come from any.
+    """
+
+    def __init__(self, low_priority: bool = False, verbose: bool = False) -> None:
+        self._low_priority = low_priority
+        self._verbose = verbose
+        self._process: subprocess.Popen[bytes] | None = None
+        self._closed = False
+        self._guard = threading.Lock()
+
+    @property
+    def pid(self) -> int | None:
+        """Return the process id of the running child, None if there is none."""
+        process = self._process
+        return process.pid if process is not None and process.poll() is None else None
+
+    def call(self, function: Callable[..., Any], *arguments: Any,
+             progress: Progress | None = None) -> Any:
+        """Run a module-level function in the child and return what it returns.
+
+        progress: given on to the function as its last argument `progress`, called in the parent.
+        Raises what the function raises, and ChildDiedError if the child ends before it answers.
+        """
+        process = self._running()
+        assert process.stdin is not None and process.stdout is not None
+        try:
+            _send(process.stdin, (function, arguments, progress is not None))
+            while True:
+                kind, value = _receive(process.stdout)
+                if kind == 'progress' and progress is not None:
+                    progress(*value)
+                elif kind == 'result':
+                    return value
+                elif kind == 'error':
+                    raise value
+        except (EOFError, OSError, pickle.UnpicklingError) as error:
+            self.kill()
+            raise ChildDiedError(
+                f'the reconstruction process died (exit code {process.returncode}); it is started '
+                f'again at the next try. If it dies each time, free memory or set '
+                f'scene.tracks lower') from error
+
+    def kill(self) -> None:
+        """End the child at once; a call that waits for it raises ChildDiedError."""
+        process = self._process
+        if process is None:
+            return
+        with contextlib.suppress(OSError):
+            process.kill()
+        process.wait()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError, ValueError):
+                    pipe.close()
+
+    def close(self) -> None:
+        """End the child for good."""
+        with self._guard:
+            self._closed = True
+            self.kill()
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        with self._guard:
+            if self._closed:
+                raise ChildDiedError('the calibrator is closed')
+            if self._process is None or self._process.poll() is not None:
+                self._process = self._start()
+            return self._process
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        environment = dict(os.environ)
+        environment['PYTHONPATH'] = os.pathsep.join(path for path in sys.path if path)
+        environment.update({name: '1' for name in THREAD_VARIABLES})
+        command = [sys.executable, '-m', 'dashcalib_ros.reconstruction.child',
+                   str(LOW_PRIORITY if self._low_priority else 0)]
+        try:
+            return subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment,
+                stderr=None if self._verbose else subprocess.DEVNULL)
+        except OSError as error:
+            raise WorkerError(f'cannot start the reconstruction process: {error}; '
+                              f'check memory and process limits (ulimit -u)') from error
+
+
+def _send(pipe: BinaryIO | Any, message: object) -> None:
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    pipe.write(HEADER.pack(len(data)))
+    pipe.write(data)
+    pipe.flush()
+
+
+def _receive(pipe: BinaryIO | Any) -> Any:
+    header = pipe.read(HEADER.size)
+    if len(header) < HEADER.size:
+        raise EOFError
+    (length,) = HEADER.unpack(header)
+    data = pipe.read(length)
+    if len(data) < length:
+        raise EOFError
+    return pickle.loads(data)
+
+
+def _watch_parent(parent: int) -> None:
+    """End this process when its parent is gone, even in the middle of a call."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
+
+
+def main() -> None:
+    """Answer calls until the parent closes the pipe."""
+    # Ctrl-C reaches the whole terminal group: the parent decides what becomes of the child
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(int(sys.argv[1]))
+    threading.Thread(target=_watch_parent, args=(os.getppid(),), daemon=True).start()
+    requests = sys.stdin.buffer
+    # libraries may print: they get stderr, the answers keep the pipe
+    answers = os.fdopen(os.dup(1), 'wb')
+    os.dup2(2, 1)
+
+    import cv2
+    cv2.setNumThreads(1)
+
+    def report(stage: str, done: float) -> None:
+        _send(answers, ('progress', (stage, done)))
+
+    while True:
+        try:
+            function, arguments, wants_progress = _receive(requests)
+        except EOFError:
+            return
+        try:
+            extra = {'progress': report} if wants_progress else {}
+            answer = ('result', function(*arguments, **extra))
+        except Exception as error:
+            answer = ('error', error)
+        _send(answers, answer)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,129 @@
+"""Peaks and their topographic prominence, while the signal still comes in."""
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A local maximum that stands out.
+
+    position: of the sample, counted from 0; a plateau's middle, rounded down.
+    prominence: how far one must descend from it before a higher place is reached. Until the peak
+    is settled this is a lower bound: what is still to come can only let it grow.
+    """
+
+    position: int
+    height: float
+    prominence: float
+    settled: bool
+
+
+@dataclass
+class _Open:
+    """A peak that nothing higher has followed yet; left_min is final, right_min still falls."""
+
+    position: int
+    height: float
+    left_min: float
+    right_min: float
+    reported: bool = False
+
+    @property
+    def prominence(self) -> float:
+        return self.height - max(self.left_min, self.right_min)
+
+
+class PeakFinder:
+    """Streaming twin of scipy.signal.find_peaks(signal, prominence=min_prominence).
+
+    Each peak is reported as soon as its prominence so far reaches the minimum, again whenever it
+    has grown, and once more when it is settled; the last reports equal scipy's answer.
+    Open peaks form a stack of falling heights: memory and time per sample are those of the
+    longest staircase downwards, not of the signal.
+    """
+
+    def __init__(self, min_prominence: float) -> None:
+        self.min_prominence = min_prominence
+        self._open: list[_Open] = []
+        self._count = 0
+        self._last = math.inf
+        self._lowest = math.inf
+        # where the current rise reached its present height; None while falling
+        self._summit: int | None = None
+        self._fresh = False
+
+    @property
+    def needed_from(self) -> int:
+        """Return the earliest sample at which a peak can still appear."""
+        return self._count if self._summit is None else (self._summit + self._count - 1) // 2
+
+    @property
+    def newcomer(self) -> Peak | None:
+        """Return the peak the last sample opened, with the highest prominence it may reach."""
+        top = self._open[-1] if self._fresh else None
+        if top is None or top.height - top.left_min < self.min_prominence:
+            return None
+        return Peak(top.position, top.height, top.height - top.left_min, False)
+
+    def alive(self) -> set[int]:
+        """Return the positions of the peaks that are open and may still count."""
+        return {peak.position for peak in self._open
+                if peak.height - peak.left_min >= self.min_prominence}
+
+    def push(self, value: float) -> list[Peak]:
+        """Take the next sample (not NaN); return the peaks that appeared, grew or are settled."""
+        reports: list[Peak] = []
+        self._fresh = False
+        if self._count == 0:
+            self._last = value
+        if value > self._last:
+            self._summit = self._count
+            while self._open and self._open[-1].height < value:
+                reports += self._settle(self._open.pop())
+        elif value < self._last:
+            if self._summit is not None:
+                self._rise((self._summit + self._count - 1) // 2, self._last)
+            self._summit = None
+            reports += self._fall(value)
+        self._lowest = min(self._lowest, value)
+        self._last = value
+        self._count += 1
+        return reports
+
+    def finish(self) -> list[Peak]:
+        """End the signal; return the peaks that this settles."""
+        reports: list[Peak] = []
+        while self._open:
+            reports += self._settle(self._open.pop())
+        return reports
+
+    def _rise(self, position: int, height: float) -> None:
+        """Open a peak. What is lower was settled on the way up; equal heights do not end it."""
+        left_min = self._lowest
+        for peak in reversed(self._open):
+            if peak.height > height:
+                left_min = peak.right_min
+                break
+        self._open.append(_Open(position, height, left_min, height))
+        self._fresh = True
+
+    def _fall(self, value: float) -> list[Peak]:
+        reports: list[Peak] = []
+        # the deeper in the stack, the more samples its minimum is of: the first that stays ends it
+        for peak in reversed(self._open):
+            if peak.right_min <= value:
+                break
+            before = peak.prominence
+            peak.right_min = value
+            if peak.prominence >= self.min_prominence and not (
+                    peak.reported and peak.prominence == before):
+                peak.reported = True
+                reports.append(Peak(peak.position, peak.height, peak.prominence, False))
+        return reports
+
+    def _settle(self, peak: _Open) -> list[Peak]:
+        if peak.prominence < self.min_prominence:
+            return []
+        return [Peak(peak.position, peak.height, peak.prominence, True)]
