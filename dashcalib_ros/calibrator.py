@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.frames.shrink import shrink, shrink_factor
 from dashcalib_ros.intrinsics import Calibration
@@ -30,8 +30,9 @@ Progress = Callable[[str, float], None]
 class Status:
     """Where the calibrator stands after a frame.
 
-    frames: pushed so far. turns: in the bank. built: of the wanted turns, how many are scenes.
-    yaw_deg: their sum. magnitude: the newest filtered turning magnitude, of the image width.
+    frames: pushed so far. turns: in the bank. built: how many scenes a calibration would use now,
+    at the most those wanted; centers: of their turns. yaw_deg: their sum.
+    magnitude: the newest filtered turning magnitude, of the image width.
     """
 
     frames: int
@@ -40,6 +41,7 @@ class Status:
     yaw_deg: float
     magnitude: float
     standing: bool
+    centers: tuple[int, ...] = ()
 
 
 class Calibrator:
@@ -65,6 +67,7 @@ class Calibrator:
         self._frames = 0
         self._standing = False
         self._detect_s = 0.0
+        self._closed = False
         self._started = time.monotonic()
 
     def push(self, frame: Frame) -> Status:
@@ -132,19 +135,20 @@ class Calibrator:
         """Return where the calibrator stands."""
         scenes = self._workshop.scenes()
         with self._lock:
-            wanted = self._detector.turns()[:self._config.turns.wanted]
-            built = [scene for turn in wanted
-                     if (scene := scenes.get(turn.center)) is not None]
+            # as calibrate() chooses: a turn without a scene gives way to the next
+            built = [scene for turn in self._detector.turns()
+                     if (scene := scenes.get(turn.center)) is not None][:self._config.turns.wanted]
             return Status(self._frames, len(self._detector.turns()), len(built),
                           sum(scene.yaw_deg for scene in built), self._detector.magnitude,
-                          self._standing)
+                          self._standing, tuple(scene.center for scene in built))
 
     def child_pids(self) -> list[int]:
         """Return the process ids of the children that run now."""
         return self._workshop.pids()
 
     def close(self) -> None:
-        """End the child processes."""
+        """End the child processes; a calibrate() that runs in another thread raises WorkerError."""
+        self._closed = True
         self._workshop.close()
 
     def __enter__(self) -> Calibrator:
@@ -178,6 +182,8 @@ class Calibrator:
                 return self._workshop.waiting == 0
 
             self._workshop.wait(idle)
+            if self._closed:
+                raise WorkerError('the calibrator was closed while it calibrated')
             with self._lock:
                 self._submit()
                 if self._workshop.waiting:

@@ -114,6 +114,8 @@ class IntrinsicsConfig:
     focal_bound: float = setting(0.15, 'of step 1\'s; step 2 moves fx and fy no farther', 0.01, 0.5)
     centre_bound: float = setting(0.1, 'of the size; AliceVision\'s bound', 0.01, 0.5)
     k_bound: float = setting(1.0, 'k1 and k2 beyond are no lens', 0.1, 5.0)
+    profile_tracks: int = setting(
+        200, 'of each turn, for the focal profile around the result', 20, 5000)
     aspect_sigma: float = setting(
         0.003, 'fy / fx is 1 to within this: planar turns know fx but hardly fy', 1e-5, 1.0)
     centre_sigma: float = setting(

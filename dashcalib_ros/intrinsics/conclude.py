@@ -99,13 +99,12 @@ def _summary(turn: Turn, evidence: Evidence, solution: Solution | None) -> TurnS
 
 
 def _details(solution: Solution) -> dict[str, object]:
-    profile = solution.profile
     width = solution.camera.image_size[0]
     return {
         'step1': {'f_over_width': solution.step1.fx / width, 'k1': solution.step1.k1,
                   'k2': solution.step1.k2},
-        'focal_profile': {'f_over_width': profile.ratios[::8].tolist(),
-                          'cost_px2': profile.costs[::8].tolist()},
+        'focal_profile': {'f_over_width': solution.around.ratios.tolist(),
+                          'cost_px2': solution.around.costs.tolist()},
         'profile_contrast': profile_contrast(solution),
         'turns_disagree_fx': focal_disagreement(solution),
         'correlation': (solution.covariance / np.outer(solution.sigma, solution.sigma)).tolist(),

@@ -1,15 +1,17 @@
-"""What each turn knows of the six parameters: information, score, and honest sigmas.
+"""What each turn knows of the lens: information, score, and honest sigmas.
 
 At the adjusted solution the residuals are linearised, and the points and poses of a turn are
-eliminated (Schur complement). What is left of turn i is its information H_i (6, 6) and its score
-g_i (6,), the pull of its residuals on fx, fy, cx, cy, k1, k2. From these three estimates of the
-covariance follow:
+eliminated (Schur complement). What is left of turn i is its information H_i and its score g_i, the
+pull of its residuals on fx, fy, cx, cy, k1, k2, and on three parameters that the model holds at
+zero: p1, p2, k3. Of the variances that follow, the largest counts in each parameter:
 
 - H^-1 times the noise of the residuals: right if each were independent and the model exact;
-- H^-1 (sum over tracks s s') H^-1: residuals of one track may share an error (drift, a moving car);
+- H^-1 (sum over tracks s s') H^-1: residuals of one track may share an error (drift, a car);
 - H^-1 (sum over turns g g') H^-1: whatever makes turns disagree (rolling shutter, a bad scene).
 
 The last two are the sandwich estimator with clusters; over turns it is the first-order jackknife.
+To them comes, squared, what the six would move by if p1, p2 and k3 were free: the error of a model
+that real lenses do not quite follow.
 """
 from __future__ import annotations
 
@@ -23,14 +25,18 @@ from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.scene import Scene
 
 Array = npt.NDArray[np.float64]
+# fx fy cx cy k1 k2, and p1 p2 k3, which the model holds at zero
+LENS = 9
+# what p1, p2 and k3 of real lenses are like
+EXTRA_SIGMA = np.array([1e-3, 1e-3, 0.1])
 
 
 @dataclass(frozen=True)
 class Information:
     """What one turn contributes, in units of its residuals' weight (px^-2).
 
-    hessian: (6, 6) reduced information of fx, fy, cx, cy, k1, k2; score: (6,) -> (6,) minus the
-    gradient; by_track: (6, 6) sum over tracks of the outer products of their scores.
+    hessian: (9, 9) reduced information of fx, fy, cx, cy, k1, k2, p1, p2, k3. score: (9,) minus the
+    gradient. by_track: (9, 9) sum over tracks of the outer products of their scores.
     squares: weighted sum of squared residuals, px^2; freedom: residuals minus parameters.
     """
 
@@ -64,15 +70,16 @@ def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
     nuisance = 6 * (int(pose.max()) + 1)
     points = int(point.max()) + 1
 
-    # global block: all poses of the turn, then the six parameters
-    size = nuisance + 6
+    # global block: all poses of the turn, then the lens
+    size = nuisance + LENS
     normal = np.zeros((size, size))
     mixed = np.zeros((points, size, 3))
     own = np.zeros((points, 3, 3))
     np.add.at(own, point, by_point.transpose(0, 2, 1) @ by_point)
     slots = 6 * pose[:, None] + np.arange(6)
     wide = np.concatenate([by_pose, by_camera], axis=2)
-    where = np.concatenate([slots, np.broadcast_to(np.arange(nuisance, size), slots.shape)], axis=1)
+    last = np.broadcast_to(np.arange(nuisance, size), (len(rows), LENS))
+    where = np.concatenate([slots, last], axis=1)
     np.add.at(normal, (where[:, :, None], where[:, None, :]), wide.transpose(0, 2, 1) @ wide)
     np.add.at(mixed, (point[:, None], where), wide.transpose(0, 2, 1) @ by_point)
     # a point that its rays fix badly gets a little damping instead of a wild inverse
@@ -89,12 +96,12 @@ def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
     follow = inner @ reduced[:nuisance, nuisance:]
     hessian = reduced[nuisance:, nuisance:] - reduced[:nuisance, nuisance:].T @ follow
 
-    # each track's score, after its poses and its point have followed the six parameters
-    combine = np.concatenate([-follow, np.eye(6)])
+    # each track's score, after its poses and its point have followed the lens
+    combine = np.concatenate([-follow, np.eye(LENS)])
     point_follow = inverse @ (mixed.transpose(0, 2, 1) @ combine)
     effective = (np.einsum('nij,njc->nic', wide, combine[where])
                  - by_point @ point_follow[point])
-    scores = np.zeros((points, 6))
+    scores = np.zeros((points, LENS))
     np.add.at(scores, point, np.einsum('nic,ni->nc', effective, residual))
     freedom = max(2 * len(rows) - 3 * points - nuisance + 7 - 6, 1)
     return Information(hessian, scores.sum(axis=0), scores.T @ scores,
@@ -113,21 +120,37 @@ def covariance(parts: Sequence[Information], prior: Array) -> Array:
     noise). The correlations are those of the first estimate.
     """
     noise = noise_of(parts)
-    hessian = sum((part.hessian for part in parts), np.zeros((6, 6))) / noise + prior
-    inverse = np.linalg.inv(hessian)
-    by_track = sum((part.by_track for part in parts), np.zeros((6, 6))) / noise**2
+    whole = sum((part.hessian for part in parts), np.zeros((LENS, LENS))) / noise
+    inverse = np.linalg.inv(whole[:6, :6] + prior)
+    by_track = sum((part.by_track[:6, :6] for part in parts), np.zeros((6, 6))) / noise**2
     estimates = [np.diag(inverse), np.diag(inverse @ by_track @ inverse)]
     if len(parts) > 1:
-        scores = np.array([part.score for part in parts]) / noise
+        scores = np.array([part.score[:6] for part in parts]) / noise
         scores = scores - scores.mean(axis=0)
         count = len(parts)
         # few turns know their own scatter badly: Student's t instead of the normal's width
         tails = (count - 1) / (count - 3) if count > 3 else 3.0
         by_turn = scores.T @ scores * count / (count - 1) * tails
         estimates.append(np.diag(inverse @ by_turn @ inverse))
-    sigma = np.sqrt(np.max(estimates, axis=0))
+    sigma = np.sqrt(np.max(estimates, axis=0) + model_error(parts, prior) ** 2)
     correlation = inverse / np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
     return np.asarray(correlation * np.outer(sigma, sigma))
+
+
+def model_error(parts: Sequence[Information], prior: Array) -> Array:
+    """Return (6,) by how much each parameter would move if p1, p2 and k3 were free.
+
+    prior: (6, 6) as for covariance(). p1, p2 and k3 themselves are believed to be as large as real
+    lenses have them (EXTRA_SIGMA). One Gauss-Newton step: the six are at their optimum, so only the
+    three pull.
+    """
+    noise = noise_of(parts)
+    whole = sum((part.hessian for part in parts), np.zeros((LENS, LENS))) / noise
+    whole[:6, :6] += prior
+    whole[6:, 6:] += np.diag(1 / np.square(EXTRA_SIGMA))
+    pull = sum((part.score for part in parts), np.zeros(LENS)) / noise
+    pull[:6] = 0.0
+    return np.asarray(np.abs(np.linalg.solve(whole, pull)[:6]))
 
 
 def _cross(vectors: Array) -> Array:
@@ -138,7 +161,7 @@ def _cross(vectors: Array) -> Array:
 
 
 def _derivatives(local: Array, camera: Camera) -> tuple[Array, Array, Array]:
-    """Return d pixel / d camera (n, 2, 6), d pixel / d local point (n, 2, 3), pixels (n, 2)."""
+    """Return d pixel / d lens (n, 2, 9), d pixel / d local point (n, 2, 3), pixels (n, 2)."""
     x, y = (local[:, :2] / local[:, 2:]).T
     square = x * x + y * y
     factor = 1 + square * (camera.k1 + square * camera.k2)
@@ -146,9 +169,11 @@ def _derivatives(local: Array, camera: Camera) -> tuple[Array, Array, Array]:
     zero, one = np.zeros_like(x), np.ones_like(x)
     by_camera = np.stack([
         np.stack([x * factor, zero, one, zero, camera.fx * x * square,
-                  camera.fx * x * square**2], axis=1),
+                  camera.fx * x * square**2, camera.fx * 2 * x * y,
+                  camera.fx * (square + 2 * x * x), camera.fx * x * square**3], axis=1),
         np.stack([zero, y * factor, zero, one, camera.fy * y * square,
-                  camera.fy * y * square**2], axis=1)], axis=1)
+                  camera.fy * y * square**2, camera.fy * (square + 2 * y * y),
+                  camera.fy * 2 * x * y, camera.fy * y * square**3], axis=1)], axis=1)
     by_normal = np.stack([
         np.stack([factor + 2 * slope * x * x, 2 * slope * x * y], axis=1),
         np.stack([2 * slope * x * y, factor + 2 * slope * y * y], axis=1)], axis=1)

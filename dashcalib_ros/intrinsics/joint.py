@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,9 +13,16 @@ from dashcalib_ros.intrinsics.solution import Solution
 from dashcalib_ros.reconstruction.adjust import Prior, Solver, adjust_step1, adjust_step2
 from dashcalib_ros.reconstruction.build import chain_scene
 from dashcalib_ros.reconstruction.camera import Camera
-from dashcalib_ros.reconstruction.scene import Profile, Scene, retriangulated
+from dashcalib_ros.reconstruction.scene import (
+    Profile,
+    Scene,
+    retriangulated,
+    truncated_cost,
+)
 
 Array = npt.NDArray[np.float64]
+# the focal length is held at these times the result to see what the turns know of it
+PROBES = (0.8, 0.9, 1.0, 1.1, 1.25)
 Progress = Callable[[str, float], None]
 
 
@@ -48,7 +56,43 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     parts = tuple(information(scene, camera, scene_config.loss_px) for scene in together)
     spread = covariance(parts, np.asarray(
         np.linalg.inv(_prior(step1, config, 1.0).covariance), np.float64))
-    return Solution(camera, spread, step1, tuple(together), parts, profile, np.array(bounds))
+    progress('focal profile', 0.0)
+    around = _profile_around(together, camera, config, scene_config)
+    return Solution(camera, spread, step1, tuple(together), parts, profile, around,
+                    np.array(bounds))
+
+
+def _profile_around(scenes: Sequence[Scene], camera: Camera, config: IntrinsicsConfig,
+                    scene_config: SceneConfig) -> Profile:
+    """Return the cost with the focal length held at PROBES times the result, all else adjusted.
+
+    Started from the result, with a part of the tracks: it costs an adjustment each.
+    """
+    few = [_every(scene, config.profile_tracks) for scene in scenes]
+    costs = []
+    for probe in PROBES:
+        held = replace(camera, fx=camera.fx * probe, fy=camera.fx * probe)
+        moved = few
+        # the first residuals are large: a loss as wide as they are brings the poses along
+        for loss_px in (0.01 * camera.image_size[0], scene_config.loss_px, scene_config.loss_px):
+            moved, held = adjust_step1(
+                moved, held, Solver(loss_px, scene_config.iterations), None)
+            moved = [_again(scene, held, scene_config) for scene in moved]
+        seen = [int(scene.tracks.seen.sum()) for scene in moved]
+        costs.append(np.average([truncated_cost(scene, held, scene_config.error_px)
+                                 for scene in moved], weights=seen))
+    ratio = camera.fx / camera.image_size[0]
+    return Profile(ratio * np.array(PROBES), np.array(costs), sum(seen))
+
+
+def _every(scene: Scene, wanted: int) -> Scene:
+    """Return the scene with only as many of its tracks."""
+    chosen = np.unique(np.linspace(0, scene.tracks.xy.shape[1] - 1, wanted).astype(int))
+    structure = scene.structure
+    return replace(
+        scene, tracks=replace(scene.tracks, xy=scene.tracks.xy[:, chosen]),
+        structure=replace(structure, points=structure.points[chosen],
+                          used=structure.used[:, chosen]))
 
 
 def summed(profiles: Sequence[Profile]) -> Profile:

@@ -18,7 +18,8 @@ class Solution:
     """All turns adjusted together.
 
     camera: the six parameters; covariance: (6, 6) of them; step1: the camera after the first step.
-    scenes: as adjusted, in the order given; parts: what each knows; profile: summed over the turns.
+    scenes: as adjusted, in the order given; parts: what each knows of the lens.
+    coarse: the turns' focal profiles, summed; around: the profile near the result, all together.
     bounds: (2, 6) lowest and highest values that were allowed.
     """
 
@@ -27,7 +28,8 @@ class Solution:
     step1: Camera
     scenes: tuple[Scene, ...]
     parts: tuple[Information, ...]
-    profile: Profile
+    coarse: Profile
+    around: Profile
     bounds: Array
 
     @property

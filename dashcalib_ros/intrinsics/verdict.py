@@ -64,18 +64,17 @@ def _flat_profile(solution: Solution, config: VerdictConfig) -> tuple[list[str],
 
 
 def profile_contrast(solution: Solution) -> float:
-    """Return by how much the summed cost rises, relatively, 25 % to either side of the result."""
-    profile = solution.profile
-    ratio = solution.camera.fx / solution.camera.image_size[0]
-    costs = np.interp(np.log([ratio, ratio / 1.25, ratio * 1.25]), np.log(profile.ratios),
-                      profile.costs)
-    lowest = min(float(costs[0]), float(profile.costs.min()))
-    return float(min(costs[1], costs[2]) / lowest - 1)
+    """Return by how much the cost rises, relatively, 20 to 25 % to either side of the result.
+
+    Negative when the best focal length held fixed is at an end of the profile.
+    """
+    costs = solution.around.costs
+    return float(min(costs[0], costs[-1]) / costs.min() - 1)
 
 
 def _far_from_profile(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
     width = solution.camera.image_size[0]
-    best = solution.profile.best
+    best = solution.coarse.best
     if not 1 / config.max_profile_gap < solution.camera.fx / width / best < config.max_profile_gap:
         return [f'the focal length {solution.camera.fx:.0f} px contradicts the one that explains '
                 f'most observations, about {best * width:.0f} px'], []
@@ -111,8 +110,8 @@ def focal_disagreement(solution: Solution) -> float:
     stiff = 1 / (0.003 * solution.camera.fx) ** 2
     weak_prior[:2, :2] += stiff * np.array([[1, -1], [-1, 1]])
     for part in solution.parts:
-        inverse = np.linalg.inv(part.hessian / noise + weak_prior)
-        offsets.append(float((inverse @ part.score)[0] / noise))
+        inverse = np.linalg.inv(part.hessian[:6, :6] / noise + weak_prior)
+        offsets.append(float((inverse @ part.score[:6])[0] / noise))
         weights.append(1 / float(inverse[0, 0]))
     mean = np.average(offsets, weights=weights)
     scatter = np.average((np.array(offsets) - mean) ** 2, weights=weights)

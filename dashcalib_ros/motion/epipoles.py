@@ -1,10 +1,10 @@
 """The epipoles of a pair of images, and what they say about turning (paper, 3.1).
 
 The paper takes the epipoles' mean distance from the image centre. That distance is mostly the
-camera's mounting (where straight ahead is in the picture) and the lever arm to the rear axle, and a
-bend adds to it or takes from it, depending on the side. The two epipoles of a pair see the same
-direction, the baseline, from before and after: e' ~ K R K^-1 e. Half their distance from each other
-is their distance from the pair's own centre, and that is rotation alone, wherever the camera
+camera's mounting (where straight ahead is in the picture) and its lever arm to the rear axle, and
+a bend adds to it or takes from it, depending on the side. The two epipoles of a pair see the same
+direction, the baseline, from before and from after: e' ~ K R K^-1 e. Half their distance from each
+other is their distance from the pair's own centre, and that is rotation alone, wherever the camera
 points. On kitti03 (triplets over 0.6 s) its median correlates with the true yaw rate by 0.98,
 the distance from the image centre by 0.34.
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,7 +29,9 @@ WINDOW = 9
 LEVELS = 3
 STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.02)
 BORDER = 5
-REPLENISH = 0.8
+REPLENISH = 0.65
+# times standing_px that points may have moved over a whole triplet of a standing car
+JITTER = 3.0
 # s; the ego vehicle is looked for at each spacing, and taken out of the tracking this often
 MASK_PERIOD = 3.0
 
@@ -45,6 +48,14 @@ class _Seen:
 
 class MotionEstimator:
     """Tracks points through the drive and measures how much the car turns."""
+
+    _seen: deque[_Seen]
+    _pairs: dict[tuple[int, int], Floats | None]
+    _last: GreyImage | None
+    _ids: npt.NDArray[np.int64]
+    _xy: Points
+    _ego: EgoMask | None = None
+    _valid: Mask | None = None
 
     def __init__(self, config: MotionConfig, mask: MaskConfig | None = None,
                  valid: Mask | None = None) -> None:
@@ -68,13 +79,16 @@ class MotionEstimator:
                 return None
         image = self._shrink(frame.image)
         before = self._seen[-1] if self._seen else None
-        if self._last is not None:
-            self._follow(image)
+        self._follow(image)
         now = _Seen(frame.index, frame.stamp_ns, self._ids, self._xy)
         moved = math.nan if before is None else _median_shift(*_common(before, now))
         self._seen.append(now)
+        first, middle = self._triplet()
         standing = moved < self.config.standing_px
-        magnitude, middle = self._magnitude()
+        if first is not None:
+            # in the dark points jitter by more than that, but they get nowhere
+            standing |= _median_shift(*_common(first, now)) < JITTER * self.config.standing_px
+        magnitude = self._magnitude(first, middle)
         if self._ego is not None and middle is not None and not standing:
             self._look_for_ego(image, middle, now)
         self._replenish(image)
@@ -85,7 +99,7 @@ class MotionEstimator:
             middle.stamp_ns if middle else None)
 
     def valid(self) -> Mask | None:
-        """Return (height, width) of the full image: False where the ego vehicle or the user's mask is.
+        """Return (height, width) of the full image: False where vehicle or user's mask hide it.
 
         None while nothing is known to be hidden.
         """
@@ -99,9 +113,9 @@ class MotionEstimator:
     def _reset(self) -> None:
         """Forget the points: the next image does not continue the last."""
         keep = math.ceil(2 * SPACING * self.config.rate / (1 - EARLY)) + 3
-        self._seen: deque[_Seen] = deque(maxlen=keep)
-        self._pairs: dict[tuple[int, int], Floats | None] = {}
-        self._last: GreyImage | None = None
+        self._seen = deque(maxlen=keep)
+        self._pairs = {}
+        self._last = None
         self._ids = np.zeros(0, np.int64)
         self._xy = np.zeros((0, 2), np.float32)
         self._born = 0
@@ -154,14 +168,16 @@ class MotionEstimator:
 
     def _follow(self, image: GreyImage) -> None:
         """Move the points on to this image; drop those that do not track back."""
-        if len(self._ids) == 0:
+        if self._last is None or len(self._ids) == 0:
             return
         height, width = image.shape
+        # the stubs do not know that cv2 makes room itself, nor which arrays come out
+        flow: Any = cv2.calcOpticalFlowPyrLK
         window = (WINDOW, WINDOW)
-        moved, ahead, _ = cv2.calcOpticalFlowPyrLK(
+        moved, ahead, _ = flow(
             self._last, image, self._xy, None, winSize=window, maxLevel=LEVELS, criteria=STEPS)
         # back at full resolution only, from where it should arrive: a third of the cost
-        back, behind, _ = cv2.calcOpticalFlowPyrLK(
+        back, behind, _ = flow(
             image, self._last, moved, self._xy.copy(), winSize=window, maxLevel=0, criteria=STEPS,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
         error = np.linalg.norm(back - self._xy, axis=1)
@@ -179,33 +195,38 @@ class MotionEstimator:
         """Find new points where there are few; at half resolution, for tracking it is enough."""
         if len(self._ids) >= REPLENISH * self.config.points:
             return
-        half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        half = np.asarray(
+            cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
         valid = None
         if self._valid is not None:
             valid = cv2.resize(self._valid.astype(np.uint8), half.shape[::-1],
                                interpolation=cv2.INTER_NEAREST) > 0
-        corners = find_corners(half, self._xy / 2, self.config.points, valid) * 2 + 0.5
+        corners = find_corners(half, self._xy / np.float32(2), self.config.points, valid) * 2 + 0.5
         self._ids = np.concatenate([self._ids, self._born + np.arange(len(corners))])
         self._xy = np.concatenate([self._xy, corners.astype(np.float32)])
         self._born += len(corners)
 
-    def _magnitude(self) -> tuple[float, _Seen | None]:
-        """Return the triplet's turning magnitude and its middle image."""
-        last = self._seen[-1]
-        middle = self._earlier(last)
+    def _triplet(self) -> tuple[_Seen | None, _Seen | None]:
+        """Return the first and the middle image of the triplet that ends now, None until then."""
+        middle = self._earlier(self._seen[-1])
         first = self._earlier(middle) if middle else None
-        if middle is None or first is None:
-            return math.nan, None
+        return (first, middle) if first else (None, None)
+
+    def _magnitude(self, first: _Seen | None, middle: _Seen | None) -> float:
+        """Return the triplet's turning magnitude; NaN without a triplet, or without epipoles."""
+        if first is None or middle is None:
+            return math.nan
+        last = self._seen[-1]
         pairs = ((first, middle), (middle, last), (first, last))
         found = {(a.index, b.index): self._epipoles(a, b) for a, b in pairs}
         # the next triplets need only what begins within this one
         self._pairs = {key: value for key, value in {**self._pairs, **found}.items()
                        if key[0] >= first.index}
         values = [turning(epipoles) for epipoles in found.values() if epipoles is not None]
-        return (float(np.mean(values)) if values else math.nan), middle
+        return float(np.mean(values)) if values else math.nan
 
     def _earlier(self, seen: _Seen) -> _Seen | None:
-        """Return the image nearest to one spacing before, None if that is not recorded any more."""
+        """Return the image nearest to one spacing before, None if there is none so early."""
         target = seen.stamp_ns - SPACING * 1e9
         before = [other for other in self._seen if other.stamp_ns < seen.stamp_ns]
         if not before or before[0].stamp_ns > target + 0.5 * self._period_ns:

@@ -24,11 +24,15 @@ MOVED = 2.5
 TURNED = 4.0
 # samples a cell needs before anything is said of it
 SAMPLES = 12
-# share of a cell's gradient that stays: the world's is about 1 / sqrt(samples), the vehicle's 0.8
-STAYS = 0.6
-# ... and of a pixel's, of which so many of a cell's must stay (text covers little of a cell)
-PIXEL_STAYS = 0.8
-PIXELS = 0.08
+# ... and remembers: then all counts half, so that a camera that was moved is noticed
+REMEMBERED = 2000
+# coherence of a cell's gradient over the drive: the world's is about 0, the vehicle's 0.7
+STAYS = 0.4
+# ... and of a pixel's, of which so many of a cell's must stay (text covers little of a cell); a
+# pixel needs so many independent samples, for few look alike by chance
+PIXEL_STAYS = 0.7
+PIXEL_SAMPLES = 6.0
+PIXELS = 0.06
 # grey levels per px; a gradient below this is noise or a flat place
 FLAT = 1.5
 # of a flat region's outline that must stay, for the region to belong to the vehicle
@@ -48,6 +52,7 @@ class EgoMask:
         self.grid = -(-height // self._cell), -(-width // self._cell)
         self._sum = np.zeros((2, height, width), np.float32)
         self._strength = np.zeros((height, width), np.float32)
+        self._squares = np.zeros((height, width), np.float32)
         self._weight = np.zeros((height, width), np.float32)
         self._samples = np.zeros(self.grid, np.float32)
 
@@ -57,7 +62,7 @@ class EgoMask:
         before, after: (n, 2) px, points in an earlier image and in this one. epipoles: (2, 2) of
         that pair, relative to the image centre and the width.
         """
-        flow = self._world_flow(before / 2, after / 2, epipoles)
+        flow = self._world_flow(before / np.float32(2), after / np.float32(2), epipoles)
         if flow is None:
             return
         moves = np.linalg.norm(flow, axis=2)
@@ -76,9 +81,15 @@ class EgoMask:
         weight = across * across * self._spread(counts)
         self._sum[0] += weight * x
         self._sum[1] += weight * y
-        self._strength += weight * strength
+        strength *= weight
+        self._strength += strength
+        self._squares += strength * strength
         self._weight += weight
         self._samples += counts
+        if self._samples.max() > REMEMBERED:
+            for total in (
+                    self._sum, self._strength, self._squares, self._weight, self._samples):
+                np.multiply(total, 0.5, out=total)
 
     def cells(self) -> Mask | None:
         """Return (rows, columns): where the ego vehicle is; None while too little is known."""
@@ -106,16 +117,22 @@ class EgoMask:
         row, column = (
             np.minimum(np.arange(length) // (2 * factor * self._cell), count - 1)
             for length, count in zip(shape, self.grid, strict=True))
-        return cells[row[:, None], column[None, :]]
+        return np.asarray(cells[row[:, None], column[None, :]], bool)
 
-    def _evidence(self) -> tuple[Singles, Singles, Singles]:
-        """Return per cell: the gradient's share that stays, its strength, the pixels that stay."""
-        length = cv2.magnitude(self._sum[0], self._sum[1])
-        stays = self._pool(length) / np.maximum(self._pool(self._strength), 1e-6)
+    def _evidence(self) -> tuple[Floats, Floats, Floats]:
+        """Return per cell: the gradient's coherence, its strength, the share of pixels that stay.
+
+        Coherence is |sum g|^2 / (sum |g|)^2 without what each sample has in common with itself:
+        0 for directions at random however few the samples are, 1 for what never changes.
+        """
+        whole = self._strength ** 2
+        together = self._sum[0] ** 2 + self._sum[1] ** 2 - self._squares
+        most = whole - self._squares
+        stays = self._pool(together) / np.maximum(self._pool(most), 1e-6)
         strength = self._pool(self._strength) / np.maximum(self._pool(self._weight), 1e-6)
-        lasting = (length > PIXEL_STAYS * self._strength) & (length > 2 * FLAT * self._weight)
-        pixels = self._pool(lasting.astype(np.float32)) / self._cell ** 2
-        return stays, strength, pixels
+        lasting = ((together > PIXEL_STAYS * most) & (whole > PIXEL_SAMPLES * self._squares)
+                   & (self._strength > 2 * FLAT * self._weight))
+        return stays, strength, self._pool(lasting) / self._cell ** 2
 
     def _world_flow(self, before: Points, after: Points, epipoles: Floats) -> Singles | None:
         """Return (rows, columns, 2) px: how the world would have moved in each cell.
@@ -132,7 +149,8 @@ class EgoMask:
         target = flow[moved]
         weight = np.ones(len(target))
         for _ in range(4):
-            fit, *_ = np.linalg.lstsq(terms * weight[:, None], target * weight[:, None], rcond=None)
+            scale = weight[:, None]
+            fit, *_ = np.linalg.lstsq(terms * scale, target * scale, rcond=None)
             error = np.linalg.norm(terms @ fit - target, axis=1)
             weight = 1 / (1 + (error / (np.median(error) + 0.1)) ** 2)
         rows, columns = np.mgrid[:self.grid[0], :self.grid[1]]
@@ -159,13 +177,14 @@ class EgoMask:
                 result |= region
         return result
 
-    def _pool(self, values: Singles) -> Singles:
+    def _pool(self, values: npt.NDArray[Any]) -> Floats:
         """Sum (height, width) over the cells."""
         rows, columns = self.grid
         height, width = values.shape
-        padded = np.zeros((rows * self._cell, columns * self._cell), np.float32)
+        padded = np.zeros((rows * self._cell, columns * self._cell))
         padded[:height, :width] = values
-        return padded.reshape(rows, self._cell, columns, self._cell).sum(axis=(1, 3))
+        return np.asarray(
+            padded.reshape(rows, self._cell, columns, self._cell).sum(axis=(1, 3)), np.float64)
 
     def _spread(self, cells: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Repeat (rows, columns, ...) to the mask's resolution."""
@@ -180,7 +199,7 @@ def _without_specks(cells: Mask) -> Mask:
     left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
     inside = ((left > 0) & (top > 0) & (left + stats[:, cv2.CC_STAT_WIDTH] < cells.shape[1])
               & (top + stats[:, cv2.CC_STAT_HEIGHT] < cells.shape[0]))
-    return cells & ~(inside & (stats[:, cv2.CC_STAT_AREA] < 3))[labels]
+    return np.asarray(cells & ~(inside & (stats[:, cv2.CC_STAT_AREA] < 3))[labels], bool)
 
 
 def _closed(cells: Mask) -> Mask:

@@ -1,6 +1,8 @@
 """Points: found where the picture has corners, followed from image to image."""
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -40,7 +42,7 @@ def find_corners(image: npt.NDArray[np.uint8], present: npt.NDArray[np.float32],
             image[window], int(share - held[row, column]), 0.02, spacing, mask=free[window],
             blockSize=5)
         if corners is not None:
-            found.append(corners.reshape(-1, 2) + np.float32([left, top]))
+            found.append(np.asarray(corners.reshape(-1, 2) + (left, top), np.float32))
     return np.concatenate(found)
 
 
@@ -54,10 +56,12 @@ def follow_points(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8],
     if len(points) == 0:
         return points, np.zeros(0, bool)
     height, width = after.shape
+    # cv2's stubs know neither the optional output nor what comes out
+    flow: Any = cv2.calcOpticalFlowPyrLK
     settings = {'winSize': (window, window), 'maxLevel': levels,
                 'criteria': (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)}
-    moved, ahead, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, **settings)
-    back, behind, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None, **settings)
+    moved, ahead, _ = flow(before, after, points, None, **settings)
+    back, behind, _ = flow(after, before, moved, None, **settings)
     x, y = moved[:, 0], moved[:, 1]
     trusted = (
         (ahead.ravel() > 0) & (behind.ravel() > 0)

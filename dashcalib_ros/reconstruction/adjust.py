@@ -57,6 +57,8 @@ def adjust_step1(scenes: Sequence[Scene], camera: Camera, solver: Solver,
     adjuster = _adjuster(reconstruction, solver, refine_focal=focal_range is not None,
                          refine_centre=False)
     values = reconstruction.cameras[1].params
+    if not adjuster.problem.has_parameter_block(values):
+        return list(scenes), camera  # nothing is seen: there is nothing to adjust
     if focal_range is not None:
         _bound(adjuster.problem, values, 0, *focal_range)
     for index in (3, 4):
@@ -79,6 +81,8 @@ def adjust_step2(scenes: Sequence[Scene], camera: Camera, solver: Solver, prior:
     adjuster = _adjuster(reconstruction, solver, refine_focal=True, refine_centre=True)
     values = reconstruction.cameras[1].params
     problem = adjuster.problem
+    if not problem.has_parameter_block(values):
+        return list(scenes), camera
     problem.set_manifold(values, pyceres.SubsetManifold(OPENCV_SIZE, OPENCV_HELD))
     for index, (low, high) in enumerate(zip(bounds[0] + shift, bounds[1] + shift, strict=True)):
         _bound(problem, values, index, low, high)

@@ -4,9 +4,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-INSTALL = ("calibrator: error: the Python package {name} is missing: source your ROS 2 installation "
-           "(. /opt/ros/jazzy/setup.sh), or pip install 'ros-jazzy-rclpy[fastrtps]' "
-           "ros-jazzy-common-interfaces")
+INSTALL = ("calibrator: error: the Python package {name} is missing: source your ROS 2 "
+           "installation (. /opt/ros/jazzy/setup.sh), or pip install "
+           "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces")
 ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'rcl_interfaces', 'sensor_msgs',
                 'std_msgs', 'std_srvs')
 

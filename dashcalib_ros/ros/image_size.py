@@ -1,5 +1,10 @@
-"""How large a compressed image is, without decoding it."""
+"""How large an image message's picture is, without decoding it where that can be avoided."""
 from __future__ import annotations
+
+from typing import Any
+
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.frames.decode import decode_compressed
 
 JPEG, PNG = b'\xff\xd8', b'\x89PNG\r\n\x1a\n'
 # start-of-frame markers; C4, C8 and CC are tables
@@ -30,3 +35,21 @@ def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
         else:
             place += 2 + int.from_bytes(data[place + 2:place + 4], 'big')
     return None
+
+
+def image_size(message: Any) -> tuple[int, int]:
+    """Return (width, height) of an Image or CompressedImage message.
+
+    Raises InputError when it has none: neither a size in the header nor an image in the data.
+    """
+    if hasattr(message, 'encoding'):
+        if message.width <= 0 or message.height <= 0:
+            raise InputError(f'an image says it is {message.width}x{message.height}: the camera '
+                             f'driver is broken')
+        return message.width, message.height
+    # formats other than JPEG and PNG are rare enough to be decoded for it
+    size = encoded_size(memoryview(message.data))
+    if size is None:
+        height, width = decode_compressed(message).shape
+        size = width, height
+    return size

@@ -1,4 +1,4 @@
-"""The node's parameters: every setting of the core by its own name, and those of the node alone."""
+"""The node's parameters: every setting of the core by its own name, and the node's own."""
 from __future__ import annotations
 
 import dataclasses
@@ -30,7 +30,8 @@ class NodeConfig:
     """What only the node needs. Raises ConfigError like Config."""
 
     image_transport: str = setting(
-        'raw', 'compressed subscribes IMAGE_TOPIC/compressed instead', choices=('raw', 'compressed'))
+        'raw', 'compressed subscribes image_raw/compressed instead',
+        choices=('raw', 'compressed'))
     reliability: str = setting(
         'auto', 'auto does as the publishers do: best effort if any of them does',
         choices=('auto', 'best_effort', 'reliable'))
@@ -39,15 +40,16 @@ class NodeConfig:
     camera_name: str = setting(
         '', "in the file and its name; empty: the last part of the node's namespace, or dashcam")
     camera_info_file: str = setting(
-        '', 'where the accepted calibration is kept; empty: $ROS_HOME/camera_info/CAMERA_NAME.yaml, '
-        'where camera_info_manager looks')
+        '', 'where the accepted calibration is kept; empty: '
+        '$ROS_HOME/camera_info/CAMERA_NAME.yaml, where camera_info_manager looks')
     commit: bool = setting(
         False, 'give an accepted calibration to the camera driver: service set_camera_info')
     commit_timeout: float = setting(5.0, 's; how long the driver may take to answer', 0.1, 600.0)
     publish_stale: bool = setting(
         False, 'go on publishing a calibration that new turns contradict')
     better: float = setting(
-        0.7, "ratio; a new calibration replaces the old one when fx's sigma falls to this", 0.1, 1.0)
+        0.7, "ratio; a new calibration replaces the old one when fx's sigma falls to this",
+        0.1, 1.0)
     contradictions: int = setting(
         3, 'accepted calibrations in a row that contradict the old one before it is given up: one '
         'or two may be chance', 1, 20)

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 
 import rclpy
+import rclpy.utilities
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 
@@ -36,5 +37,5 @@ def run(argv: Sequence[str] | None, stopping: Stopping) -> int:
     finally:
         if node is not None:
             node.close()
-        rclpy.try_shutdown()
+        rclpy.utilities.try_shutdown()
     return 0

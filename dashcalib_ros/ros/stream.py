@@ -65,6 +65,11 @@ class StampWatch:
             self._count_lost(step)
         return now
 
+    def forget(self) -> None:
+        """Begin anew with the next image; the counts stay."""
+        self.unstamped, self._last = False, None
+        self._steps.clear()
+
     def _count_lost(self, step: int) -> None:
         if len(self._steps) >= 5:
             period = statistics.median(self._steps)
@@ -100,24 +105,25 @@ class Source:
 
 
 class SourceWatch:
-    """Tells a camera that changed from images that strayed in; strays counts the latter."""
+    """Tells a camera that changed from images that strayed in. previous: before the change."""
 
     def __init__(self) -> None:
         self.current: Source | None = None
-        self.strays = 0
+        self.previous: Source | None = None
         self._other: Source | None = None
         self._run = 0
 
-    def take(self, source: Source) -> Literal['same', 'stray', 'changed']:
-        """Take the next image's source; the first one counts as changed."""
+    def take(self, source: Source) -> Literal['first', 'same', 'stray', 'changed']:
+        """Take the next image's source."""
         if source == self.current:
             self._run = 0
             return 'same'
-        if self.current is not None:
-            self._run = self._run + 1 if source == self._other else 1
-            self._other = source
-            if self._run < LASTING:
-                self.strays += 1
-                return 'stray'
-        self.current, self._run = source, 0
+        if self.current is None:
+            self.current = source
+            return 'first'
+        self._run = self._run + 1 if source == self._other else 1
+        self._other = source
+        if self._run < LASTING:
+            return 'stray'
+        self.previous, self.current, self._run = self.current, source, 0
         return 'changed'

@@ -11,9 +11,9 @@ PAPER_RATE = 10.0
 class StreamingMedian:
     """Median over the samples within half a window of each sample (paper, 3.1).
 
-    The paper's window has 2 * floor(k / 2) - 1 images, k = half_width * 10 fps: 29 for 3 s. Said in
-    time, that is everything within half_width / 2 - 0.05 s: the very same window at a steady 10 Hz,
-    and the right one at any other rate. At the ends it has what is there.
+    The paper's window has 2 * floor(k / 2) - 1 images, k = half_width * 10 fps: 29 for 3 s. In
+    time that is everything within half_width / 2 - 0.05 s: the very same window at a steady
+    10 Hz, and the right one at any other rate. At the ends it has what is there.
     """
 
     def __init__(self, half_width: float) -> None:

@@ -1,0 +1,68 @@
+"""Gives an accepted calibration to the camera driver: the client of set_camera_info."""
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo
+from sensor_msgs.srv import SetCameraInfo
+
+LOOK_S = 0.1
+
+
+class Commit:
+    """Calls the driver without waiting for it; says in the log what came of it.
+
+    Drivers without the service, that never answer, or that die meanwhile all end in one warning.
+    """
+
+    def __init__(self, node: Node, timeout_s: float, clock: Clock) -> None:
+        self._node = node
+        self._timeout_s = timeout_s
+        self._client = node.create_client(SetCameraInfo, 'set_camera_info')
+        self._timer = node.create_timer(LOOK_S, self._look, clock=clock, autostart=False)
+        self._waiting: CameraInfo | None = None
+        self._answer: Any = None
+        self._deadline = 0.0
+
+    def call(self, info: CameraInfo) -> None:
+        """Offer a calibration; one that is still on its way is given up."""
+        self._forget()
+        self._waiting = info
+        self._deadline = time.monotonic() + self._timeout_s
+        self._timer.reset()
+
+    def _look(self) -> None:
+        if self._answer is None and self._client.service_is_ready():
+            request = SetCameraInfo.Request(camera_info=self._waiting)
+            self._answer = self._client.call_async(request)
+        if self._answer is not None and self._answer.done():
+            self._report(self._answer)
+            self._forget()
+        elif time.monotonic() > self._deadline:
+            name = self._client.srv_name
+            self._node.get_logger().warning(
+                f'{name} did not answer within {self._timeout_s:g} s: the camera driver has the '
+                f'old calibration; start a driver with that service, or set commit to false'
+                if self._answer is not None else
+                f'there is no service {name}: start a camera driver that has it, or set commit '
+                f'to false')
+            self._forget()
+
+    def _report(self, answer: Any) -> None:
+        if answer.exception() is not None:
+            text = f'{self._client.srv_name} failed: {answer.exception()}'
+        elif answer.result().success:
+            self._node.get_logger().info(f'{self._client.srv_name} took the calibration')
+            return
+        else:
+            text = f'{self._client.srv_name} refused: {answer.result().status_message}'
+        self._node.get_logger().warning(text)
+
+    def _forget(self) -> None:
+        if self._answer is not None and not self._answer.done():
+            self._client.remove_pending_request(self._answer)
+        self._answer = self._waiting = None
+        self._timer.cancel()

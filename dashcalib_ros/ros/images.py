@@ -1,0 +1,65 @@
+"""The subscription to the camera: raw or compressed, with the reliability its publishers have."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CompressedImage, Image
+
+from dashcalib_ros.ros.parameters import NodeConfig
+
+# images a subscription holds for a callback that is late
+DEPTH = 5
+LOOK_S = 1.0
+NAMED = {'best_effort': ReliabilityPolicy.BEST_EFFORT, 'reliable': ReliabilityPolicy.RELIABLE}
+
+
+class ImageInput:
+    """Subscribes to the image topic; with reliability 'auto' it follows the publishers.
+
+    A reliable subscription never hears a best-effort camera; a best-effort one hears both, but
+    loses large images that a reliable one would get. So: reliable if all publishers are.
+    """
+
+    def __init__(self, node: Node, config: NodeConfig, callback: Callable[[Any], None],
+                 clock: Clock) -> None:
+        self._node = node
+        self._callback = callback
+        self._compressed = config.image_transport == 'compressed'
+        # as image_transport does: remap the base topic, then append the transport
+        base = node.resolve_topic_name('image_raw')
+        self.topic = f'{base}/compressed' if self._compressed else base
+        self.publishers = 0
+        self._auto = config.reliability == 'auto'
+        self._reliability = NAMED.get(config.reliability, ReliabilityPolicy.BEST_EFFORT)
+        self._subscription = self._subscribe()
+        self._timer = node.create_timer(LOOK_S, self._look, clock=clock)
+
+    @property
+    def reliability(self) -> str:
+        """Return what is subscribed with now."""
+        return self._reliability.name.lower()
+
+    def _subscribe(self) -> Any:
+        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH,
+                             reliability=self._reliability, durability=DurabilityPolicy.VOLATILE)
+        kind = CompressedImage if self._compressed else Image
+        return self._node.create_subscription(kind, self.topic, self._callback, profile)
+
+    def _look(self) -> None:
+        offered = [info.qos_profile.reliability
+                   for info in self._node.get_publishers_info_by_topic(self.topic)]
+        self.publishers = len(offered)
+        if not self._auto or not offered:
+            return
+        every = all(each == ReliabilityPolicy.RELIABLE for each in offered)
+        fitting = ReliabilityPolicy.RELIABLE if every else ReliabilityPolicy.BEST_EFFORT
+        if fitting != self._reliability:
+            self._node.get_logger().info(
+                f'{self.topic}: subscribing {fitting.name.lower()}, as its publishers do')
+            self._node.destroy_subscription(self._subscription)
+            self._reliability = fitting
+            self._subscription = self._subscribe()

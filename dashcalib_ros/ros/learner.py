@@ -1,0 +1,237 @@
+"""The Calibrator at work beside the executor: one thread detects, another calibrates."""
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import DashcalibError, InputError
+from dashcalib_ros.frames import Frame
+from dashcalib_ros.frames.decode import BitDepth, decode
+from dashcalib_ros.intrinsics import Calibration
+from dashcalib_ros.ros.backlog import Backlog
+
+# s between two looks at whether enough turns are built: their scenes come without a push
+LOOK_S = 0.25
+LONGEST_BACK_OFF_S = 60.0
+NOTHING = Status(0, 0, 0, 0.0, 0.0, False)
+
+
+@dataclass(frozen=True)
+class Activity:
+    """What the learner does now. stage, share: of the calibration that runs."""
+
+    status: Status = NOTHING
+    calibrating: bool = False
+    stage: str = ''
+    share: float = 0.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """A calibration; complete: it had all the turns wanted; bank: the number of their bank."""
+
+    calibration: Calibration
+    complete: bool
+    bank: int
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Who is told; each is called from one of the learner's threads and must not wait.
+
+    result: of a calibration. status: after each image. trouble: a kind to count it by, and one
+    line for people.
+    """
+
+    result: Callable[[Result], None]
+    status: Callable[[Status], None]
+    trouble: Callable[[str, str], None]
+
+
+class _Bank:
+    """A Calibrator and what belongs to its images alone."""
+
+    def __init__(self, config: Config, number: int) -> None:
+        self.number = number
+        self.calibrator = Calibrator(config, live=True)
+        self.depth = BitDepth()
+        self.tried: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class _Job:
+    """An image on its way; it keeps to the bank it was taken for."""
+
+    bank: _Bank
+    index: int
+    stamp_ns: int
+    message: Any
+    size: tuple[int, int]
+
+
+class Learner:
+    """Learns in the background. All methods may be called from any thread; none of them waits.
+
+    goal: calibrations start by themselves when so many turns are built, and again when others are
+    among the best.
+    """
+
+    def __init__(self, config: Config, queue_size: int, listener: Listener) -> None:
+        self.goal = config.turns.wanted
+        self._config = config
+        self._tell = listener
+        self._backlog: Backlog[_Job] = Backlog(queue_size)
+        self._changed = threading.Condition()
+        self._bank = _Bank(config, 0)
+        self._activity = Activity()
+        self._requested = False
+        self._failures = 0
+        self._not_before = 0.0
+        self._closed = False
+        self._closing: list[threading.Thread] = []
+        self._threads = [threading.Thread(target=self._detect, name='detect', daemon=True),
+                         threading.Thread(target=self._calibrate, name='calibrate', daemon=True)]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """Return how many images were dropped because detection did not keep up."""
+        return self._backlog.dropped
+
+    @property
+    def bank(self) -> int:
+        """Return the number of the bank; results of an older one are out of date."""
+        return self._bank.number
+
+    def offer(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int]) -> None:
+        """Take an image message; size is what its header says."""
+        self._backlog.put(_Job(self._bank, index, stamp_ns, message, size))
+
+    def activity(self) -> Activity:
+        """Return what is going on."""
+        return self._activity
+
+    def request(self) -> str:
+        """Calibrate now, with the turns there are; return why not, or nothing."""
+        with self._changed:
+            activity = self._activity
+            if activity.calibrating:
+                return 'a calibration is running already'
+            if not activity.status.turns:
+                return 'no turn was found so far: drive some'
+            self._requested = True
+            self._changed.notify_all()
+        return ''
+
+    def restart(self) -> None:
+        """Forget all turns and begin with an empty bank; a running calibration is cancelled."""
+        with self._changed:
+            if self._closed:
+                return
+            old = self._bank
+            self._bank = _Bank(self._config, old.number + 1)
+            self._backlog.clear()
+            self._requested = False
+            self._failures, self._not_before = 0, 0.0
+            self._activity = replace(self._activity, status=NOTHING)
+            self._closing = [thread for thread in self._closing if thread.is_alive()]
+            # ending a child takes a moment
+            self._closing.append(threading.Thread(target=old.calibrator.close, daemon=True))
+            self._closing[-1].start()
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """End both threads and every child process."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._backlog.close()
+        self._bank.calibrator.close()
+        for thread in (*self._closing, *self._threads):
+            thread.join(timeout=10)
+
+    def _detect(self) -> None:
+        while (job := self._backlog.get()) is not None:
+            try:
+                image = decode(job.message, job.bank.depth)
+                if image.shape[::-1] != job.size:
+                    raise InputError(
+                        f'an image is {image.shape[1]}x{image.shape[0]} but its header says '
+                        f'{job.size[0]}x{job.size[1]}: the camera driver is broken')
+                status = job.bank.calibrator.push(Frame(job.index, job.stamp_ns, image))
+            except InputError as error:
+                self._tell.trouble('undecodable', str(error))
+                continue
+            except Exception as error:
+                self._tell.trouble('failed', f'an image could not be used: {_named(error)}')
+                continue
+            if self._note(job.bank, status):
+                self._tell.status(status)
+
+    def _note(self, bank: _Bank, status: Status) -> bool:
+        with self._changed:
+            if bank is not self._bank:
+                return False
+            self._activity = replace(self._activity, status=status)
+            self._changed.notify_all()
+            return True
+
+    def _calibrate(self) -> None:
+        while (bank := self._wait_until_due()) is not None:
+            try:
+                calibration = bank.calibrator.calibrate(self._progress, final=False)
+            except Exception as error:
+                self._failed(bank, error)
+                continue
+            used = frozenset(turn.center for turn in calibration.turns if turn.used)
+            with self._changed:
+                bank.tried = used
+                self._failures = 0
+                self._activity = replace(self._activity, calibrating=False, stage='')
+            complete = len(used) >= self._config.turns.wanted
+            self._tell.result(Result(calibration, complete, bank.number))
+
+    def _wait_until_due(self) -> _Bank | None:
+        """Return the bank to calibrate, None when closed."""
+        while not self._closed:
+            bank = self._bank
+            self._note(bank, bank.calibrator.status())
+            with self._changed:
+                centers = self._activity.status.centers
+                news = len(centers) >= self.goal and frozenset(centers) != bank.tried
+                if (bank is self._bank and (self._requested or news)
+                        and time.monotonic() >= self._not_before):
+                    self._requested = False
+                    self._activity = replace(self._activity, calibrating=True)
+                    return bank
+                if not self._closed:
+                    self._changed.wait(LOOK_S)
+        return None
+
+    def _progress(self, stage: str, share: float) -> None:
+        with self._changed:
+            self._activity = replace(self._activity, stage=stage, share=share)
+
+    def _failed(self, bank: _Bank, error: Exception) -> None:
+        with self._changed:
+            self._activity = replace(self._activity, calibrating=False, stage='')
+            if bank is not self._bank or self._closed:
+                return  # cancelled
+            self._failures += 1
+            delay = min(2.0 ** self._failures, LONGEST_BACK_OFF_S)
+            self._not_before = time.monotonic() + delay
+            # the same turns are tried again
+            self._requested = True
+        self._tell.trouble('failed_calibrations', f'a calibration failed ({_named(error)}); the '
+                                                  f'turns are kept, next try in {delay:.0f} s')
+
+
+def _named(error: Exception) -> str:
+    text = ' '.join(str(error).split())
+    return text if isinstance(error, DashcalibError) else f'{type(error).__name__}: {text}'

@@ -1,0 +1,118 @@
+"""What the node publishes, built from what it knows."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import Header
+
+from dashcalib_ros.calibrator import Status
+from dashcalib_ros.report import Camera
+from dashcalib_ros.ros.learner import NOTHING
+from dashcalib_ros.ros.state import State, sigma_text
+
+OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR,
+                          DiagnosticStatus.STALE)
+
+
+def camera_info(camera: Camera, header: Header) -> CameraInfo:
+    """Return the camera as ROS has it: plumb_bob, no rectification, P with K's values."""
+    c = camera.intrinsics
+    width, height = camera.image_size
+    return CameraInfo(
+        header=header, width=width, height=height, distortion_model='plumb_bob',
+        d=[c.k1, c.k2, 0.0, 0.0, 0.0],
+        k=[c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0],
+        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p=[c.fx, 0.0, c.cx, 0.0, 0.0, c.fy, c.cy, 0.0, 0.0, 0.0, 1.0, 0.0])
+
+
+def uncalibrated(header: Header) -> CameraInfo:
+    """Return what sensor_msgs calls uncalibrated: K[0] is 0. It takes a latched one back."""
+    return CameraInfo(header=header)
+
+
+@dataclass(frozen=True)
+class Health:
+    """All that diagnostics tell. Counts are of images, since the start.
+
+    published: the camera that is published now. stale: it is contradicted. verdict, reasons: of
+    the last calibration. silent_s: since the last image, None before the first.
+    """
+
+    state: State
+    wanted: int
+    topic: str
+    status: Status = NOTHING
+    stage: str = ''
+    published: Camera | None = None
+    stale: bool = False
+    verdict: str = ''
+    reasons: tuple[str, ...] = ()
+    silent_s: float | None = None
+    file: str = ''
+    warnings: tuple[str, ...] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+# s; a camera that is silent for longer has stopped
+SILENT_S = 5.0
+
+
+def diagnostic_status(health: Health, name: str, hardware_id: str) -> DiagnosticStatus:
+    """Return the status of one camera."""
+    level, message = _summary(health)
+    status = health.status
+    values = {
+        'state': health.state,
+        'stage': health.stage,
+        'turns found': status.turns,
+        'turns built': status.built,
+        'turns wanted': health.wanted,
+        'yaw (deg)': f'{status.yaw_deg:.0f}',
+        'percent': percent(health),
+        'turning magnitude': f'{status.magnitude:.4f}',
+        'standing': status.standing,
+        'verdict': health.verdict,
+        'reasons': '; '.join(health.reasons),
+        'published': sigma_text(health.published) if health.published else 'nothing',
+        'sigma fx (px)': _sigma(health.published),
+        'file': health.file,
+        'topic': health.topic,
+        'warnings': '; '.join(health.warnings),
+        **health.counts,
+    }
+    return DiagnosticStatus(
+        level=level, name=name, hardware_id=hardware_id, message=message,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+
+
+def percent(health: Health) -> int:
+    """Return how much of the evidence for the next calibration is there."""
+    return min(100, round(100 * health.status.built / health.wanted))
+
+
+def _summary(health: Health) -> tuple[bytes, str]:
+    status = health.status
+    turns = (f'{status.built} of {health.wanted} turns, {status.yaw_deg:.0f}° of yaw')
+    if health.silent_s is None or health.silent_s > SILENT_S:
+        since = 'yet' if health.silent_s is None else f'for {health.silent_s:.0f} s'
+        return STALE, f'no image on {health.topic} {since}'
+    if health.stale:
+        return ERROR, f'the published calibration is contradicted; new turns: {turns}'
+    if health.warnings:
+        return WARN, f'{health.state}: {health.warnings[0]}'
+    if health.published is not None:
+        return OK, f'calibrated; {turns} for the next look at it'
+    if health.state == 'calibrating':
+        return WARN, f'calibrating with {turns}: {health.stage}'
+    if health.state == 'refused_so_far':
+        why = health.reasons[0] if health.reasons else health.verdict
+        return WARN, f'not calibrated, {turns}; so far {health.verdict}: {why}'
+    return WARN, f'not calibrated yet: {turns}'
+
+
+def _sigma(camera: Camera | None) -> str:
+    return '' if camera is None or camera.sigma is None else f'{camera.sigma.fx:.3f}'
