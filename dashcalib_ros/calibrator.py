@@ -4,7 +4,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 
 import numpy as np
@@ -60,7 +60,10 @@ class Calibrator:
         self._config = config or Config()
         self._live = live
         self._motion = MotionEstimator(self._config.motion, self._config.mask, mask)
-        self._detector = TurnDetector(self._config.turns)
+        # a turn without a scene needs another to give way to, and --turns may ask for many
+        turns = self._config.turns
+        self._detector = TurnDetector(
+            replace(turns, capacity=max(turns.capacity, turns.wanted)))
         self._workshop = Workshop(self._config, low_priority=live, verbose=verbose)
         self._lock = threading.Lock()
         self._size: tuple[int, int] | None = None
@@ -147,7 +150,7 @@ class Calibrator:
         return self._workshop.pids()
 
     def close(self) -> None:
-        """End the child processes; a calibrate() that runs in another thread raises WorkerError."""
+        """End the child processes; a calibrate() in another thread raises WorkerError."""
         self._closed = True
         self._workshop.close()
 

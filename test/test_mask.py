@@ -52,8 +52,8 @@ def test_bonnet_pillar_and_text_are_found(drive, bare):
     hidden = ~observe(frames)
     truth = other.overlay.mask
     assert (hidden & truth).sum() > 0.9 * truth.sum()
-    # the right end of the picture's top: the logo, which is not in the overlay's mask
-    assert hidden[5:17, 402:470].mean() > 0.5
+    # the logo at the top, which is not in the overlay's mask
+    assert hidden[8:16, 402:436].mean() > 0.7
     # cells reach a little beyond the vehicle
     assert hidden.mean() < truth.mean() + 0.12
     assert hidden[60:230, 100:].mean() < 0.02
@@ -70,7 +70,7 @@ def test_users_mask_adds_to_it(drive, bare):
     user[100:150, 200:300] = False
     both = observe(frames, user)
     assert not both[100:150, 200:300].any()
-    assert not both[-8:, 60:420].any() and both[30:90].all()
+    assert not both[-8:, 60:420].any() and both[30:90].mean() > 0.98
     alone = observe(frames, user, enabled=False)
     assert np.array_equal(alone, user)
     assert observe(frames[:20], enabled=False) is None
@@ -79,7 +79,7 @@ def test_users_mask_adds_to_it(drive, bare):
 def test_standing_and_straight_tell_nothing_above_the_horizon(drive, bare):
     assert observe([dataclasses.replace(bare[0], index=i, stamp_ns=i * 10**8)
                     for i in range(60)]) is None
-    street = Drive(LENS, DriveSpec(turns=0, lead_m=45.0, seed=4, timestamp=True))
+    street = Drive(LENS, DriveSpec(turns=0, lead_m=30.0, seed=4, timestamp=True))
     valid = observe(street.frames())
     assert valid is None or valid[:120].all()
 

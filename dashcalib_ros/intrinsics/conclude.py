@@ -68,8 +68,8 @@ def _nothing(evidence: Evidence) -> Verdict:
                                    f'turns',))
     if not evidence.turns:
         return Verdict('refused', (
-            'no turn was found: the car stood, drove straight on, or the pictures show too little; '
-            'record a drive with turns, in daylight',))
+            'no turn was found: the car stood, drove straight on, or the pictures show too '
+            'little; record a drive with turns, in daylight',))
     return Verdict('refused', (
         f'none of the {len(evidence.turns)} turns could be reconstructed: the pictures are too '
         f'dark or blurred, or the camera turned without moving',))

@@ -35,8 +35,8 @@ EXTRA_SIGMA = np.array([1e-3, 1e-3, 0.1])
 class Information:
     """What one turn contributes, in units of its residuals' weight (px^-2).
 
-    hessian: (9, 9) reduced information of fx, fy, cx, cy, k1, k2, p1, p2, k3. score: (9,) minus the
-    gradient. by_track: (9, 9) sum over tracks of the outer products of their scores.
+    hessian: (9, 9) reduced information of fx, fy, cx, cy, k1, k2, p1, p2, k3. score: (9,) minus
+    the gradient. by_track: (9, 9) sum over tracks of the outer products of their scores.
     squares: weighted sum of squared residuals, px^2; freedom: residuals minus parameters.
     """
 
@@ -132,7 +132,9 @@ def covariance(parts: Sequence[Information], prior: Array) -> Array:
         tails = (count - 1) / (count - 3) if count > 3 else 3.0
         by_turn = scores.T @ scores * count / (count - 1) * tails
         estimates.append(np.diag(inverse @ by_turn @ inverse))
-    sigma = np.sqrt(np.max(estimates, axis=0) + model_error(parts, prior) ** 2)
+    # a scene without evidence can have a variance that is negative but for rounding: it knows nothing
+    variance = np.where(np.min(estimates, axis=0) > 0, np.max(estimates, axis=0), np.inf)
+    sigma = np.sqrt(variance + model_error(parts, prior) ** 2)
     correlation = inverse / np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
     return np.asarray(correlation * np.outer(sigma, sigma))
 
@@ -141,8 +143,8 @@ def model_error(parts: Sequence[Information], prior: Array) -> Array:
     """Return (6,) by how much each parameter would move if p1, p2 and k3 were free.
 
     prior: (6, 6) as for covariance(). p1, p2 and k3 themselves are believed to be as large as real
-    lenses have them (EXTRA_SIGMA). One Gauss-Newton step: the six are at their optimum, so only the
-    three pull.
+    lenses have them (EXTRA_SIGMA). One Gauss-Newton step: the six are at their optimum, so only
+    the three pull.
     """
     noise = noise_of(parts)
     whole = sum((part.hessian for part in parts), np.zeros((LENS, LENS))) / noise

@@ -134,8 +134,8 @@ def _again(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
 def _prior(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
     """Return square pixels and a centred principal point, as far as either is believed.
 
-    noise: variance of a residual, px^2. The adjustment takes residuals in px as if their sigma were
-    1: the prior must be weakened by as much as they are more exact.
+    noise: variance of a residual, px^2. The adjustment takes residuals in px as if their sigma
+    were 1: the prior must be weakened by as much as they are more exact.
     """
     width, height = camera.image_size
     wide = (10 * camera.fx) ** 2

@@ -30,8 +30,10 @@ LEVELS = 3
 STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.02)
 BORDER = 5
 REPLENISH = 0.65
-# times standing_px that points may have moved over a whole triplet of a standing car
-JITTER = 3.0
+# a standing car's points move over a whole triplet at most this many times standing_px, and hardly
+# further than from one image to the next: night at 480 px has 1.5 px and a ratio of 0.4 to 1.2
+JITTER = 6.0
+NOWHERE = 1.5
 # s; the ego vehicle is looked for at each spacing, and taken out of the tracking this often
 MASK_PERIOD = 3.0
 
@@ -87,14 +89,15 @@ class MotionEstimator:
         standing = moved < self.config.standing_px
         if first is not None:
             # in the dark points jitter by more than that, but they get nowhere
-            standing |= _median_shift(*_common(first, now)) < JITTER * self.config.standing_px
-        magnitude = self._magnitude(first, middle)
+            whole = _median_shift(*_common(first, now))
+            standing |= whole < min(JITTER * self.config.standing_px, NOWHERE * moved)
+        magnitude = 0.0 if standing else self._magnitude(first, middle)
         if self._ego is not None and middle is not None and not standing:
             self._look_for_ego(image, middle, now)
         self._replenish(image)
         self._last = image
         return Motion(
-            frame.index, frame.stamp_ns, 0.0 if standing else magnitude, standing,
+            frame.index, frame.stamp_ns, magnitude, standing,
             moved * self._factor, len(now.ids), middle.index if middle else None,
             middle.stamp_ns if middle else None)
 
@@ -193,7 +196,7 @@ class MotionEstimator:
 
     def _replenish(self, image: GreyImage) -> None:
         """Find new points where there are few; at half resolution, for tracking it is enough."""
-        if len(self._ids) >= REPLENISH * self.config.points:
+        if len(self._ids) >= REPLENISH * self.config.points or min(image.shape) < 4 * BORDER:
             return
         half = np.asarray(
             cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)

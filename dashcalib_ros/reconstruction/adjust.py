@@ -66,7 +66,7 @@ def adjust_step1(scenes: Sequence[Scene], camera: Camera, solver: Solver,
     adjuster.solve()
     focal, _, _, k1, k2 = reconstruction.cameras[1].params
     return (_updated(scenes, reconstruction),
-            replace(camera, fx=focal, fy=focal, k1=float(k1), k2=float(k2)))
+            replace(camera, fx=float(focal), fy=float(focal), k1=float(k1), k2=float(k2)))
 
 
 def adjust_step2(scenes: Sequence[Scene], camera: Camera, solver: Solver, prior: Prior,

@@ -57,7 +57,8 @@ def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
         scene.tracks, scene.structure, images, config.patch_half_window, config.max_shift_px)
     scene = retriangulated(replace(scene, tracks=registered), scene.camera,
                            config.error_px, config.min_angle_deg)
-    return _refined(scene, config, reach)
+    scene = _refined(scene, config, reach)
+    return scene if scene.structure.used.any() else None
 
 
 def chain_scene(tracks: Tracks, center: int, camera: Camera, profile: Profile,

@@ -42,8 +42,8 @@ class Camera:
     def rays(self, xy: Array) -> Array:
         """Return the normalised, undistorted coordinates (..., 2) of pixels (..., 2).
 
-        NaN stays NaN, and so does a pixel that the model cannot reach because it folds over before.
-        Newton's method on the radius.
+        NaN stays NaN; a pixel that the model cannot reach, because it folds over before, becomes
+        NaN. Newton's method on the radius.
         """
         distorted = (xy - [self.cx, self.cy]) / [self.fx, self.fy]
         target = np.linalg.norm(distorted, axis=-1)

@@ -1,8 +1,9 @@
 """A first scene from tracks, at a given camera: a pair by its essential matrix, then one by one.
 
 Images of a drive come in order and their tracks are known, so the general machinery of
-incremental mapping (match graph, next-best-view search, local adjustments) is not needed: resection
-and triangulation in turn take a tenth of its time, and hold any focal length one asks for.
+incremental mapping (match graph, next-best-view search, local adjustments) is not needed:
+resection and triangulation in turn take a tenth of its time, and hold any focal length one asks
+for.
 """
 from __future__ import annotations
 
@@ -46,6 +47,8 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
     """
     cv2.setRNGSeed(seed)
     rays = camera.rays(tracks.xy)
+    # a camera that folds over cannot reach every pixel
+    seen = np.isfinite(rays[:, :, 0])
     tolerance = error_px / camera.fx
     start = _initial_pair(rays, tolerance)
     if start is None:
@@ -63,11 +66,11 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
     newest = second
     while True:
         # only what the newest image sees can have changed
-        touched = tracks.seen[newest]
+        touched = seen[newest]
         points[touched], used[:, touched] = triangulate(
             rays[:, touched], rotations, translations, registered, tolerance, min_angle_deg)
         known: Mask = np.asarray(used.any(axis=0), bool)
-        support = np.where(registered | failed, -1, (tracks.seen & known).sum(axis=1))
+        support = np.where(registered | failed, -1, (seen & known).sum(axis=1))
         nearest = int(np.argmax(support))
         if support[nearest] < MIN_RESECTION:
             return Structure(rotations, translations, points, registered, used)
@@ -137,7 +140,8 @@ def _initial_pair(rays: Array, tolerance: float) -> tuple[int, int, Array, Array
         ahead, rotation, translation, _ = cv2.recoverPose(
             essential, a, b, np.eye(3), mask=inliers.copy())[:4]
         if ahead >= 0.5 * both.sum():
-            return first, second, np.asarray(rotation), np.asarray(translation).ravel()
+            return (first, second, np.asarray(rotation, np.float64),
+                    np.asarray(translation, np.float64).ravel())
     return None
 
 
@@ -157,7 +161,8 @@ def _resection(rays: Array, points: Array, known: Mask, rotations: Array, transl
     chosen = inliers.ravel()
     rotvec, translation = cv2.solvePnPRefineLM(
         points[common][chosen], rays[common][chosen], np.eye(3), None, rotvec, translation)
-    return np.asarray(cv2.Rodrigues(rotvec)[0]), np.asarray(translation).ravel()
+    return (np.asarray(cv2.Rodrigues(rotvec)[0], np.float64),
+            np.asarray(translation, np.float64).ravel())
 
 
 def _linear_points(rays: Array, rotations: Array, translations: Array, seen: Mask) -> Array:

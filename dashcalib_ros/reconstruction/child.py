@@ -1,8 +1,8 @@
 """A child process that does the heavy calls: COLMAP aborts its process when a check fails.
 
-The parent sends (function, arguments) and receives progress, then a result or an exception, pickled
-over pipes. The child is plain `python -m dashcalib_ros.reconstruction.child`, not multiprocessing:
-a spawned multiprocessing child would import the user's main script again.
+The parent sends (function, arguments) and receives progress, then a result or an exception,
+pickled over pipes. The child is plain `python -m dashcalib_ros.reconstruction.child`, not
+multiprocessing: a spawned multiprocessing child would import the user's main script again.
 """
 from __future__ import annotations
 

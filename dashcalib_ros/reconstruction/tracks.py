@@ -93,14 +93,17 @@ def _follow(images: list[npt.NDArray[np.uint8]], config: TracksConfig, valid: Ma
 
 def _keyframes(ids: npt.NDArray[np.int64], frames: npt.NDArray[np.int64], xy: Array, width: int,
                config: TracksConfig) -> npt.NDArray[np.int64]:
-    """Choose keyframes by how far the points moved since the last one; a standing car adds none."""
+    """Choose keyframes by how far the points moved since the last; a standing car adds none."""
     def observed(k: int) -> tuple[npt.NDArray[np.int64], Array]:
         rows = frames == k
         return ids[rows], xy[rows]
 
-    chosen = [0]
-    last_ids, last_xy = observed(0)
-    for k in range(1, int(frames.max()) + 1):
+    if len(frames) == 0:
+        return np.zeros(0, np.int64)
+    # the first pictures may be black
+    chosen = [int(frames[0])]
+    last_ids, last_xy = observed(chosen[0])
+    for k in range(chosen[0] + 1, int(frames.max()) + 1):
         now_ids, now_xy = observed(k)
         _, a, b = np.intersect1d(last_ids, now_ids, assume_unique=True, return_indices=True)
         moved = np.linalg.norm(now_xy[b] - last_xy[a], axis=1)
@@ -119,4 +122,4 @@ def _worth_keeping(table: Array) -> Mask:
         low = np.min(np.where(seen[:, :, None], table, np.inf), axis=0)
         high = np.max(np.where(seen[:, :, None], table, -np.inf), axis=0)
     extent = np.linalg.norm(high - low, axis=1)
-    return (seen.sum(axis=0) >= MIN_LENGTH) & (extent > 2.0)
+    return np.asarray((seen.sum(axis=0) >= MIN_LENGTH) & (extent > 2.0))

@@ -1,0 +1,190 @@
+"""The tests' side of the wire: the node as a process of its own, and a camera that it hears."""
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+DOMAIN = 1 + os.getpid() % 100
+# s; how long anything may take that should come at once: machines are slow, DDS discovery too
+SOON = 30.0
+COMMAND = [sys.executable, '-m', 'dashcalib_ros.ros']
+
+
+def ros_environment(home):
+    """Return what keeps a process on this machine, in this run, and strict."""
+    return {
+        'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_PYTHON_CHECK_FIELDS': '1', 'HOME': str(home), 'ROS_LOG_DIR': str(Path(home) / 'log'),
+        'PYTHONPATH': os.pathsep.join([str(REPOSITORY), os.environ.get('PYTHONPATH', '')])}
+
+
+class NodeProcess:
+    """The node, started as a user would; its output goes to a file."""
+
+    def __init__(self, home, *arguments, command=COMMAND, **parameters):
+        self.home = Path(home)
+        self.output = self.home / f'node-{time.monotonic_ns()}.log'
+        pairs = [part for name, value in parameters.items()
+                 for part in ('-p', f'{name.replace("__", ".")}:={_yaml(value)}')]
+        with self.output.open('wb') as stream:
+            self.process = subprocess.Popen(
+                [*command, '--ros-args', *pairs, *arguments], stdout=stream,
+                stderr=subprocess.STDOUT, env={**os.environ, **ros_environment(home)},
+                start_new_session=True)
+
+    @property
+    def text(self):
+        return self.output.read_text()
+
+    def wait_for(self, words, limit=SOON):
+        """Wait until the log has these words."""
+        end = time.monotonic() + limit
+        while words not in self.text:
+            assert self.process.poll() is None, self.text
+            assert time.monotonic() < end, f'no {words!r} in\n{self.text}'
+            time.sleep(0.05)
+
+    def children(self):
+        """Return the ids of the living processes that the node started."""
+        found = []
+        for path in Path('/proc').glob('[0-9]*/stat'):
+            try:
+                fields = path.read_text().rpartition(')')[2].split()
+            except OSError:
+                continue  # it ended meanwhile
+            own = int(fields[3]) == self.process.pid and int(path.parent.name) != self.process.pid
+            if own and fields[0] != 'Z':
+                found.append(int(path.parent.name))
+        return found
+
+    def stop(self, *signals, limit=SOON):
+        """Send the signals, wait for the end and return the exit code."""
+        for each in signals or (signal.SIGINT,):
+            self.process.send_signal(each)
+        return self.process.wait(limit)
+
+    def kill(self):
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait(SOON)
+
+
+class Bench:
+    """A camera and a listener in one node; nothing waits without a limit."""
+
+    def __init__(self, context, namespace='', image_type=Image, topic='image_raw',
+                 reliable=True, listen=True):
+        self.node = rclpy.create_node('bench', context=context, namespace=namespace)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        kind = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        self.images = self.node.create_publisher(
+            image_type, topic, QoSProfile(depth=50, reliability=kind))
+        self.infos, self.latched, self.status, self.magnitudes = [], [], None, []
+        if listen:
+            latched = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                                 durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            for kind, name, call, profile in (
+                    (CameraInfo, 'camera_info', self.infos.append, 1000),
+                    (CameraInfo, 'calibrator/calibration', self.latched.append, latched),
+                    (DiagnosticArray, '/diagnostics', self._on_diagnostics, 10),
+                    (Float64, 'calibrator/turn_magnitude', self.magnitudes.append, 100)):
+                self.node.create_subscription(kind, name, call, profile)
+
+    def _on_diagnostics(self, message):
+        self.status = message.status[0]
+
+    @property
+    def values(self):
+        """Return the diagnostics' values by name, of the newest message."""
+        return {pair.key: pair.value for pair in self.status.values} if self.status else {}
+
+    def until(self, condition, limit=SOON, what='what was waited for', node=None):
+        """Spin until the condition holds and return it."""
+        end = time.monotonic() + limit
+        while not (held := condition()):
+            dead = node is not None and node.process.poll() is not None
+            assert not dead and time.monotonic() < end, (
+                f'{what} did not come; diagnostics: {self.values}\n{node.text if node else ""}')
+            self.executor.spin_once(timeout_sec=0.02)
+        return held
+
+    def spin(self, seconds):
+        """Spin for a while."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def connect(self, node):
+        """Wait until the node hears the images and is heard."""
+        self.until(lambda: self.images.get_subscription_count() > 0 and self.status is not None,
+                   what='the connection', node=node)
+
+    def publish(self, *messages):
+        for message in messages:
+            self.images.publish(message)
+            self.executor.spin_once(timeout_sec=0)
+
+    def count(self, key):
+        return int(self.values.get(key, -1))
+
+    def counted(self, key, at_least, node):
+        """Wait until diagnostics have counted so many."""
+        self.until(lambda: self.count(key) >= at_least, what=f'{key} >= {at_least}', node=node)
+
+    def call(self, name, node, kind=Trigger):
+        """Call one of the node's services and return the answer."""
+        client = self.node.create_client(kind, f'calibrator/{name}')
+        self.until(client.service_is_ready, what=f'the service {name}', node=node)
+        future = client.call_async(kind.Request())
+        self.until(future.done, what=f'the answer of {name}', node=node)
+        self.node.destroy_client(client)
+        return future.result()
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+
+
+def image_message(picture, stamp_ns, frame_id='camera', encoding=None):
+    """Return a sensor_msgs/Image; (h, w) is mono8, (h, w, 3) bgr8."""
+    picture = np.ascontiguousarray(picture)
+    message = Image(height=picture.shape[0], width=picture.shape[1],
+                    encoding=encoding or ('mono8' if picture.ndim == 2 else 'bgr8'),
+                    step=picture.strides[0])
+    message.data.frombytes(picture.tobytes())
+    return _stamped(message, stamp_ns, frame_id)
+
+
+def compressed_message(picture, stamp_ns, frame_id='camera', suffix='.jpg'):
+    """Return a sensor_msgs/CompressedImage."""
+    message = CompressedImage(format='jpeg' if suffix == '.jpg' else suffix[1:])
+    message.data.frombytes(cv2.imencode(suffix, picture)[1].tobytes())
+    return _stamped(message, stamp_ns, frame_id)
+
+
+def _stamped(message, stamp_ns, frame_id):
+    message.header.frame_id = frame_id
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    return message
+
+
+def _yaml(value):
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, (int, float)) else str(value)
