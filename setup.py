@@ -34,11 +34,11 @@ setup(
         'lz4>=4',
         'PyYAML>=6',
         'rich>=13',
-        'matplotlib>=3.8',
     ],
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        'test': ['pytest>=8', 'hypothesis>=6', 'ruff', 'mypy', 'types-PyYAML'],
+        'test': ['pytest>=8', 'pytest-xdist>=3', 'hypothesis>=6', 'ruff', 'mypy', 'types-PyYAML'],
+        'benchmark': ['matplotlib>=3.8'],
     },
     entry_points={
         'console_scripts': [

@@ -54,8 +54,10 @@ class Calibrator:
 
     def __init__(self, config: Config | None = None, mask: Mask | None = None,
                  verbose: bool = False, live: bool = False) -> None:
-        """mask: (h, w), False where the ego vehicle is. live: children run at low priority, and
-        push() never waits for them; offline it does, so that few turns are in memory at a time.
+        """mask: (h, w), False where the ego vehicle is.
+
+        live: children run at low priority, and push() never waits for them; offline it does, so
+        that few turns are in memory at a time.
         """
         self._config = config or Config()
         self._live = live
@@ -113,6 +115,10 @@ class Calibrator:
         solution = None
         if scenes:
             solution = self._workshop.run(solve_scenes, scenes, self._config, progress=tell)
+            used = {scene.center for scene in solution.scenes} if solution else set()
+            for scene in scenes:
+                if scene.center not in used:
+                    self._workshop.reject(scene.center)
         ended = time.monotonic()
         with self._lock:
             evidence = Evidence(
@@ -161,19 +167,27 @@ class Calibrator:
                  trace: TracebackType | None) -> None:
         self.close()
 
-    def _submit(self) -> None:
-        """Have the best turns built, and drop the images of those that are."""
+    def _submit(self, replace_failed: bool = False) -> None:
+        """Have the best turns built.
+
+        A turn's images are handed over when it is submitted, and not when it is built: what
+        becomes of turns that overlap it must not depend on how fast the children are. For the same
+        reason others are tried in the place of turns that gave no scene only when a calibration
+        is asked for (replace_failed).
+        """
+        turns = self._detector.turns()
         built = self._workshop.scenes()
-        good = 0
-        for turn in self._detector.turns():
-            if turn.center in built:
-                self._detector.release(turn.center)
-                good += built[turn.center] is not None
-            elif turn.frames:
-                self._workshop.submit(turn, self._motion.valid())
-                good += 1
-            if good >= self._config.turns.wanted:
+        self._workshop.keep_only({turn.center for turn in turns})
+        places = self._config.turns.wanted
+        for turn in turns:
+            if replace_failed and turn.center in built and built[turn.center] is None:
+                continue
+            if places == 0:
                 return
+            places -= 1
+            if turn.frames:
+                self._workshop.submit(turn, self._motion.valid())
+                self._detector.release(turn.center)
 
     def _wanted_scenes(self, tell: Progress) -> list[Scene]:
         """Return the scenes of the best turns; a turn without a scene gives way to the next."""
@@ -188,7 +202,7 @@ class Calibrator:
             if self._closed:
                 raise WorkerError('the calibrator was closed while it calibrated')
             with self._lock:
-                self._submit()
+                self._submit(replace_failed=True)
                 if self._workshop.waiting:
                     continue
                 built = self._workshop.scenes()

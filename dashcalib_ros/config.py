@@ -173,7 +173,7 @@ class Config:
 
     def replace(self, changes: Mapping[str, Any]) -> Config:
         """Return a copy with settings changed by full name; raises ConfigError."""
-        known = self.flat()
+        known = {name: spec for name, spec, _ in _settings(self)}
         top: dict[str, Any] = {}
         nested: dict[str, dict[str, Any]] = {}
         for name, value in changes.items():
@@ -183,7 +183,7 @@ class Config:
                 raise ConfigError(f'unknown setting {name!r}{hint}')
             section, _, key = name.rpartition('.')
             # an integer is a fine float; everything else must fit as it is
-            if isinstance(known[name], float) and type(value) is int:
+            if isinstance(known[name].default, float) and _is_exact(value):
                 value = float(value)
             (nested.setdefault(section, {}) if section else top)[key] = value
         for section, values in nested.items():
@@ -197,6 +197,8 @@ class Config:
         for key, value in data.items():
             if isinstance(value, Mapping):
                 flat.update({f'{key}.{inner}': item for inner, item in value.items()})
+            elif value is None and dataclasses.is_dataclass(getattr(cls(), str(key), None)):
+                continue  # a section of which every line is a comment
             else:
                 flat[str(key)] = value
         return cls().replace(flat)
@@ -218,9 +220,14 @@ def _settings(config: Config) -> Iterator[tuple[str, dataclasses.Field[Any], Any
             yield outer.name, outer, value
 
 
+def _is_exact(value: Any) -> bool:
+    # int and not bool, and no larger than a float can hold
+    return type(value) is int and abs(value) <= 2**53
+
+
 def _check(name: str, spec: dataclasses.Field[Any], value: Any) -> None:
     expected = type(spec.default)
-    if type(value) is not expected:
+    if type(value) is not expected and not (expected is float and _is_exact(value)):
         raise ConfigError(f'{name} must be {expected.__name__}, not {value!r}')
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f'{name} must be a finite number, not {value!r}')

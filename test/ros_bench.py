@@ -10,8 +10,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -22,6 +24,9 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 DOMAIN = 1 + os.getpid() % 100
 # s; how long anything may take that should come at once: machines are slow, DDS discovery too
 SOON = 30.0
+SECOND = 10**9
+# ns; stamp of the first image
+START = 1_767_614_400 * SECOND
 COMMAND = [sys.executable, '-m', 'dashcalib_ros.ros']
 
 
@@ -84,6 +89,47 @@ class NodeProcess:
         self.process.wait(SOON)
 
 
+@pytest.fixture(scope='module')
+def context(tmp_path_factory):
+    """rclpy in the tests' own process, in this run's own domain."""
+    before = dict(os.environ)
+    os.environ.update(ros_environment(tmp_path_factory.mktemp('home')))
+    context = Context()
+    rclpy.init(context=context)
+    yield context
+    rclpy.try_shutdown(context=context)
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.fixture
+def start(tmp_path, context):
+    """Start nodes that are gone after the test, whatever happens."""
+    nodes = []
+
+    def start_node(*arguments, **parameters):
+        nodes.append(NodeProcess(tmp_path, *arguments, **parameters))
+        return nodes[-1]
+
+    yield start_node
+    for node in nodes:
+        node.kill()
+
+
+@pytest.fixture
+def bench(context):
+    """Make benches that are closed after the test."""
+    made = []
+
+    def make(**options):
+        made.append(Bench(context, **options))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
 class Bench:
     """A camera and a listener in one node; nothing waits without a limit."""
 
@@ -93,6 +139,7 @@ class Bench:
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
         kind = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        self.reliability = kind.name.lower()
         self.images = self.node.create_publisher(
             image_type, topic, QoSProfile(depth=50, reliability=kind))
         self.infos, self.latched, self.status, self.magnitudes = [], [], None, []
@@ -131,8 +178,9 @@ class Bench:
             self.executor.spin_once(timeout_sec=0.02)
 
     def connect(self, node):
-        """Wait until the node hears the images and is heard."""
-        self.until(lambda: self.images.get_subscription_count() > 0 and self.status is not None,
+        """Wait until the node hears the images, as reliably as they come, and is heard."""
+        self.until(lambda: self.images.get_subscription_count() > 0
+                   and self.values.get('reliability') == self.reliability,
                    what='the connection', node=node)
 
     def publish(self, *messages):

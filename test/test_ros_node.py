@@ -1,4 +1,4 @@
-"""The node between real processes: driven to acceptance, stopped in every state, fed bad input."""
+"""The node between real processes: stopped in every state, fed bad input, asked for services."""
 from __future__ import annotations
 
 import os
@@ -10,69 +10,18 @@ import time
 import numpy as np
 import pytest
 
-rclpy = pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
+pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
+pytest_plugins = ['ros_bench']
 
 from ros_bench import (
+    SECOND,
     SOON,
-    Bench,
-    NodeProcess,
+    START,
     compressed_message,
     image_message,
     ros_environment,
 )
 from sensor_msgs.msg import CameraInfo, CompressedImage
-from sensor_msgs.srv import SetCameraInfo
-
-from dashcalib_ros.demo import Drive, DriveSpec, Lens
-from dashcalib_ros.report import load_calibration_yaml
-
-LENS = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
-# few points: what is tested is the node, the core has tests of its own
-QUICK = {'turns__wanted': 2, 'scene__tracks': 200, 'scene__profile_tracks': 100,
-         'tracks__points': 300, 'queue_size': 300}
-SECOND = 10**9
-START = 1_767_614_400 * SECOND
-
-
-@pytest.fixture(scope='module')
-def context(tmp_path_factory):
-    """rclpy in this process, in this run's own domain."""
-    before = dict(os.environ)
-    os.environ.update(ros_environment(tmp_path_factory.mktemp('home')))
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    yield context
-    rclpy.try_shutdown(context=context)
-    os.environ.clear()
-    os.environ.update(before)
-
-
-@pytest.fixture
-def start(tmp_path, context):
-    """Start nodes that are gone after the test, whatever happens."""
-    nodes = []
-
-    def start_node(*arguments, **parameters):
-        nodes.append(NodeProcess(tmp_path, *arguments, **parameters))
-        return nodes[-1]
-
-    yield start_node
-    for node in nodes:
-        node.kill()
-
-
-@pytest.fixture
-def bench(context):
-    """Make benches that are closed after the test."""
-    made = []
-
-    def make(**options):
-        made.append(Bench(context, **options))
-        return made[-1]
-
-    yield make
-    for each in made:
-        each.close()
 
 
 def noise(index, size=(320, 240)):
@@ -110,152 +59,6 @@ def keep_file(home, text, name='dashcam'):
     return path
 
 
-# -- a drive to acceptance --------------------------------------------------------------------
-
-@pytest.fixture(scope='module')
-def rendered():
-    """Return a drive with two turns, and all its frames."""
-    drive = Drive(LENS, DriveSpec(seed=0, turns=2))
-    return drive, list(drive.frames(processes=2))
-
-
-class Driven:
-    """What was seen while a rendered drive was published to a node until it was calibrated."""
-
-
-@pytest.fixture(scope='module')
-def driven(context, rendered, tmp_path_factory):
-    home = tmp_path_factory.mktemp('driven')
-    seen = Driven()
-    seen.drive, seen.frames = rendered
-    seen.node = NodeProcess(home, commit=True, commit_timeout=SOON, **QUICK)
-    seen.bench = bench = Bench(context)
-    seen.committed = []
-
-    def set_camera_info(request, response):
-        seen.committed.append(request.camera_info)
-        response.success = True
-        return response
-
-    bench.node.create_service(SetCameraInfo, 'set_camera_info', set_camera_info)
-    try:
-        bench.connect(seen.node)
-        drive(seen)
-        yield seen
-    finally:
-        seen.node.kill()
-        bench.close()
-
-
-def drive(seen):
-    """Publish the drive, kill the first child, wait for the calibration, publish some more."""
-    bench, node = seen.bench, seen.node
-    seen.killed = 0
-    for frame in seen.frames:
-        bench.publish(image_message(frame.image, frame.stamp_ns))
-        bench.spin(0.02)
-        if not seen.killed and (children := node.children()):
-            os.kill(children[0], signal.SIGKILL)
-            seen.killed = children[0]
-    seen.before = len(bench.infos)
-    bench.until(lambda: seen.committed, 120.0, 'an accepted calibration', node)
-    seen.latched = list(bench.latched)
-    seen.after = [image_message(frame.image, frame.stamp_ns + 100 * SECOND, 'camera')
-                  for frame in seen.frames[:5]]
-    bench.publish(*seen.after)
-    bench.until(lambda: len(bench.infos) >= 5, what='camera_info for each image', node=node)
-    bench.until(lambda: bench.values.get('state') == 'calibrated', node=node)
-
-
-def test_nothing_is_published_before_acceptance_and_one_per_image_after(driven):
-    assert driven.before == 0
-    assert [info.header for info in driven.bench.infos] == [
-        image.header for image in driven.after]
-
-
-def test_camera_info_is_complete_and_close_to_the_truth(driven):
-    info, truth = driven.bench.infos[0], driven.drive.truth
-    assert (info.width, info.height, info.distortion_model) == (640, 360, 'plumb_bob')
-    fx, fy, cx, cy = info.k[0], info.k[4], info.k[2], info.k[5]
-    assert list(info.k) == [fx, 0, cx, 0, fy, cy, 0, 0, 1]
-    assert list(info.p) == [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]
-    assert list(info.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1]
-    assert len(info.d) == 5 and list(info.d[2:]) == [0, 0, 0]
-    assert abs(fx / truth.fx - 1) < 0.015 and abs(fy / truth.fy - 1) < 0.015
-    assert abs(info.d[0] - truth.k1) < 0.02
-
-
-def test_a_killed_child_costs_no_turn(driven):
-    assert driven.killed
-    assert driven.killed not in driven.node.children()
-    saved = load_calibration_yaml(driven.node.home / '.ros' / 'camera_info' / 'dashcam.yaml')
-    assert saved.verdict == 'accepted'
-    # both turns of the drive were needed, and the child that died had one of them
-    assert 'turns_used: 2' in (
-        driven.node.home / '.ros' / 'camera_info' / 'dashcam.yaml').read_text()
-
-
-def test_the_latched_calibration_reaches_late_subscribers(driven, context):
-    late = Bench(context)
-    try:
-        late.until(lambda: late.latched, node=driven.node)
-        assert late.latched[-1].k.tolist() == driven.bench.infos[0].k.tolist()
-    finally:
-        late.close()
-
-
-def test_the_driver_was_given_the_calibration(driven):
-    assert len(driven.committed) == 1
-    assert driven.committed[0].k.tolist() == driven.bench.infos[0].k.tolist()
-    driven.node.wait_for('set_camera_info took the calibration')
-
-
-def test_the_turning_magnitude_was_published(driven):
-    values = [message.data for message in driven.bench.magnitudes]
-    assert max(values) > 0.02 > min(values) >= 0
-
-
-def test_the_calibration_is_saved_again_on_request(driven):
-    path = driven.node.home / '.ros' / 'camera_info' / 'dashcam.yaml'
-    path.unlink()
-    answer = driven.bench.call('save', driven.node)
-    assert answer.success and str(path) in answer.message
-    assert load_calibration_yaml(path).intrinsics.fx == driven.bench.infos[0].k[0]
-
-
-def test_diagnostics_tell_an_operator_everything(driven):
-    bench = driven.bench
-    # images, so that it is not stale
-    bench.publish(*driven.after)
-    bench.until(lambda: bench.status.level == b'\x00', node=driven.node)
-    assert bench.status.name == 'calibrator: camera calibration'
-    assert bench.status.hardware_id == 'dashcam'
-    values = bench.values
-    assert values['verdict'] == 'accepted' and values['turns wanted'] == '2'
-    assert int(values['received']) >= len(driven.drive)
-    assert values['dropped'] == '0'
-    assert float(values['sigma fx (px)']) > 0
-    assert values['published'].startswith('fx 4')
-
-
-def test_reset_takes_everything_back(driven):
-    """The last one with this node."""
-    bench = driven.bench
-    assert bench.call('reset', driven.node).success
-    bench.until(lambda: bench.values.get('state') == 'collecting', node=driven.node)
-    bench.until(lambda: bench.latched[-1].k[0] == 0, what='the latched one', node=driven.node)
-    heard = len(bench.infos)
-    received = bench.count('received')
-    bench.publish(*driven.after)
-    bench.counted('received', received + 5, driven.node)
-    assert len(bench.infos) == heard
-    folder = driven.node.home / '.ros' / 'camera_info'
-    assert [path.name for path in folder.iterdir()] == ['dashcam.previous.yaml']
-    assert not bench.call('save', driven.node).success
-    assert driven.node.stop() == 0
-    assert 'Traceback' not in driven.node.text
-
-
 # -- the end ----------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('signals', [
@@ -267,19 +70,6 @@ def test_it_ends_cleanly_while_it_collects(start, bench, signals):
     stream(camera, 5)
     assert node.stop(*signals) == 0, node.text
     assert 'Traceback' not in node.text
-
-
-def test_it_ends_cleanly_while_children_work(start, bench, rendered):
-    node, camera = start(**QUICK), bench()
-    camera.connect(node)
-    for frame in rendered[1]:
-        camera.publish(image_message(frame.image, frame.stamp_ns))
-        camera.spin(0.02)
-        if node.children():
-            break
-    assert node.children()
-    assert node.stop(signal.SIGINT, signal.SIGINT) == 0, node.text
-    assert node.children() == [] and 'Traceback' not in node.text
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

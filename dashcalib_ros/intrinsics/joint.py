@@ -27,11 +27,12 @@ Progress = Callable[[str, float], None]
 
 
 def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: SceneConfig,
-          seed: int = 0, progress: Progress = lambda stage, done: None) -> Solution:
+          seed: int = 0, progress: Progress = lambda stage, done: None) -> Solution | None:
     """Adjust all scenes with one shared camera.
 
     scenes: at least one. The summed focal profile picks the start; a scene that was built far from
-    it is chained anew.
+    it is chained anew, and one of which nothing is left with the shared camera is dropped. None
+    when that becomes of all.
     """
     solver = Solver(scene_config.loss_px, scene_config.iterations)
     profile = summed([scene.profile for scene in scenes])
@@ -42,7 +43,9 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     for n in range(config.rounds):
         progress('step 1: one focal length', n / config.rounds)
         together, camera = adjust_step1(together, camera, solver, reach)
-        together = [_again(scene, camera, scene_config) for scene in together]
+        together = _all_again(together, camera, scene_config)
+    if not together:
+        return None
     step1 = camera
     known = [information(scene, camera, scene_config.loss_px) for scene in together]
     prior = _prior(step1, config, noise_of(known))
@@ -50,7 +53,9 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     for n in range(config.rounds):
         progress('step 2: all six', n / config.rounds)
         together, camera = adjust_step2(together, camera, solver, prior, bounds)
-        together = [_again(scene, camera, scene_config) for scene in together]
+        together = _all_again(together, camera, scene_config)
+    if not together:
+        return None
     progress('sigma', 0.0)
     together, camera = adjust_step2(together, camera, solver, prior, bounds)
     parts = tuple(information(scene, camera, scene_config.loss_px) for scene in together)
@@ -125,6 +130,11 @@ def _brought_to(scene: Scene, camera: Camera, config: SceneConfig, seed: int) ->
         if anew is not None:
             return anew
     return _again(scene, camera, config)
+
+
+def _all_again(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> list[Scene]:
+    again = [_again(scene, camera, config) for scene in scenes]
+    return [scene for scene in again if scene.structure.used.any()]
 
 
 def _again(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:

@@ -9,7 +9,8 @@ from dashcalib_ros.reconstruction.scene import Scene
 
 
 def solve_scenes(scenes: Sequence[Scene], config: Config,
-                 progress: Callable[[str, float], None] = lambda stage, done: None) -> Solution:
+                 progress: Callable[[str, float], None] = lambda stage, done: None
+                 ) -> Solution | None:
     """Adjust all scenes together; COLMAP is loaded in the process that runs this only."""
     from dashcalib_ros.intrinsics.joint import solve
     return solve(scenes, config.intrinsics, config.scene, config.seed, progress)

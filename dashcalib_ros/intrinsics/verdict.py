@@ -58,7 +58,7 @@ def _flat_profile(solution: Solution, config: VerdictConfig) -> tuple[list[str],
     contrast = profile_contrast(solution)
     message = (f'the turns hardly tell one focal length from another (the error rises by '
                f'{100 * contrast:.1f} % when it is 25 % off): drive sharper turns in daylight')
-    if contrast < config.refused_contrast:
+    if not contrast >= config.refused_contrast:  # NaN is no evidence either
         return [message], []
     return [], [message] if contrast < config.min_contrast else []
 
@@ -66,7 +66,7 @@ def _flat_profile(solution: Solution, config: VerdictConfig) -> tuple[list[str],
 def profile_contrast(solution: Solution) -> float:
     """Return by how much the cost rises, relatively, 20 to 25 % to either side of the result.
 
-    Negative when the best focal length held fixed is at an end of the profile.
+    Zero when the best focal length held fixed is at an end of the profile.
     """
     costs = solution.around.costs
     return float(min(costs[0], costs[-1]) / costs.min() - 1)
@@ -92,7 +92,7 @@ def _sigma_too_large(solution: Solution, config: VerdictConfig) -> tuple[list[st
 def _turns_disagree(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
     """Each turn alone says what fx it would rather have: compare that with its own sigma."""
     spread = focal_disagreement(solution)
-    if spread > config.max_disagreement:
+    if not spread <= config.max_disagreement:
         return [], [f'the turns disagree about fx by {100 * spread:.1f} %: was the camera moved, '
                     f'or is there much traffic?']
     return [], []

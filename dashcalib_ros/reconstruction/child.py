@@ -1,8 +1,8 @@
 """A child process that does the heavy calls: COLMAP aborts its process when a check fails.
 
 The parent sends (function, arguments) and receives progress, then a result or an exception,
-pickled over pipes. The child is plain `python -m dashcalib_ros.reconstruction.child`, not
-multiprocessing: a spawned multiprocessing child would import the user's main script again.
+pickled over pipes. The child is a plain `python -c`, not multiprocessing: a child that the latter
+spawns would import the user's main script again.
 """
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, BinaryIO
 
 from dashcalib_ros.errors import WorkerError
 
 HEADER = struct.Struct('>Q')
+PROTOCOL = pickle.HIGHEST_PROTOCOL
+# not `-m`: it would import from the current folder first, and a random.py may lie there
+START = ("import sys; sys.path[:1] = [] if sys.path[0] == '' else sys.path[:1]; "
+         'from dashcalib_ros.reconstruction.child import main; main()')
 # libraries that would otherwise start a thread for every core
 THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 LOW_PRIORITY = 10
@@ -58,30 +63,49 @@ class Child:
         progress: given on to the function as its last argument `progress`, called in the parent.
         Raises what the function raises, and ChildDiedError if the child ends before it answers.
         """
+        # what cannot be sent fails here, before anything is on its way
+        request = pickle.dumps((function, arguments, progress is not None), PROTOCOL)
         process = self._running()
+        try:
+            kind, value = self._answer(process, request, progress)
+        except BaseException:
+            # Ctrl-C, say: the answer to this call must not be taken for one to the next
+            self._end(process)
+            raise
+        if kind == 'error':
+            raise value
+        return value
+
+    def _answer(self, process: subprocess.Popen[bytes], request: bytes,
+                progress: Progress | None) -> tuple[str, Any]:
         assert process.stdin is not None and process.stdout is not None
         try:
-            _send(process.stdin, (function, arguments, progress is not None))
-            while True:
+            _write(process.stdin, request)
+        except (OSError, ValueError) as error:
+            raise self._died(process) from error
+        while True:
+            try:
                 kind, value = _receive(process.stdout)
-                if kind == 'progress' and progress is not None:
-                    progress(*value)
-                elif kind == 'result':
-                    return value
-                elif kind == 'error':
-                    raise value
-        except (EOFError, OSError, pickle.UnpicklingError) as error:
-            self.kill()
-            raise ChildDiedError(
-                f'the reconstruction process died (exit code {process.returncode}); it is started '
-                f'again at the next try. If it dies each time, free memory or set '
-                f'scene.tracks lower') from error
+            except (EOFError, OSError, ValueError, pickle.UnpicklingError) as error:
+                raise self._died(process) from error
+            if kind != 'progress':
+                return kind, value
+            if progress is not None:
+                progress(*value)
+
+    def _died(self, process: subprocess.Popen[bytes]) -> ChildDiedError:
+        self._end(process)
+        return ChildDiedError(
+            f'the reconstruction process died (exit code {process.returncode}); it is started '
+            f'again at the next try. If it dies each time, free memory or set '
+            f'scene.tracks lower')
 
     def kill(self) -> None:
         """End the child at once; a call that waits for it raises ChildDiedError."""
-        process = self._process
-        if process is None:
-            return
+        if self._process is not None:
+            self._end(self._process)
+
+    def _end(self, process: subprocess.Popen[bytes]) -> None:
         with contextlib.suppress(OSError):
             process.kill()
         process.wait()
@@ -106,10 +130,10 @@ class Child:
 
     def _start(self) -> subprocess.Popen[bytes]:
         environment = dict(os.environ)
-        environment['PYTHONPATH'] = os.pathsep.join(path for path in sys.path if path)
+        environment['PYTHONPATH'] = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
         environment.update({name: '1' for name in THREAD_VARIABLES})
-        command = [sys.executable, '-m', 'dashcalib_ros.reconstruction.child',
-                   str(LOW_PRIORITY if self._low_priority else 0)]
+        command = [sys.executable, '-c', START, str(LOW_PRIORITY if self._low_priority else 0),
+                   str(os.getpid())]
         try:
             return subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment,
@@ -120,21 +144,37 @@ class Child:
 
 
 def _send(pipe: BinaryIO | Any, message: object) -> None:
-    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    _write(pipe, pickle.dumps(message, PROTOCOL))
+
+
+def _write(pipe: BinaryIO | Any, data: bytes) -> None:
     pipe.write(HEADER.pack(len(data)))
     pipe.write(data)
     pipe.flush()
 
 
 def _receive(pipe: BinaryIO | Any) -> Any:
+    return pickle.loads(_read(pipe))
+
+
+def _read(pipe: BinaryIO | Any) -> bytes:
     header = pipe.read(HEADER.size)
     if len(header) < HEADER.size:
         raise EOFError
     (length,) = HEADER.unpack(header)
-    data = pipe.read(length)
+    data: bytes = pipe.read(length)
     if len(data) < length:
         raise EOFError
-    return pickle.loads(data)
+    return data
+
+
+def _portable(error: Exception) -> Exception:
+    """Return the error, or one that says the same if the parent could not be given it."""
+    try:
+        pickle.loads(pickle.dumps(error, PROTOCOL))
+    except Exception:
+        return WorkerError(f'{type(error).__name__}: {error}')
+    return error
 
 
 def _watch_parent(parent: int) -> None:
@@ -149,7 +189,7 @@ def main() -> None:
     # Ctrl-C reaches the whole terminal group: the parent decides what becomes of the child
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(int(sys.argv[1]))
-    threading.Thread(target=_watch_parent, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_watch_parent, args=(int(sys.argv[2]),), daemon=True).start()
     requests = sys.stdin.buffer
     # libraries may print: they get stderr, the answers keep the pipe
     answers = os.fdopen(os.dup(1), 'wb')
@@ -163,16 +203,13 @@ def main() -> None:
 
     while True:
         try:
-            function, arguments, wants_progress = _receive(requests)
+            request = _read(requests)
         except EOFError:
             return
         try:
+            function, arguments, wants_progress = pickle.loads(request)
             extra = {'progress': report} if wants_progress else {}
-            answer = ('result', function(*arguments, **extra))
+            answer = pickle.dumps(('result', function(*arguments, **extra)), PROTOCOL)
         except Exception as error:
-            answer = ('error', error)
-        _send(answers, answer)
-
-
-if __name__ == '__main__':
-    main()
+            answer = pickle.dumps(('error', _portable(error)), PROTOCOL)
+        _write(answers, answer)

@@ -3,8 +3,7 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from typing import Any
 
 import numpy as np
@@ -37,7 +36,10 @@ class Workshop:
         self._scenes: dict[int, Scene | None] = {}
         self._waiting: set[int] = set()
         self._error: Exception | None = None
+        self._failed: list[tuple[Turn, Mask | None]] = []
+        self._changes = 0
         self._closed = False
+        self._ended = threading.Event()
         self._solver = Child(low_priority, verbose)
 
     def submit(self, turn: Turn, valid: Mask | None) -> None:
@@ -46,17 +48,24 @@ class Workshop:
             if self._closed or turn.center in self._waiting or turn.center in self._scenes:
                 return
             self._waiting.add(turn.center)
-        if not self._threads:
-            self._threads = [threading.Thread(target=self._work, args=(child,), daemon=True)
-                             for child in self._children]
-            for thread in self._threads:
-                thread.start()
-        self._jobs.put((turn, valid))
+            if not self._threads:
+                self._threads = [threading.Thread(target=self._work, args=(child,), daemon=True)
+                                 for child in self._children]
+                for thread in self._threads:
+                    thread.start()
+            self._jobs.put((turn, valid))
 
-    def forget(self, center: int) -> None:
-        """Drop a scene whose turn is no longer wanted."""
+    def keep_only(self, centers: Set[int]) -> None:
+        """Drop the scenes, and the wish for scenes, of all other turns."""
         with self._changed:
-            self._scenes.pop(center, None)
+            self._waiting &= centers
+            self._scenes = {center: scene for center, scene in self._scenes.items()
+                            if center in centers}
+
+    def reject(self, center: int) -> None:
+        """Take out a scene that does not fit the others; its turn counts as one without."""
+        with self._changed:
+            self._scenes[center] = None
 
     @property
     def waiting(self) -> int:
@@ -69,13 +78,27 @@ class Workshop:
             return dict(self._scenes)
 
     def wait(self, until: Callable[[], bool]) -> None:
-        """Wait until the condition holds; raises what a worker raised."""
-        with self._changed:
-            while not until() and self._error is None and not self._closed:
-                self._changed.wait(0.2)
-            if self._error is not None:
-                error, self._error = self._error, None
-                raise error
+        """Wait until the condition holds; raises what a worker raised.
+
+        The turn that it was raised for is tried again, for whoever waits next.
+        The condition is asked without a lock: it may take the caller's own, or show progress.
+        """
+        while True:
+            with self._changed:
+                seen = self._changes
+                if self._error is not None:
+                    error, self._error = self._error, None
+                    for job in self._failed:
+                        self._jobs.put(job)
+                    self._failed.clear()
+                    raise error
+                if self._closed:
+                    return
+            if until():
+                return
+            with self._changed:
+                if self._changes == seen:
+                    self._changed.wait(0.2)
 
     def run(self, function: Callable[..., Any], *arguments: Any,
             progress: Callable[[str, float], None] | None = None) -> Any:
@@ -86,7 +109,7 @@ class Workshop:
             except ChildDiedError:
                 if self._closed or attempt == ATTEMPTS - 1:
                     raise
-                time.sleep(BACK_OFF_S * 2**attempt)
+                self._ended.wait(BACK_OFF_S * 2**attempt)
         raise AssertionError('unreachable')
 
     def pids(self) -> list[int]:
@@ -98,6 +121,7 @@ class Workshop:
         """End every child; what waits for one is told that the calibrator is closed."""
         with self._changed:
             self._closed = True
+            self._ended.set()
             self._changed.notify_all()
         for _ in self._threads:
             self._jobs.put(None)
@@ -107,16 +131,19 @@ class Workshop:
             thread.join(timeout=5)
 
     def _work(self, child: Child) -> None:
-        # here and not above: only a process that reconstructs loads COLMAP; this names it
         while (job := self._jobs.get()) is not None and not self._closed:
             turn, valid = job
+            if turn.center not in self._waiting:
+                continue
             scene, error = self._built(child, turn, valid)
             with self._changed:
-                self._waiting.discard(turn.center)
-                if error is None:
-                    self._scenes[turn.center] = scene
-                else:
+                if error is not None:
                     self._error = error
+                    self._failed.append(job)
+                elif turn.center in self._waiting:
+                    self._waiting.remove(turn.center)
+                    self._scenes[turn.center] = scene
+                self._changes += 1
                 self._changed.notify_all()
 
     def _built(self, child: Child, turn: Turn, valid: Mask | None
@@ -125,9 +152,9 @@ class Workshop:
             try:
                 return child.call(build_turn, turn, self._config, valid), None
             except ChildDiedError:
-                if self._closed:
-                    return None, None
-                time.sleep(BACK_OFF_S * 2**attempt)
+                if self._closed or attempt == ATTEMPTS - 1:
+                    break
+                self._ended.wait(BACK_OFF_S * 2**attempt)
             except DashcalibError as error:
                 return None, error
             except Exception as error:

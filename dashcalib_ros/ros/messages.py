@@ -45,6 +45,7 @@ class Health:
     state: State
     wanted: int
     topic: str
+    reliability: str
     status: Status = NOTHING
     stage: str = ''
     published: Camera | None = None
@@ -81,6 +82,7 @@ def diagnostic_status(health: Health, name: str, hardware_id: str) -> Diagnostic
         'sigma fx (px)': _sigma(health.published),
         'file': health.file,
         'topic': health.topic,
+        'reliability': health.reliability,
         'warnings': '; '.join(health.warnings),
         **health.counts,
     }

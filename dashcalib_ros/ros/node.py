@@ -289,7 +289,8 @@ class CalibratorNode(Node):
                   **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},
                   'contradictions': self._contradictions}
         return Health(
-            state, self._core.turns.wanted, self._images.topic, activity.status, activity.stage,
+            state, self._core.turns.wanted, self._images.topic, self._images.reliability,
+            activity.status, activity.stage,
             publication.kept.camera if publication.kept else None, publication.stale,
             verdict.level if verdict else '', verdict.reasons if verdict else (), silent,
             str(self._store.path), tuple(self._warnings()), counts)

@@ -1,0 +1,163 @@
+"""Settings: valid defaults with reasons, and one clear line for every value that does not fit."""
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import yaml
+
+from dashcalib_ros.config import (
+    Config,
+    MotionConfig,
+    TurnsConfig,
+    VerdictConfig,
+    describe,
+)
+from dashcalib_ros.errors import ConfigError
+
+SPECS = dict(describe())
+
+
+def test_defaults_are_inside_their_ranges_and_not_on_the_edge_of_types():
+    flat = Config().flat()
+    assert set(flat) == set(SPECS)
+    for name, value in flat.items():
+        meta = SPECS[name].metadata
+        assert type(value) in (int, float, bool, str), name
+        if isinstance(value, bool):
+            continue
+        assert meta['minimum'] <= value <= meta['maximum'], name
+
+
+@pytest.mark.parametrize('name', SPECS)
+def test_every_setting_says_why(name):
+    reason = SPECS[name].metadata['reason']
+    assert len(reason) >= 10 and '\n' not in reason
+
+
+@pytest.mark.parametrize('name', [n for n, s in SPECS.items() if isinstance(s.default, float)])
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+def test_not_a_finite_number(name, value):
+    with pytest.raises(ConfigError, match='finite') as caught:
+        Config().replace({name: value})
+    assert name in str(caught.value)
+
+
+@pytest.mark.parametrize('name', [n for n, s in SPECS.items() if not isinstance(s.default, bool)])
+def test_out_of_range_names_the_range(name):
+    meta = SPECS[name].metadata
+    kind = type(SPECS[name].default)
+    for value in (meta['minimum'] - 1, meta['maximum'] + 1):
+        with pytest.raises(ConfigError, match='between') as caught:
+            Config().replace({name: kind(value)})
+        assert name in str(caught.value)
+    for value in (meta['minimum'], meta['maximum']):
+        assert Config().replace({name: kind(value)}).flat()[name] == value
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('turns.wanted', 2.5), ('turns.wanted', '5'), ('turns.wanted', True), ('turns.wanted', None),
+    ('motion.rate', 'fast'), ('motion.rate', True), ('motion.rate', None), ('motion.rate', [10.0]),
+    ('mask.enabled', 1), ('mask.enabled', 'yes'), ('seed', 1.0), ('seed', False),
+    ('motion.rate', {'hz': 10}),
+])
+def test_wrong_type_names_the_right_one(name, value):
+    with pytest.raises(ConfigError) as caught:
+        Config().replace({name: value})
+    message = str(caught.value)
+    assert name in message and type(SPECS[name].default).__name__ in message
+    assert '\n' not in message
+
+
+@pytest.mark.parametrize(('name', 'hint'), [
+    ('turns.half_with', 'turns.half_width'), ('turn.wanted', 'turns.wanted'), ('sed', 'seed'),
+    ('motion.Rate', 'motion.rate')])
+def test_a_typo_gets_the_nearest_name(name, hint):
+    with pytest.raises(ConfigError, match=f'did you mean {hint}'):
+        Config().replace({name: 1})
+
+
+def test_a_name_like_no_other_gets_the_list():
+    with pytest.raises(ConfigError, match='unknown setting') as caught:
+        Config().replace({'qqqqqqqqqqqqqq': 1})
+    assert 'turns.wanted' in str(caught.value) and 'seed' in str(caught.value)
+
+
+@pytest.mark.parametrize('name', ['__class__', 'turns', 'flat', 'turns.', '.', '', 'turns.wanted.x'])
+def test_names_that_are_attributes_but_no_settings(name):
+    with pytest.raises(ConfigError, match='unknown setting'):
+        Config().replace({name: 1})
+
+
+def test_an_integer_is_a_fine_float():
+    config = Config().replace({'motion.rate': 10, 'turns.half_width': 2})
+    assert type(config.motion.rate) is float and config.motion.rate == 10.0
+    assert type(config.turns.half_width) is float
+
+
+def test_an_integer_is_a_fine_float_in_yaml_and_in_python():
+    text = 'motion: {rate: 12}\nverdict:\n  min_yaw_deg: 70\nturns.half_width: 2\n'
+    config = Config.from_mapping(yaml.safe_load(text))
+    assert (config.motion.rate, config.verdict.min_yaw_deg, config.turns.half_width) == (12, 70, 2)
+    made = Config(motion=MotionConfig(rate=12), turns=TurnsConfig(half_width=2),
+                  verdict=VerdictConfig(min_yaw_deg=70))
+    assert made == config
+    assert type(made.replace({'motion.rate': 15}).motion.rate) is float
+
+
+@pytest.mark.parametrize('value', [10**30, -10**400])
+def test_an_integer_that_no_float_can_hold(value):
+    with pytest.raises(ConfigError, match=r'motion\.rate'):
+        Config().replace({'motion.rate': value})
+    with pytest.raises(ConfigError, match=r'motion\.rate'):
+        Config(motion=MotionConfig(rate=value))
+
+
+def test_a_config_made_directly_is_checked_too():
+    with pytest.raises(ConfigError, match=r'turns\.wanted'):
+        Config(turns=TurnsConfig(wanted=0))
+    with pytest.raises(ConfigError, match='threads'):
+        Config(threads=0)
+    with pytest.raises(ConfigError, match=r'motion\.rate'):
+        Config(motion=MotionConfig(rate=math.nan))
+
+
+def test_nested_and_dotted_names_mean_the_same():
+    nested = Config.from_mapping({'turns': {'wanted': 3, 'half_width': 2.0}, 'seed': 7})
+    dotted = Config.from_mapping({'turns.wanted': 3, 'turns.half_width': 2.0, 'seed': 7})
+    assert nested == dotted
+    assert (nested.turns.wanted, nested.turns.half_width, nested.seed) == (3, 2.0, 7)
+    # what was not named keeps its default
+    assert nested.turns.capacity == Config().turns.capacity
+
+
+def test_a_section_without_lines_is_no_error():
+    data = yaml.safe_load('turns:\n  # wanted: 3\nseed: 4\n')
+    assert Config.from_mapping(data) == Config().replace({'seed': 4})
+
+
+@pytest.mark.parametrize('data', [{'turns': 5}, {'turns': {'wanted': {'x': 1}}}, {3: 4},
+                                  {'turns': {None: 1}}, {'nothing': None}])
+def test_yaml_of_another_shape(data):
+    with pytest.raises(ConfigError):
+        Config.from_mapping(data)
+
+
+def test_replace_leaves_the_original_alone():
+    config = Config()
+    before = config.flat()
+    changed = config.replace({'turns.wanted': 2, 'seed': 5})
+    assert config.flat() == before and config == Config()
+    assert (changed.turns.wanted, changed.seed) == (2, 5)
+    assert {name for name, value in changed.flat().items() if value != before[name]} == {
+        'turns.wanted', 'seed'}
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.seed = 3
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.turns.wanted = 3
+
+
+def test_what_flat_gives_makes_the_same_config_again():
+    config = Config().replace({'turns.wanted': 7, 'mask.enabled': False, 'motion.rate': 8})
+    assert Config.from_mapping(config.flat()) == config

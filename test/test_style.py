@@ -1,0 +1,15 @@
+"""The linters are part of the tests: what they find fails here too."""
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.parametrize('command', [['ruff', 'check', '.'], ['mypy', 'dashcalib_ros']])
+def test_the_code_is_clean(command):
+    done = subprocess.run([sys.executable, '-m', *command], cwd=ROOT, capture_output=True,
+                          text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
