@@ -27,7 +27,7 @@ def main() -> None:
         picture[~result.mask] = picture[~result.mask] // 2 + np.uint8([110, 0, 0])
     left.imshow(picture)
     left.set_axis_off()
-    left.set_title('a turn of the drive; the ego vehicle found by itself (red)')
+    left.set_title('the ego vehicle, found by itself (red)')
     first = frames[0].stamp_ns / 1e9
     right.plot(result.magnitudes[:, 0] - first, 100 * result.magnitudes[:, 1], color='k', lw=1.2)
     for turn in result.turns:

@@ -10,10 +10,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -41,7 +39,7 @@ def ros_environment(home):
 class NodeProcess:
     """The node, started as a user would; its output goes to a file."""
 
-    def __init__(self, home, *arguments, command=COMMAND, **parameters):
+    def __init__(self, home, *arguments, command=COMMAND, python_path=None, **parameters):
         self.home = Path(home)
         self.output = self.home / f'node-{time.monotonic_ns()}.log'
         pairs = [part for name, value in parameters.items()
@@ -49,7 +47,9 @@ class NodeProcess:
         with self.output.open('wb') as stream:
             self.process = subprocess.Popen(
                 [*command, '--ros-args', *pairs, *arguments], stdout=stream,
-                stderr=subprocess.STDOUT, env={**os.environ, **ros_environment(home)},
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **ros_environment(home),
+                     **({'PYTHONPATH': python_path} if python_path else {})},
                 start_new_session=True)
 
     @property
@@ -87,47 +87,6 @@ class NodeProcess:
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait(SOON)
-
-
-@pytest.fixture(scope='module')
-def context(tmp_path_factory):
-    """rclpy in the tests' own process, in this run's own domain."""
-    before = dict(os.environ)
-    os.environ.update(ros_environment(tmp_path_factory.mktemp('home')))
-    context = Context()
-    rclpy.init(context=context)
-    yield context
-    rclpy.try_shutdown(context=context)
-    os.environ.clear()
-    os.environ.update(before)
-
-
-@pytest.fixture
-def start(tmp_path, context):
-    """Start nodes that are gone after the test, whatever happens."""
-    nodes = []
-
-    def start_node(*arguments, **parameters):
-        nodes.append(NodeProcess(tmp_path, *arguments, **parameters))
-        return nodes[-1]
-
-    yield start_node
-    for node in nodes:
-        node.kill()
-
-
-@pytest.fixture
-def bench(context):
-    """Make benches that are closed after the test."""
-    made = []
-
-    def make(**options):
-        made.append(Bench(context, **options))
-        return made[-1]
-
-    yield make
-    for each in made:
-        each.close()
 
 
 class Bench:
@@ -186,7 +145,8 @@ class Bench:
     def publish(self, *messages):
         for message in messages:
             self.images.publish(message)
-            self.executor.spin_once(timeout_sec=0)
+            # a camera has a rate; a burst would overrun the subscription's queue
+            self.spin(0.01)
 
     def count(self, key):
         return int(self.values.get(key, -1))

@@ -84,7 +84,8 @@ def test_a_name_like_no_other_gets_the_list():
     assert 'turns.wanted' in str(caught.value) and 'seed' in str(caught.value)
 
 
-@pytest.mark.parametrize('name', ['__class__', 'turns', 'flat', 'turns.', '.', '', 'turns.wanted.x'])
+@pytest.mark.parametrize(
+    'name', ['__class__', 'turns', 'flat', 'turns.', '.', '', 'turns.wanted.x'])
 def test_names_that_are_attributes_but_no_settings(name):
     with pytest.raises(ConfigError, match='unknown setting'):
         Config().replace({name: 1})

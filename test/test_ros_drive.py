@@ -7,7 +7,6 @@ import signal
 import pytest
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
-pytest_plugins = ['ros_bench']
 
 from ros_bench import (
     SECOND,
@@ -34,8 +33,8 @@ def rendered():
     return drive, list(drive.frames(processes=2))
 
 
-def test_it_ends_cleanly_while_children_work(start, bench, rendered):
-    node, camera = start(**QUICK), bench()
+def test_it_ends_cleanly_while_children_work(start_node, make_bench, rendered):
+    node, camera = start_node(**QUICK), make_bench()
     camera.connect(node)
     for frame in rendered[1]:
         camera.publish(image_message(frame.image, frame.stamp_ns))
@@ -52,12 +51,12 @@ class Driven:
 
 
 @pytest.fixture(scope='module')
-def driven(context, rendered, tmp_path_factory):
+def driven(ros_context, rendered, tmp_path_factory):
     home = tmp_path_factory.mktemp('driven')
     seen = Driven()
     seen.drive, seen.frames = rendered
     seen.node = NodeProcess(home, commit=True, commit_timeout=SOON, **QUICK)
-    seen.bench = bench = Bench(context)
+    seen.bench = bench = Bench(ros_context)
     seen.committed = []
 
     def set_camera_info(request, response):
@@ -123,8 +122,8 @@ def test_a_killed_child_costs_no_turn(driven):
         driven.node.home / '.ros' / 'camera_info' / 'dashcam.yaml').read_text()
 
 
-def test_the_latched_calibration_reaches_late_subscribers(driven, context):
-    late = Bench(context)
+def test_the_latched_calibration_reaches_late_subscribers(driven, ros_context):
+    late = Bench(ros_context)
     try:
         late.until(lambda: late.latched, node=driven.node)
         assert late.latched[-1].k.tolist() == driven.bench.infos[0].k.tolist()

@@ -22,7 +22,7 @@ from dashcalib_ros.reconstruction.scene import (
 
 Array = npt.NDArray[np.float64]
 # the focal length is held at these times the result to see what the turns know of it
-PROBES = (0.8, 0.9, 1.0, 1.1, 1.25)
+PROBES = (0.8, 1.0, 1.25)
 Progress = Callable[[str, float], None]
 
 
@@ -61,6 +61,8 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     parts = tuple(information(scene, camera, scene_config.loss_px) for scene in together)
     spread = covariance(parts, np.asarray(
         np.linalg.inv(_prior(step1, config, 1.0).covariance), np.float64))
+    floor = np.square([config.focal_floor * camera.fx] * 2 + [0.0] * 4)
+    spread += np.diag(floor)
     progress('focal profile', 0.0)
     around = _profile_around(together, camera, config, scene_config)
     return Solution(camera, spread, step1, tuple(together), parts, profile, around,

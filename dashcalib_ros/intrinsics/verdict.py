@@ -23,7 +23,7 @@ def judge(solution: Solution, config: VerdictConfig) -> Verdict:
     """Return the verdict on a solution, with every reason against it."""
     rules: tuple[Callable[[Solution, VerdictConfig], tuple[list[str], list[str]]], ...] = (
         _too_few_turns, _too_little_yaw, _flat_profile, _far_from_profile, _sigma_too_large,
-        _turns_disagree, _on_bound, _folds_over)
+        _turns_disagree, _strange_aspect, _on_bound, _folds_over)
     refused: list[str] = []
     weak: list[str] = []
     for rule in rules:
@@ -116,6 +116,15 @@ def focal_disagreement(solution: Solution) -> float:
     mean = np.average(offsets, weights=weights)
     scatter = np.average((np.array(offsets) - mean) ** 2, weights=weights)
     return float(np.sqrt(scatter) / solution.camera.fx)
+
+
+def _strange_aspect(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    """A rolling shutter shears and stretches what passes: fy takes the blame first."""
+    aspect = solution.camera.fy / solution.camera.fx
+    if abs(aspect - 1) > config.max_aspect:
+        return [], [f'fy is {100 * (aspect - 1):+.1f} % off fx, more than pixels are out of '
+                    f'square: a strong rolling shutter looks like this']
+    return [], []
 
 
 def _on_bound(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:

@@ -27,6 +27,7 @@ Mask = npt.NDArray[np.bool_]
 # focal length / width: 0.256 is 126 degrees across, 1.91 is 29
 RATIOS = tuple(0.256 * 1.25**n for n in range(10))
 COARSE = (1, 3, 5, 7, 9)
+COMPLETIONS = 2
 
 
 def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
@@ -94,7 +95,7 @@ def _profile_trials(tracks: Tracks, center: int, config: SceneConfig, seed: int
         camera = Camera.centred(tracks.image_size, RATIOS[n] * tracks.image_size[0])
         scene = chain_scene(tracks, center, camera, _NO_PROFILE, config, seed)
         if scene is not None:
-            scene = _refined(scene, config, None)
+            scene = _completed(_refined(scene, config, None), config, seed)
             cost = truncated_cost(scene, scene.camera, config.error_px)
             trials[RATIOS[n]] = replace(scene, profile=Profile(
                 np.array([RATIOS[n]]), np.array([cost]), int(tracks.seen.sum())))
@@ -107,6 +108,25 @@ def _profile_trials(tracks: Tracks, center: int, config: SceneConfig, seed: int
         attempt(best + 1)
         # the minimum may have moved to one of them: its other neighbour was tried already
     return trials
+
+
+def _completed(scene: Scene, config: SceneConfig, seed: int) -> Scene:
+    """Chain again where images are missing, now that the distortion is known better.
+
+    A chain without distortion soon breaks behind a wide lens, at the true focal length too.
+    """
+    for _ in range(COMPLETIONS):
+        if scene.structure.registered.all():
+            break
+        again = chain_scene(scene.tracks, scene.center, scene.camera, scene.profile, config, seed)
+        if again is None:
+            break
+        again = _refined(again, config, None)
+        if (truncated_cost(again, again.camera, config.error_px)
+                >= truncated_cost(scene, scene.camera, config.error_px)):
+            break
+        scene = again
+    return scene
 
 
 _NO_PROFILE = Profile(np.zeros(0), np.zeros(0), 0)

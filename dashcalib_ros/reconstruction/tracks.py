@@ -17,6 +17,8 @@ from dashcalib_ros.turns.turn import Turn
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 MIN_LENGTH = 3
+# between two keyframes
+STANDING_PX = 0.3
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def _keyframes(ids: npt.NDArray[np.int64], frames: npt.NDArray[np.int64], xy: Ar
         return ids[rows], xy[rows]
 
     if len(frames) == 0:
-        return np.zeros(0, np.int64)
+        return np.zeros(1, np.int64)
     # the first pictures may be black
     chosen = [int(frames[0])]
     last_ids, last_xy = observed(chosen[0])
@@ -122,4 +124,7 @@ def _worth_keeping(table: Array) -> Mask:
         low = np.min(np.where(seen[:, :, None], table, np.inf), axis=0)
         high = np.max(np.where(seen[:, :, None], table, -np.inf), axis=0)
     extent = np.linalg.norm(high - low, axis=1)
-    return np.asarray((seen.sum(axis=0) >= MIN_LENGTH) & (extent > 2.0))
+    # a track on a burnt-in text stands, and may hop from one letter to the next
+    step = np.linalg.norm(np.diff(table, axis=0), axis=2)
+    standing = (step < STANDING_PX).sum(axis=0) > 0.5 * np.isfinite(step).sum(axis=0)
+    return np.asarray((seen.sum(axis=0) >= MIN_LENGTH) & (extent > 2.0) & ~standing)

@@ -166,5 +166,11 @@ class Workshop:
 
 def build_turn(turn: Turn, config: Config, valid: Mask | None) -> Scene | None:
     """Run in the child: COLMAP is loaded there only."""
+    import cv2
+
     from dashcalib_ros.reconstruction.build import build_scene
-    return build_scene(turn, config.tracks, config.scene, valid, config.seed)
+    try:
+        return build_scene(turn, config.tracks, config.scene, valid, config.seed)
+    except (np.linalg.LinAlgError, cv2.error):
+        # hopeless pictures make hopeless equations: such a turn has no scene, the others still may
+        return None

@@ -13,7 +13,8 @@ from dashcalib_ros.ros.parameters import NodeConfig
 
 # images a subscription holds for a callback that is late
 DEPTH = 5
-LOOK_S = 1.0
+# s between two looks at the publishers: what comes before the right subscription is lost
+LOOK_S = 0.25
 NAMED = {'best_effort': ReliabilityPolicy.BEST_EFFORT, 'reliable': ReliabilityPolicy.RELIABLE}
 
 

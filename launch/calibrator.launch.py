@@ -1,0 +1,31 @@
+"""ros2 launch dashcalib_ros calibrator.launch.py [namespace:=front] [image:=image_raw] ..."""
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+ARGUMENTS = (
+    ('namespace', '', "the camera's namespace; it names the camera, too"),
+    ('image', 'image_raw', 'its image topic, without /compressed'),
+    ('camera_info', 'camera_info', 'where its calibration is published'),
+    ('image_transport', 'raw', 'raw or compressed'),
+    ('use_sim_time', 'false', 'true with a bag that is played with --clock'),
+    ('config', PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'config',
+                                     'calibrator.yaml']), 'the file of parameters'),
+)
+
+
+def generate_launch_description():
+    """Start one calibrator; include this once for each camera."""
+    value = {name: LaunchConfiguration(name) for name, _, _ in ARGUMENTS}
+    return LaunchDescription([
+        *(DeclareLaunchArgument(name, default_value=default, description=about)
+          for name, default, about in ARGUMENTS),
+        Node(
+            package='dashcalib_ros', executable='calibrator', name='calibrator',
+            namespace=value['namespace'], output='screen',
+            parameters=[value['config'], {'image_transport': value['image_transport'],
+                                          'use_sim_time': value['use_sim_time']}],
+            remappings=[('image_raw', value['image']), ('camera_info', value['camera_info'])]),
+    ])

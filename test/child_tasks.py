@@ -1,0 +1,112 @@
+"""What the tests have done in a child process; it must be importable there by name."""
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+
+from dashcalib_ros.errors import InputError
+
+
+class AwkwardError(Exception):
+    """Pickles, but cannot be made again from what was pickled."""
+
+    def __init__(self, part, whole):
+        super().__init__(f'{part} of {whole}')
+
+
+def add(a, b):
+    return a + b
+
+
+def pid():
+    return os.getpid()
+
+
+def niceness():
+    return os.nice(0)
+
+
+def sleep(seconds, started=None):
+    if started is not None:
+        Path(started).write_text(str(os.getpid()))
+    time.sleep(seconds)
+    return 'slept'
+
+
+def echo(value):
+    return value
+
+
+def fail(kind):
+    raise {'input': InputError('no turn: drive one'), 'os': FileNotFoundError(2, 'gone'),
+           'eof': EOFError('end'), 'value': ValueError('odd'), 'awkward': AwkwardError(1, 2),
+           'local': type('LocalError', (Exception,), {})('made here')}[kind]
+
+
+def count(steps, progress):
+    for n in range(steps):
+        progress(f'step {n}', n / steps)
+    return steps
+
+
+def unpicklable():
+    return threading.Lock()
+
+
+def print_much():
+    print('this is not an answer' * 1000, flush=True)
+    sys.stdout.write('nor this')
+    ctypes.CDLL(None).puts(b'nor what a C library prints')
+    ctypes.CDLL(None).fflush(None)
+    os.write(1, b'nor this' * 100)
+    return 'answer'
+
+
+def die(code=1):
+    os._exit(code)
+
+
+def abort():
+    os.abort()
+
+
+def die_at_first(flag):
+    """End this process the first time, answer the second time."""
+    path = Path(flag)
+    if not path.exists():
+        path.write_text('been here')
+        os._exit(9)
+    return 'second time'
+
+
+# stand-ins for workshop.build_turn(turn, config, valid)
+
+def build_dies(turn, config, valid):
+    with Path(turn.frames[0]).open('a') as log:
+        log.write(f'{turn.center}\n')
+    os._exit(1)
+
+
+def build_dies_at_first(turn, config, valid):
+    return die_at_first(f'{turn.frames[0]}.{turn.center}')
+
+
+def build_slowly(turn, config, valid):
+    Path(f'{turn.frames[0]}.{turn.center}').write_text(str(os.getpid()))
+    time.sleep(60)
+
+
+def build_fails_at_first(turn, config, valid):
+    path = Path(f'{turn.frames[0]}.{turn.center}')
+    if not path.exists():
+        path.write_text('been here')
+        raise MemoryError('no room')
+    return f'scene of {turn.center}'
+
+
+def build(turn, config, valid):
+    return f'scene of {turn.center}'

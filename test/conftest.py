@@ -1,0 +1,51 @@
+"""Fixtures of the tests that talk to the node; they import rclpy only when they are used."""
+import os
+
+import pytest
+
+pytest.register_assert_rewrite('ros_bench')
+
+
+@pytest.fixture(scope='module')
+def ros_context(tmp_path_factory):
+    """rclpy in the tests' own process, in this run's own domain."""
+    rclpy = pytest.importorskip('rclpy')
+    from ros_bench import ros_environment
+    before = dict(os.environ)
+    os.environ.update(ros_environment(tmp_path_factory.mktemp('home')))
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    yield context
+    rclpy.try_shutdown(context=context)
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.fixture
+def start_node(tmp_path, ros_context):
+    """Start nodes that are gone after the test, whatever happens."""
+    from ros_bench import NodeProcess
+    nodes = []
+
+    def start(*arguments, **parameters):
+        nodes.append(NodeProcess(tmp_path, *arguments, **parameters))
+        return nodes[-1]
+
+    yield start
+    for node in nodes:
+        node.kill()
+
+
+@pytest.fixture
+def make_bench(ros_context):
+    """Make benches that are closed after the test."""
+    from ros_bench import Bench
+    made = []
+
+    def make(**options):
+        made.append(Bench(ros_context, **options))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()

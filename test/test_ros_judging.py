@@ -1,0 +1,194 @@
+"""What the node does with a calibration: published, kept on disk, replaced, given up, committed.
+
+The real node in this process, between real publishers; only the calibrations are made up here,
+since a camera that is bumped in the middle of a drive takes fifteen turns to show.
+"""
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from ros_bench import START, Bench, image_message
+from sensor_msgs.srv import SetCameraInfo
+
+from dashcalib_ros.config import Config
+from dashcalib_ros.intrinsics import Calibration, Intrinsics, Verdict
+from dashcalib_ros.report import load_calibration_yaml
+from dashcalib_ros.ros.learner import Result
+from dashcalib_ros.ros.node import CalibratorNode
+
+FIRST = Intrinsics(400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
+SIGMA = Intrinsics(2.0, 2.0, 2.0, 2.0, 0.01, 0.01)
+STAMPS = iter(range(START, START + 10**12, 10**8))
+
+
+class Desk:
+    """The node and a bench, spun in turns."""
+
+    def __init__(self, context, home, **parameters):
+        arguments = ['--ros-args', '-p', f'camera_info_file:={home}/camera.yaml']
+        for name, value in parameters.items():
+            arguments += ['-p', f'{name}:={value}']
+        rclpy.init(args=['calibrator', *arguments])
+        self.file = home / 'camera.yaml'
+        self.node = CalibratorNode()
+        self.spinner = SingleThreadedExecutor()
+        self.spinner.add_node(self.node)
+        self.bench = Bench(context)
+        self.until(lambda: self.bench.images.get_subscription_count() > 0
+                   and self.bench.values.get('reliability') == 'reliable')
+        self.show()
+
+    def until(self, condition):
+        def spun():
+            self.spinner.spin_once(timeout_sec=0.01)
+            return condition()
+        return self.bench.until(spun)
+
+    def give(self, level='accepted', complete=True, sigma=SIGMA, **changes):
+        """Let the learner's thread come up with a calibration."""
+        intrinsics = dataclasses.replace(FIRST, **changes) if level != 'refused' else None
+        calibration = Calibration(
+            Verdict(level, () if level == 'accepted' else ('few turns',)), (320, 240), intrinsics,
+            sigma if intrinsics else None, (), 10, 0.3, {}, {}, Config())
+        result = Result(calibration, complete, self.node._learner.bank)
+        done = []
+        self.node._later(lambda: self.node._on_result(result))
+        self.node._later(lambda: done.append(True))
+        self.until(lambda: done)
+
+    def show(self):
+        """Publish an image; return the fx of its camera_info, None if there is none."""
+        before, received = len(self.bench.infos), self.bench.count('received')
+        message = image_message(black(), next(STAMPS))
+        self.bench.images.publish(message)
+        self.until(lambda: self.bench.count('received') > received)
+        infos = self.bench.infos[before:]
+        return infos[0].k[0] if infos else None
+
+    def close(self):
+        self.bench.close()
+        self.spinner.shutdown()
+        self.node.close()
+        rclpy.try_shutdown()
+
+
+def black():
+    import numpy as np
+    return np.zeros((240, 320), np.uint8)
+
+
+@pytest.fixture
+def make_desk(ros_context, tmp_path):
+    made = []
+
+    def make(**parameters):
+        made.append(Desk(ros_context, tmp_path, **parameters))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def test_its_life_with_a_camera_that_is_bumped(make_desk):
+    desk = make_desk()
+    desk.give('weak')
+    assert desk.show() is None and desk.bench.values['state'] == 'refused_so_far'
+    assert desk.bench.values['reasons'] == 'few turns'
+    desk.give()
+    assert desk.show() == 400.0
+    assert load_calibration_yaml(desk.file).intrinsics.fx == 400.0
+    assert desk.bench.values['state'] == 'calibrated'
+    # confirmed, but no better
+    desk.give(fx=401.0)
+    assert desk.show() == 400.0
+    # clearly better
+    desk.give(fx=402.0, sigma=dataclasses.replace(SIGMA, fx=1.0))
+    assert desk.show() == 402.0
+    assert load_calibration_yaml(desk.file).intrinsics.fx == 402.0
+    # bumped
+    for count in (1, 2):
+        desk.give(complete=False, cx=350.0)
+        assert desk.show() == 402.0 and desk.bench.values['contradictions'] == str(count)
+    desk.give(complete=False, cx=350.0)
+    assert desk.show() is None and desk.bench.values['state'] == 'collecting'
+    desk.until(lambda: desk.bench.latched[-1].k[0] == 0)
+    assert not desk.file.exists()
+    desk.give(fx=403.0, cx=350.0)
+    assert desk.show() == 403.0
+    desk.until(lambda: desk.bench.latched[-1].k[0] == 403.0)
+
+
+def test_a_contradicted_one_goes_on_where_that_is_wanted(make_desk):
+    desk = make_desk(publish_stale='true', contradictions=1)
+    desk.give()
+    desk.give(complete=False, fx=450.0)
+    assert desk.show() == 400.0
+    assert desk.bench.status.level == b'\x02' and not desk.file.exists()
+    assert desk.bench.values['state'] == 'collecting'
+    desk.give(fx=450.0)
+    assert desk.show() == 450.0 and desk.bench.status.level == b'\x00'
+
+
+def test_results_of_forgotten_turns_are_not_used(make_desk):
+    desk = make_desk()
+    result_of_old_bank = desk.node._learner.bank
+    assert desk.node._on_reset(None, SetCameraInfo.Response()).success
+    assert desk.node._learner.bank == result_of_old_bank + 1
+    calibration = Calibration(Verdict('accepted'), (320, 240), FIRST, SIGMA, (), 10, 0.3, {}, {},
+                              Config())
+    desk.node._on_result(Result(calibration, True, result_of_old_bank))
+    assert desk.show() is None
+
+
+def test_a_disk_that_takes_nothing_is_counted_and_the_calibration_published(make_desk, tmp_path):
+    (tmp_path / 'plain').write_text('a file, no folder')
+    desk = make_desk()
+    desk.node._store.path = tmp_path / 'plain' / 'camera.yaml'
+    desk.give()
+    assert desk.show() == 400.0
+    assert desk.bench.values['unsaved'] == '1'
+    assert 'camera_info_file' in desk.node._save(desk.node._publication.kept)
+
+
+def test_a_file_of_another_tool_is_set_aside(make_desk, tmp_path):
+    (tmp_path / 'camera.yaml').write_text('camera_matrix: theirs\n')
+    desk = make_desk()
+    desk.give()
+    assert load_calibration_yaml(desk.file).intrinsics.fx == 400.0
+    assert (tmp_path / 'camera.previous.yaml').read_text() == 'camera_matrix: theirs\n'
+
+
+@pytest.mark.parametrize('driver', ['missing', 'hangs', 'refuses'])
+def test_a_driver_that_does_not_take_the_calibration_disturbs_nothing(make_desk, driver, capfd):
+    desk = make_desk(commit='true', commit_timeout=1.0)
+    asked = []
+
+    def refuse(request, response):
+        asked.append(request)
+        response.success, response.status_message = False, 'no flash'
+        return response
+
+    if driver == 'hangs':
+        # a service that is there, in a process that never spins it
+        context = rclpy.Context()
+        rclpy.init(context=context)
+        dead = rclpy.create_node('driver', context=context)
+        dead.create_service(SetCameraInfo, 'set_camera_info', refuse)
+    elif driver == 'refuses':
+        desk.bench.node.create_service(SetCameraInfo, 'set_camera_info', refuse)
+    desk.give()
+    words = {'missing': 'there is no service /set_camera_info',
+             'hangs': 'did not answer within 1 s', 'refuses': 'refused: no flash'}[driver]
+    said = []
+    desk.until(lambda: said.append(capfd.readouterr().err) or words in ''.join(said))
+    assert desk.show() == 400.0 and bool(asked) == (driver == 'refuses')
+    if driver == 'hangs':
+        dead.destroy_node()
+        rclpy.try_shutdown(context=context)
