@@ -140,8 +140,6 @@ class VerdictConfig:
         0.05, 'relative rise of the error 25 % off the focal length; less is weak', 0.0, 10.0)
     refused_contrast: float = setting(
         0.01, 'the same; with less nothing can be known', 0.0, 10.0)
-    max_profile_gap: float = setting(
-        1.25, 'ratio between the result and the focal profile\'s minimum', 1.0, 3.0)
     max_sigma: float = setting(0.015, 'of fx; more is weak', 0.0, 1.0)
     refused_sigma: float = setting(0.1, 'of fx; more is no result', 0.0, 1.0)
     max_aspect: float = setting(

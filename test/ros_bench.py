@@ -106,11 +106,14 @@ class Bench:
             latched = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                                  durability=DurabilityPolicy.TRANSIENT_LOCAL)
             for kind, name, call, profile in (
-                    (CameraInfo, 'camera_info', self.infos.append, 1000),
+                    (CameraInfo, 'camera_info', self.on_info, 1000),
                     (CameraInfo, 'calibrator/calibration', self.latched.append, latched),
                     (DiagnosticArray, '/diagnostics', self._on_diagnostics, 10),
                     (Float64, 'calibrator/turn_magnitude', self.magnitudes.append, 100)):
                 self.node.create_subscription(kind, name, call, profile)
+
+    def on_info(self, message):
+        self.infos.append(message)
 
     def _on_diagnostics(self, message):
         self.status = message.status[0]

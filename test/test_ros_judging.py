@@ -15,6 +15,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from ros_bench import START, Bench, image_message
 from sensor_msgs.srv import SetCameraInfo
+from std_srvs.srv import Trigger
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.intrinsics import Calibration, Intrinsics, Verdict
@@ -139,7 +140,7 @@ def test_a_contradicted_one_goes_on_where_that_is_wanted(make_desk):
 def test_results_of_forgotten_turns_are_not_used(make_desk):
     desk = make_desk()
     result_of_old_bank = desk.node._learner.bank
-    assert desk.node._on_reset(None, SetCameraInfo.Response()).success
+    assert desk.node._on_reset(Trigger.Request(), Trigger.Response()).success
     assert desk.node._learner.bank == result_of_old_bank + 1
     calibration = Calibration(Verdict('accepted'), (320, 240), FIRST, SIGMA, (), 10, 0.3, {}, {},
                               Config())
@@ -167,7 +168,7 @@ def test_a_file_of_another_tool_is_set_aside(make_desk, tmp_path):
 
 @pytest.mark.parametrize('driver', ['missing', 'hangs', 'refuses'])
 def test_a_driver_that_does_not_take_the_calibration_disturbs_nothing(make_desk, driver, capfd):
-    desk = make_desk(commit='true', commit_timeout=1.0)
+    desk = make_desk(commit='true', commit_timeout=1.0 if driver == 'missing' else 6.0)
     asked = []
 
     def refuse(request, response):
@@ -185,7 +186,7 @@ def test_a_driver_that_does_not_take_the_calibration_disturbs_nothing(make_desk,
         desk.bench.node.create_service(SetCameraInfo, 'set_camera_info', refuse)
     desk.give()
     words = {'missing': 'there is no service /set_camera_info',
-             'hangs': 'did not answer within 1 s', 'refuses': 'refused: no flash'}[driver]
+             'hangs': 'did not answer within 6 s', 'refuses': 'refused: no flash'}[driver]
     said = []
     desk.until(lambda: said.append(capfd.readouterr().err) or words in ''.join(said))
     assert desk.show() == 400.0 and bool(asked) == (driver == 'refuses')

@@ -63,6 +63,8 @@ def _add_run(commands: Any) -> None:
     _add_drive_arguments(parser)
     parser.add_argument('--threads', type=int, metavar='N',
                         help='threads of one reconstruction; more than 1 is not reproducible')
+    parser.add_argument('--write-bag', type=Path, metavar='OUT',
+                        help='when accepted: INPUT again, a bag, with camera_info per image')
     _add_out(parser, 'calibration')
 
 

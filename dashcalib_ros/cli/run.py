@@ -9,6 +9,7 @@ from dashcalib_ros.cli.drive import calibrate
 from dashcalib_ros.cli.settings import read_config, read_mask
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
 from dashcalib_ros.frames import open_frames
+from dashcalib_ros.intrinsics import Calibration
 from dashcalib_ros.report import output_folder, write_results
 from dashcalib_ros.report.tables import summary
 
@@ -18,6 +19,9 @@ def run(args: argparse.Namespace) -> int:
     config = read_config(args)
     mask = read_mask(args.mask)
     source = open_frames(args.input, topic=args.topic, fps=args.fps)
+    if args.write_bag is not None:
+        from dashcalib_ros.report.write_bag import check_bag
+        check_bag(args.input, source.topic, args.write_bag)
     with output_folder(args.out):
         with Stages() as stages:
             calibration = calibrate(source, config, mask, args.verbose, stages)
@@ -25,7 +29,19 @@ def run(args: argparse.Namespace) -> int:
     warn(calibration.warnings)
     show(summary(calibration))
     show_text('written: ' + ', '.join(map(str, written)))
+    if args.write_bag is not None:
+        _write_bag(args, str(source.topic), calibration)
     return exit_codes.of_verdict(calibration.verdict.level)
+
+
+def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration) -> None:
+    from dashcalib_ros.report.write_bag import camera_info_topic, write_bag
+    if calibration.verdict.level != 'accepted':
+        warn([f'no bag was written: a calibration that is {calibration.verdict.level} is not to '
+              f'be trusted'])
+        return
+    count = write_bag(args.input, topic, calibration, args.write_bag)
+    show_text(f'written: {args.write_bag} with {count} messages on {camera_info_topic(topic)}')
 
 
 def now() -> str:

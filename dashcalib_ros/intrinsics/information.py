@@ -37,7 +37,8 @@ class Information:
 
     hessian: (9, 9) reduced information of fx, fy, cx, cy, k1, k2, p1, p2, k3. score: (9,) minus
     the gradient. by_track: (9, 9) sum over tracks of the outer products of their scores.
-    squares: weighted sum of squared residuals, px^2; freedom: residuals minus parameters.
+    squares: sum of squared residuals, weighted by w^2 over the mean of w^2, px^2: divided by
+    freedom (residuals minus parameters) it is the variance that H^-1 is to be multiplied by.
     """
 
     hessian: Array
@@ -50,7 +51,7 @@ class Information:
 def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
     """Return what a scene knows of the camera, at the solution.
 
-    loss_px: scale of the Cauchy loss, whose weights 1 / (1 + e^2 / loss^2) apply.
+    loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply.
     """
     structure = scene.structure
     rows, columns = np.nonzero(structure.used)
@@ -59,9 +60,9 @@ def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
     local = rotated + structure.translations[rows]
     by_camera, by_local, projected = _derivatives(local, camera)
     residual = scene.tracks.xy[rows, columns] - projected
-    root = 1 / np.sqrt(1 + np.sum(residual**2, axis=1) / loss_px**2)
-    by_camera, by_local = by_camera * root[:, None, None], by_local * root[:, None, None]
-    residual = residual * root[:, None]
+    # the loss pulls with w e, and its curvature is w^2 on average over the directions of e
+    weight = 1 / (1 + np.sum(residual**2, axis=1) / loss_px**2)
+    by_camera, by_local = by_camera * weight[:, None, None], by_local * weight[:, None, None]
     # a small turn w of the camera moves the local point by w x (R X)
     by_pose = np.concatenate([by_local @ -_cross(rotated), by_local], axis=2)
     by_point = by_local @ rotation
@@ -104,8 +105,9 @@ def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
     scores = np.zeros((points, LENS))
     np.add.at(scores, point, np.einsum('nic,ni->nc', effective, residual))
     freedom = max(2 * len(rows) - 3 * points - nuisance + 7 - 6, 1)
-    return Information(hessian, scores.sum(axis=0), scores.T @ scores,
-                       float(np.sum(residual**2)), float(freedom))
+    pull = np.sum((residual * weight[:, None])**2) / np.mean(weight**2)
+    return Information(hessian, scores.sum(axis=0), scores.T @ scores, float(pull),
+                       float(freedom))
 
 
 def noise_of(parts: Sequence[Information]) -> float:

@@ -64,32 +64,44 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     floor = np.square([config.focal_floor * camera.fx] * 2 + [0.0] * 4)
     spread += np.diag(floor)
     progress('focal profile', 0.0)
-    around = _profile_around(together, camera, config, scene_config)
+    around = _profile_around(together, camera, profile, config, scene_config, seed)
     return Solution(camera, spread, step1, tuple(together), parts, profile, around,
                     np.array(bounds))
 
 
-def _profile_around(scenes: Sequence[Scene], camera: Camera, config: IntrinsicsConfig,
-                    scene_config: SceneConfig) -> Profile:
+def _profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
+                    config: IntrinsicsConfig, scene_config: SceneConfig, seed: int) -> Profile:
     """Return the cost with the focal length held at PROBES times the result, all else adjusted.
 
-    Started from the result, with a part of the tracks: it costs an adjustment each.
+    Started from the result, with a part of the tracks: it costs an adjustment each. Where the
+    coarse profile has its minimum elsewhere, that focal length is probed too, from a chain of its
+    own: whichever explains more observations is right.
     """
     few = [_every(scene, config.profile_tracks) for scene in scenes]
-    costs = []
+    width = camera.image_size[0]
+    costs = {}
     for probe in PROBES:
         held = replace(camera, fx=camera.fx * probe, fy=camera.fx * probe)
-        moved = few
-        # the first residuals are large: a loss as wide as they are brings the poses along
-        for loss_px in (0.01 * camera.image_size[0], scene_config.loss_px, scene_config.loss_px):
-            moved, held = adjust_step1(
-                moved, held, Solver(loss_px, scene_config.iterations), None)
-            moved = [_again(scene, held, scene_config) for scene in moved]
-        seen = [int(scene.tracks.seen.sum()) for scene in moved]
-        costs.append(np.average([truncated_cost(scene, held, scene_config.error_px)
-                                 for scene in moved], weights=seen))
-    ratio = camera.fx / camera.image_size[0]
-    return Profile(ratio * np.array(PROBES), np.array(costs), sum(seen))
+        costs[held.fx / width] = _held_cost(few, held, scene_config)
+    if not PROBES[0] < coarse.best * width / camera.fx < PROBES[-1]:
+        held = Camera.centred(camera.image_size, coarse.best * width)
+        anew = [chain_scene(scene.tracks, scene.center, held, scene.profile, scene_config, seed)
+                or scene for scene in few]
+        costs[coarse.best] = _held_cost(anew, held, scene_config)
+    ratios = sorted(costs)
+    observations = sum(int(scene.tracks.seen.sum()) for scene in few)
+    return Profile(np.array(ratios), np.array([costs[ratio] for ratio in ratios]), observations)
+
+
+def _held_cost(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> float:
+    """Return the truncated cost over all scenes after adjusting all but the focal length, px^2."""
+    moved = list(scenes)
+    # the first residuals are large: a loss as wide as they are brings the poses along
+    for loss_px in (0.01 * camera.image_size[0], config.loss_px, config.loss_px):
+        moved, camera = adjust_step1(moved, camera, Solver(loss_px, config.iterations), None)
+        moved = [_again(scene, camera, config) for scene in moved]
+    return float(np.average([truncated_cost(scene, camera, config.error_px) for scene in moved],
+                            weights=[int(scene.tracks.seen.sum()) for scene in moved]))
 
 
 def _every(scene: Scene, wanted: int) -> Scene:

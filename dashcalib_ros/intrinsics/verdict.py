@@ -57,27 +57,34 @@ def _flat_profile(solution: Solution, config: VerdictConfig) -> tuple[list[str],
     """The cost must rise to both sides of its minimum, or the turns know nothing of the focal."""
     contrast = profile_contrast(solution)
     message = (f'the turns hardly tell one focal length from another (the error rises by '
-               f'{100 * contrast:.1f} % when it is 25 % off): drive sharper turns in daylight')
+               f'{100 * max(contrast, 0.0):.1f} % when it is 20 % off): drive sharper turns in daylight')
     if not contrast >= config.refused_contrast:  # NaN is no evidence either
         return [message], []
     return [], [message] if contrast < config.min_contrast else []
 
 
 def profile_contrast(solution: Solution) -> float:
-    """Return by how much the cost rises, relatively, 20 to 25 % to either side of the result.
+    """Return by how much the cost rises, relatively, from the result to the next best probe.
 
-    Zero when the best focal length held fixed is at an end of the profile.
+    Negative when another focal length explains the observations better than the result.
     """
+    at = _of_result(solution)
     costs = solution.around.costs
-    return float(min(costs[0], costs[-1]) / costs.min() - 1)
+    return float(np.delete(costs, at).min() / costs[at] - 1)
+
+
+def _of_result(solution: Solution) -> int:
+    """Return which probe of the profile is the result itself."""
+    ratio = solution.camera.fx / solution.camera.image_size[0]
+    return int(np.argmin(np.abs(solution.around.ratios - ratio)))
 
 
 def _far_from_profile(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
     width = solution.camera.image_size[0]
-    best = solution.coarse.best
-    if not 1 / config.max_profile_gap < solution.camera.fx / width / best < config.max_profile_gap:
+    best = solution.around.best * width
+    if not np.isclose(best, solution.camera.fx):
         return [f'the focal length {solution.camera.fx:.0f} px contradicts the one that explains '
-                f'most observations, about {best * width:.0f} px'], []
+                f'most observations, about {best:.0f} px'], []
     return [], []
 
 

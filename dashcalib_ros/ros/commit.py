@@ -21,6 +21,7 @@ class Commit:
     def __init__(self, node: Node, timeout_s: float, clock: Clock) -> None:
         self._node = node
         self._timeout_s = timeout_s
+        self._name = node.resolve_service_name('set_camera_info')
         self._client = node.create_client(SetCameraInfo, 'set_camera_info')
         self._timer = node.create_timer(LOOK_S, self._look, clock=clock, autostart=False)
         self._waiting: CameraInfo | None = None
@@ -42,23 +43,21 @@ class Commit:
             self._report(self._answer)
             self._forget()
         elif time.monotonic() > self._deadline:
-            name = self._client.srv_name
+            trouble = (f'there is no service {self._name}' if self._answer is None else
+                       f'{self._name} did not answer within {self._timeout_s:g} s')
             self._node.get_logger().warning(
-                f'{name} did not answer within {self._timeout_s:g} s: the camera driver has the '
-                f'old calibration; start a driver with that service, or set commit to false'
-                if self._answer is not None else
-                f'there is no service {name}: start a camera driver that has it, or set commit '
-                f'to false')
+                f'{trouble}: the camera driver does not have the calibration; start a driver with '
+                f'that service, or set commit to false')
             self._forget()
 
     def _report(self, answer: Any) -> None:
         if answer.exception() is not None:
-            text = f'{self._client.srv_name} failed: {answer.exception()}'
+            text = f'{self._name} failed: {answer.exception()}'
         elif answer.result().success:
-            self._node.get_logger().info(f'{self._client.srv_name} took the calibration')
+            self._node.get_logger().info(f'{self._name} took the calibration')
             return
         else:
-            text = f'{self._client.srv_name} refused: {answer.result().status_message}'
+            text = f'{self._name} refused: {answer.result().status_message}'
         self._node.get_logger().warning(text)
 
     def _forget(self) -> None:

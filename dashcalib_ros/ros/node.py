@@ -170,9 +170,13 @@ class CalibratorNode(Node):
             log.error(f'the published calibration is given up: {judged.why}')
             self._give_up()
         else:
-            say = log.warning if judged.contradictions else log.info
-            say(f'a calibration of {len([t for t in calibration.turns if t.used])} turns is '
-                f'{calibration.verdict.level}' + (f': {judged.why}' if judged.why else ''))
+            text = (f'a calibration of {sum(turn.used for turn in calibration.turns)} turns is '
+                    f'{calibration.verdict.level}' + (f': {judged.why}' if judged.why else ''))
+            # rclpy takes one severity for each line of code
+            if judged.contradictions:
+                log.warning(text)
+            else:
+                log.info(text)
             if trusted is not None and complete:
                 # the next opinion is formed from turns of its own
                 self._learner.restart()

@@ -1,0 +1,516 @@
+"""Scenes -> six parameters, sigmas that are honest, and a verdict for every kind of evidence."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
+
+from dashcalib_ros.config import Config
+from dashcalib_ros.intrinsics import joint
+from dashcalib_ros.intrinsics.conclude import Evidence, conclude
+from dashcalib_ros.intrinsics.information import (
+    Information,
+    covariance,
+    information,
+    model_error,
+    noise_of,
+)
+from dashcalib_ros.intrinsics.joint import solve, summed
+from dashcalib_ros.intrinsics.solution import Solution
+from dashcalib_ros.intrinsics.solve import solve_scenes
+from dashcalib_ros.intrinsics.verdict import focal_disagreement, judge, profile_contrast
+from dashcalib_ros.reconstruction import adjust
+from dashcalib_ros.reconstruction.adjust import Prior, Solver, adjust_step2
+from dashcalib_ros.reconstruction.camera import Camera
+from dashcalib_ros.reconstruction.scene import Profile, Scene, residuals_px, retriangulated
+from dashcalib_ros.turns.turn import Turn
+
+CONFIG = Config().replace({'intrinsics.profile_tracks': 60})
+START = Camera.centred(SIZE, 1.03 * LENS.fx, -0.25)
+YAWS = (80.0, -70.0, 85.0, -90.0, 65.0, -78.0)
+NO_PRIOR = Prior(LENS.params, np.diag([1e9, 1e9, 1e9, 1e9, 1e6, 1e6]))
+FREE = (LENS.params - [200, 200, 100, 100, 1, 1], LENS.params + [200, 200, 100, 100, 1, 1])
+NOTHING = np.zeros((6, 6))
+
+
+def scenes_of(count: int, camera: Camera = LENS, seed: int = 0, start: Camera = START,
+              **options) -> list[Scene]:
+    options = {'tracks': 180, 'keyframes': 14, 'noise_px': 0.25, **options}
+    return [synthetic_turn(camera, yaw, seed=seed, world=world, **options).scene(start, world)
+            for world, yaw in enumerate(YAWS[:count])]
+
+
+def solved(scenes: Sequence[Scene], config: Config = CONFIG) -> Solution:
+    solution = solve(scenes, config.intrinsics, config.scene)
+    assert solution is not None
+    return solution
+
+
+def z_of(solution: Solution, truth: Camera = LENS) -> np.ndarray:
+    return (solution.camera.params - truth.params) / solution.sigma
+
+
+@pytest.fixture
+def no_profile(monkeypatch):
+    """Leave out the focal profile around the result, which takes most of the time."""
+    monkeypatch.setattr(joint, 'PROBES', (1.0,))
+
+
+@pytest.fixture(scope='module')
+def good() -> Solution:
+    return solved(scenes_of(3, outliers=0.03))
+
+
+# the adjustment
+
+def test_three_turns_give_all_six_within_three_sigma(good):
+    assert np.abs(z_of(good)).max() < 3
+    assert good.sigma[0] / LENS.fx < 0.01
+    # and sigma is not just large
+    assert np.abs(good.camera.params[:4] - LENS.params[:4]).max() < 5
+    assert np.abs(good.camera.params[4:] - LENS.params[4:]).max() < 0.01
+    assert 0.25 < good.reprojection_error_px < 0.5
+    assert [scene.center for scene in good.scenes] == [0, 1, 2]
+    assert good.step1.fx == good.step1.fy and good.step1.cx == (SIZE[0] - 1) / 2
+    ratio = LENS.fx / SIZE[0]
+    assert good.coarse.best == pytest.approx(ratio, rel=0.1)
+    assert np.argmin(good.around.costs) not in (0, len(good.around.costs) - 1)
+    assert judge(good, CONFIG.verdict).level == 'accepted', judge(good, CONFIG.verdict)
+
+
+def test_the_covariance_is_one(good):
+    correlation = good.covariance / np.outer(good.sigma, good.sigma)
+    np.testing.assert_allclose(correlation, correlation.T, atol=1e-4)
+    assert (np.linalg.eigvalsh(correlation) > 0).all()
+
+
+def test_the_same_again_to_the_last_bit():
+    first, second = (solved(scenes_of(2, tracks=100)) for _ in range(2))
+    np.testing.assert_array_equal(first.camera.params, second.camera.params)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+
+
+def test_more_turns_know_more(no_profile):
+    few, many = (solved(scenes_of(count, tracks=110, keyframes=12)) for count in (2, 6))
+    # three times the turns: 1.7 times, and less Student's t
+    ratio = few.sigma[:4] / many.sigma[:4]
+    assert (ratio > 1.2).all() and ratio.max() < 8
+    assert np.abs(z_of(many)).max() < 3.5
+
+
+def test_sigma_is_honest(no_profile):
+    config = CONFIG.replace({'intrinsics.rounds': 1})
+    z = np.array([z_of(solved(scenes_of(2, seed=seed, tracks=90, keyframes=10), config))
+                  for seed in range(20)])
+    assert (np.abs(z[:, 0]) < 2).mean() >= 0.85
+    assert (np.abs(z) < 2).mean() >= 0.85
+    # neither too small nor so large that it says nothing; fy is drawn to fx by the prior
+    spread = np.sqrt(np.mean(z**2, axis=0))
+    assert (spread > 0.4).all() and (spread < 1.5).all()
+
+
+def test_pixels_that_are_not_square_are_believed_when_the_evidence_is_strong(no_profile):
+    tall = replace(LENS, fy=1.006 * LENS.fx)
+    scenes = scenes_of(4, tall, noise_px=0.1, tracks=250, keyframes=16)
+    camera = solved(scenes).camera
+    assert camera.fy / camera.fx == pytest.approx(1.006, abs=0.0015)
+    # and square ones where one has more faith
+    faith = CONFIG.replace({'intrinsics.aspect_sigma': 1e-5})
+    camera = solved(scenes[:2], faith).camera
+    assert camera.fy / camera.fx == pytest.approx(1.0, abs=3e-4)
+
+
+def test_a_scene_that_knows_nothing_is_dropped_and_told(no_profile):
+    scenes = scenes_of(3, tracks=100)
+    lost = replace(scenes[1], tracks=replace(
+        scenes[1].tracks,
+        xy=np.random.default_rng(1).uniform(20, 430, scenes[1].tracks.xy.shape)))
+    hopeless = CONFIG.replace({'scene.error_px': 0.2, 'scene.min_angle_deg': 10.0})
+    solution = solve([lost], hopeless.intrinsics, hopeless.scene)
+    assert solution is None or judge(solution, hopeless.verdict).level != 'accepted'
+    nothing = replace(scenes[1], tracks=replace(
+        scenes[1].tracks, xy=np.full_like(scenes[1].tracks.xy, np.nan)))
+    assert solve_scenes([nothing], CONFIG) is None
+    solution = solve_scenes([scenes[0], nothing, scenes[2]], CONFIG)
+    assert [scene.center for scene in solution.scenes] == [0, 2]
+    assert np.isfinite(solution.sigma).all()
+
+
+def test_a_scene_far_from_the_common_focal_length_is_brought_to_it(no_profile):
+    scenes = scenes_of(2, tracks=150)
+    wide = replace(scenes[1], camera=Camera.centred(SIZE, 0.7 * LENS.fx, -0.2))
+    camera = solved([scenes[0], wide]).camera
+    assert camera.fx == pytest.approx(LENS.fx, rel=0.01)
+
+
+def test_profiles_add_up_by_their_observations():
+    ratios = np.geomspace(0.3, 1.2, 9)
+    strong = Profile(ratios, 0.2 + np.log(ratios / 0.6)**2, 900)
+    weak = Profile(ratios, 0.2 + np.log(ratios / 0.9)**2, 100)
+    both = summed([strong, weak])
+    expected = 0.9 * np.log(0.6) + 0.1 * np.log(0.9)
+    # straight lines between the samples: half a step of the grid
+    assert np.log(both.best) == pytest.approx(expected, abs=0.09)
+    assert both.observations == 1000
+    # profiles that share no range still add up
+    apart = summed([Profile(np.array([0.3, 0.4]), np.array([1.0, 2.0]), 10),
+                    Profile(np.array([0.5, 0.6]), np.array([2.0, 1.0]), 10)])
+    assert 0.3 <= apart.best <= 0.6
+    single = Profile(np.array([0.5]), np.array([1.0]), 10)
+    assert summed([single]).best == pytest.approx(0.5)
+
+
+# what a turn knows
+
+def small_scene(noise_px: float = 0.2, **options) -> Scene:
+    turn = synthetic_turn(LENS, 70.0, 6, 30, noise_px=noise_px, **options)
+    return turn.scene(LENS)
+
+
+def numeric(scene: Scene, loss_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return hessian (9, 9) and score (9,) by differences, all poses and points eliminated."""
+    structure = scene.structure
+    rows, columns = np.nonzero(structure.used)
+    poses, points = len(structure.rotations), len(structure.points)
+
+    def residuals(values: np.ndarray) -> np.ndarray:
+        lens, pose, point = np.split(values, [9, 9 + 6 * poses])
+        fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens
+        pose, point = pose.reshape(-1, 6), structure.points + point.reshape(-1, 3)
+        turned = [rotation(0, w[0]) @ rotation(1, w[1]) @ rotation(2, w[2]) @ matrix
+                  for w, matrix in zip(pose[:, :3], structure.rotations, strict=True)]
+        local = np.einsum('nij,nj->ni', np.array(turned)[rows], point[columns])
+        local += structure.translations[rows] + pose[rows, 3:]
+        x, y = (local[:, :2] / local[:, 2:]).T
+        q = x * x + y * y
+        radial = 1 + k1 * q + k2 * q**2 + k3 * q**3
+        u = fx * (x * radial + 2 * p1 * x * y + p2 * (q + 2 * x * x)) + cx
+        v = fy * (y * radial + p1 * (q + 2 * y * y) + 2 * p2 * x * y) + cy
+        return (np.stack([u, v], axis=1) - scene.tracks.xy[rows, columns]).ravel()
+
+    at = np.concatenate([LENS.params, np.zeros(3 + 6 * poses + 3 * points)])
+    base = residuals(at)
+    jacobian = np.zeros((len(base), len(at)))
+    for j in range(len(at)):
+        step = np.zeros(len(at))
+        step[j] = 1e-5
+        jacobian[:, j] = (residuals(at + step) - residuals(at - step)) / 2e-5
+    error = np.linalg.norm(base.reshape(-1, 2), axis=1)
+    weight = np.repeat(1 / (1 + error**2 / loss_px**2), 2)
+    weighted = jacobian * weight[:, None]
+    normal, pull = weighted.T @ weighted, -weighted.T @ base
+    inner = np.linalg.pinv(normal[9:, 9:], rcond=1e-11, hermitian=True)
+    follow = normal[:9, 9:] @ inner
+    return normal[:9, :9] - follow @ normal[9:, :9], pull[:9] - follow @ pull[9:]
+
+
+@pytest.mark.parametrize('loss_px', [0.5, 50.0])
+def test_information_agrees_with_differences(loss_px):
+    scene = small_scene()
+    part = information(scene, LENS, loss_px)
+    hessian, score = numeric(scene, loss_px)
+    scale = 1 / np.sqrt(np.diag(hessian))
+    np.testing.assert_allclose(part.hessian * np.outer(scale, scale),
+                               hessian * np.outer(scale, scale), atol=2e-3)
+    np.testing.assert_allclose(part.score * scale, score * scale, atol=0.02)
+    assert np.abs(score * scale).max() > 0.1
+
+
+def adjusted(scenes: list[Scene], loss_px: float, rounds: int = 1) -> tuple[list[Scene], Camera]:
+    camera = LENS
+    for _ in range(rounds):
+        scenes, camera = adjust_step2(
+            scenes, camera, Solver(loss_px, 200, 1e-14), NO_PRIOR, FREE)
+    return scenes, camera
+
+
+def test_the_score_is_nothing_at_the_optimum():
+    scenes = scenes_of(2, start=LENS, tracks=120)
+    loss = 0.5
+    before = [information(scene, LENS, loss) for scene in scenes]
+    scenes, camera = adjusted(scenes, loss, 3)
+    parts = [information(scene, camera, loss) for scene in scenes]
+    noise = noise_of(parts)
+    together = sum(part.hessian for part in parts)
+    pull = sum(part.score for part in parts) / np.sqrt(np.diag(together) * noise)
+    assert np.abs(pull[:6]).max() < 0.02
+    first = sum(part.score for part in before) / np.sqrt(np.diag(together) * noise)
+    assert np.abs(first[:6]).max() > 0.3
+    # each turn alone would rather be elsewhere
+    assert max(np.abs(part.score[:6] / np.sqrt(np.diag(part.hessian)[:6] * noise)).max()
+               for part in parts) > 0.05
+
+
+def test_the_variance_of_the_noise_is_found():
+    scenes, camera = adjusted(scenes_of(2, start=LENS, noise_px=0.3), 100.0)
+    assert noise_of([information(scene, camera, 100.0) for scene in scenes]) == pytest.approx(
+        0.09, rel=0.08)
+
+
+def test_information_agrees_with_colmaps_covariance():
+    import pycolmap
+    loss = 100.0
+    [scene], camera = adjusted(scenes_of(1, start=LENS), loss)
+    part = information(scene, camera, loss)
+    shift = np.array([0, 0, 0.5, 0.5, 0, 0])
+    colmap = adjust._camera('OPENCV', camera, [*(camera.params + shift), 0.0, 0.0])
+    reconstruction = adjust._reconstruction([scene], colmap)
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    # what our scenes leave free: where the world is, and how large
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
+    estimate = pycolmap.estimate_ba_covariance_from_problem(
+        pycolmap.BACovarianceOptions(), reconstruction, adjuster.problem)
+    # without held parameters (that crashes): p1 and p2 are free too
+    theirs = estimate.get_other_params_cov(reconstruction.cameras[1].params)
+    ours = np.linalg.inv(part.hessian[:8, :8])
+    scale = 1 / np.sqrt(np.diag(theirs))
+    np.testing.assert_allclose(ours * np.outer(scale, scale), theirs * np.outer(scale, scale),
+                               atol=0.01)
+
+
+def test_the_largest_of_the_estimates_counts():
+    eye = np.eye(9)
+    hessian = 1e4 * eye
+
+    def part(score: float, by_track: float = 1e4) -> Information:
+        return Information(hessian, np.full(9, score), by_track * eye, 100.0, 100.0)
+
+    def sigma(*parts: Information) -> np.ndarray:
+        return np.sqrt(np.diag(covariance(parts, NOTHING)))
+
+    calm = sigma(part(1.0), part(-1.0))
+    np.testing.assert_allclose(calm, 1 / np.sqrt(2e4), rtol=1e-3)
+    # tracks that share their errors
+    np.testing.assert_allclose(sigma(part(1.0, 9e4), part(-1.0, 9e4)), 3 * calm, rtol=1e-3)
+    # turns that disagree: g = +-1e3 where 1e2 is to be expected
+    assert (sigma(part(1e3), part(-1e3)) > 5 * calm).all()
+    # turns that are all off by the same do not disagree, but the prior may hold them there
+    np.testing.assert_allclose(sigma(part(1e3), part(1e3 - 1)), calm, rtol=1e-3)
+    np.testing.assert_allclose(sigma(*[part(1.0), part(-1.0)] * 4), calm / 2, rtol=1e-3)
+
+
+def test_a_turn_without_information_adds_no_certainty():
+    nothing = Information(np.zeros((9, 9)), np.zeros(9), np.zeros((9, 9)), 1.0, 1.0)
+    something = Information(1e4 * np.eye(9), np.ones(9), 1e4 * np.eye(9), 100.0, 100.0)
+    prior = 1e-2 * np.eye(6)
+    alone = np.sqrt(np.diag(covariance([nothing], prior)))
+    assert (alone >= 10.0).all()
+    both = np.sqrt(np.diag(covariance([something, nothing], prior)))
+    only = np.sqrt(np.diag(covariance([something], prior)))
+    assert (both >= 0.99 * only).all()
+
+
+def test_the_models_error_shows_in_sigma():
+    calm = scenes_of(3, start=LENS)
+    errors = {}
+    for name, extra in {'none': (0, 0, 0), 'p': (2e-3, -2e-3, 0), 'k3': (0, 0, -0.05)}.items():
+        scenes = scenes_of(3, start=LENS, extra=extra) if any(extra) else calm
+        scenes, camera = adjusted(scenes, 0.5, 2)
+        scenes = [retriangulated(scene, camera, 2.0, 1.0) for scene in scenes]
+        scenes, camera = adjusted(scenes, 0.5)
+        parts = [information(scene, camera, 0.5) for scene in scenes]
+        errors[name] = model_error(parts, NOTHING)
+    assert (errors['p'][2:4] > 3 * errors['none'][2:4]).all()
+    assert errors['k3'][5] > 3 * errors['none'][5]
+    assert errors['none'][0] < 0.005 * LENS.fx
+
+
+# the verdict
+
+def levels(solution: Solution, config: Config = CONFIG) -> tuple[str, str]:
+    verdict = judge(solution, config.verdict)
+    return verdict.level, ' | '.join(verdict.reasons)
+
+
+def with_camera(solution: Solution, **changes: float) -> Solution:
+    return replace(solution, camera=replace(solution.camera, **changes))
+
+
+def test_a_good_solution_is_accepted_without_reasons(good):
+    assert levels(good) == ('accepted', '')
+
+
+def test_one_turn_is_weak(good):
+    level, reasons = levels(replace(good, scenes=good.scenes[:1], parts=good.parts[:1]))
+    assert level == 'weak' and 'only 1 of at least 2 turns' in reasons
+
+
+def narrowed(scene: Scene, yaw_deg: float) -> Scene:
+    rotations = np.array([rotation(1, np.radians(yaw_deg) * n / 13).T for n in range(14)])
+    return replace(scene, structure=replace(scene.structure, rotations=rotations))
+
+
+@pytest.mark.parametrize(('yaw_deg', 'level'), [(2.0, 'refused'), (12.0, 'weak'),
+                                                (40.0, 'accepted')])
+def test_too_little_yaw(good, yaw_deg, level):
+    solution = replace(good, scenes=tuple(narrowed(scene, yaw_deg) for scene in good.scenes))
+    assert solution.scenes[0].yaw_deg == pytest.approx(yaw_deg, abs=1e-3)
+    found, reasons = levels(solution)
+    assert found == level and (f'{3 * yaw_deg:.0f} degrees' in reasons) == (level != 'accepted')
+
+
+@pytest.mark.parametrize(('costs', 'contrast', 'level'), [
+    ((0.305, 0.301, 0.300, 0.301, 0.302), 0.0067, 'refused'),
+    ((0.31, 0.303, 0.300, 0.303, 0.309), 0.03, 'weak'),
+    ((0.40, 0.31, 0.300, 0.31, 0.36), 0.2, 'accepted'),
+    # the minimum lies at an end: longer focal lengths explain even more
+    ((0.40, 0.35, 0.300, 0.28, 0.25), 0.0, 'refused'),
+    ((0.0, 0.0, 0.0, 0.0, 0.0), np.nan, 'refused'),
+    ((np.nan, 0.3, 0.2, 0.3, 0.4), np.nan, 'refused')])
+def test_a_flat_profile(good, costs, contrast, level):
+    solution = replace(good, around=replace(
+        good.around, ratios=good.camera.fx / SIZE[0] * np.array([0.8, 0.9, 1, 1.1, 1.25]),
+        costs=np.array(costs)))
+    with np.errstate(invalid='ignore'):
+        assert profile_contrast(solution) == pytest.approx(contrast, abs=0.001, nan_ok=True)
+        found, reasons = levels(solution)
+    assert found == level and ('hardly tell one focal length' in reasons) == (level != 'accepted')
+
+
+def test_a_focal_length_far_from_the_profiles_minimum(good):
+    off = replace(good.coarse, ratios=good.coarse.ratios * 1.5)
+    level, reasons = levels(replace(good, coarse=off))
+    assert level == 'refused' and 'contradicts' in reasons
+
+
+@pytest.mark.parametrize(('relative', 'level'), [
+    (0.01, 'accepted'), (0.03, 'weak'), (0.2, 'refused'), (np.inf, 'refused'),
+    (np.nan, 'refused')])
+def test_sigma_too_large(good, relative, level):
+    wide = good.covariance.copy()
+    wide[0, 0] = (relative * good.camera.fx)**2
+    found, reasons = levels(replace(good, covariance=wide))
+    assert found == level and ('fx is uncertain' in reasons) == (level != 'accepted')
+
+
+def test_turns_that_disagree_are_weak(good):
+    parts = [replace(part, score=part.score + part.hessian @ np.array(
+        [side * 0.08 * LENS.fx, side * 0.08 * LENS.fx, *np.zeros(7)]))
+        for part, side in zip(good.parts, (1, -1, 0), strict=True)]
+    solution = replace(good, parts=tuple(parts))
+    assert focal_disagreement(good) < 0.01 < 0.03 < focal_disagreement(solution)
+    level, reasons = levels(solution)
+    assert level == 'weak' and 'disagree about fx' in reasons
+    assert focal_disagreement(replace(good, parts=good.parts[:1])) == 0.0
+
+
+@pytest.mark.parametrize('name', ['fx', 'cy', 'k2'])
+def test_a_parameter_on_its_bound(good, name):
+    index = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2').index(name)
+    for side in (0, 1):
+        level, reasons = levels(with_camera(good, **{name: float(good.bounds[side][index])}))
+        assert level != 'accepted' and f'{name} ran into the bound' in reasons
+
+
+def test_a_distortion_that_folds_over(good):
+    level, reasons = levels(with_camera(good, k1=-0.5, k2=0.0))
+    assert level != 'accepted' and 'folds over' in reasons
+
+
+def test_refused_tells_the_doubts_too(good):
+    solution = replace(with_camera(good, k1=-0.5, k2=0.0), around=replace(
+        good.around, costs=np.ones_like(good.around.costs)))
+    level, reasons = levels(solution)
+    assert level == 'refused' and 'hardly tell' in reasons and 'folds over' in reasons
+    assert '\n' not in reasons
+
+
+def test_turns_through_different_lenses_are_not_accepted():
+    other = replace(LENS, fx=1.15 * LENS.fx, fy=1.15 * LENS.fx)
+    second = Camera.centred(SIZE, 1.03 * other.fx, -0.25)
+    scenes = [*scenes_of(2), *scenes_of(4, other, start=second)[2:]]
+    verdict = judge(solved(scenes), CONFIG.verdict)
+    assert verdict.level != 'accepted', verdict
+
+
+def test_a_drive_that_is_nearly_straight_is_not_accepted():
+    scenes = [synthetic_turn(LENS, yaw, 14, 180, 0.25, world=n).scene(START, n)
+              for n, yaw in enumerate((2.0, -1.5, 1.0))]
+    verdict = judge(solved(scenes), CONFIG.verdict)
+    assert verdict.level != 'accepted' and 'yaw' in ' '.join(verdict.reasons)
+
+
+def test_a_turn_without_a_step_aside_is_not_accepted():
+    """A camera that only rotates sees no depth: points may be anywhere along their rays."""
+    turn = synthetic_turn(LENS, 80.0, 14, 180, 0.25)
+    still = turn.structure.translations * 1e-3
+    local = (turn.structure.points @ turn.structure.rotations.transpose(0, 2, 1)
+             + still[:, None])
+    local[local[:, :, 2] < 1.0] = np.nan
+    xy = LENS.project(local) + 0.25 * np.random.default_rng(1).standard_normal(
+        local[..., :2].shape)
+    xy[~turn.tracks.seen] = np.nan
+    spin = SyntheticTurn(replace(turn.tracks, xy=xy), replace(turn.structure, translations=still))
+    solution = solve([spin.scene(LENS)], CONFIG.intrinsics, CONFIG.scene)
+    assert solution is None or judge(solution, CONFIG.verdict).level != 'accepted'
+
+
+# what the user gets
+
+def evidence_for(solution: Solution | None, shrink: int = 1, turns: int = 3, frames: int = 500
+                 ) -> Evidence:
+    built = {scene.center: scene for scene in solution.scenes} if solution else {}
+    return Evidence(
+        (SIZE[0] * shrink, SIZE[1] * shrink), frames,
+        tuple(Turn(n, n - 5, n + 5, n / 10, 0.05) for n in range(turns)), built,
+        np.zeros((0, 2)), None, shrink, {'detect': 1.0, 'calibrate': 2.0, 'total': 3.0})
+
+
+def test_a_refused_solution_gives_no_numbers(good):
+    bad = replace(good, around=replace(good.around, costs=np.ones_like(good.around.costs)))
+    calibration = conclude(bad, evidence_for(bad), CONFIG)
+    assert calibration.verdict.level == 'refused'
+    assert calibration.intrinsics is None and calibration.sigma is None
+    assert calibration.reprojection_error_px is None
+
+
+@pytest.mark.parametrize(('turns', 'frames', 'text'), [
+    (0, 0, '0 image'), (0, 1, 'only 1 image'), (0, 500, 'no turn was found'),
+    (3, 500, 'none of the 3 turns')])
+def test_no_solution_is_refused_with_the_reason(turns, frames, text):
+    calibration = conclude(None, evidence_for(None, 1, turns, frames), CONFIG)
+    assert calibration.verdict.level == 'refused' and text in calibration.verdict.reasons[0]
+    assert calibration.intrinsics is None and calibration.sigma is None
+    assert len(calibration.turns) == turns and not any(t.used for t in calibration.turns)
+
+
+def test_turns_are_summed_up_in_the_order_of_the_drive(good):
+    calibration = conclude(good, evidence_for(good, turns=5), CONFIG)
+    assert [turn.center for turn in calibration.turns] == [0, 1, 2, 3, 4]
+    assert [turn.used for turn in calibration.turns] == [True, True, True, False, False]
+    used = calibration.turns[0]
+    assert used.images == used.registered == 14
+    assert used.yaw_deg == pytest.approx(80, abs=3) and 0.2 < used.reprojection_error_px < 0.6
+    assert calibration.turns[4].yaw_deg is None
+
+
+@pytest.mark.parametrize('factor', [1, 2, 4])
+def test_the_full_size_camera_sees_what_the_small_one_sees(good, factor):
+    calibration = conclude(good, evidence_for(good, factor), CONFIG)
+    full = calibration.intrinsics
+    camera = Camera(calibration.image_size, full.fx, full.fy, full.cx, full.cy, full.k1, full.k2)
+    points = np.array([[0.3, -0.2, 1.0], [-2.0, 1.1, 4.0], [0.0, 0.0, 2.0]])
+    small = good.camera.project(points)
+    # frames/shrink.py: pixel x of the small image is (x + 0.5) factor - 0.5 of the large one
+    np.testing.assert_allclose(camera.project(points), (small + 0.5) * factor - 0.5, atol=1e-9)
+    np.testing.assert_allclose(
+        [calibration.sigma.fx, calibration.sigma.cy, calibration.sigma.k1],
+        good.sigma[[0, 3, 4]] * [factor, factor, 1])
+    assert calibration.reprojection_error_px == pytest.approx(
+        good.reprojection_error_px * factor)
+
+
+def test_residuals_are_projected_minus_seen(good):
+    scene = good.scenes[0]
+    k, t = np.argwhere(scene.structure.used)[7]
+    local = (scene.structure.rotations[k] @ scene.structure.points[t]
+             + scene.structure.translations[k])
+    np.testing.assert_allclose(residuals_px(scene, good.camera)[k, t],
+                               good.camera.project(local) - scene.tracks.xy[k, t])
