@@ -121,8 +121,8 @@ class IntrinsicsConfig:
     aspect_sigma: float = setting(
         0.003, 'fy / fx is 1 to within this: planar turns know fx but hardly fy', 1e-5, 1.0)
     focal_floor: float = setting(
-        0.001, 'of fx, in every sigma: tracking itself; 7 of 8 rendered drives came out 0.1 % long',
-        0.0, 0.1)
+        0.001, 'of fx, in every sigma: tracking itself; 7 of 8 rendered drives came out 0.1 % '
+        'long', 0.0, 0.1)
     centre_sigma: float = setting(
         0.02, 'of the width; how far lenses sit off the middle of their sensors', 1e-4, 1.0)
 

@@ -1,9 +1,10 @@
 """ros2 launch dashcalib_ros calibrator.launch.py [namespace:=front] [image:=image_raw] ..."""
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
 
 ARGUMENTS = (
     ('namespace', '', "the camera's namespace; it names the camera, too"),

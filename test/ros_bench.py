@@ -98,7 +98,7 @@ class Bench:
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
         kind = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        self.reliability = kind.name.lower()
+        self.kind, self.reliability = kind, kind.name.lower()
         self.images = self.node.create_publisher(
             image_type, topic, QoSProfile(depth=50, reliability=kind))
         self.infos, self.latched, self.status, self.magnitudes = [], [], None, []
@@ -141,9 +141,15 @@ class Bench:
 
     def connect(self, node):
         """Wait until the node hears the images, as reliably as they come, and is heard."""
-        self.until(lambda: self.images.get_subscription_count() > 0
-                   and self.values.get('reliability') == self.reliability,
-                   what='the connection', node=node)
+        def heard():
+            others = self.node.get_subscriptions_info_by_topic(self.images.topic_name)
+            return (self.images.get_subscription_count() == len(others) > 0
+                    and all(each.qos_profile.reliability == self.kind for each in others)
+                    and self.values.get('reliability') == self.reliability)
+
+        self.until(heard, what='the connection', node=node)
+        # the other side matches a moment later
+        self.spin(0.2)
 
     def publish(self, *messages):
         for message in messages:

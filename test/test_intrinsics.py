@@ -356,28 +356,35 @@ def test_too_little_yaw(good, yaw_deg, level):
     assert found == level and (f'{3 * yaw_deg:.0f} degrees' in reasons) == (level != 'accepted')
 
 
-@pytest.mark.parametrize(('costs', 'contrast', 'level'), [
-    ((0.305, 0.301, 0.300, 0.301, 0.302), 0.0067, 'refused'),
-    ((0.31, 0.303, 0.300, 0.303, 0.309), 0.03, 'weak'),
-    ((0.40, 0.31, 0.300, 0.31, 0.36), 0.2, 'accepted'),
-    # the minimum lies at an end: longer focal lengths explain even more
-    ((0.40, 0.35, 0.300, 0.28, 0.25), 0.0, 'refused'),
-    ((0.0, 0.0, 0.0, 0.0, 0.0), np.nan, 'refused'),
-    ((np.nan, 0.3, 0.2, 0.3, 0.4), np.nan, 'refused')])
-def test_a_flat_profile(good, costs, contrast, level):
-    solution = replace(good, around=replace(
-        good.around, ratios=good.camera.fx / SIZE[0] * np.array([0.8, 0.9, 1, 1.1, 1.25]),
+def with_profile(solution: Solution, ratios: Sequence[float], costs: Sequence[float]) -> Solution:
+    """Return the solution with other costs at so many times its focal length."""
+    return replace(solution, around=replace(
+        solution.around, ratios=solution.camera.fx / SIZE[0] * np.array(ratios),
         costs=np.array(costs)))
+
+
+@pytest.mark.parametrize(('costs', 'contrast', 'level'), [
+    ((0.302, 0.300, 0.301), 0.0033, 'refused'),
+    ((0.31, 0.300, 0.309), 0.03, 'weak'),
+    ((0.40, 0.300, 0.36), 0.2, 'accepted'),
+    # longer focal lengths explain even more
+    ((0.40, 0.300, 0.25), -0.1667, 'refused'),
+    ((0.0, 0.0, 0.0), np.nan, 'refused'),
+    ((np.nan, 0.2, 0.4), np.nan, 'refused')])
+def test_a_flat_profile(good, costs, contrast, level):
+    solution = with_profile(good, (0.8, 1.0, 1.25), costs)
     with np.errstate(invalid='ignore'):
         assert profile_contrast(solution) == pytest.approx(contrast, abs=0.001, nan_ok=True)
         found, reasons = levels(solution)
     assert found == level and ('hardly tell one focal length' in reasons) == (level != 'accepted')
 
 
-def test_a_focal_length_far_from_the_profiles_minimum(good):
-    off = replace(good.coarse, ratios=good.coarse.ratios * 1.5)
-    level, reasons = levels(replace(good, coarse=off))
+def test_another_focal_length_that_explains_more(good):
+    level, reasons = levels(with_profile(good, (0.8, 1.0, 1.25, 1.9), (0.5, 0.4, 0.5, 0.2)))
     assert level == 'refused' and 'contradicts' in reasons
+    assert f'about {1.9 * good.camera.fx:.0f} px' in reasons
+    level, reasons = levels(with_profile(good, (0.5, 0.8, 1.0, 1.25), (0.9, 0.5, 0.4, 0.5)))
+    assert (level, reasons) == ('accepted', '')
 
 
 @pytest.mark.parametrize(('relative', 'level'), [

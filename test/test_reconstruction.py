@@ -9,7 +9,7 @@ from synthetic import LENS, SIZE, SyntheticTurn, angle_deg, only_tracks, synthet
 
 from dashcalib_ros.config import SceneConfig, TracksConfig
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.reconstruction import build
+from dashcalib_ros.reconstruction import adjust, build
 from dashcalib_ros.reconstruction.adjust import Prior, Solver, adjust_step1, adjust_step2
 from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.chain import Structure, chain, ray_error, triangulate
@@ -325,6 +325,19 @@ def test_pixels_are_colmaps_minus_a_half(colmap_scene):
     assert errors_px(scene, wrong)[scene.structure.used].min() > 0.7
 
 
+def test_colmap_is_given_its_own_pixels(colmap_scene):
+    shift = np.array([0, 0, 0.5, 0.5, 0, 0])
+    camera = adjust._camera('OPENCV', colmap_scene.camera,
+                            [*(colmap_scene.camera.params + shift), 0.0, 0.0])
+    reconstruction = adjust._reconstruction([colmap_scene], camera)
+    first = reconstruction.image(1).points2D[0].xy
+    t = int(np.flatnonzero(colmap_scene.structure.used[0])[0])
+    np.testing.assert_allclose(first, colmap_scene.tracks.xy[0, t] + 0.5)
+    # COLMAP itself finds that everything fits
+    reconstruction.update_point_3d_errors()
+    assert reconstruction.compute_mean_reprojection_error() < 1e-6
+
+
 def test_the_principal_point_comes_back_in_our_pixels(colmap_scene):
     start = replace(colmap_scene.camera, fx=F * 1.01, fy=F * 0.99, cx=CX + 6, cy=CY - 6, k1=-0.1)
     prior = Prior(start.params, np.diag([1e12, 1e12, 1e12, 1e12, 1e6, 1e6]))
@@ -513,6 +526,16 @@ def test_a_burnt_in_text_gives_no_tracks():
     # half a tracking window from the text's edge: the street shows in it there
     inside = (x > 30) & (x < 100) & (y > 200) & (y < 220)
     assert tracks.xy.shape[1] > 100 and not inside.any()
+
+
+def test_a_track_that_stands_and_hops_is_no_track():
+    moving = np.stack([20.0 + 12 * np.arange(10), 50 + 0.2 * np.arange(10)], axis=1)
+    # from one letter to the next; far away on the right the street hardly moves, but it does
+    hopping = np.array([[50.0, 200], *[[50, 200]] * 3, *[[62, 201]] * 6])
+    slow = np.stack([300 + 0.5 * np.arange(10), np.full(10, 90.0)], axis=1)
+    tracks = Tracks(np.arange(10), np.stack([moving, hopping, slow], axis=1), (WIDTH, HEIGHT))
+    kept = thinned(tracks, 9)
+    np.testing.assert_array_equal(kept.xy[0], [moving[0], slow[0]])
 
 
 def test_standing_frames_are_no_keyframes():

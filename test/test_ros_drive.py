@@ -75,15 +75,21 @@ def driven(ros_context, rendered, tmp_path_factory):
 
 
 def drive(seen):
-    """Publish the drive, kill the first child, wait for the calibration, publish some more."""
+    """Publish the drive, kill the first child, ask for a calibration after the first turn, wait
+    for that of both turns, and publish some more.
+    """
     bench, node = seen.bench, seen.node
-    seen.killed = 0
+    seen.killed, seen.asked = 0, None
     for frame in seen.frames:
         bench.publish(image_message(frame.image, frame.stamp_ns))
         bench.spin(0.02)
         if not seen.killed and (children := node.children()):
             os.kill(children[0], signal.SIGKILL)
             seen.killed = children[0]
+        if seen.asked is None and bench.count('turns found') > 0:
+            seen.asked = bench.call('calibrate', node)
+            # the second turn must not come to its help
+            node.wait_for('a calibration of 1 turn', 90.0)
     seen.before = len(bench.infos)
     bench.until(lambda: seen.committed, 120.0, 'an accepted calibration', node)
     seen.latched = list(bench.latched)
@@ -98,6 +104,11 @@ def test_nothing_is_published_before_acceptance_and_one_per_image_after(driven):
     assert driven.before == 0
     assert [info.header for info in driven.bench.infos] == [
         image.header for image in driven.after]
+
+
+def test_one_turn_is_calibrated_on_request_but_too_weak_to_publish(driven):
+    assert driven.asked.success and 'started' in driven.asked.message
+    assert 'a calibration of 1 turn is weak: only 1 of at least 2 turns' in driven.node.text
 
 
 def test_camera_info_is_complete_and_close_to_the_truth(driven):

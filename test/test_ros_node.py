@@ -290,6 +290,14 @@ def test_silence_is_stale(plain):
     assert camera.status.message == 'no image on /plain_image yet'
 
 
+def test_a_paused_simulation_does_not_silence_the_diagnostics(start_node, make_bench):
+    node, camera = start_node(use_sim_time=True), make_bench()
+    camera.connect(node)
+    stream(camera, 3)
+    camera.counted('received', 3, node)
+    assert node.stop() == 0
+
+
 # -- services and parameters ------------------------------------------------------------------
 
 def test_services_say_why_not(plain):

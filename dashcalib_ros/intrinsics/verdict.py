@@ -57,7 +57,8 @@ def _flat_profile(solution: Solution, config: VerdictConfig) -> tuple[list[str],
     """The cost must rise to both sides of its minimum, or the turns know nothing of the focal."""
     contrast = profile_contrast(solution)
     message = (f'the turns hardly tell one focal length from another (the error rises by '
-               f'{100 * max(contrast, 0.0):.1f} % when it is 20 % off): drive sharper turns in daylight')
+               f'{100 * max(contrast, 0.0):.1f} % when it is 20 % off): drive sharper turns in '
+               f'daylight')
     if not contrast >= config.refused_contrast:  # NaN is no evidence either
         return [message], []
     return [], [message] if contrast < config.min_contrast else []

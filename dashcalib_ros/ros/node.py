@@ -170,7 +170,8 @@ class CalibratorNode(Node):
             log.error(f'the published calibration is given up: {judged.why}')
             self._give_up()
         else:
-            text = (f'a calibration of {sum(turn.used for turn in calibration.turns)} turns is '
+            used = sum(turn.used for turn in calibration.turns)
+            text = (f'a calibration of {used} turn{"" if used == 1 else "s"} is '
                     f'{calibration.verdict.level}' + (f': {judged.why}' if judged.why else ''))
             # rclpy takes one severity for each line of code
             if judged.contradictions:

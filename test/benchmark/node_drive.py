@@ -16,7 +16,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,7 @@ def at_their_own_rate(frames: Iterator[Frame], bench: Rectifier) -> Iterator[Fra
         yield frame
 
 
-def drive(frames: list[Frame] | Iterator[Frame], turns: list[int], half_width: float
+def drive(frames: Iterable[Frame], turns: list[int], half_width: float
           ) -> dict[str, Any]:
     """Play the frames; go on with the last one until the calibration is there."""
     home = Path(tempfile.mkdtemp(prefix='dashcalib-bench-'))
@@ -165,8 +166,7 @@ def main() -> None:
         seen = drive(frames, list(demo.turn_centers), half_width)
         text = seen.pop('calibration')
         print(json.dumps(seen, indent=1))
-        truth = demo.truth
-        against(text, {name: getattr(truth, name) for name in ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')})
+        against(text, asdict(demo.truth))
         return
     seen = drive(iter(open_frames(args.bag)), [], half_width)
     text = seen.pop('calibration')

@@ -1,0 +1,247 @@
+"""The whole story on a rendered drive: the right lens, the same every time, or a refusal."""
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import pytest
+
+from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.config import Config
+from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
+from dashcalib_ros.errors import InputError, WorkerError
+from dashcalib_ros.frames import Frame
+from dashcalib_ros.intrinsics import Calibration
+
+LENS = Lens.of(640, 360, 80.0, -0.25, 0.06, offset=(6.0, -4.0))
+SPEC = DriveSpec(turns=(Turn(85.0), Turn(-80.0)), straight_m=20.0, lead_m=24.0, seed=3)
+# enough for this drive, and quick
+QUICK = Config().replace({
+    'turns.wanted': 2, 'tracks.points': 350, 'scene.tracks': 250, 'scene.profile_tracks': 150,
+    'scene.keyframes': 20, 'scene.profile_keyframes': 10, 'intrinsics.profile_tracks': 40})
+LIMIT_S = 300.0
+
+
+@pytest.fixture(scope='session')
+def drive() -> Drive:
+    return Drive(LENS, SPEC)
+
+
+@pytest.fixture(scope='session')
+def frames(drive) -> list[Frame]:
+    return list(drive.frames(processes=2))
+
+
+@contextlib.contextmanager
+def limited(calibrator: Calibrator) -> Iterator[Calibrator]:
+    """Close a calibrator that takes far too long: what waits for it then raises."""
+    guard = threading.Timer(LIMIT_S, calibrator.close)
+    guard.daemon = True
+    guard.start()
+    try:
+        with calibrator:
+            yield calibrator
+    finally:
+        guard.cancel()
+
+
+def calibrated(frames: Iterable[Frame], config: Config = QUICK, **options) -> Calibration:
+    with limited(Calibrator(config, **options)) as calibrator:
+        for frame in frames:
+            calibrator.push(frame)
+        return calibrator.calibrate()
+
+
+@pytest.fixture(scope='session')
+def result(frames) -> Calibration:
+    return calibrated(frames)
+
+
+def same(first: Calibration, second: Calibration) -> bool:
+    """Tell whether two results are equal to the last bit (but for the time they took)."""
+    assert first.intrinsics is not None
+    return (first.intrinsics, first.sigma, first.verdict, first.turns, first.details) == (
+        second.intrinsics, second.sigma, second.verdict, second.turns, second.details)
+
+
+# a drive with two turns
+
+def test_it_finds_the_lens(drive, frames, result):
+    assert result.verdict.level != 'refused', result.verdict
+    truth, found, sigma = drive.truth, result.intrinsics, result.sigma
+    for name, tolerance in {'fx': 0.02 * truth.fx, 'fy': 0.02 * truth.fy, 'cx': 6.0, 'cy': 6.0,
+                            'k1': 0.02, 'k2': 0.02}.items():
+        off = abs(getattr(found, name) - getattr(truth, name))
+        assert off < tolerance, name
+        assert off < 4 * getattr(sigma, name), name
+    assert result.image_size == (640, 360) and result.frames == len(frames)
+    assert 0.05 < result.reprojection_error_px < 0.8
+
+
+def test_it_tells_of_its_turns(drive, result):
+    assert len(result.turns) == 2 and all(turn.used for turn in result.turns)
+    for turn, center, angle in zip(result.turns, drive.turn_centers, (85.0, 80.0), strict=True):
+        assert abs(turn.center - center) <= 8
+        assert turn.first <= turn.center <= turn.last
+        assert turn.yaw_deg == pytest.approx(angle, abs=8.0)
+        assert 0.8 * turn.images < turn.registered <= turn.images <= 20
+    assert set(result.timing) == {'detect', 'calibrate', 'total'}
+    assert result.magnitudes.shape[1] == 2 and len(result.magnitudes) > 50
+    assert result.versions['pycolmap'] != 'unknown'
+
+
+def test_one_thread_and_a_child_that_is_killed_change_nothing(frames, result):
+    killed = []
+
+    def assassin(calibrator: Calibrator, ended: threading.Event) -> None:
+        while not killed and not ended.wait(0.05):
+            for pid in calibrator.child_pids():
+                time.sleep(0.5)  # in the middle of something
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+                    killed.append(pid)
+
+    ended = threading.Event()
+    with limited(Calibrator(QUICK.replace({'threads': 1}))) as calibrator:
+        thread = threading.Thread(target=assassin, args=(calibrator, ended), daemon=True)
+        thread.start()
+        try:
+            for frame in frames:
+                calibrator.push(frame)
+            again = calibrator.calibrate()
+        finally:
+            ended.set()
+            thread.join(10)
+    assert killed and same(result, again)
+
+
+def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way(frames, result):
+    stages: dict[str, float] = {}
+    with limited(Calibrator(QUICK, live=True)) as calibrator:
+        for frame in frames[:95]:
+            status = calibrator.push(frame)
+        assert status.frames == 95 and status.turns == 1
+        early = calibrator.calibrate(stages.__setitem__, final=False)
+        assert calibrator.status().built == 1
+        assert calibrator.status().yaw_deg == pytest.approx(85.0, abs=8.0)
+        for frame in frames[95:]:
+            calibrator.push(frame)
+        late = calibrator.calibrate()
+        pids = calibrator.child_pids()
+        assert pids and all(os.getpriority(os.PRIO_PROCESS, pid) >= 10 for pid in pids)
+    assert early.frames == 95 and early.verdict.level in ('weak', 'refused')
+    assert any('only 1 of at least 2 turns' in reason for reason in early.verdict.reasons)
+    assert 'reconstructing turns' in stages and len(stages) >= 4
+    assert all(0.0 <= done <= 1.0 for done in stages.values())
+    assert same(result, late)
+    # no process is left behind
+    assert not any(os.path.exists(f'/proc/{pid}') for pid in pids)  # noqa: PTH110
+
+
+def test_close_ends_a_calibration_that_runs(frames):
+    calibrator = Calibrator(QUICK)
+    outcome: list[object] = []
+
+    def calibrate() -> None:
+        try:
+            outcome.append(calibrator.calibrate())
+        except Exception as error:
+            outcome.append(error)
+
+    with limited(calibrator):
+        for frame in frames[:95]:
+            calibrator.push(frame)
+        thread = threading.Thread(target=calibrate, daemon=True)
+        thread.start()
+        time.sleep(0.3)
+        calibrator.close()
+        thread.join(20)
+        assert not thread.is_alive()
+    assert len(outcome) == 1 and isinstance(outcome[0], WorkerError)
+    assert calibrator.child_pids() == []
+
+
+def test_more_turns_than_the_bank_would_hold():
+    config = QUICK.replace({'turns.wanted': 12, 'turns.capacity': 3})
+    with Calibrator(config) as calibrator:
+        assert calibrator._detector.config.capacity == 12
+    # what the user has set is what is written down
+    assert config.turns.capacity == 3
+    with Calibrator(QUICK) as calibrator:
+        assert calibrator._detector.config.capacity == QUICK.turns.capacity
+
+
+# drives that cannot calibrate
+
+def pictures(count: int, width: int, height: int, seed: int | None = None) -> list[Frame]:
+    rng = np.random.default_rng(seed)
+    return [Frame(n, n * 10**8, np.zeros((height, width), np.uint8) if seed is None
+                  else rng.integers(0, 256, (height, width), np.uint8)) for n in range(count)]
+
+
+def refused(frames: Iterable[Frame]) -> str:
+    calibration = calibrated(frames)
+    assert calibration.verdict.level == 'refused'
+    assert calibration.intrinsics is None and calibration.sigma is None
+    assert calibration.verdict.reasons and '\n' not in ''.join(calibration.verdict.reasons)
+    return ' | '.join(calibration.verdict.reasons)
+
+
+def test_no_image_and_one_image():
+    assert '0 image' in refused([])
+    assert 'only 1 image' in refused(pictures(1, 640, 360, 1))
+
+
+def test_black_pictures():
+    assert 'no turn was found' in refused(pictures(80, 320, 180))
+
+
+@pytest.mark.parametrize(('width', 'height'), [(32, 32), (1, 1), (400, 8)])
+def test_tiny_pictures(width, height):
+    refused(pictures(80, width, height))
+    refused(pictures(80, width, height, 1))
+
+
+def test_noise_is_no_drive():
+    refused(pictures(80, 320, 180, 7))
+
+
+def test_a_picture_that_stands(frames):
+    assert 'no turn was found' in refused(
+        Frame(n, n * 10**8, frames[0].image) for n in range(80))
+
+
+def test_a_drive_without_a_turn():
+    lens = Lens.of(320, 180, 80.0, -0.25, 0.06)
+    straight = Drive(lens, DriveSpec(turns=0, duration_s=8.0, seed=4))
+    assert 'no turn was found' in refused(straight.frames(processes=2))
+
+
+def test_a_change_of_size_is_named(frames):
+    with Calibrator(QUICK) as calibrator:
+        for frame in frames[:3]:
+            calibrator.push(frame)
+        small = Frame(3, frames[3].stamp_ns, frames[3].image[:180, :320])
+        with pytest.raises(InputError, match='640x360 to 320x180 at frame 3'):
+            calibrator.push(small)
+        # the drive may go on with the old size
+        assert calibrator.push(frames[3]).frames == 4
+
+
+def test_large_pictures_are_shrunk_for_everything(monkeypatch):
+    sizes = []
+    with Calibrator(QUICK.replace({'max_width': 320})) as calibrator:
+        push = calibrator._motion.push
+        monkeypatch.setattr(calibrator._motion, 'push',
+                            lambda frame: sizes.append(frame.size) or push(frame))
+        for frame in pictures(5, 642, 362, 2):
+            calibrator.push(frame)
+        calibration = calibrator.calibrate()
+    # 642 is halved twice: 321 does not fit
+    assert set(sizes) == {(160, 90)}
+    assert calibration.image_size == (642, 362)
