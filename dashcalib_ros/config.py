@@ -100,6 +100,8 @@ class SceneConfig:
         1.0, 'degrees; rays that meet at less give no point; COLMAP has 1.5', 0.1, 10.0)
     loss_px: float = setting(0.5, 'px; scale of the Cauchy loss', 0.05, 10.0)
     iterations: int = setting(20, 'of one adjustment', 5, 500)
+    min_explained: float = setting(
+        0.3, 'of a turn\'s observations; a camera that explains fewer is not its camera', 0.0, 0.9)
     patch_half_window: int = setting(7, 'px; of the affine registration', 3, 25)
     max_shift_px: float = setting(
         3.0, 'px; a registration that moves a point farther has lost it', 0.2, 20.0)

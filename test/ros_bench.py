@@ -64,6 +64,12 @@ class NodeProcess:
             assert time.monotonic() < end, f'no {words!r} in\n{self.text}'
             time.sleep(0.05)
 
+    def catches(self, number):
+        """Tell whether the process handles this signal itself."""
+        status = Path(f'/proc/{self.process.pid}/status').read_text()
+        mask = int(status.partition('SigCgt:')[2].split()[0], 16)
+        return bool(mask >> (number - 1) & 1)
+
     def children(self):
         """Return the ids of the living processes that the node started."""
         found = []

@@ -135,7 +135,7 @@ def covariance(parts: Sequence[Information], prior: Array) -> Array:
         by_turn = scores.T @ scores * count / (count - 1) * tails
         estimates.append(np.diag(inverse @ by_turn @ inverse))
     # without evidence rounding can make a variance negative: such scenes know nothing
-    variance = np.where(np.min(estimates, axis=0) > 0, np.max(estimates, axis=0), np.inf)
+    variance = np.where(np.min(estimates, axis=0) >= 0, np.max(estimates, axis=0), np.inf)
     sigma = np.sqrt(variance + model_error(parts, prior) ** 2)
     correlation = inverse / np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
     return np.asarray(correlation * np.outer(sigma, sigma))

@@ -31,8 +31,8 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     """Adjust all scenes with one shared camera.
 
     scenes: at least one. The summed focal profile picks the start; a scene that was built far from
-    it is chained anew, and one of which nothing is left with the shared camera is dropped. None
-    when that becomes of all.
+    it is chained anew, and one that the shared camera does not explain is dropped. None when that
+    becomes of all.
     """
     solver = Solver(scene_config.loss_px, scene_config.iterations)
     profile = summed([scene.profile for scene in scenes])
@@ -44,6 +44,7 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
         progress('step 1: one focal length', n / config.rounds)
         together, camera = adjust_step1(together, camera, solver, reach)
         together = _all_again(together, camera, scene_config)
+    together = _explained(together, camera, scene_config, seed)
     if not together:
         return None
     step1 = camera
@@ -54,6 +55,7 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
         progress('step 2: all six', n / config.rounds)
         together, camera = adjust_step2(together, camera, solver, prior, bounds)
         together = _all_again(together, camera, scene_config)
+    together = _explained(together, camera, scene_config, seed)
     if not together:
         return None
     progress('sigma', 0.0)
@@ -149,6 +151,19 @@ def _brought_to(scene: Scene, camera: Camera, config: SceneConfig, seed: int) ->
 def _all_again(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> list[Scene]:
     again = [_again(scene, camera, config) for scene in scenes]
     return [scene for scene in again if scene.structure.used.any()]
+
+
+def _explained(scenes: Sequence[Scene], camera: Camera, config: SceneConfig, seed: int
+               ) -> list[Scene]:
+    """Return the scenes that the camera explains, some of them chained anew with it."""
+    kept = []
+    for scene in scenes:
+        if scene.explained < config.min_explained:
+            anew = chain_scene(scene.tracks, scene.center, camera, scene.profile, config, seed)
+            scene = _again(anew, camera, config) if anew is not None else scene
+        if scene.explained >= config.min_explained:
+            kept.append(scene)
+    return kept
 
 
 def _again(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:

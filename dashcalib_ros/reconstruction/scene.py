@@ -44,10 +44,17 @@ class Scene:
 
     @property
     def yaw_deg(self) -> float:
-        """Return the largest rotation between any two registered images, in degrees."""
+        """Return by how much the camera turned about its vertical axis, in degrees."""
         rotations = self.structure.rotations[self.structure.registered]
-        traces = np.einsum('aij,bij->ab', rotations, rotations)
-        return float(np.degrees(np.arccos(np.clip((traces.min() - 1) / 2, -1, 1))))
+        # where each camera looks, seen from the first: pitch and roll are no yaw
+        ahead = rotations[:, 2] @ rotations[0].T
+        yaw = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))
+        return float(np.degrees(np.ptp(yaw)))
+
+    @property
+    def explained(self) -> float:
+        """Return the share of all observations that the structure explains."""
+        return float(self.structure.used.sum() / max(int(self.tracks.seen.sum()), 1))
 
 
 def errors_px(scene: Scene, camera: Camera) -> Array:

@@ -1,0 +1,172 @@
+"""The learner's two threads: when it calibrates, what a failure costs, how it ends."""
+from __future__ import annotations
+
+import threading
+import time
+import types
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from dashcalib_ros.calibrator import Status
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.intrinsics import Calibration, TurnSummary, Verdict
+from dashcalib_ros.ros import learner as room
+from dashcalib_ros.ros.learner import Learner, Listener
+
+LIMIT = 20.0
+CONFIG = Config().replace({'turns.wanted': 2})
+
+
+class Core:
+    """In the Calibrator's place: turns by command, calibrations that fail or last."""
+
+    made: ClassVar[list[Core]] = []
+    failures: ClassVar[list[Exception]] = []
+
+    def __init__(self, config, live):
+        assert live
+        self.centers, self.frames, self.calls = (), 0, 0
+        self.hold, self.closed = threading.Event(), threading.Event()
+        self.hold.set()
+        Core.made.append(self)
+
+    def push(self, frame):
+        self.frames += 1
+        return self.status()
+
+    def status(self):
+        return Status(self.frames, len(self.centers), len(self.centers), 0.0, 0.1, False,
+                      self.centers)
+
+    def calibrate(self, progress, final):
+        assert not final
+        self.calls += 1
+        centers = self.centers
+        while not self.hold.wait(0.01):
+            if self.closed.is_set():
+                raise WorkerError('the calibrator was closed while it calibrated')
+        if Core.failures:
+            raise Core.failures.pop()
+        turns = tuple(TurnSummary(c, c, c, 0.0, 0.1, 1, 1, True) for c in centers)
+        return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG)
+
+    def close(self):
+        self.closed.set()
+
+
+@pytest.fixture
+def desk(monkeypatch):
+    """A learner over such cores, and all it tells."""
+    monkeypatch.setattr(room, 'Calibrator', Core)
+    Core.made, Core.failures = [], []
+    heard = types.SimpleNamespace(results=[], troubles=[], statuses=[])
+    heard.learner = Learner(CONFIG, 10, Listener(
+        heard.results.append, heard.statuses.append,
+        lambda kind, text: heard.troubles.append((kind, text))))
+    yield heard
+    heard.learner.close()
+
+
+def until(condition):
+    end = time.monotonic() + LIMIT
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def image(width=64):
+    data = np.zeros((48, width), np.uint8)
+    return types.SimpleNamespace(encoding='mono8', width=width, height=48, step=width,
+                                 is_bigendian=0, data=data.tobytes())
+
+
+def test_it_calibrates_when_enough_turns_are_built_and_again_only_with_others(desk):
+    core = Core.made[0]
+    core.centers = (10,)
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 0
+    core.centers = (10, 20)
+    until(lambda: len(desk.results) == 1)
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 1 and desk.results[0].complete
+    core.centers = (20, 30)
+    until(lambda: len(desk.results) == 2)
+    assert core.calls == 2
+
+
+def test_a_lower_goal_calibrates_sooner_but_not_completely(desk):
+    desk.learner.goal = 1
+    Core.made[0].centers = (10,)
+    until(lambda: desk.results)
+    assert not desk.results[0].complete
+
+
+def test_a_request_needs_turns_and_only_one_runs(desk):
+    core = Core.made[0]
+    assert 'no turn' in desk.learner.request()
+    core.centers = (10,)
+    core.hold.clear()
+    until(lambda: desk.learner.request() == '')
+    until(lambda: desk.learner.activity().calibrating)
+    assert 'running already' in desk.learner.request()
+    core.hold.set()
+    until(lambda: desk.results)
+    assert not desk.learner.activity().calibrating
+
+
+def test_a_failed_calibration_is_told_and_tried_again(desk):
+    Core.failures = [RuntimeError('odd'), WorkerError('the process died')]
+    Core.made[0].centers = (10, 20)
+    until(lambda: len(desk.results) == 1)
+    assert [kind for kind, _ in desk.troubles] == ['failed_calibrations'] * 2
+    assert 'the process died' in desk.troubles[0][1] and 'in 2 s' in desk.troubles[0][1]
+    assert 'RuntimeError: odd' in desk.troubles[1][1] and 'in 4 s' in desk.troubles[1][1]
+    assert len(Core.made) == 1  # the turns are kept
+
+
+def test_a_restart_cancels_what_runs_and_its_result_is_out_of_date(desk):
+    first = Core.made[0]
+    first.centers = (10, 20)
+    first.hold.clear()
+    until(lambda: desk.learner.activity().calibrating)
+    desk.learner.restart()
+    until(first.closed.is_set)
+    until(lambda: not desk.learner.activity().calibrating)
+    assert desk.troubles == [] and desk.results == [] and desk.learner.bank == 1
+    Core.made[1].centers = (30, 40)
+    until(lambda: desk.results)
+    assert desk.results[0].bank == 1
+
+
+def test_images_keep_to_the_bank_they_were_taken_for(desk):
+    desk.learner.offer(0, 0, image(), (64, 48))
+    until(lambda: desk.statuses)
+    desk.learner.restart()
+    desk.learner.offer(1, 1, image(32), (32, 48))
+    until(lambda: len(desk.statuses) == 2)
+    assert [core.frames for core in Core.made] == [1, 1] and desk.troubles == []
+
+
+def test_images_that_cannot_be_used_are_told(desk):
+    desk.learner.offer(0, 0, image(), (640, 480))
+    odd = image()
+    odd.encoding = 'smell'
+    desk.learner.offer(1, 1, odd, (64, 48))
+    desk.learner.offer(2, 2, object(), (64, 48))
+    until(lambda: len(desk.troubles) == 3)
+    assert [kind for kind, _ in desk.troubles] == ['undecodable', 'undecodable', 'failed']
+    desk.learner.offer(3, 3, image(), (64, 48))
+    until(lambda: desk.statuses)
+
+
+def test_closing_ends_both_threads_in_the_middle_of_a_calibration(desk):
+    core = Core.made[0]
+    core.centers = (10, 20)
+    core.hold.clear()
+    until(lambda: desk.learner.activity().calibrating)
+    desk.learner.close()
+    assert not any(thread.is_alive() for thread in desk.learner._threads)
+    assert desk.troubles == []
