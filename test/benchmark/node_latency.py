@@ -141,9 +141,9 @@ def report(values: dict[str, str], sent: int, latencies: dict[bool, list[float]]
                   f'{median:.1f}, {p99:.1f} ms |')
     print(f'| CPU of the node\'s process (transport and detection), of one core | '
           f'{100 * share:.0f} % |')
-    part = max(1, min(60, len(memory) // 3))
-    print(f'| resident memory, first and last {part} s | {np.mean(memory[:part]):.0f}, '
-          f'{np.mean(memory[-part:]):.0f} MB (most {max(memory):.0f}) |')
+    minutes = [f'{np.mean(memory[n:n + 60]):.0f}' for n in range(0, len(memory), 60)]
+    print(f'| resident memory, mean of each minute | {", ".join(minutes)} MB '
+          f'(most {max(memory):.0f}) |')
 
 
 def main() -> None:
