@@ -13,7 +13,7 @@ import numpy.typing as npt
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.shrink import shrink, shrink_factor
+from dashcalib_ros.frames.shrink import shrink, shrink_factor, shrink_mask
 from dashcalib_ros.intrinsics import Calibration
 from dashcalib_ros.intrinsics.conclude import Evidence, conclude
 from dashcalib_ros.intrinsics.solve import solve_scenes
@@ -61,6 +61,9 @@ class Calibrator:
         """
         self._config = config or Config()
         self._live = live
+        if mask is not None:
+            size = mask.shape[1], mask.shape[0]
+            mask = shrink_mask(mask, shrink_factor(size, self._config.max_width))
         self._motion = MotionEstimator(self._config.motion, self._config.mask, mask)
         # a turn without a scene needs another to give way to, and --turns may ask for many
         turns = self._config.turns

@@ -245,3 +245,17 @@ def test_large_pictures_are_shrunk_for_everything(monkeypatch):
     # 642 is halved twice: 321 does not fit
     assert set(sizes) == {(160, 90)}
     assert calibration.image_size == (642, 362)
+
+
+def test_a_mask_fits_images_that_are_shrunk():
+    picture = np.random.default_rng(0).integers(0, 255, (900, 1600), np.uint8)
+    mask = np.ones(picture.shape, bool)
+    mask[801:] = False
+    with Calibrator(mask=mask) as calibrator:
+        calibrator.push(Frame(0, 10**9, picture))
+        valid = calibrator.calibrate().mask
+    # row 400 of the small picture holds rows 800 and 801: one of them is masked
+    assert valid is not None and valid.shape == (450, 800)
+    assert valid[:400].all() and not valid[400:].any()
+    with Calibrator(mask=mask[:, :-4]) as calibrator, pytest.raises(InputError):
+        calibrator.push(Frame(0, 10**9, picture))

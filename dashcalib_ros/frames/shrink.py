@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from dashcalib_ros.frames.frame import Frame, GreyImage
 
@@ -29,6 +30,13 @@ def shrink_image(image: GreyImage, factor: int) -> GreyImage:
     small = cv2.resize(image[:height, :width], (width // factor, height // factor),
                        interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8)
+
+
+def shrink_mask(valid: npt.NDArray[np.bool_], factor: int) -> npt.NDArray[np.bool_]:
+    """Return the mask for an image shrunk alike: valid where all of a block is."""
+    height, width = (side // factor for side in valid.shape)
+    blocks = valid[:height * factor, :width * factor].reshape(height, factor, width, factor)
+    return np.asarray(blocks.all(axis=(1, 3)), bool)
 
 
 def shrink(frame: Frame, factor: int) -> Frame:
