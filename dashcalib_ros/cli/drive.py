@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.calibrator import Calibrator
-from dashcalib_ros.cli.settings import check_mask
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.frames import FrameSource
+from dashcalib_ros.frames.mask_file import check_mask
 from dashcalib_ros.intrinsics import Calibration
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def feed(calibrator: Calibrator, source: FrameSource, mask: Mask | None, stages:
     stages.show('reading', None)
     for frame in source:
         if not frames:
-            check_mask(mask, frame)
+            check_mask(mask, frame.size)
         status = calibrator.push(frame)
         frames += 1
         turns = '1 turn' if status.turns == 1 else f'{status.turns} turns'

@@ -6,9 +6,10 @@ from datetime import datetime, timezone
 
 from dashcalib_ros.cli import exit_codes
 from dashcalib_ros.cli.drive import calibrate
-from dashcalib_ros.cli.settings import read_config, read_mask
+from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
 from dashcalib_ros.frames import open_frames
+from dashcalib_ros.frames.mask_file import read_mask
 from dashcalib_ros.intrinsics import Calibration
 from dashcalib_ros.report import output_folder, write_results
 from dashcalib_ros.report.tables import summary
@@ -17,7 +18,7 @@ from dashcalib_ros.report.tables import summary
 def run(args: argparse.Namespace) -> int:
     """Calibrate, write the results, show them; return the verdict's exit code."""
     config = read_config(args)
-    mask = read_mask(args.mask)
+    mask = None if args.mask is None else read_mask(args.mask)
     source = open_frames(args.input, topic=args.topic, fps=args.fps)
     if args.write_bag is not None:
         from dashcalib_ros.report.write_bag import check_bag

@@ -1,4 +1,4 @@
-"""From --config, --set and the dedicated flags to a Config and a mask."""
+"""From --config, --set and the dedicated flags to a Config."""
 from __future__ import annotations
 
 import argparse
@@ -7,13 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import yaml
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import ConfigError, InputError
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.errors import ConfigError
 
 FLAGS = {'turns': 'turns.wanted', 'seed': 'seed', 'threads': 'threads'}
 EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+')  # 1e-3, a word to YAML 1.1
@@ -42,36 +39,6 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
             raise ConfigError(f'--set {pair}: the value is not valid YAML; '
                               'write a plain number, true or false') from error
     return changes
-
-
-def read_mask(path: Path | None) -> npt.NDArray[np.bool_] | None:
-    """Read a mask picture: True where it is not black. Raises InputError."""
-    if path is None:
-        return None
-    import cv2
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(f'cannot read the mask {path} ({error.strerror}); '
-                         'check the path') from error
-    picture = None
-    if data.size:
-        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    if picture is None:
-        raise InputError(f'the mask {path} is no picture; give a PNG, black where the image is '
-                         'not to be used')
-    mask: npt.NDArray[np.bool_] = np.asarray(picture) > 0
-    if not mask.any():
-        raise InputError(f'the mask {path} is all black, nothing is left of the image; '
-                         'make the part to use white')
-    return mask
-
-
-def check_mask(mask: npt.NDArray[np.bool_] | None, frame: Frame) -> None:
-    """Raise InputError unless the mask is as large as the image."""
-    if mask is not None and (size := mask.shape[::-1]) != frame.size:
-        raise InputError(f'the mask is {size[0]}x{size[1]} and the images are '
-                         f'{frame.size[0]}x{frame.size[1]}; make the mask as large as the images')
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:

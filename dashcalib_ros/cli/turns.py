@@ -9,9 +9,10 @@ from rich.text import Text
 
 from dashcalib_ros.cli import exit_codes
 from dashcalib_ros.cli.drive import feed, open_calibrator
-from dashcalib_ros.cli.settings import read_config, read_mask
+from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
 from dashcalib_ros.frames import open_frames
+from dashcalib_ros.frames.mask_file import read_mask
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.tables import text_table
 
@@ -21,7 +22,7 @@ COLUMNS = ('frame', 'from', 'to', 'at s', 'prominence', 'images')
 def turns(args: argparse.Namespace) -> int:
     """List the turns found, best first. None found is an answer too: exit code 0."""
     config = read_config(args)
-    mask = read_mask(args.mask)
+    mask = None if args.mask is None else read_mask(args.mask)
     source = open_frames(args.input, topic=args.topic, fps=args.fps)
     with open_calibrator(config, mask, args.verbose) as calibrator:
         with Stages() as stages:
