@@ -1,167 +1,179 @@
 #!/usr/bin/env python3
 """Accuracy, honesty and refusals, measured on rendered drives with exact truth and on real ones.
 
-    python test/benchmark/accuracy.py [SETTING ...] [--seeds 0 1 2] [--data DIR] [--out DIR]
+    python test/benchmark/accuracy.py [SETTING ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]
+                                      [--out DIR] [--again] [--list] [--summary]
 
-Runs every setting (or those named) with every seed, writes DIR/accuracy.json after each drive and
-prints a table. --data: a folder with kitti03/ and carnd/ (bag or video beside a truth.json).
+Runs every setting (or those named; part of a name will do) with every seed. Rows go to
+DIR/accuracy.json after each drive, and one that is there is not run again (--again: it is);
+DIR/accuracy.md is the table with medians, bars and honesty. --data: a folder with kitti03/ and
+carnd/ (bag or video beside a truth.json). --cache: where rendered pictures are kept, about
+100 MB a drive; a second run renders nothing.
 """
 from __future__ import annotations
 
 import argparse
 import json
-import resource
-import statistics
+import os
+import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from dashcalib_ros import Calibrator, Config, open_frames
-from dashcalib_ros.demo import Drive, DriveSpec, Lens, Stop, Turn
+from drives import BY_NAME, SETTINGS, Pictures, drive_of, pictures_of
+from measure import (
+    Outcome,
+    calibrate,
+    commit,
+    complain,
+    error_cells,
+    isolated,
+    load,
+    save,
+    summarised,
+    table,
+)
+from summary import summary
+
+from dashcalib_ros import Config, open_frames
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.intrinsics import Calibration
 from dashcalib_ros.report import camera_of, compare, load_camera
 
-KITTI_RAW = Lens(1392, 512, 960.115, 954.891, 694.792, 240.355, -0.363, 0.151)
-DEMO = Lens.of(960, 540, 75.0, -0.30, 0.10, offset=(14.0, -9.0), aspect=1.003)
-WIDE = Lens.of(1280, 720, 115.0, -0.22, 0.04, offset=(-20.0, 12.0), aspect=0.998)
-TELE = Lens.of(1280, 720, 48.0, 0.08, 0.05, offset=(10.0, 20.0))
-VGA = Lens.of(640, 480, 65.0, -0.35, 0.12, offset=(6.0, 5.0), aspect=1.01)
-FULL_HD = Lens.of(1920, 1080, 90.0, -0.28, 0.07, offset=(25.0, -15.0), aspect=1.001)
-
-# what must be calibrated
-DRIVES = {
-    'kitti-raw lens': (KITTI_RAW, {}),
-    'demo': (DEMO, {'bonnet': True, 'timestamp': True}),
-    'wide 115 deg': (WIDE, {'bonnet': True}),
-    'narrow 48 deg, pincushion': (TELE, {}),
-    '640x480, fy/fx 1.01': (VGA, {'noise': 3.0}),
-    '1920x1080, 30 fps': (FULL_HD, {'rate': 30.0, 'turns': 3}),
-    '5 fps': (DEMO, {'rate': 5.0}),
-    '3 fps': (DEMO, {'rate': 3.0}),
-    'noise 6, blur 1': (DEMO, {'noise': 6.0, 'blur': 1.0}),
-    'JPEG 50': (DEMO, {'jpeg_quality': 50}),
-    'pillar, bonnet, text': (WIDE, {'bonnet': True, 'pillar': True, 'timestamp': True}),
-    'moving cars': (DEMO, {'moving_cars': 8}),
-    'rolling shutter 10 ms': (DEMO, {'rolling_shutter_ms': 10.0}),
-    'rolling shutter 20 ms': (DEMO, {'rolling_shutter_ms': 20.0}),
-    'wide turns': (DEMO, {'turns': tuple(Turn(side * 70.0, 18.0) for side in (1, -1, -1, 1, 1))}),
-    'one sharp turn': (DEMO, {'turns': 1}),
-    'two turns': (DEMO, {'turns': 2}),
-}
-# what must be refused
-HOPELESS = {
-    'straight': (DEMO, {'turns': 0, 'duration_s': 30.0}),
-    'parked': (DEMO, {'kind': 'parked', 'duration_s': 20.0}),
-    'at a light, others moving': (
-        DEMO, {'turns': 0, 'duration_s': 30.0, 'moving_cars': 8, 'stops': (Stop(0, 20.0),)}),
-    'parked at night': (DEMO, {'kind': 'parked', 'night': True, 'duration_s': 20.0}),
-    'turning on the spot': (DEMO, {'kind': 'spin', 'duration_s': 20.0}),
-}
-KEYS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')
+RECORDED = {'kitti03': 'bag', 'carnd': 'drive.mp4'}
 
 
-def calibrate(frames: Iterable[Frame], config: Config) -> tuple[Calibration, float]:
-    """Return the calibration and the seconds it took, rendering and decoding not counted."""
-    spent = 0.0
-    with Calibrator(config) as calibrator:
-        for frame in frames:
-            started = time.monotonic()
-            calibrator.push(frame)
-            spent += time.monotonic() - started
-        started = time.monotonic()
-        result = calibrator.calibrate()
-        return result, spent + time.monotonic() - started
+def rendered(pictures: Pictures, seed: int, truth: Mapping[str, float]) -> dict[str, Any]:
+    """Calibrate a rendered drive (in a process of its own)."""
+    return _row(pictures, Config(seed=seed), truth)
 
 
-def measured(result: Calibration, truth: dict[str, float], seconds: float) -> dict[str, object]:
-    """Return errors, sigmas and what else the tables need; truth has fx..k2, width, height."""
-    row: dict[str, object] = {
-        'verdict': result.verdict.level, 'reasons': list(result.verdict.reasons),
-        'frames': result.frames, 'seconds': round(seconds, 1), 'timing': result.timing,
-        'turns': [[turn.center, turn.used] for turn in result.turns], 'truth': truth,
-        'peak_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
-        'child_peak_mb': resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024}
-    if result.intrinsics is None or result.sigma is None:
-        return row
-    estimate, sigma = asdict(result.intrinsics), asdict(result.sigma)
-    row['estimate'], row['sigma'] = estimate, sigma
-    row['error'] = {key: estimate[key] - truth[key] for key in KEYS}
-    row['percent'] = {key: 100 * abs(estimate[key] / truth[key] - 1)
-                      for key in KEYS if abs(truth[key]) > 1e-9}
-    row['z'] = {key: (estimate[key] - truth[key]) / sigma[key] for key in KEYS}
-    return row
-
-
-def rendered(name: str, seed: int) -> dict[str, object]:
-    """Render one drive and calibrate it."""
-    lens, changes = {**DRIVES, **HOPELESS}[name]
-    drive = Drive(lens, DriveSpec(seed=seed, **changes))
-    truth = {**asdict(drive.truth), 'width': lens.width, 'height': lens.height}
-    result, seconds = calibrate(drive.frames(processes=2), Config(seed=seed))
-    row = measured(result, truth, seconds)
-    row['true_turns'] = list(drive.turn_centers)
-    return row
-
-
-def recorded(name: str, data: Path) -> dict[str, object]:
-    """Calibrate a real drive."""
-    path = {'kitti03': data / 'kitti03/bag', 'carnd': data / 'carnd/drive.mp4'}[name]
+def recorded(name: str, data: Path) -> dict[str, Any]:
+    """Calibrate a real drive (in a process of its own)."""
     truth_path = data / name / 'truth.json'
-    result, seconds = calibrate(open_frames(path), Config())
-    row = measured(result, json.loads(truth_path.read_text()), seconds)
-    if result.intrinsics is not None:
+    truth = {key: value for key, value in json.loads(truth_path.read_text()).items()
+             if not isinstance(value, list)}
+    return _row(open_frames(data / name / RECORDED[name]), Config(), truth, truth_path)
+
+
+def _row(frames: Iterable[Frame], config: Config, truth: Mapping[str, float],
+         truth_path: Path | None = None) -> dict[str, Any]:
+    result, seconds = calibrate(frames, config)
+    row = summarised(result, truth)
+    if truth_path is not None and result.intrinsics is not None:
         row['mapping_px'] = compare(camera_of(result), load_camera(truth_path)).mapping_px
-    return row
+    return row | {'truth': dict(truth), 'seconds': seconds}
 
 
-def table(rows: dict[str, dict[str, object]]) -> str:
-    """Return the drives as a Markdown table, then the medians and what honesty came to."""
-    lines = ['| drive | verdict | fx % | fy % | cx % | cy % | k1 % | k2 % | z of fx | s |',
-             '|---|---|---|---|---|---|---|---|---|---|']
-    for name, row in rows.items():
-        percent = row.get('percent', {})
-        cells = [f'{percent[key]:.3f}' if key in percent else '' for key in KEYS]
-        z = f'{row["z"]["fx"]:+.1f}' if 'z' in row else ''
-        lines.append(f'| {name} | {row["verdict"]} | {" | ".join(cells)} | {z} | '
-                     f'{row["seconds"]} |')
-    accepted = [row for row in rows.values() if row['verdict'] == 'accepted']
-    if accepted:
-        lines.append('')
-        for key in KEYS:
-            errors = [row['percent'][key] for row in accepted if key in row['percent']]
-            z = [abs(row['z'][key]) for row in accepted]
-            if errors:
-                lines.append(
-                    f'{key}: median {statistics.median(errors):.3f} %, worst {max(errors):.3f} %; '
-                    f'within 1 sigma {sum(value <= 1 for value in z)} of {len(z)}, '
-                    f'2 sigma {sum(value <= 2 for value in z)} of {len(z)}')
-        false = sum(row['percent']['fx'] > 3 for row in accepted)
-        lines.append(f'accepted with fx off by more than 3 %: {false} of {len(accepted)}')
-    return '\n'.join(lines)
+def _finished(outcome: Outcome, about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the row to keep; a crash is a verdict too."""
+    row = outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure], 'seconds': {}}
+    return {**about, **row, 'peak_mb': round(outcome.peak_mb), 'commit': commit()}
+
+
+def run_rendered(name: str, seed: int, cache: Path) -> dict[str, Any]:
+    """Render a drive, or take it from the cache, and calibrate it."""
+    setting = BY_NAME[name]
+    drive = drive_of(setting, seed)
+    started = time.monotonic()
+    pictures = pictures_of(drive, cache)
+    about = {'setting': name, 'seed': seed, 'must': setting.must, 'counts': setting.counts,
+             'true_turns': list(drive.turn_centers),
+             'render_s': round(time.monotonic() - started, 1)}
+    truth = {**asdict(drive.truth), 'width': drive.lens.width, 'height': drive.lens.height}
+    return _finished(isolated(rendered, pictures, seed, truth), about)
+
+
+def run_recorded(name: str, data: Path) -> dict[str, Any]:
+    """Calibrate a real drive."""
+    about = {'setting': name, 'seed': 0, 'must': 'accept' if name == 'kitti03' else 'judge',
+             'counts': False, 'recorded': True}
+    return _finished(isolated(recorded, name, data), about)
+
+
+def drives_table(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Return a line for each drive."""
+    head = ['drive', 'seed', 'verdict', 'turns', 'fx %', 'fy %', 'cx %', 'cy %', 'k1 %', 'k2 %',
+            'z of fx', 'worst z', 's', 'MB']
+    lines = []
+    for row in rows:
+        z = row.get('z')
+        lines.append([
+            row['setting'], str(row['seed']), row['verdict'], str(row.get('turns_used', '')),
+            *error_cells(row), f'{z["fx"]:+.1f}' if z else '',
+            f'{max(map(abs, z.values())):.1f}' if z else '',
+            f'{row["seconds"].get("total", 0.0):.0f}', str(row['peak_mb'])])
+    return table(head, lines)
+
+
+def _chosen(wanted: list[str], data: Path | None) -> list[str]:
+    real = [name for name in RECORDED if data is not None and (data / name).is_dir()]
+    names = [*real, *BY_NAME]
+    for part in wanted:
+        if not any(part in name for name in names):
+            raise SystemExit(f'no setting has {part!r} in its name; --list shows them all')
+    return [name for name in names
+            if not wanted or name in wanted or any(part in name for part in wanted)]
 
 
 def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('settings', nargs='*', help='default: all')
-    parser.add_argument('--seeds', nargs='+', type=int, default=[0])
-    parser.add_argument('--data', type=Path, default=Path('../shared/data'))
+    parser.add_argument('--seeds', nargs='+', type=int, default=[0, 1, 2])
+    parser.add_argument('--data', type=Path)
+    parser.add_argument('--cache', type=Path)
     parser.add_argument('--out', type=Path, default=Path('benchmark'))
+    parser.add_argument('--again', action='store_true', help='run drives that have a row, too')
+    parser.add_argument('--list', action='store_true', help='name the settings, and end')
+    parser.add_argument('--summary', action='store_true', help='of the rows there are, and end')
     arguments = parser.parse_args()
-    real = [name for name in ('kitti03', 'carnd') if (arguments.data / name).is_dir()]
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    rows: dict[str, dict[str, object]] = {}
-    for name in arguments.settings or [*real, *HOPELESS, *DRIVES]:
-        for seed in [0] if name in ('kitti03', 'carnd') else arguments.seeds:
-            recording = name in ('kitti03', 'carnd')
-            row = recorded(name, arguments.data) if recording else rendered(name, seed)
-            rows[f'{name}, seed {seed}'] = row
-            (arguments.out / 'accuracy.json').write_text(json.dumps(rows, indent=1))
-            print(table({f'{name}, seed {seed}': row}).splitlines()[2], row['reasons'] or '',
-                  flush=True)
-    print(table(rows))
+    if arguments.list:
+        print('\n'.join(f'{setting.name} ({setting.must})' for setting in SETTINGS))
+        return
+    path = arguments.out / 'accuracy.json'
+    rows = load(path)
+    if not arguments.summary:
+        names = _chosen(arguments.settings, arguments.data)
+        # one seed of everything before the next seed: an interrupted run covers all settings
+        jobs = [(name, seed) for seed in arguments.seeds for name in names
+                if name not in RECORDED or seed == arguments.seeds[0]]
+        with tempfile.TemporaryDirectory() as passing:
+            for number, (name, seed) in enumerate(jobs, 1):
+                seed = 0 if name in RECORDED else seed
+                key = f'{name}, seed {seed}'
+                if key in rows and not arguments.again:
+                    continue
+                if name in RECORDED:
+                    row = run_recorded(name, arguments.data)
+                else:
+                    row = run_rendered(name, seed, arguments.cache or Path(passing) / str(number))
+                rows[key] = row
+                save(path, rows)
+                complain(f'{number} of {len(jobs)}, rendered in {row.get("render_s", 0)} s')
+                print(drives_table([row]).splitlines()[-1], '; '.join(row['reasons']), flush=True)
+                if not arguments.cache:
+                    _forget(Path(passing) / str(number))
+    text = f'{drives_table(_ordered(rows))}\n\n{summary(rows.values())}\n'
+    (arguments.out / 'accuracy.md').write_text(
+        f'Measured on {os.cpu_count()} cores at {", ".join(_commits(rows))}.\n\n{text}')
+    print(f'\n{text}')
+
+
+def _ordered(rows: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    order = [*RECORDED, *BY_NAME]
+    known = [row for row in rows.values() if row['setting'] in order]
+    return sorted(known, key=lambda row: (order.index(row['setting']), row['seed']))
+
+
+def _commits(rows: Mapping[str, dict[str, Any]]) -> list[str]:
+    return sorted({row['commit'] for row in rows.values() if row['commit']})
+
+
+def _forget(folder: Path) -> None:
+    import shutil
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == '__main__':

@@ -1,0 +1,196 @@
+"""What every benchmark here needs: errors, a process of its own for each measurement, files."""
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from dashcalib_ros import Calibrator, Config
+from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.frames import Frame
+from dashcalib_ros.intrinsics import Calibration
+from dashcalib_ros.report.result import plain_values
+
+KEYS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')
+FALSE_PERCENT = 3.0
+SAMPLE_S = 0.25
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a function. value: what it returned; failure: why it did not, or ''.
+
+    seconds: wall clock, starting the process included. peak_mb: proportional set size of the
+    process and all its children together.
+    """
+
+    value: Any
+    failure: str
+    seconds: float
+    peak_mb: float
+
+
+def isolated(function: Callable[..., Any], *arguments: Any, limit_s: float = 3600.0) -> Outcome:
+    """Run a module-level function in a spawned process, which may abort, hang or hoard memory."""
+    context = multiprocessing.get_context('spawn')
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_answer, args=(sender, function, arguments))
+    started = time.monotonic()
+    process.start()
+    sender.close()
+    assert process.pid is not None
+    peak, value, failure = 0.0, None, ''
+    try:
+        while not receiver.poll(SAMPLE_S):
+            peak = max(peak, memory_mb(process.pid))
+            if time.monotonic() - started > limit_s:
+                failure = f'not done after {limit_s:.0f} s'
+                break
+        else:
+            try:
+                value, failure = receiver.recv()
+            except EOFError:
+                process.join()
+                failure = f'the process died (exit code {process.exitcode})'
+        return Outcome(value, failure, time.monotonic() - started, peak)
+    finally:
+        for pid in (*_descendants(process.pid), process.pid):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        process.join()
+
+
+def _answer(sender: Connection, function: Callable[..., Any], arguments: Sequence[Any]) -> None:
+    try:
+        sender.send((function(*arguments), ''))
+    except Exception as error:
+        sender.send((None, f'{type(error).__name__}: {error}'))
+
+
+def memory_mb(pid: int) -> float:
+    """Return what a process and its children have resident, shared pages by their share, MB."""
+    total = 0
+    for member in (pid, *_descendants(pid)):
+        with contextlib.suppress(OSError):
+            for line in Path(f'/proc/{member}/smaps_rollup').read_text().splitlines():
+                if line.startswith('Pss:'):
+                    total += int(line.split()[1])
+    return total / 1024
+
+
+def _descendants(pid: int) -> list[int]:
+    children: dict[int, list[int]] = {}
+    for stat in Path('/proc').glob('[0-9]*/stat'):
+        with contextlib.suppress(OSError):
+            parent = int(stat.read_text().rpartition(')')[2].split()[1])
+            children.setdefault(parent, []).append(int(stat.parent.name))
+    found = list(children.get(pid, []))
+    for child in found:
+        found += children.get(child, [])
+    return found
+
+
+def calibrate(frames: Iterable[Frame], config: Config) -> tuple[Calibration, dict[str, float]]:
+    """Return the calibration, and the seconds of each stage.
+
+    decode: getting the frames; push: all of detection, with waiting for scenes; then whatever
+    stages calibrate() names. total: without decode.
+    """
+    seconds = {'decode': 0.0, 'push': 0.0}
+    stage, since = 'decode', time.monotonic()
+
+    def enter(name: str, done: float = 0.0) -> None:
+        nonlocal stage, since
+        now = time.monotonic()
+        seconds[stage] = seconds.get(stage, 0.0) + now - since
+        stage, since = name, now
+
+    with Calibrator(config) as calibrator:
+        for frame in frames:
+            enter('push')
+            calibrator.push(frame)
+            enter('decode')
+        enter('conclude')
+        result = calibrator.calibrate(enter)
+        enter('closing')
+    seconds['total'] = sum(seconds.values()) - seconds['decode']
+    return result, {name: round(value, 2) for name, value in seconds.items()}
+
+
+def errors(estimate: Mapping[str, float], truth: Mapping[str, float],
+           sigma: Mapping[str, float] | None = None) -> dict[str, Any]:
+    """Return error (estimate - truth), percent (absolute, None where the truth is 0) and z."""
+    off = {key: estimate[key] - truth[key] for key in KEYS}
+    found: dict[str, Any] = {
+        'estimate': {key: estimate[key] for key in KEYS}, 'error': off,
+        'percent': {key: 100 * abs(off[key] / truth[key]) if abs(truth[key]) > 1e-9 else None
+                    for key in KEYS}}
+    if sigma is not None:
+        found['sigma'] = {key: sigma[key] for key in KEYS}
+        found['z'] = {key: off[key] / sigma[key] for key in KEYS}
+    return found
+
+
+def summarised(result: Calibration, truth: Mapping[str, float]) -> dict[str, Any]:
+    """Return a calibration as a row of results."""
+    row: dict[str, Any] = {
+        'verdict': result.verdict.level, 'reasons': list(result.verdict.reasons),
+        'frames': result.frames, 'turns_used': sum(turn.used for turn in result.turns),
+        'turns': [[turn.center, turn.used, turn.yaw_deg] for turn in result.turns],
+        'timing': result.timing}
+    if result.intrinsics is not None and result.sigma is not None:
+        row |= errors(asdict(result.intrinsics), truth, asdict(result.sigma))
+    return dict(plain_values(row))
+
+
+def error_cells(row: Mapping[str, Any]) -> list[str]:
+    """Return the six errors as cells: percent of the truth, or 'abs' where that is 0."""
+    if 'error' not in row:
+        return [''] * len(KEYS)
+    return [f'{abs(row["error"][key]):.3f} abs' if row['percent'][key] is None
+            else f'{row["percent"][key]:.2f}' for key in KEYS]
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ['---'] * len(head), *rows]
+    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Return the results that are there already."""
+    return dict(json.loads(path.read_text())) if path.exists() else {}
+
+
+def save(path: Path, data: Mapping[str, Any]) -> None:
+    """Write results; an interrupted run leaves the former file or the new one, whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = path.with_suffix('.new')
+    fresh.write_text(json.dumps(plain_values(data), indent=1) + '\n')
+    fresh.replace(path)
+
+
+def commit() -> str:
+    """Return what code is measured, '+' for uncommitted changes; '' outside a repository."""
+    try:
+        done = subprocess.run(
+            ['git', 'describe', '--always', '--dirty=+', '--exclude=*'],
+            cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    except OSError:
+        return ''
+    return done.stdout.strip()
+
+
+def complain(error: DashcalibError | str) -> None:
+    """Say on stderr what went wrong, and go on."""
+    print(error, file=sys.stderr, flush=True)
