@@ -37,7 +37,9 @@ setup(
     ],
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        'test': ['pytest>=8', 'pytest-xdist>=3', 'hypothesis>=6', 'ruff', 'mypy', 'types-PyYAML'],
+        'segmentation': ['onnxruntime>=1.17'],
+        'test': ['pytest>=8', 'pytest-xdist>=3', 'hypothesis>=6', 'ruff', 'mypy', 'types-PyYAML',
+                 'onnxruntime>=1.17', 'onnx>=1.16'],
         'benchmark': ['matplotlib>=3.8'],
     },
     entry_points={

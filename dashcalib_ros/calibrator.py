@@ -131,7 +131,8 @@ class Calibrator:
                 shrink=shrink_factor(self._size or (1, 1), self._config.max_width),
                 timing={'detect': self._detect_s, 'calibrate': ended - started,
                         'total': ended - self._started})
-        return conclude(solution, evidence, self._config)
+            warnings = self._motion.warnings()
+        return replace(conclude(solution, evidence, self._config), warnings=warnings)
 
     def turns(self) -> tuple[Turn, ...]:
         """Return the bank's turns, the most prominent first."""

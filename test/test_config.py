@@ -25,7 +25,7 @@ def test_defaults_are_inside_their_ranges_and_not_on_the_edge_of_types():
     for name, value in flat.items():
         meta = SPECS[name].metadata
         assert type(value) in (int, float, bool, str), name
-        if isinstance(value, bool):
+        if isinstance(value, (bool, str)):
             continue
         assert meta['minimum'] <= value <= meta['maximum'], name
 
@@ -44,7 +44,8 @@ def test_not_a_finite_number(name, value):
     assert name in str(caught.value)
 
 
-@pytest.mark.parametrize('name', [n for n, s in SPECS.items() if not isinstance(s.default, bool)])
+@pytest.mark.parametrize(
+    'name', [n for n, s in SPECS.items() if not isinstance(s.default, (bool, str))])
 def test_out_of_range_names_the_range(name):
     meta = SPECS[name].metadata
     kind = type(SPECS[name].default)
@@ -60,7 +61,8 @@ def test_out_of_range_names_the_range(name):
     ('turns.wanted', 2.5), ('turns.wanted', '5'), ('turns.wanted', True), ('turns.wanted', None),
     ('motion.rate', 'fast'), ('motion.rate', True), ('motion.rate', None), ('motion.rate', [10.0]),
     ('mask.enabled', 1), ('mask.enabled', 'yes'), ('seed', 1.0), ('seed', False),
-    ('motion.rate', {'hz': 10}),
+    ('motion.rate', {'hz': 10}), ('mask.segmentation', None), ('mask.segmentation', True),
+    ('mask.segmentation_classes', [63, 64]),
 ])
 def test_wrong_type_names_the_right_one(name, value):
     with pytest.raises(ConfigError) as caught:

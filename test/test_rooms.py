@@ -25,7 +25,7 @@ ALLOWED = {
     'cli': CORE | {'report', 'demo', 'calibrator'},
 }
 HOMES = {'pycolmap': {'reconstruction', 'intrinsics'}, 'pyceres': {'reconstruction', 'intrinsics'},
-         'rclpy': {'ros'}}
+         'rclpy': {'ros'}, 'onnxruntime': {'motion'}}
 MODULES = sorted(PACKAGE.rglob('*.py'))
 
 

@@ -116,6 +116,8 @@ def _add_drive_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--turns', type=int, metavar='N', help='how many turns are wanted')
     parser.add_argument('--mask', type=Path, metavar='PNG',
                         help='black pixels are not used; as large as the images')
+    parser.add_argument('--segmentation', metavar='MODEL.onnx',
+                        help='a network that sees the own car, asked beside the automatic mask')
     parser.add_argument('--config', type=Path, metavar='YAML', help='settings from a file')
     parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
                         help='one setting, over those of --config; may be repeated')

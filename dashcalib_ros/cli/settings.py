@@ -12,12 +12,13 @@ import yaml
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError
 
-FLAGS = {'turns': 'turns.wanted', 'seed': 'seed', 'threads': 'threads'}
+FLAGS = {'turns': 'turns.wanted', 'seed': 'seed', 'threads': 'threads',
+         'segmentation': 'mask.segmentation'}
 EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+')  # 1e-3, a word to YAML 1.1
 
 
 def read_config(args: argparse.Namespace) -> Config:
-    """Return the settings: --config, then --set over it, then --turns, --seed and --threads."""
+    """Return the settings: --config, then --set over it, then the flags of their own."""
     path: Path | None = getattr(args, 'config', None)
     config = Config() if path is None else Config.from_mapping(_read_yaml(path))
     changes = parse_settings(getattr(args, 'set', []))

@@ -17,6 +17,7 @@ from dashcalib_ros.motion.epipoles import Floats, epipoles_of, turning
 from dashcalib_ros.motion.mask import EgoMask
 from dashcalib_ros.motion.motion import Motion
 from dashcalib_ros.motion.points import Mask, Points, find_corners
+from dashcalib_ros.motion.segmentation import SegmentationMask, open_segmentation
 
 # s between a triplet's images. Rotation adds up over it and vibration does not; further apart too
 # few points survive a sharp turn. Correlation with kitti03's yaw rate: 0.95, 0.97, 0.98 for 0.1,
@@ -57,13 +58,18 @@ class MotionEstimator:
     _ids: npt.NDArray[np.int64]
     _xy: Points
     _ego: EgoMask | None = None
+    _segmented: SegmentationMask | None = None
     _valid: Mask | None = None
 
     def __init__(self, config: MotionConfig, mask: MaskConfig | None = None,
                  valid: Mask | None = None) -> None:
-        """valid: (height, width) of the full image, False where the user masks; None: nowhere."""
+        """valid: (height, width) of the full image, False where the user masks; None: nowhere.
+
+        Raises ConfigError for a segmentation model that cannot be used.
+        """
         self.config = config
         self.mask_config = mask or MaskConfig()
+        self._model = open_segmentation(self.mask_config)
         self._user = valid
         self._period_ns = 1e9 / config.rate
         self._shape: tuple[int, int] | None = None
@@ -92,8 +98,10 @@ class MotionEstimator:
             whole = _median_shift(*_common(first, now))
             standing |= whole < min(JITTER * self.config.standing_px, NOWHERE * moved)
         magnitude = 0.0 if standing else self._magnitude(first, middle)
-        if self._ego is not None and middle is not None and not standing:
+        if middle is not None and not standing:
             self._look_for_ego(image, middle, now)
+            if self._segmented is not None and self._segmented.push(frame.image, frame.stamp_ns):
+                self._exclude(self.valid())
         self._replenish(image)
         self._last = image
         return Motion(
@@ -104,14 +112,23 @@ class MotionEstimator:
     def valid(self) -> Mask | None:
         """Return (height, width) of the full image: False where vehicle or user's mask hide it.
 
+        The vehicle is what stays in the picture, and what the segmentation model takes for it.
         None while nothing is known to be hidden.
         """
-        if self._shape is None or self._ego is None:
-            return self._user
-        hidden = self._ego.hidden(self._shape, self._factor)
-        if hidden is None:
-            return self._user
-        return ~hidden if self._user is None else self._user & ~hidden
+        valid = self._user
+        if self._shape is None:
+            return valid
+        found = [self._ego.hidden(self._shape, self._factor) if self._ego else None,
+                 self._segmented.hidden(self._shape) if self._segmented else None]
+        for hidden in found:
+            if hidden is not None:
+                valid = ~hidden if valid is None else valid & ~hidden
+        return valid
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what the user should know of the masks, one line each."""
+        warning = self._segmented and self._segmented.warning()
+        return (warning,) if warning else ()
 
     def _reset(self) -> None:
         """Forget the points: the next image does not continue the last."""
@@ -136,6 +153,7 @@ class MotionEstimator:
         # smaller pictures have no room for cells
         if self.mask_config.enabled and min(self._size) >= 4 * self.mask_config.cell:
             self._ego = EgoMask(self.mask_config, self._size)
+        self._segmented = SegmentationMask(self._model) if self._model else None
         self._ego_ns = self._masked_ns = -math.inf
         self._exclude(self._user)
 
@@ -147,9 +165,9 @@ class MotionEstimator:
             self._valid = small > 0
 
     def _look_for_ego(self, image: GreyImage, middle: _Seen, now: _Seen) -> None:
-        assert self._ego is not None
         epipoles = self._pairs.get((middle.index, now.index))
-        if epipoles is None or abs(now.stamp_ns - self._ego_ns) < 0.9e9 * SPACING:
+        early = abs(now.stamp_ns - self._ego_ns) < 0.9e9 * SPACING
+        if self._ego is None or epipoles is None or early:
             return
         self._ego_ns = now.stamp_ns
         self._ego.push(image, *_common(middle, now), epipoles)
