@@ -1,8 +1,9 @@
 """A child process that does the heavy calls: COLMAP aborts its process when a check fails.
 
 The parent sends (function, arguments) and receives progress, then a result or an exception,
-pickled over pipes. The child is a plain `python -c`, not multiprocessing: a child that the latter
-spawns would import the user's main script again.
+pickled over pipes; arrays go beside the pickle, so that a turn's images are not copied to be sent.
+The child is a plain `python -c`, not multiprocessing: a child that the latter spawns would import
+the user's main script again.
 """
 from __future__ import annotations
 
@@ -31,6 +32,7 @@ THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'
 LOW_PRIORITY = 10
 
 Progress = Callable[[str, float], None]
+Parts = list[Any]
 
 
 class ChildDiedError(WorkerError):
@@ -64,7 +66,7 @@ class Child:
         Raises what the function raises, and ChildDiedError if the child ends before it answers.
         """
         # what cannot be sent fails here, before anything is on its way
-        request = pickle.dumps((function, arguments, progress is not None), PROTOCOL)
+        request = _packed((function, arguments, progress is not None))
         process = self._running()
         try:
             kind, value = self._answer(process, request, progress)
@@ -76,7 +78,7 @@ class Child:
             raise value
         return value
 
-    def _answer(self, process: subprocess.Popen[bytes], request: bytes,
+    def _answer(self, process: subprocess.Popen[bytes], request: Parts,
                 progress: Progress | None) -> tuple[str, Any]:
         assert process.stdin is not None and process.stdout is not None
         try:
@@ -143,28 +145,43 @@ class Child:
                               f'check memory and process limits (ulimit -u)') from error
 
 
-def _send(pipe: BinaryIO | Any, message: object) -> None:
-    _write(pipe, pickle.dumps(message, PROTOCOL))
+def _packed(message: object) -> Parts:
+    """Return the pickle, and the arrays that it leaves out: views, no copies."""
+    buffers: list[pickle.PickleBuffer] = []
+    head = pickle.dumps(message, PROTOCOL, buffer_callback=buffers.append)
+    return [head, *(buffer.raw() for buffer in buffers)]
 
 
-def _write(pipe: BinaryIO | Any, data: bytes) -> None:
-    pipe.write(HEADER.pack(len(data)))
-    pipe.write(data)
+def _unpacked(parts: Parts) -> Any:
+    return pickle.loads(parts[0], buffers=parts[1:])
+
+
+def _write(pipe: BinaryIO | Any, parts: Parts) -> None:
+    pipe.write(HEADER.pack(len(parts)))
+    for part in parts:
+        pipe.write(HEADER.pack(len(part)))
+        pipe.write(part)
     pipe.flush()
 
 
 def _receive(pipe: BinaryIO | Any) -> Any:
-    return pickle.loads(_read(pipe))
+    return _unpacked(_read(pipe))
 
 
-def _read(pipe: BinaryIO | Any) -> bytes:
-    header = pipe.read(HEADER.size)
-    if len(header) < HEADER.size:
-        raise EOFError
-    (length,) = HEADER.unpack(header)
-    data: bytes = pipe.read(length)
-    if len(data) < length:
-        raise EOFError
+def _read(pipe: BinaryIO | Any) -> Parts:
+    (count,) = HEADER.unpack(_filled(pipe, HEADER.size))
+    return [_filled(pipe, *HEADER.unpack(_filled(pipe, HEADER.size))) for _ in range(count)]
+
+
+def _filled(pipe: BinaryIO | Any, length: int) -> bytearray:
+    """Read so many bytes: they can be written to, as the arrays made of them."""
+    data = bytearray(length)
+    view, read = memoryview(data), 0
+    while read < length:
+        got = pipe.readinto(view[read:])
+        if not got:
+            raise EOFError
+        read += got
     return data
 
 
@@ -199,17 +216,18 @@ def main() -> None:
     cv2.setNumThreads(1)
 
     def report(stage: str, done: float) -> None:
-        _send(answers, ('progress', (stage, done)))
+        _write(answers, _packed(('progress', (stage, done))))
 
-    while True:
-        try:
-            request = _read(requests)
-        except EOFError:
-            return
-        try:
-            function, arguments, wants_progress = pickle.loads(request)
-            extra = {'progress': report} if wants_progress else {}
-            answer = pickle.dumps(('result', function(*arguments, **extra)), PROTOCOL)
-        except Exception as error:
-            answer = pickle.dumps(('error', _portable(error)), PROTOCOL)
-        _write(answers, answer)
+    with contextlib.suppress(EOFError):
+        while True:
+            # nothing of a call is kept for the time until the next
+            _write(answers, _answered(_read(requests), report))
+
+
+def _answered(request: Parts, report: Progress) -> Parts:
+    try:
+        function, arguments, wants_progress = _unpacked(request)
+        extra = {'progress': report} if wants_progress else {}
+        return _packed(('result', function(*arguments, **extra)))
+    except Exception as error:
+        return _packed(('error', _portable(error)))

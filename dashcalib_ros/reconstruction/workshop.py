@@ -1,9 +1,9 @@
 """Turns are made into scenes side by side, in child processes, while the drive goes on."""
 from __future__ import annotations
 
-import queue
 import threading
 from collections.abc import Callable, Set
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,22 +21,40 @@ ATTEMPTS = 3
 BACK_OFF_S = 1.0
 
 
+@dataclass(frozen=True)
+class _Job:
+    """A turn to be built, and where its pictures show no ego vehicle (None: everywhere)."""
+
+    turn: Turn
+    valid: Mask | None
+
+
 class Workshop:
     """Builds scenes in the background. All methods may be called from any thread.
 
-    A turn stays in the queue until its scene is there: a child that dies loses nothing.
+    The most prominent turn is built first. A turn stays until its scene is there: a child that
+    dies loses nothing.
     """
 
-    def __init__(self, config: Config, low_priority: bool = False, verbose: bool = False) -> None:
+    def __init__(self, config: Config, low_priority: bool = False, verbose: bool = False,
+                 queue: int | None = None, on_built: Callable[[], None] = lambda: None) -> None:
+        """queue: how many turns may wait for a child, with their images; None: any number.
+
+        With more, the least prominent of them counts as one without a scene.
+        on_built: called from a thread of the workshop whenever a turn is settled; raises nothing.
+        """
         self._config = config
+        self._queue = queue
+        self._on_built = on_built
         self._children = [Child(low_priority, verbose) for _ in range(config.threads)]
-        self._jobs: queue.SimpleQueue[tuple[Turn, Mask | None] | None] = queue.SimpleQueue()
+        # by the turn's centre; those that a child has begun are in none of the two
+        self._jobs: dict[int, _Job] = {}
+        self._failed: dict[int, _Job] = {}
         self._threads: list[threading.Thread] = []
         self._changed = threading.Condition()
         self._scenes: dict[int, Scene | None] = {}
         self._waiting: set[int] = set()
         self._error: Exception | None = None
-        self._failed: list[tuple[Turn, Mask | None]] = []
         self._changes = 0
         self._closed = False
         self._ended = threading.Event()
@@ -53,12 +71,21 @@ class Workshop:
                                  for child in self._children]
                 for thread in self._threads:
                     thread.start()
-            self._jobs.put((turn, valid))
+            self._jobs[turn.center] = _Job(turn, valid)
+            if self._queue is not None and len(self._jobs) > self._queue:
+                worst = min(self._jobs.values(), key=lambda job: job.turn.prominence)
+                self._jobs.pop(worst.turn.center)
+                self._settle(worst.turn.center, None)
+            self._changed.notify_all()
 
     def keep_only(self, centers: Set[int]) -> None:
         """Drop the scenes, and the wish for scenes, of all other turns."""
         with self._changed:
             self._waiting &= centers
+            # and their images with them
+            for jobs in (self._jobs, self._failed):
+                for center in jobs.keys() - centers:
+                    del jobs[center]
             self._scenes = {center: scene for center, scene in self._scenes.items()
                             if center in centers}
 
@@ -71,6 +98,11 @@ class Workshop:
     def waiting(self) -> int:
         """Return how many turns are not built yet."""
         return len(self._waiting)
+
+    def unbuilt(self) -> frozenset[int]:
+        """Return the centres of the turns that are not built yet."""
+        with self._changed:
+            return frozenset(self._waiting)
 
     def scenes(self) -> dict[int, Scene | None]:
         """Return what has been built, by the turn's centre; None where no scene came of it."""
@@ -88,9 +120,9 @@ class Workshop:
                 seen = self._changes
                 if self._error is not None:
                     error, self._error = self._error, None
-                    for job in self._failed:
-                        self._jobs.put(job)
+                    self._jobs.update(self._failed)
                     self._failed.clear()
+                    self._changed.notify_all()
                     raise error
                 if self._closed:
                     return
@@ -123,34 +155,46 @@ class Workshop:
             self._closed = True
             self._ended.set()
             self._changed.notify_all()
-        for _ in self._threads:
-            self._jobs.put(None)
         for child in (*self._children, self._solver):
             child.close()
         for thread in self._threads:
             thread.join(timeout=5)
 
     def _work(self, child: Child) -> None:
-        while (job := self._jobs.get()) is not None and not self._closed:
-            turn, valid = job
-            if turn.center not in self._waiting:
-                continue
-            scene, error = self._built(child, turn, valid)
-            with self._changed:
+        # a thread that waits must not hold the images of the turn before
+        while self._begin_next(child):
+            self._on_built()
+
+    def _begin_next(self, child: Child) -> bool:
+        """Build the next turn; False when closed."""
+        with self._changed:
+            while not self._jobs and not self._closed:
+                self._changed.wait()
+            if self._closed:
+                return False
+            job = max(self._jobs.values(), key=lambda job: job.turn.prominence)
+            del self._jobs[job.turn.center]
+        scene, error = self._built(child, job)
+        with self._changed:
+            # it may have left the bank meanwhile
+            if job.turn.center in self._waiting:
                 if error is not None:
                     self._error = error
-                    self._failed.append(job)
-                elif turn.center in self._waiting:
-                    self._waiting.remove(turn.center)
-                    self._scenes[turn.center] = scene
-                self._changes += 1
-                self._changed.notify_all()
+                    self._failed[job.turn.center] = job
+                else:
+                    self._settle(job.turn.center, scene)
+            self._changes += 1
+            self._changed.notify_all()
+        return True
 
-    def _built(self, child: Child, turn: Turn, valid: Mask | None
-               ) -> tuple[Scene | None, Exception | None]:
+    def _settle(self, center: int, scene: Scene | None) -> None:
+        self._waiting.discard(center)
+        self._scenes[center] = scene
+
+    def _built(self, child: Child, job: _Job) -> tuple[Scene | None, Exception | None]:
         for attempt in range(ATTEMPTS):
             try:
-                return child.call(build_turn, turn, self._config, valid), None
+                return child.call(build_turn, job.turn, self._config, job.valid), None
             except ChildDiedError:
                 if self._closed or attempt == ATTEMPTS - 1:
                     break
@@ -158,7 +202,7 @@ class Workshop:
             except DashcalibError as error:
                 return None, error
             except Exception as error:
-                return None, WorkerError(f'reconstruction of the turn at frame {turn.center} '
+                return None, WorkerError(f'reconstruction of the turn at frame {job.turn.center} '
                                          f'failed: {type(error).__name__}: {error}')
         # a turn that kills the child every time is no evidence; the others still are
         return None, None
