@@ -28,6 +28,7 @@ from measure import (
     calibrate,
     commit,
     complain,
+    done,
     error_cells,
     isolated,
     load,
@@ -143,7 +144,7 @@ def main() -> None:
             for number, (name, seed) in enumerate(jobs, 1):
                 seed = 0 if name in RECORDED else seed
                 key = f'{name}, seed {seed}'
-                if key in rows and not arguments.again:
+                if done(rows.get(key)) and not arguments.again:
                     continue
                 if name in RECORDED:
                     row = run_recorded(name, arguments.data)

@@ -172,6 +172,11 @@ def load(path: Path) -> dict[str, Any]:
     return dict(json.loads(path.read_text())) if path.exists() else {}
 
 
+def done(row: Mapping[str, Any] | None) -> bool:
+    """Return whether a row needs not be measured again; one that failed is tried anew."""
+    return row is not None and row.get('verdict') != 'failed'
+
+
 def save(path: Path, data: Mapping[str, Any]) -> None:
     """Write results; an interrupted run leaves the former file or the new one, whole."""
     path.parent.mkdir(parents=True, exist_ok=True)

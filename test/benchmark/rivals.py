@@ -29,6 +29,7 @@ from drives import BY_NAME, DEMO, KITTI_RAW, NARROW, STREET, Setting, drive_of, 
 from measure import (
     commit,
     complain,
+    done,
     error_cells,
     errors,
     isolated,
@@ -177,7 +178,8 @@ def _colmap(task: Task, windows: Sequence[Turn]) -> dict[str, Any]:
 def run(rival: str, task: Task) -> dict[str, Any]:
     """Run one rival in a process of its own."""
     outcome = isolated(RIVALS[rival], task, limit_s=task.limit_s)
-    row = outcome.value or {'seconds': outcome.seconds, 'reasons': [outcome.failure]}
+    row = outcome.value or {'seconds': outcome.seconds, 'reasons': [outcome.failure],
+                            'verdict': 'failed'}
     return {'rival': rival, 'matcher': task.matcher, **row, 'peak_mb': round(outcome.peak_mb),
             'commit': commit()}
 
@@ -243,7 +245,7 @@ def main() -> None:
                     key = f'{name}, seed {seed}, {arguments.turns} turns, {rival}'
                     if 'COLMAP' in rival:
                         key += f', {arguments.matcher}'
-                    if key in rows and not arguments.again:
+                    if done(rows.get(key)) and not arguments.again:
                         continue
                     task = task or _task(name, seed, arguments, Path(passing))
                     complain(key)

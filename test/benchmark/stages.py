@@ -37,10 +37,11 @@ class Detected:
     seconds: float
 
 
-class GivenTurns:
-    """Stands in for the TurnDetector of a drive that is over."""
+class GivenTurns(TurnDetector):
+    """A TurnDetector of a drive that is over; all else it does to its empty bank."""
 
-    def __init__(self, turns: Sequence[Turn]) -> None:
+    def __init__(self, config: Config, turns: Sequence[Turn]) -> None:
+        super().__init__(config.turns)
         self._turns = list(turns)
 
     def turns(self) -> tuple[Turn, ...]:
@@ -85,7 +86,7 @@ def given(detected: Detected, turns: Sequence[Turn], config: Config) -> Iterator
     """Give a Calibrator that has found these turns, and reconstructed none of them yet."""
     with Calibrator(config) as calibrator:
         calibrator._motion = detected.motion
-        calibrator._detector = GivenTurns(turns)  # type: ignore[assignment]
+        calibrator._detector = GivenTurns(config, turns)
         calibrator._size = detected.size
         calibrator._frames = detected.count
         yield calibrator
