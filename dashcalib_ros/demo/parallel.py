@@ -3,10 +3,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import threading
 from collections import deque
 from collections.abc import Iterator
+from contextlib import contextmanager
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.synchronize import Event
 from typing import TYPE_CHECKING, Literal
 
 import cv2
@@ -33,11 +37,13 @@ def render_parallel(lens: Lens, spec: DriveSpec, first: int, last: int,
     Raises WorkerError when a worker dies.
     """
     context = multiprocessing.get_context('spawn')
-    pool = ProcessPoolExecutor(processes, context, _start, (lens, spec))
+    stop = context.Event()
+    pool = ProcessPoolExecutor(processes, context, _start, (lens, spec, stop))
     pending: deque[Future[list[Frame]]] = deque()
     try:
         for start in range(first, last, CHUNK):
-            pending.append(pool.submit(_render, start, min(start + CHUNK, last)))
+            with _deaf():
+                pending.append(pool.submit(_render, start, min(start + CHUNK, last)))
             if len(pending) > 3 * processes:
                 yield from pending.popleft().result()
         while pending:
@@ -46,6 +52,8 @@ def render_parallel(lens: Lens, spec: DriveSpec, first: int, last: int,
         raise WorkerError('a process that rendered died: free some memory, or use fewer '
                           'processes') from error
     finally:
+        # whoever breaks off does not wait for what nobody will see
+        stop.set()
         pool.shutdown(wait=True, cancel_futures=True)
 
 
@@ -62,9 +70,25 @@ def render_to_bag(drive: Drive, path: str | os.PathLike[str], processes: int = 2
             writer.write(frame)
 
 
-def _start(lens: Lens, spec: DriveSpec) -> None:
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Have workers that start here not hear Ctrl-C: it is this process that ends them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_on(stop: Event) -> None:
+    stop.wait()
+    os._exit(1)
+
+
+def _start(lens: Lens, spec: DriveSpec, stop: Event) -> None:
     """Prepare a worker."""
     global _drive
+    threading.Thread(target=_end_on, args=(stop,), daemon=True).start()
     from dashcalib_ros.demo.drive import Drive
     cv2.setNumThreads(1)
     _drive = Drive(lens, spec)
