@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import child_tasks
@@ -324,6 +325,47 @@ def test_scenes_of_turns_that_left_are_dropped(workshop, monkeypatch, tmp_path):
     assert workshop.waiting == 0
     workshop.reject(50)
     assert workshop.scenes() == {50: None}
+
+
+def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_slowly)
+    settled = threading.Semaphore(0)
+    workshop = Workshop(Config().replace({'threads': 1}), queue=2, on_built=settled.release)
+    try:
+        workshop.submit(turn(10, tmp_path / 'flag'), None)
+        wait_for((tmp_path / 'flag.10').exists)
+        use(monkeypatch, child_tasks.build)
+        for center, prominence in ((20, 0.02), (30, 0.03), (40, 0.01), (50, 0.04)):
+            workshop.submit(replace(turn(center), prominence=prominence), None)
+        # one is being built, two wait with their images
+        assert set(workshop._jobs) == {30, 50} and workshop.unbuilt() == {10, 30, 50}
+        assert workshop.scenes() == {20: None, 40: None}
+        workshop.keep_only({20, 30, 40, 50})
+        os.kill(int((tmp_path / 'flag.10').read_text()), signal.SIGKILL)
+        wait_until_built(workshop)
+        assert list(workshop.scenes().items())[2:] == [(50, 'scene of 50'), (30, 'scene of 30')]
+        for _ in (10, 50, 30):
+            assert settled.acquire(timeout=LIMIT_S)
+        workshop.submit(turn(60), None)
+        workshop.keep_only(set())
+        assert not workshop._jobs and workshop.waiting == 0
+    finally:
+        workshop.close()
+
+
+def test_what_failed_is_not_kept_for_a_turn_that_left(workshop, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_fails_at_first)
+    workshop.submit(turn(10, tmp_path / 'flag'), None)
+    wait_for(lambda: workshop._failed)
+    workshop.keep_only(set())
+    assert not workshop._failed and workshop.waiting == 0
+
+
+def test_arrays_travel_beside_the_pickle_and_can_be_written_to(child):
+    arrays = [np.arange(6.0).reshape(2, 3), np.zeros((0, 3)), np.arange(9)[::2],
+              np.asfortranarray(np.eye(3))]
+    for sent, back in zip(arrays, child.call(child_tasks.echo, arrays), strict=True):
+        assert np.array_equal(sent, back) and sent.shape == back.shape and back.flags.writeable
 
 
 def test_the_condition_may_take_a_lock_that_a_submitter_holds(workshop, monkeypatch):

@@ -206,6 +206,21 @@ def test_release_drops_the_frames_and_keeps_the_turn():
     assert second.first == turn.last + 1 and second.frames[0].index == second.first
 
 
+def test_a_turn_that_is_fixed_is_as_one_that_is_released_but_has_its_frames():
+    """So a drive gives the same turns whether or not their images are handed over."""
+    turns = {}
+    for choose in ('fix', 'release'):
+        stream = Stream().feed(quiet(10)).feed(hump(3, 0.03)).feed(quiet(1.7))
+        turn, = stream.detector.turns()
+        getattr(stream.detector, choose)(turn.center)
+        stream.feed(hump(4, 0.06)).feed(quiet(10))
+        turns[choose] = stream.finish()
+    outlines = [[(turn.center, turn.first, turn.last, turn.images) for turn in each]
+                for each in turns.values()]
+    assert outlines[0] == outlines[1] and len(outlines[0]) == 2
+    assert all(turn.frames for turn in turns['fix'])
+
+
 def test_gap_and_clock_set_back_end_a_turn():
     for jump in (10_000_000_000, -20_000_000_000):
         stream = Stream().feed(quiet(10)).feed(hump(6, 0.05)[:35])

@@ -173,7 +173,7 @@ def _read(pipe: BinaryIO | Any) -> Parts:
     return [_filled(pipe, *HEADER.unpack(_filled(pipe, HEADER.size))) for _ in range(count)]
 
 
-def _filled(pipe: BinaryIO | Any, length: int) -> bytearray:
+def _filled(pipe: Any, length: int) -> bytearray:
     """Read so many bytes: they can be written to, as the arrays made of them."""
     data = bytearray(length)
     view, read = memoryview(data), 0

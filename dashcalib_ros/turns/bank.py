@@ -33,6 +33,7 @@ class _Candidate:
 class _Kept:
     """A turn in the bank, made of one peak or several; first_ns, last_ns: its frames' stamps.
 
+    fixed: its frames are chosen; what overlaps it gives way or is trimmed.
     height: of its highest peak. It tells which of two turns that overlap is the stronger: the
     height is final, while a prominence can still grow when that is decided.
     """
@@ -41,7 +42,7 @@ class _Kept:
     height: float
     first_ns: int
     last_ns: int
-    released: bool = False
+    fixed: bool = False
     peaks: set[int] = field(default_factory=set)
 
 
@@ -128,13 +129,19 @@ class TurnBank:
         present = self.turns()
         return [turn for turn in changed if turn in present]
 
+    def fix(self, center: int) -> None:
+        """Change the frames of the turn at this centre no more."""
+        for kept in self._kept:
+            if kept.turn.center == center:
+                kept.fixed = True
+
     def release(self, center: int) -> None:
         """Drop the frames of the turn at this centre; the turn stays, and does not change."""
+        self.fix(center)
         for kept in self._kept:
             if kept.turn.center == center:
                 kept.turn = dataclasses.replace(
                     kept.turn, frames=(), released_images=kept.turn.images)
-                kept.released = True
 
     def _enter(self, candidate: _Candidate) -> list[Turn]:
         """Put a turn into the bank; turns that overlap it are merged, trimmed or dropped."""
@@ -150,12 +157,12 @@ class TurnBank:
             if not _overlap(new.turn, other.turn):
                 continue
             span = max(new.last_ns, other.last_ns) - min(new.first_ns, other.first_ns)
-            if not other.released and span <= LONGEST * self._half_ns + ROUNDING:
+            if not other.fixed and span <= LONGEST * self._half_ns + ROUNDING:
                 self._kept.remove(other)
                 new = _merge(new, other)
                 continue
             wins = new.height > other.height
-            if other.released or not wins:
+            if other.fixed or not wins:
                 trimmed = _trim(new, other.turn)
                 if trimmed is not None:
                     new = trimmed

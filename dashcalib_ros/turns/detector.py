@@ -68,8 +68,12 @@ class TurnDetector:
         """Return the turns found so far, best first."""
         return self.bank.turns()
 
+    def fix(self, center: int) -> None:
+        """Choose a turn's frames for good: turns that overlap it are not merged with it."""
+        self.bank.fix(center)
+
     def release(self, center: int) -> None:
-        """Drop a turn's frames, once its scene is made."""
+        """Drop a turn's frames, once they are handed over; they are chosen for good, too."""
         self.bank.release(center)
 
     def magnitudes(self) -> npt.NDArray[np.float64]:
