@@ -15,9 +15,11 @@ from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.frames.shrink import shrink, shrink_factor, shrink_mask
 from dashcalib_ros.intrinsics import Calibration
+from dashcalib_ros.intrinsics.calibration import StoredTurnSummary
 from dashcalib_ros.intrinsics.conclude import Evidence, conclude
 from dashcalib_ros.intrinsics.solve import solve_scenes
 from dashcalib_ros.motion import MotionEstimator
+from dashcalib_ros.reconstruction.archive import Archive, Origin, StoredTurn
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.reconstruction.workshop import Workshop
 from dashcalib_ros.turns import Turn, TurnDetector
@@ -30,8 +32,9 @@ Progress = Callable[[str, float], None]
 class Status:
     """Where the calibrator stands after a frame.
 
-    frames: pushed so far. turns: in the bank. built: how many scenes a calibration would use now,
-    at the most those wanted; centers: of their turns. yaw_deg: their sum.
+    frames: pushed so far. turns: in the bank and stored. built: how many scenes a calibration
+    would use now, at the most those wanted; centers: of their turns, stored ones have negative
+    numbers. yaw_deg: their sum. stored: how many turns are of earlier drives.
     magnitude: the newest filtered turning magnitude, of the image width.
     """
 
@@ -42,6 +45,7 @@ class Status:
     magnitude: float
     standing: bool
     centers: tuple[int, ...] = ()
+    stored: int = 0
 
 
 class Calibrator:
@@ -53,11 +57,14 @@ class Calibrator:
     """
 
     def __init__(self, config: Config | None = None, mask: Mask | None = None,
-                 verbose: bool = False, live: bool = False) -> None:
+                 verbose: bool = False, live: bool = False, use_stored: bool = True,
+                 warn: Callable[[str], None] = lambda text: None) -> None:
         """mask: (h, w), False where the ego vehicle is.
 
         live: children run at low priority, and push() never waits for them; offline it does, so
-        that few turns are in memory at a time.
+        that few turns are in memory at a time. use_stored: False begins without the turns in
+        turns.store, and adds to them. warn: told of each trouble with turns.store, one line, from
+        any thread; the result's warnings have them, too.
         """
         self._config = config or Config()
         self._live = live
@@ -67,9 +74,14 @@ class Calibrator:
         self._motion = MotionEstimator(self._config.motion, self._config.mask, mask)
         # a turn without a scene needs another to give way to, and --turns may ask for many
         turns = self._config.turns
-        self._detector = TurnDetector(
-            replace(turns, capacity=max(turns.capacity, turns.wanted)))
-        self._workshop = Workshop(self._config, low_priority=live, verbose=verbose)
+        capacity = max(turns.capacity, turns.wanted)
+        self._detector = TurnDetector(replace(turns, capacity=capacity))
+        self._workshop = Workshop(self._config, low_priority=live, verbose=verbose,
+                                  queue=turns.wanted if live else None, on_built=self._store_turns)
+        self._archive = Archive(turns.store, capacity, turns.half_width, self._on_trouble)
+        self._use_stored = use_stored
+        self._warnings: list[str] = []
+        self._warn = warn
         self._lock = threading.Lock()
         self._size: tuple[int, int] | None = None
         self._frames = 0
@@ -84,6 +96,9 @@ class Calibrator:
         with self._lock:
             if self._size is None:
                 self._size = frame.size
+                self._archive.load(Origin(
+                    frame.size, shrink_factor(frame.size, self._config.max_width),
+                    frame.frame_id), self._use_stored)
             elif frame.size != self._size:
                 raise InputError(
                     f'the image size changes from {self._size[0]}x{self._size[1]} to '
@@ -114,14 +129,17 @@ class Calibrator:
             self._submit()
         started = time.monotonic()
         tell('reconstructing turns', 0.0)
-        scenes = self._wanted_scenes(tell)
+        # what is told of turns that are not used must not depend on who is first
+        scenes, stored = self._wanted_scenes(tell, everything=final or not self._live)
         solution = None
+        used: set[int] = set()
         if scenes:
             solution = self._workshop.run(solve_scenes, scenes, self._config, progress=tell)
             used = {scene.center for scene in solution.scenes} if solution else set()
             for scene in scenes:
                 if scene.center not in used:
-                    self._workshop.reject(scene.center)
+                    self._reject(scene.center)
+            self._store_turns()
         ended = time.monotonic()
         with self._lock:
             evidence = Evidence(
@@ -131,8 +149,9 @@ class Calibrator:
                 shrink=shrink_factor(self._size or (1, 1), self._config.max_width),
                 timing={'detect': self._detect_s, 'calibrate': ended - started,
                         'total': ended - self._started})
-            warnings = self._motion.warnings()
-        return replace(conclude(solution, evidence, self._config), warnings=warnings)
+            warnings = (*self._motion.warnings(), *self._warnings)
+        return replace(conclude(solution, evidence, self._config), warnings=warnings,
+                       stored_turns=tuple(_summary(turn, used) for turn in stored.values()))
 
     def turns(self) -> tuple[Turn, ...]:
         """Return the bank's turns, the most prominent first."""
@@ -146,14 +165,22 @@ class Calibrator:
 
     def status(self) -> Status:
         """Return where the calibrator stands."""
-        scenes = self._workshop.scenes()
         with self._lock:
-            # as calibrate() chooses: a turn without a scene gives way to the next
-            built = [scene for turn in self._detector.turns()
-                     if (scene := scenes.get(turn.center)) is not None][:self._config.turns.wanted]
-            return Status(self._frames, len(self._detector.turns()), len(built),
+            built = self._built()[:self._config.turns.wanted]
+            stored = len(self._archive.turns)
+            return Status(self._frames, len(self._detector.turns()) + stored, len(built),
                           sum(scene.yaw_deg for scene in built), self._detector.magnitude,
-                          self._standing, tuple(scene.center for scene in built))
+                          self._standing, tuple(scene.center for scene in built), stored)
+
+    def forget_stored(self) -> None:
+        """Drop the turns of earlier drives, on disk too: the camera is not what it was."""
+        with self._lock:
+            self._archive.turns.clear()
+        self._store_turns()
+
+    def clear_store(self) -> None:
+        """Remove all turns of this calibrator from turns.store; it stores no others."""
+        self._archive.clear()
 
     def child_pids(self) -> list[int]:
         """Return the process ids of the children that run now."""
@@ -171,45 +198,103 @@ class Calibrator:
                  trace: TracebackType | None) -> None:
         self.close()
 
+    # of these, the first four need the lock
+
+    def _ranked(self) -> list[int]:
+        """Return all turns, the most prominent first: this drive's by their centres."""
+        found = [(-turn.prominence, turn.center) for turn in self._detector.turns()]
+        found += [(-turn.prominence, key) for key, turn in self._archive.turns.items()]
+        return [key for _, key in sorted(found)]
+
+    def _built(self) -> list[Scene]:
+        """Return the scenes there are, best first: a turn without one gives way to the next."""
+        scenes = {**self._workshop.scenes(),
+                  **{key: turn.scene for key, turn in self._archive.turns.items()}}
+        return [scene for key in self._ranked() if (scene := scenes.get(key)) is not None]
+
     def _submit(self, replace_failed: bool = False) -> None:
-        """Have the best turns built.
+        """Have the best turns built; live, all: a scene is a fiftieth of its images.
 
-        A turn's images are handed over when it is submitted, and not when it is built: what
-        becomes of turns that overlap it must not depend on how fast the children are. For the same
-        reason others are tried in the place of turns that gave no scene only when a calibration
-        is asked for (replace_failed).
+        A turn's images are chosen for good when it is confirmed, and not when it is built: what
+        becomes of turns that overlap it must depend neither on how fast the children are, nor on
+        whether the drive is live. For the same reason others are tried in the place of turns that
+        gave no scene only when a calibration is asked for (replace_failed).
         """
-        turns = self._detector.turns()
+        turns = {turn.center: turn for turn in self._detector.turns()}
+        self._archive.drop_repeated(turn.stamp_s for turn in turns.values())
         built = self._workshop.scenes()
-        self._workshop.keep_only({turn.center for turn in turns})
+        self._workshop.keep_only(set(turns))
         places = self._config.turns.wanted
-        for turn in turns:
-            if replace_failed and turn.center in built and built[turn.center] is None:
-                continue
-            if places == 0:
-                return
-            places -= 1
-            if turn.frames:
+        for key in self._ranked():
+            turn = turns.get(key)
+            if turn is not None and (places > 0 or self._live) and turn.frames:
                 self._workshop.submit(turn, self._motion.valid())
-                self._detector.release(turn.center)
+                self._detector.release(key)
+            elif turn is not None:
+                self._detector.fix(key)
+            if not (replace_failed and key in built and built[key] is None):
+                places -= 1
 
-    def _wanted_scenes(self, tell: Progress) -> list[Scene]:
-        """Return the scenes of the best turns; a turn without a scene gives way to the next."""
+    def _undecided(self) -> bool:
+        """Tell whether a turn that is not built yet may be among the best."""
+        unbuilt = self._workshop.unbuilt()
+        built = {scene.center for scene in self._built()}
+        candidates = [key for key in self._ranked() if key in unbuilt or key in built]
+        return any(key in unbuilt for key in candidates[:self._config.turns.wanted])
+
+    def _wanted_scenes(self, tell: Progress, everything: bool
+                       ) -> tuple[list[Scene], dict[int, StoredTurn]]:
+        """Return the scenes of the best turns, and the stored turns they were chosen among.
+
+        everything: wait for the scenes of the other turns, too.
+        """
         while True:
             total = max(self._workshop.waiting, 1)
 
-            def idle(total: int = total) -> bool:
-                tell('reconstructing turns', 1 - self._workshop.waiting / total)
-                return self._workshop.waiting == 0
+            def ready(total: int = total) -> bool:
+                waiting = self._workshop.waiting
+                tell('reconstructing turns', max(0.0, 1 - waiting / total))
+                if everything or not waiting:
+                    return waiting == 0
+                with self._lock:
+                    return not self._undecided()
 
-            self._workshop.wait(idle)
+            self._workshop.wait(ready)
             if self._closed:
                 raise WorkerError('the calibrator was closed while it calibrated')
             with self._lock:
+                # only now: what is submitted meanwhile must not depend on the children's speed
+                own = [scene for scene in self._workshop.scenes().values() if scene is not None]
+                self._archive.drop_repeated((), own)
                 self._submit(replace_failed=True)
-                if self._workshop.waiting:
-                    continue
+                if not self._undecided() and not (everything and self._workshop.waiting):
+                    return (self._built()[:self._config.turns.wanted],
+                            self._archive.turns.copy())
+
+    def _reject(self, key: int) -> None:
+        """Take out a scene that does not fit the others."""
+        with self._lock:
+            if self._archive.turns.pop(key, None) is None:
+                self._workshop.reject(key)
+
+    def _store_turns(self) -> None:
+        """Have turns.store hold the scenes there are; whoever calls must not have the lock."""
+        def snapshot() -> dict[int, StoredTurn]:
+            with self._lock:
                 built = self._workshop.scenes()
-                scenes = [scene for turn in self._detector.turns()
-                          if (scene := built.get(turn.center)) is not None]
-            return scenes[:self._config.turns.wanted]
+                own = {turn.center: StoredTurn(scene, turn.stamp_s, turn.prominence)
+                       for turn in self._detector.turns()
+                       if (scene := built.get(turn.center)) is not None}
+                return {**self._archive.turns, **own}
+
+        self._archive.mirror(snapshot)
+
+    def _on_trouble(self, text: str) -> None:
+        self._warnings.append(text)
+        self._warn(text)
+
+
+def _summary(turn: StoredTurn, used: set[int]) -> StoredTurnSummary:
+    scene = turn.scene
+    return StoredTurnSummary(scene.center, turn.stamp_s, turn.prominence, scene.yaw_deg,
+                             len(scene.tracks.frames), scene.center in used)

@@ -78,6 +78,9 @@ class TurnsConfig:
         "per frame 0.003 to 0.008, carnd's bends 0.004, rendered turns 0.02 to 0.06; a rendered "
         'straight street has no peak of 0.0015', 0.0, 1.0)
     capacity: int = setting(10, 'turns kept at the most: twice those wanted', 1, 50)
+    store: str = setting(
+        '', 'folder that keeps reconstructed turns, so that short trips add up; one for each '
+        'camera. Empty: turns are forgotten with the drive')
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,11 @@ import signal
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from synthetic import synthetic_turn
 
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.config import Config
@@ -17,6 +19,9 @@ from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.intrinsics import Calibration
+from dashcalib_ros.reconstruction.archive import Archive, Origin, StoredTurn
+from dashcalib_ros.reconstruction.camera import Camera
+from dashcalib_ros.reconstruction.scene import Scene
 
 LENS = Lens.of(640, 360, 80.0, -0.25, 0.06, offset=(6.0, -4.0))
 SPEC = DriveSpec(turns=(Turn(85.0), Turn(-80.0)), straight_m=20.0, lead_m=24.0, seed=3)
@@ -131,6 +136,8 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way(frames, resul
         assert calibrator.status().yaw_deg == pytest.approx(85.0, abs=8.0)
         for frame in frames[95:]:
             calibrator.push(frame)
+            # whatever waits, waits in the workshop, whose queue has an end
+            assert not any(turn.frames for turn in calibrator.turns())
         late = calibrator.calibrate()
         pids = calibrator.child_pids()
         assert pids and all(os.getpriority(os.PRIO_PROCESS, pid) >= 10 for pid in pids)
@@ -174,6 +181,75 @@ def test_more_turns_than_the_bank_would_hold():
     assert config.turns.capacity == 3
     with Calibrator(QUICK) as calibrator:
         assert calibrator._detector.config.capacity == QUICK.turns.capacity
+
+
+# drives that add up
+
+def later(frames: Iterable[Frame], seconds: float) -> list[Frame]:
+    return [replace(frame, index=frame.index - frames[0].index,
+                    stamp_ns=frame.stamp_ns + round(seconds * 1e9)) for frame in frames]
+
+
+def garbage(center: int = 0) -> Scene:
+    """Return a scene of the drive's camera that no lens explains."""
+    lens = Camera((640, 360), 390.0, 390.0, 325.0, 175.0, -0.2)
+    scene = synthetic_turn(lens, keyframes=12, tracks=120).scene(lens, center)
+    xy = np.random.default_rng(0).uniform((0, 0), (640, 360), scene.tracks.xy.shape)
+    xy[~scene.tracks.seen] = np.nan
+    return replace(scene, tracks=replace(scene.tracks, xy=xy))
+
+
+def test_two_short_drives_add_up(drive, frames, tmp_path):
+    folder = tmp_path / 'turns'
+    config = QUICK.replace({'turns.store': str(folder)})
+    archive = Archive(str(folder), 10, 3.0, pytest.fail)
+    archive.load(Origin((640, 360), 1))
+    archive.mirror(lambda: {0: StoredTurn(garbage(), 5.0, 0.9)})
+    assert len(list(folder.iterdir())) == 1
+
+    first = calibrated(frames[:95], config)
+    assert first.verdict.level == 'weak' and first.turns_used == 1
+    assert any('only 1 of at least 2 turns' in reason for reason in first.verdict.reasons)
+    # the joint adjustment rejects what does not fit, and it is gone from the disk
+    assert [turn.used for turn in first.stored_turns] == [False]
+    assert len(list(folder.iterdir())) == 1
+
+    half = later(frames[75:], 86400.0)
+    second = calibrated(half, config)
+    assert len(second.turns) == len(second.stored_turns) == 1 and second.turns_used == 2
+    assert not any('turns' in reason for reason in second.verdict.reasons), second.verdict
+    # the input's frames are counted by what is of this input alone
+    assert second.frames == len(half) and 0 <= second.turns[0].first
+    stored = second.stored_turns[0]
+    assert stored.used and stored.yaw_deg == pytest.approx(85.0, abs=8.0)
+    assert stored.stamp_s == pytest.approx(first.turns[0].stamp_s)
+    assert abs(second.intrinsics.fx / drive.truth.fx - 1) < 0.02
+    assert len(list(folder.iterdir())) == 2
+
+    # the same drive again is no new evidence
+    again = calibrated(half, config)
+    assert same(second, again) and again.stored_turns == second.stored_turns
+    assert len(list(folder.iterdir())) == 2
+
+
+def test_stored_turns_of_another_size_are_left_out_and_told(tmp_path):
+    config = QUICK.replace({'turns.store': str(tmp_path)})
+    archive = Archive(str(tmp_path), 10, 3.0, pytest.fail)
+    archive.load(Origin((640, 360), 1))
+    archive.mirror(lambda: {0: StoredTurn(garbage(), 5.0, 0.9)})
+    told: list[str] = []
+    with Calibrator(config, warn=told.append) as calibrator:
+        assert calibrator.push(pictures(1, 320, 180)[0]).turns == 0
+        result = calibrator.calibrate()
+    assert len(told) == 1 and result.warnings == tuple(told) and '640x360' in told[0]
+    assert result.stored_turns == () and len(list(tmp_path.iterdir())) == 1
+    # of this size they count as turns, until they are forgotten
+    with Calibrator(config, live=True) as calibrator:
+        status = calibrator.push(pictures(1, 640, 360)[0])
+        assert (status.turns, status.built, status.stored, status.centers) == (1, 1, 1, (-1,))
+        assert status.yaw_deg == pytest.approx(80.0, abs=8.0)
+        calibrator.forget_stored()
+        assert calibrator.status().turns == 0 and list(tmp_path.iterdir()) == []
 
 
 # drives that cannot calibrate

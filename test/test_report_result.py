@@ -11,7 +11,9 @@ import pytest
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.intrinsics import Calibration, Intrinsics, TurnSummary, Verdict
+from dashcalib_ros.intrinsics.calibration import StoredTurnSummary
 from dashcalib_ros.report import load_result, result_dict, result_json
+from dashcalib_ros.report.page import report_html
 
 TRUTH = Intrinsics(721.5377, 724.25, 609.5593, 172.854, -0.363, 0.151)
 SIGMA = Intrinsics(3.5, 3.75, 2.0, 2.25, 0.004, 0.003)
@@ -35,6 +37,17 @@ def make_calibration(level='accepted', **changes):
         versions={'pycolmap': '4.2.1'}, config=Config(seed=7), input_name='drive.mcap',
         magnitudes=np.column_stack([stamps, magnitude]), mask=mask)
     return dataclasses.replace(calibration, **changes)
+
+
+def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
+    stored = StoredTurnSummary(-1, 1.7e9, 0.05, 88.0, 20, True)
+    calibration = make_calibration(stored_turns=(stored,))
+    result = strict(result_json(calibration))
+    assert result['stored_turns'] == [{
+        'stamp': 1.7e9, 'prominence': 0.05, 'yaw_deg': 88.0, 'images': 20, 'used': True}]
+    assert len(result['turns']) == 2 and calibration.turns_used == 2
+    assert '1 of 1 stored turn used' in report_html(calibration)
+    assert result_dict(make_calibration())['stored_turns'] == []
 
 
 def strict(text):

@@ -21,7 +21,8 @@ COLUMNS = ('frame', 'from', 'to', 'at s', 'prominence', 'images')
 
 def turns(args: argparse.Namespace) -> int:
     """List the turns found, best first. None found is an answer too: exit code 0."""
-    config = read_config(args)
+    # detection only: no earlier drive's turns beside these, and none of these kept
+    config = read_config(args).replace({'turns.store': ''})
     mask = None if args.mask is None else read_mask(args.mask)
     source = open_frames(args.input, topic=args.topic, fps=args.fps)
     with open_calibrator(config, mask, args.verbose) as calibrator:

@@ -16,11 +16,13 @@ class Frame:
     index: position among the input's frames, counted from 0.
     stamp_ns: time of exposure in nanoseconds (the message header's stamp, or index / rate).
     image: (height, width) uint8, grey. Never written to after the Frame is made.
+    frame_id: the message header's; empty where nobody knows.
     """
 
     index: int
     stamp_ns: int
     image: GreyImage
+    frame_id: str = ''
 
     @property
     def size(self) -> tuple[int, int]:

@@ -55,9 +55,22 @@ class TurnSummary:
 
 
 @dataclass(frozen=True)
+class StoredTurnSummary:
+    """What became of a turn of an earlier drive. key: its negative number in this run."""
+
+    key: int
+    stamp_s: float
+    prominence: float
+    yaw_deg: float
+    images: int
+    used: bool
+
+
+@dataclass(frozen=True)
 class Calibration:
     """The whole result. intrinsics and sigma are None when the verdict is refused.
 
+    turns: of this drive; stored_turns: of earlier ones, see config turns.store.
     timing: seconds, keys detect, calibrate, total. versions: package name -> version.
     magnitudes: (n, 2) float64, columns stamp [s] and filtered turning magnitude [of the width].
     mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
@@ -78,3 +91,10 @@ class Calibration:
     magnitudes: npt.NDArray[np.float64] | None = None
     mask: npt.NDArray[np.bool_] | None = None
     details: dict[str, Any] = field(default_factory=dict)
+    stored_turns: tuple[StoredTurnSummary, ...] = ()
+
+    @property
+    def turns_used(self) -> int:
+        """Return how many turns the result is made of, those of earlier drives included."""
+        return sum(turn.used for turn in self.turns) + sum(
+            turn.used for turn in self.stored_turns)

@@ -103,7 +103,7 @@ def _provenance(calibration: Calibration, created: str | None) -> dict[str, Any]
         'verdict': calibration.verdict.level,
         'reasons': calibration.verdict.reasons,
         'sigma': sigma,
-        'turns_used': sum(turn.used for turn in calibration.turns),
+        'turns_used': calibration.turns_used,
         'reprojection_error_px': calibration.reprojection_error_px,
         'input': calibration.input_name,
         'seed': calibration.config.seed,

@@ -16,6 +16,7 @@ from dashcalib_ros.report.wording import (
     PARAMETER_NAMES,
     TURN_COLUMNS,
     parameter_row,
+    stored_text,
     turn_row,
 )
 
@@ -105,6 +106,8 @@ def _mask(c: Calibration) -> str:
 
 def _drive(c: Calibration) -> str:
     rows = [('frames', str(c.frames))]
+    if c.stored_turns:
+        rows.append(('earlier drives', stored_text(c.stored_turns)))
     if c.reprojection_error_px is not None:
         rows.append(('reprojection error', f'{c.reprojection_error_px:.3f} px'))
     rows += [(f'time: {name}', f'{seconds:.1f} s') for name, seconds in c.timing.items()]

@@ -12,6 +12,7 @@ import numpy as np
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.intrinsics import Calibration, TurnSummary
+from dashcalib_ros.intrinsics.calibration import StoredTurnSummary
 from dashcalib_ros.report.source_text import read_text
 
 
@@ -33,6 +34,7 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'seed': c.config.seed,
         'versions': c.versions,
         'config': c.config.flat(),
+        'stored_turns': [_turn_dict(turn) for turn in c.stored_turns],
         'input': c.input_name,
         'warnings': c.warnings,
         'masked_fraction': None if c.mask is None else 1.0 - float(np.mean(c.mask)),
@@ -94,6 +96,8 @@ def plain_values(value: Any) -> Any:
     return str(value)
 
 
-def _turn_dict(turn: TurnSummary) -> dict[str, Any]:
+def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
     values = dataclasses.asdict(turn)
-    return {('stamp' if key == 'stamp_s' else key): item for key, item in values.items()}
+    # a stored turn's key is of this run only
+    return {('stamp' if key == 'stamp_s' else key): item for key, item in values.items()
+            if key != 'key'}

@@ -18,6 +18,7 @@ from dashcalib_ros.report.wording import (
     number,
     optional,
     parameter_row,
+    stored_text,
     turn_row,
 )
 
@@ -90,6 +91,8 @@ def _difference_row(d: Difference) -> tuple[str, ...]:
 def _facts(c: Calibration) -> str:
     used = sum(turn.used for turn in c.turns)
     facts = [f'{c.frames} frames', f'{used} of {len(c.turns)} turns used']
+    if c.stored_turns:
+        facts.append(stored_text(c.stored_turns))
     if c.reprojection_error_px is not None:
         facts.append('reprojection error ' + optional(c.reprojection_error_px, 3, ' px'))
     if c.mask is not None:

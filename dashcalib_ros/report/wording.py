@@ -2,8 +2,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from dashcalib_ros.intrinsics import Intrinsics, TurnSummary
+from dashcalib_ros.intrinsics.calibration import StoredTurnSummary
 from dashcalib_ros.report.camera import PARAMETERS
 
 PARAMETER_NAMES = PARAMETERS
@@ -39,6 +41,12 @@ def turn_row(turn: TurnSummary) -> tuple[str, ...]:
             f'{turn.prominence:.4f}', optional(turn.yaw_deg, 1),
             f'{turn.registered} of {turn.images}', optional(turn.reprojection_error_px, 2),
             'yes' if turn.used else 'no')
+
+
+def stored_text(turns: Sequence[StoredTurnSummary]) -> str:
+    """Return what became of the turns of earlier drives."""
+    used = sum(turn.used for turn in turns)
+    return f'{used} of {len(turns)} stored turn{"" if len(turns) == 1 else "s"} used'
 
 
 def optional(value: float | None, digits: int, unit: str = '') -> str:
