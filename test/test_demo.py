@@ -264,6 +264,23 @@ def test_night_is_dark(drive):
     assert image.mean() < 30 and image.std() < 15
 
 
+def test_exposure_blurs_around_the_same_place(drive):
+    index = drive.turn_centers[0]
+    sharp = drive.frame(index).image[:300]
+    blurred = variant(drive, exposure_ms=20.0).frame(index).image[:300]
+    assert cv2.Laplacian(blurred, cv2.CV_64F).std() < 0.8 * cv2.Laplacian(sharp, cv2.CV_64F).std()
+    smooth = [cv2.GaussianBlur(image, (0, 0), 4.0).astype(float) for image in (sharp, blurred)]
+    (dx, dy), _ = cv2.phaseCorrelate(*smooth)
+    assert np.hypot(dx, dy) < 0.1
+
+
+def test_corners_are_darker(drive):
+    plain, dark = (variant(drive, vignetting=share).frame(10).image.astype(float)
+                   for share in (0.0, 0.4))
+    assert dark[:20, :20].mean() < 0.7 * plain[:20, :20].mean()
+    assert abs(dark[170:190, 310:330].mean() / plain[170:190, 310:330].mean() - 1.0) < 0.01
+
+
 def test_compression_loses_little(drive):
     plain = drive.frame(10).image.astype(float)
     packed = variant(drive, jpeg_quality=80).frame(10).image.astype(float)
@@ -271,7 +288,8 @@ def test_compression_loses_little(drive):
 
 
 @pytest.mark.parametrize('wrong', [
-    {'rate': 0.0}, {'noise': -1.0}, {'turns': (Turn(200.0),)}, {'stops': (Stop(7, 1.0),)}])
+    {'rate': 0.0}, {'noise': -1.0}, {'exposure_ms': 300.0}, {'vignetting': 2.0},
+    {'turns': (Turn(200.0),)}, {'stops': (Stop(7, 1.0),)}])
 def test_impossible_drives_are_refused(wrong):
     with pytest.raises(ConfigError):
         DriveSpec(**wrong)

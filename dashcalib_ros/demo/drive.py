@@ -27,6 +27,8 @@ Grey = npt.NDArray[np.uint8]
 
 # 2026-01-05 12:00:00 UTC; the first frame's stamp
 START_NS = 1_767_614_400 * 10**9
+# of the exposure, when the light is sampled
+INSTANTS = (-1.0 / 3.0, 0.0, 1.0 / 3.0)
 
 
 class Drive:
@@ -99,12 +101,21 @@ class Drive:
         """Return a frame's time stamp in nanoseconds."""
         return START_NS + round(index * 1e9 / self.spec.rate)
 
-    def row_poses(self, index: int) -> tuple[Floats, Floats]:
+    @cached_property
+    def shading(self) -> npt.NDArray[np.float32]:
+        """Return the share of the light that arrives, (height, width)."""
+        y, x = np.indices((self.lens.height, self.lens.width), np.float32)
+        square = ((x - self.lens.cx) ** 2 + (y - self.lens.cy) ** 2) / (
+            0.25 * (self.lens.width ** 2 + self.lens.height ** 2))
+        return np.asarray(1.0 - self.spec.vignetting * np.minimum(square, 1.0), np.float32)
+
+    def row_poses(self, index: int, later_s: float = 0.0) -> tuple[Floats, Floats]:
         """Return the rotations (n, 3, 3) and positions (n, 3) m of a frame's rows.
 
-        World from camera; n is the picture's height, or 1 without a rolling shutter.
+        World from camera; n is the picture's height, or 1 without a rolling shutter. later_s:
+        after the middle of the exposure.
         """
-        time = self.times[index] + MARGIN_S
+        time = self.times[index] + MARGIN_S + later_s
         rows = np.zeros(1)
         if self.spec.rolling_shutter_ms > 0.0:
             rows = np.arange(self.lens.height) / (self.lens.height - 1) - 0.5
@@ -127,7 +138,10 @@ class Drive:
         """Render one frame; the same picture whatever was rendered before."""
         if not 0 <= index < len(self):
             raise IndexError(f'frame {index} of {len(self)}')
-        image = self.raycaster.render(self.scene(index), *self.row_poses(index))
+        scene, exposure_s = self.scene(index), self.spec.exposure_ms / 1000.0
+        instants = [share * exposure_s for share in INSTANTS] if exposure_s > 0.0 else [0.0]
+        image = sum(self.raycaster.render(scene, *self.row_poses(index, later_s))
+                    for later_s in instants) / np.float32(len(instants))
         return Frame(index, self.stamp_ns(index), self._expose(image, index))
 
     def scene(self, index: int) -> Quads:
@@ -146,6 +160,8 @@ class Drive:
         # slow and smooth, as automatic exposure is
         slow = math.sin(0.9 * time) + math.sin(2.3 * time + 1.0)
         image *= np.float32(1.0 + spec.flicker * slow)
+        if spec.vignetting > 0.0:
+            image *= self.shading
         if spec.night:
             image *= np.float32(0.11)
             image += np.float32(5.0)

@@ -9,6 +9,7 @@ import numpy as np
 from dashcalib_ros.errors import ConfigError
 
 Kind = Literal['drive', 'parked', 'spin']
+MAX_FRAME_MS = 200.0
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,11 @@ class DriveSpec:
     speed_mps on straights, turn_speed_mps in turns, accel_mps2 between them.
     height_m: of the camera. vibration_deg: RMS of pitch from the road; roll is 0.7 of it, and
     the body also dives when it brakes and leans in turns. 0 switches all of these off.
-    noise: sigma in grey levels. blur: sigma in pixels. bonnet, pillar, timestamp: what dashcams
-    see of their own car, and burn in. rolling_shutter_ms: from the first row to the last; a
-    frame's time is its middle row's. moving_cars: oncoming, leading and crossing ones.
+    noise: sigma in grey levels. blur: sigma in pixels. exposure_ms: how long each row is exposed;
+    its time is the middle of that, and 0 has no motion blur. vignetting: of the light, lost in
+    the corners. bonnet, pillar, timestamp: what dashcams see of their own car, and burn in.
+    rolling_shutter_ms: from the first row to the last; a frame's time is its middle row's.
+    moving_cars: oncoming, leading and crossing ones.
     stops: red lights. night: dark and noisy. flicker: RMS of the exposure's relative variation.
     jpeg_quality: compress as a dashcam would; None does not.
     kind: 'parked' stands still and 'spin' turns on the spot, both for duration_s.
@@ -57,6 +60,8 @@ class DriveSpec:
     seed: int = 0
     noise: float = 1.5
     blur: float = 0.4
+    exposure_ms: float = 0.0
+    vignetting: float = 0.0
     bonnet: bool = False
     pillar: bool = False
     timestamp: bool = False
@@ -75,10 +80,15 @@ class DriveSpec:
         for name in positive:
             if not getattr(self, name) > 0.0:
                 raise ConfigError(f'a drive needs {name} > 0, not {getattr(self, name)!r}')
-        for name in ('vibration_deg', 'noise', 'blur', 'rolling_shutter_ms', 'moving_cars',
-                     'flicker', 'seed'):
+        for name in ('vibration_deg', 'noise', 'blur', 'exposure_ms', 'vignetting',
+                     'rolling_shutter_ms', 'moving_cars', 'flicker', 'seed'):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f'a drive needs {name} >= 0, not {getattr(self, name)!r}')
+        if self.exposure_ms + self.rolling_shutter_ms > MAX_FRAME_MS:
+            raise ConfigError(f'a picture is taken within {MAX_FRAME_MS:g} ms: exposure_ms and '
+                              f'rolling_shutter_ms together may not be longer')
+        if self.vignetting > 1.0:
+            raise ConfigError(f'a drive needs vignetting <= 1, not {self.vignetting!r}')
         if any(abs(turn.angle_deg) > 170.0 or turn.radius_m < 4.0 for turn in self.turn_list):
             raise ConfigError('a turn needs at most 170 degrees and a radius of 4 m or more')
         for stop in self.stops:

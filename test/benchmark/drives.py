@@ -82,6 +82,7 @@ SETTINGS = (
     Setting('motorway bends', DEMO, MOTORWAY, 'judge'),
     Setting('off-centre, fy/fx 0.993', SHIFTED, STREET),
     Setting('noise 6, blur 1', DEMO, replace(STREET, noise=6.0, blur=1.0)),
+    Setting('exposure 10 ms', DEMO, replace(STREET, exposure_ms=10.0)),
     Setting('JPEG 40', DEMO, replace(STREET, jpeg_quality=40)),
     Setting('40 deg, pincushion', TELE, STREET),
     Setting('120 deg', WIDEST, STREET),
@@ -94,7 +95,8 @@ SETTINGS = (
     Setting('30 fps, two turns, 640x480', VGA, replace(STREET, rate=30.0, turns=2), 'judge'),
     Setting('everything at once', WIDE,
             replace(STREET, bonnet=True, pillar=True, timestamp=True, noise=3.0, blur=0.8,
-                    moving_cars=6, jpeg_quality=60, rolling_shutter_ms=10.0), 'judge'),
+                    moving_cars=6, jpeg_quality=60, rolling_shutter_ms=10.0, vignetting=0.5),
+            'judge'),
     Setting('eight turns', DEMO, replace(STREET, turns=8)),
     Setting('night, driving', DEMO, replace(STREET, night=True), 'judge'),
 )
