@@ -185,6 +185,7 @@ SPOILED = {
     'other type': lambda path: rewritten(path, used=np.zeros((8, 60))),
     'not finite': lambda path: rewritten(path, camera=np.full(6, np.nan)),
     'no points': lambda path: rewritten(path, points=np.full((60, 3), np.nan)),
+    'other size': lambda path: rewritten(path, size=np.array([640, 450])),
     'no scene': lambda path: rewritten(path, used=np.zeros((8, 60), bool)),
     'too large': lambda path: path.write_bytes(path.read_bytes() + bytes(room.LARGEST)),
     'a folder': lambda path: path.unlink() or path.mkdir(),

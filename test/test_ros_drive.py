@@ -16,8 +16,11 @@ from ros_bench import (
     image_message,
 )
 from sensor_msgs.srv import SetCameraInfo
+from synthetic import LENS as SYNTHETIC_LENS
+from synthetic import synthetic_turn
 
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
+from dashcalib_ros.reconstruction.archive import Archive, Origin, StoredTurn
 from dashcalib_ros.report import load_calibration_yaml
 
 LENS = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
@@ -192,3 +195,57 @@ def test_reset_takes_everything_back(driven):
     assert not bench.call('save', driven.node).success
     assert driven.node.stop() == 0
     assert 'Traceback' not in driven.node.text
+
+
+def test_turns_outlive_the_node_and_add_up(start_node, make_bench, rendered, tmp_path):
+    """Two short trips of one turn each; the calibration comes of both."""
+    drive, frames = rendered
+    folder, camera = tmp_path / 'turns', make_bench()
+    options = {**QUICK, 'turns__store': folder}
+    middle = sum(drive.turn_centers) // 2
+
+    def send(part):
+        for frame in part:
+            camera.publish(image_message(frame.image, frame.stamp_ns))
+            camera.spin(0.02)
+
+    node = start_node(**options)
+    camera.connect(node)
+    send(frames[:middle])
+    camera.until(lambda: list(folder.glob('*.npz')), 90.0, 'a stored turn', node)
+    assert node.stop() == 0
+
+    # another camera does not get it, and leaves it alone
+    node = start_node(**options)
+    camera.connect(node)
+    camera.publish(image_message(frames[0].image, frames[0].stamp_ns, 'rear'))
+    node.wait_for('left out')
+    camera.counted('store', 1, node)
+    assert camera.count('turns found') == 0
+    assert node.stop() == 0 and len(list(folder.glob('*.npz'))) == 1
+
+    node = start_node(**options)
+    camera.connect(node)
+    send(frames[middle:middle + 1])
+    camera.until(lambda: camera.count('turns stored') == 1, node=node)
+    assert camera.count('turns found') == camera.count('turns built') == 1
+    send(frames[middle + 1:])
+    camera.until(lambda: camera.values['state'] == 'calibrated', 120.0, 'a calibration', node)
+    assert abs(camera.latched[-1].k[0] / drive.truth.fx - 1) < 0.02
+    # its turns are used up: the next opinion is one of its own
+    camera.until(lambda: list(folder.iterdir()) == [], what='an empty folder', node=node)
+    assert node.stop() == 0 and 'Traceback' not in node.text
+
+
+def test_reset_forgets_the_stored_turns_even_before_the_first_image(start_node, make_bench,
+                                                                    tmp_path):
+    folder = tmp_path / 'turns'
+    archive = Archive(str(folder), 10, 3.0, pytest.fail)
+    archive.load(Origin((640, 360), 1))
+    scene = synthetic_turn(keyframes=8, tracks=60).scene(SYNTHETIC_LENS)
+    archive.mirror(lambda: {0: StoredTurn(scene, 5.0, 0.05)})
+    assert len(list(folder.iterdir())) == 1
+    node, camera = start_node(turns__store=folder), make_bench()
+    assert camera.call('reset', node).success
+    camera.until(lambda: list(folder.iterdir()) == [], what='an empty folder', node=node)
+    assert node.stop() == 0

@@ -13,6 +13,7 @@ from dashcalib_ros.calibrator import Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.intrinsics import Calibration, TurnSummary, Verdict
+from dashcalib_ros.intrinsics.calibration import StoredTurnSummary
 from dashcalib_ros.ros import learner as room
 from dashcalib_ros.ros.learner import Learner, Listener
 
@@ -26,8 +27,9 @@ class Core:
     made: ClassVar[list[Core]] = []
     failures: ClassVar[list[Exception]] = []
 
-    def __init__(self, config, live):
+    def __init__(self, config, live, **options):
         assert live
+        self.options, self.stored, self.pushed, self.done = options, (), [], []
         self.centers, self.frames, self.calls = (), 0, 0
         self.hold, self.closed = threading.Event(), threading.Event()
         self.hold.set()
@@ -35,11 +37,12 @@ class Core:
 
     def push(self, frame):
         self.frames += 1
+        self.pushed.append(frame)
         return self.status()
 
     def status(self):
-        return Status(self.frames, len(self.centers), len(self.centers), 0.0, 0.1, False,
-                      self.centers)
+        centers = self.centers + self.stored
+        return Status(self.frames, len(centers), len(centers), 0.0, 0.1, False, centers)
 
     def calibrate(self, progress, final):
         assert not final
@@ -50,11 +53,20 @@ class Core:
                 raise WorkerError('the calibrator was closed while it calibrated')
         if Core.failures:
             raise Core.failures.pop()
-        turns = tuple(TurnSummary(c, c, c, 0.0, 0.1, 1, 1, True) for c in centers)
-        return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG)
+        turns = tuple(TurnSummary(c, c, c, 0.0, 0.1, 1, 1, True) for c in centers if c > 0)
+        stored = tuple(StoredTurnSummary(key, 0.0, 0.1, 60.0, 20, True) for key in self.stored)
+        return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG,
+                           stored_turns=stored)
 
     def close(self):
         self.closed.set()
+        self.done.append('close')
+
+    def clear_store(self):
+        self.done.append('clear')
+
+    def forget_stored(self):
+        self.done.append('forget')
 
 
 @pytest.fixture
@@ -141,9 +153,39 @@ def test_a_restart_cancels_what_runs_and_its_result_is_out_of_date(desk):
     assert desk.results[0].bank == 1
 
 
+def test_stored_turns_count_as_any(desk):
+    core = Core.made[0]
+    assert core.options['use_stored']
+    core.stored = (-1,)
+    core.centers = (10,)
+    until(lambda: desk.results)
+    assert desk.results[0].complete
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 1
+
+
+def test_a_restart_empties_the_store_unless_another_camera_comes(desk):
+    first = Core.made[0]
+    desk.learner.restart()
+    until(lambda: first.done == ['close', 'clear'])
+    second = Core.made[1]
+    assert not second.options['use_stored']
+    desk.learner.restart(keep_stored=True)
+    until(lambda: second.done == ['close'])
+    assert Core.made[2].options['use_stored']
+    desk.learner.forget_stored()
+    until(lambda: Core.made[2].done == ['forget'])
+
+
+def test_troubles_with_the_store_are_told(desk):
+    Core.made[0].options['warn']('no space')
+    assert desk.troubles == [('store', 'no space')]
+
+
 def test_images_keep_to_the_bank_they_were_taken_for(desk):
-    desk.learner.offer(0, 0, image(), (64, 48))
+    desk.learner.offer(0, 0, image(), (64, 48), 'front')
     until(lambda: desk.statuses)
+    assert Core.made[0].pushed[0].frame_id == 'front'
     desk.learner.restart()
     desk.learner.offer(1, 1, image(32), (32, 48))
     until(lambda: len(desk.statuses) == 2)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import cv2
 import numpy as np
 import pytest
 
@@ -314,11 +315,33 @@ def test_services_say_why_not(plain):
     ({'turns__wanted': 2.5}, 'must be int'),
     ({'reliability': 'perfect'}, 'must be one of'),
     ({'camera_name': 'narrow_stereo'}, 'belongs to image_pipeline'),
+    ({'mask_file': 'missing.png'}, 'cannot read the mask'),
 ])
 def test_a_bad_parameter_ends_it_with_one_line(start_node, parameters, words):
     node = start_node(**parameters)
     assert node.process.wait(SOON) == 2
     assert words in node.text and len(node.text.splitlines()) == 1, node.text
+
+
+def test_a_mask_of_another_size_ends_it_at_the_first_image(start_node, make_bench, tmp_path):
+    cv2.imwrite(str(tmp_path / 'mask.png'), np.full((48, 64), 255, np.uint8))
+    node, camera = start_node(mask_file=tmp_path / 'mask.png'), make_bench()
+    camera.connect(node)
+    camera.publish(image_message(noise(0), START))
+    assert node.process.wait(SOON) == 2
+    assert node.text.splitlines()[-1] == (
+        'calibrator: error: the mask is 64x48 and the images are 320x240; '
+        'make the mask as large as the images')
+
+
+def test_a_mask_that_fits_is_taken(start_node, make_bench, tmp_path):
+    cv2.imwrite(str(tmp_path / 'mask.png'), np.full((240, 320), 255, np.uint8))
+    node, camera = start_node(mask_file=tmp_path / 'mask.png'), make_bench()
+    camera.connect(node)
+    stream(camera, 15)
+    camera.until(lambda: len(camera.magnitudes) >= 10, node=node)
+    assert camera.count('undecodable') == camera.count('failed') == 0
+    assert node.stop() == 0
 
 
 def test_a_misspelt_parameter_is_reported(start_node):

@@ -1,6 +1,7 @@
 """The user's mask: a picture as large as the images, black where they are not to be used."""
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,12 @@ from dashcalib_ros.errors import InputError
 
 
 def read_mask(path: Path) -> npt.NDArray[np.bool_]:
-    """Read a mask picture: (height, width), True where it is not black. Raises InputError."""
+    """Read a mask picture: (height, width), True where it is not black; ~ is expanded.
+
+    Raises InputError.
+    """
+    with suppress(RuntimeError):  # there is no such user: there will be no such file
+        path = path.expanduser()
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:

@@ -314,7 +314,11 @@ def _read(path: Path) -> tuple[Origin, StoredTurn]:
         if path.stat().st_size > LARGEST:
             raise ValueError('it is too large')
         with np.load(path, allow_pickle=False) as data:
-            return _origin(data), _turn(data)
+            origin, turn = _origin(data), _turn(data)
+        small = tuple(side // max(origin.shrink, 1) for side in origin.image_size)
+        if turn.scene.tracks.image_size != small:
+            raise ValueError('its numbers make no scene')
+        return origin, turn
     except FileNotFoundError:
         raise
     except Exception as error:

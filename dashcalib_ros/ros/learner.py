@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.calibrator import Calibrator, Mask, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import DashcalibError, InputError
 from dashcalib_ros.frames import Frame
@@ -56,9 +56,9 @@ class Listener:
 class _Bank:
     """A Calibrator and what belongs to its images alone."""
 
-    def __init__(self, config: Config, number: int) -> None:
+    def __init__(self, number: int, calibrator: Calibrator) -> None:
         self.number = number
-        self.calibrator = Calibrator(config, live=True)
+        self.calibrator = calibrator
         self.depth = BitDepth()
         self.tried: frozenset[int] = frozenset()
 
@@ -72,6 +72,7 @@ class _Job:
     stamp_ns: int
     message: Any
     size: tuple[int, int]
+    frame_id: str
 
 
 class Learner:
@@ -81,13 +82,16 @@ class Learner:
     among the best.
     """
 
-    def __init__(self, config: Config, queue_size: int, listener: Listener) -> None:
+    def __init__(self, config: Config, queue_size: int, listener: Listener,
+                 mask: Mask | None = None) -> None:
+        """mask: (h, w), False where the images are not to be used."""
         self.goal = config.turns.wanted
         self._config = config
+        self._mask = mask
         self._tell = listener
         self._backlog: Backlog[_Job] = Backlog(queue_size)
         self._changed = threading.Condition()
-        self._bank = _Bank(config, 0)
+        self._bank = _Bank(0, self._calibrator(use_stored=True))
         self._activity = Activity()
         self._requested = False
         self._failures = 0
@@ -109,9 +113,10 @@ class Learner:
         """Return the number of the bank; results of an older one are out of date."""
         return self._bank.number
 
-    def offer(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int]) -> None:
-        """Take an image message; size is what its header says."""
-        self._backlog.put(_Job(self._bank, index, stamp_ns, message, size))
+    def offer(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int],
+              frame_id: str = '') -> None:
+        """Take an image message; size and frame_id are what its header says."""
+        self._backlog.put(_Job(self._bank, index, stamp_ns, message, size, frame_id))
 
     def activity(self) -> Activity:
         """Return what is going on."""
@@ -129,22 +134,29 @@ class Learner:
             self._changed.notify_all()
         return ''
 
-    def restart(self) -> None:
-        """Forget all turns and begin with an empty bank; a running calibration is cancelled."""
+    def restart(self, keep_stored: bool = False) -> None:
+        """Forget all turns and begin with an empty bank; a running calibration is cancelled.
+
+        turns.store is emptied, too. keep_stored: it is not, as another camera comes now: what it
+        has of that one is used.
+        """
         with self._changed:
             if self._closed:
                 return
             old = self._bank
-            self._bank = _Bank(self._config, old.number + 1)
+            self._bank = _Bank(old.number + 1, self._calibrator(use_stored=keep_stored))
             self._backlog.clear()
             self._requested = False
             self._failures, self._not_before = 0, 0.0
             self._activity = replace(self._activity, status=NOTHING)
-            self._closing = [thread for thread in self._closing if thread.is_alive()]
             # ending a child takes a moment
-            self._closing.append(threading.Thread(target=old.calibrator.close, daemon=True))
-            self._closing[-1].start()
+            self._aside(old.calibrator.close if keep_stored else lambda: _clear(old.calibrator))
             self._changed.notify_all()
+
+    def forget_stored(self) -> None:
+        """Drop the turns of earlier drives: they are of a camera that has changed since."""
+        with self._changed:
+            self._aside(self._bank.calibrator.forget_stored)
 
     def close(self) -> None:
         """End both threads and every child process."""
@@ -156,6 +168,16 @@ class Learner:
         for thread in (*self._closing, *self._threads):
             thread.join(timeout=10)
 
+    def _calibrator(self, use_stored: bool) -> Calibrator:
+        return Calibrator(self._config, mask=self._mask, live=True, use_stored=use_stored,
+                          warn=lambda text: self._tell.trouble('store', text))
+
+    def _aside(self, task: Callable[[], None]) -> None:
+        """Do what takes a moment in a thread of its own, which close() waits for."""
+        self._closing = [thread for thread in self._closing if thread.is_alive()]
+        self._closing.append(threading.Thread(target=task, daemon=True))
+        self._closing[-1].start()
+
     def _detect(self) -> None:
         while (job := self._backlog.get()) is not None:
             try:
@@ -164,7 +186,8 @@ class Learner:
                     raise InputError(
                         f'an image is {image.shape[1]}x{image.shape[0]} but its header says '
                         f'{job.size[0]}x{job.size[1]}: the camera driver is broken')
-                status = job.bank.calibrator.push(Frame(job.index, job.stamp_ns, image))
+                status = job.bank.calibrator.push(
+                    Frame(job.index, job.stamp_ns, image, job.frame_id))
             except InputError as error:
                 self._tell.trouble('undecodable', str(error))
                 continue
@@ -189,9 +212,10 @@ class Learner:
             except Exception as error:
                 self._failed(bank, error)
                 continue
-            used = frozenset(turn.center for turn in calibration.turns if turn.used)
+            used = [turn.center for turn in calibration.turns if turn.used]
+            used += [turn.key for turn in calibration.stored_turns if turn.used]
             with self._changed:
-                bank.tried = used
+                bank.tried = frozenset(used)
                 self._failures = 0
                 self._activity = replace(self._activity, calibrating=False, stage='')
             complete = len(used) >= self._config.turns.wanted
@@ -230,6 +254,11 @@ class Learner:
             self._requested = True
         self._tell.trouble('failed_calibrations', f'a calibration failed ({_named(error)}); the '
                                                   f'turns are kept, next try in {delay:.0f} s')
+
+
+def _clear(calibrator: Calibrator) -> None:
+    calibrator.close()
+    calibrator.clear_store()
 
 
 def _named(error: Exception) -> str:

@@ -70,6 +70,7 @@ def diagnostic_status(health: Health, name: str, hardware_id: str) -> Diagnostic
         'state': health.state,
         'stage': health.stage,
         'turns found': status.turns,
+        'turns stored': status.stored,
         'turns built': status.built,
         'turns wanted': health.wanted,
         'yaw (deg)': f'{status.yaw_deg:.0f}',

@@ -5,6 +5,7 @@ import queue
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -18,6 +19,7 @@ from std_srvs.srv import Trigger
 
 from dashcalib_ros.calibrator import Status
 from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.frames.mask_file import check_mask, read_mask
 from dashcalib_ros.intrinsics import Calibration, Verdict
 from dashcalib_ros.report.camera_yaml import check_camera_name
 from dashcalib_ros.ros.commit import Commit
@@ -46,7 +48,7 @@ CURES = {
                 'are kept',
 }
 # what else is counted, with a message of its own each time
-TROUBLES = ('undecodable', 'strays', 'failed', 'failed_calibrations', 'unsaved')
+TROUBLES = ('undecodable', 'strays', 'failed', 'failed_calibrations', 'unsaved', 'store')
 
 
 class CalibratorNode(Node):
@@ -61,6 +63,9 @@ class CalibratorNode(Node):
         self._core, self._own = declare(self)
         self._name = camera_name(self._own, self.get_namespace())
         check_camera_name(self._name)
+        self._mask = None
+        if self._own.mask_file:
+            self._mask = read_mask(Path(self._own.mask_file))
         for line in unknown(self._parameter_overrides):
             self.get_logger().warning(line)
         self._complaints = Complaints(self.get_logger().warning)
@@ -83,7 +88,8 @@ class CalibratorNode(Node):
         self._learner = Learner(self._core, self._own.queue_size, Listener(
             result=lambda result: self._later(lambda: self._on_result(result)),
             status=lambda status: self._later(lambda: self._on_status(status)),
-            trouble=lambda kind, text: self._later(lambda: self._complaints.say(kind, text))))
+            trouble=lambda kind, text: self._later(lambda: self._complaints.say(kind, text))),
+            self._mask)
         self._aim()
         # a paused simulation must not silence the diagnostics
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -123,16 +129,21 @@ class CalibratorNode(Node):
         stamp = message.header.stamp
         stamp_ns = self._stamps.take(stamp.sec * 10**9 + stamp.nanosec, time.monotonic_ns())
         if stamp_ns is not None and self._thinning.wants(stamp_ns):
-            self._learner.offer(index, stamp_ns, message, source.size)
+            self._learner.offer(index, stamp_ns, message, source.size, source.frame_id)
 
     def _on_source(self, source: Source) -> None:
-        """Take the first image's source, or another one that lasts: all that was learned goes."""
+        """Take the first image's source, or another one that lasts: all that was learned goes.
+
+        Raises InputError, which ends the node, for a mask that does not fit the first image.
+        """
         kept = self._publication.kept
-        if self._source.previous is not None:
+        if self._source.previous is None:
+            check_mask(self._mask, source.size)
+        else:
             self.get_logger().error(
                 f'the camera changes from {self._source.previous} to {source}: the turns and the '
                 f'calibration are dropped')
-            self._forget()
+            self._forget(keep_stored=True)
             self._load()
             kept = self._publication.kept
         if kept is None:
@@ -170,7 +181,7 @@ class CalibratorNode(Node):
             log.error(f'the published calibration is given up: {judged.why}')
             self._give_up()
         else:
-            used = sum(turn.used for turn in calibration.turns)
+            used = calibration.turns_used
             text = (f'a calibration of {used} turn{"" if used == 1 else "s"} is '
                     f'{calibration.verdict.level}' + (f': {judged.why}' if judged.why else ''))
             # rclpy takes one severity for each line of code
@@ -202,12 +213,13 @@ class CalibratorNode(Node):
             self._publication.stale = True
         else:
             self._publication.retract()
+        self._learner.forget_stored()
         self._aim()
 
-    def _forget(self) -> None:
+    def _forget(self, keep_stored: bool = False) -> None:
         self._publication.retract()
         self._verdict, self._contradictions = None, 0
-        self._learner.restart()
+        self._learner.restart(keep_stored)
         self._stamps.forget()
         self._thinning = Thinning(self._core.motion.rate)
         self._aim()

@@ -42,6 +42,9 @@ class NodeConfig:
     camera_info_file: str = setting(
         '', 'where the accepted calibration is kept; empty: '
         '$ROS_HOME/camera_info/CAMERA_NAME.yaml, where camera_info_manager looks')
+    mask_file: str = setting(
+        '', 'picture as large as the images, black where they are not used, beside the ego '
+        'vehicle that is found by itself; empty: none')
     commit: bool = setting(
         False, 'give an accepted calibration to the camera driver: service set_camera_info')
     commit_timeout: float = setting(5.0, 's; how long the driver may take to answer', 0.1, 600.0)
