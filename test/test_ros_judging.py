@@ -16,9 +16,12 @@ from rclpy.executors import SingleThreadedExecutor
 from ros_bench import START, Bench, image_message
 from sensor_msgs.srv import SetCameraInfo
 from std_srvs.srv import Trigger
+from synthetic import synthetic_turn
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.intrinsics import Calibration, Intrinsics, Verdict
+from dashcalib_ros.reconstruction.archive import Archive, Origin, StoredTurn
+from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.report import load_calibration_yaml
 from dashcalib_ros.ros.learner import Result
 from dashcalib_ros.ros.node import CalibratorNode
@@ -193,3 +196,34 @@ def test_a_driver_that_does_not_take_the_calibration_disturbs_nothing(make_desk,
     if driver == 'hangs':
         dead.destroy_node()
         rclpy.try_shutdown(context=context)
+
+
+KEPT = """\
+image_width: 320
+image_height: 240
+camera_name: dashcam
+camera_matrix: {rows: 3, cols: 3, data: [400.0, 0.0, 160.0, 0.0, 401.0, 120.0, 0.0, 0.0, 1.0]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.01, 0.0, 0.0, 0.0]}
+dashcalib:
+  verdict: accepted
+  sigma: {fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0, k1: 0.01, k2: 0.01}
+  frame_id: camera
+"""
+
+
+def test_a_camera_that_changed_does_not_learn_from_the_turns_of_earlier_drives(
+        make_desk, tmp_path):
+    (tmp_path / 'camera.yaml').write_text(KEPT)
+    archive = Archive(str(tmp_path / 'turns'), 10, 3.0, pytest.fail)
+    archive.load(Origin((320, 240), 1))
+    lens = Camera((320, 240), 200.0, 201.0, 160.0, 120.0)
+    scene = synthetic_turn(lens, keyframes=8, tracks=60).scene(lens)
+    archive.mirror(lambda: {0: StoredTurn(scene, 5.0, 0.05)})
+    desk = make_desk(contradictions=1, **{'turns.store': tmp_path / 'turns'})
+    assert desk.show() == 400.0
+    desk.until(lambda: desk.bench.count('turns stored') == 1)
+    desk.give(complete=False, fx=450.0)
+    assert desk.show() is None
+    desk.until(lambda: desk.bench.count('turns stored') == 0)
+    desk.until(lambda: list((tmp_path / 'turns').iterdir()) == [])
