@@ -17,7 +17,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/config', glob('config/*')),
-        (f'share/{PACKAGE}/launch', glob('launch/*')),
+        (f'share/{PACKAGE}/launch', glob('launch/*.launch.*')),
     ],
     zip_safe=True,
     python_requires='>=3.10',

@@ -119,6 +119,25 @@ def test_the_permissions_are_what_the_node_uses(node_and_bench):
     assert used('get_client_names_and_types_by_node') <= allowed('service', 'request')
 
 
+def test_the_permissions_have_the_form_that_sros2_takes():
+    """Its schema: policy 0.2.0, enclaves, profiles, then lists of names with one access each."""
+    policy = ElementTree.parse(REPOSITORY / 'config' / 'sros2_policy.xml').getroot()
+    assert (policy.tag, policy.attrib) == ('policy', {'version': '0.2.0'})
+    enclave, = policy.findall('enclaves/enclave')
+    assert [each.tag for each in policy.iter()][:5] == [
+        'policy', 'enclaves', 'enclave', 'profiles', 'profile']
+    assert enclave.get('path').startswith('/')
+    profile, = enclave.findall('profiles/profile')
+    assert profile.attrib == {'ns': '/', 'node': 'calibrator'}
+    kinds = {'topics': ('topic', {'publish', 'subscribe'}),
+             'services': ('service', {'request', 'reply'})}
+    for rule in profile:
+        kind, accesses = kinds[rule.tag]
+        assert set(rule.attrib) <= accesses and set(rule.attrib.values()) == {'ALLOW'}
+        assert len(rule) and all(each.tag == kind and each.text.strip() == each.text
+                                 for each in rule)
+
+
 def test_the_large_image_profile_carries_best_effort_images(tmp_path, node_and_bench):
     """A camera process with the profile: 1280x720 bgr8 at 30 Hz, best effort."""
     node, bench = node_and_bench
