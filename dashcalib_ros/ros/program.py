@@ -10,6 +10,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 
 from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.ros.memory import give_images_back
 from dashcalib_ros.ros.node import CalibratorNode
 from dashcalib_ros.ros.stopping import Stopping
 
@@ -19,6 +20,7 @@ FAILED = 2
 def run(argv: Sequence[str] | None, stopping: Stopping) -> int:
     """Run the node: 0 when it was asked to stop, 2 when its parameters are wrong."""
     node: CalibratorNode | None = None
+    give_images_back()
     try:
         # rclpy takes the program's name for the first argument
         rclpy.init(args=None if argv is None else ['calibrator', *argv])
