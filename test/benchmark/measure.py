@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -71,10 +72,18 @@ def isolated(function: Callable[..., Any], *arguments: Any, limit_s: float = 360
 
 
 def _answer(sender: Connection, function: Callable[..., Any], arguments: Sequence[Any]) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         sender.send((function(*arguments), ''))
     except Exception as error:
         sender.send((None, f'{type(error).__name__}: {error}'))
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def memory_mb(pid: int) -> float:
