@@ -75,6 +75,8 @@ class Calibrator:
         # a turn without a scene needs another to give way to, and --turns may ask for many
         turns = self._config.turns
         capacity = max(turns.capacity, turns.wanted)
+        # how many turns are used: more than wanted once these have left a result weak
+        self._places = turns.wanted
         self._detector = TurnDetector(replace(turns, capacity=capacity))
         self._workshop = Workshop(self._config, low_priority=live, verbose=verbose,
                                   queue=turns.wanted if live else None, on_built=self._store_turns)
@@ -128,6 +130,15 @@ class Calibrator:
                 self._detector.finish()
             self._submit()
         started = time.monotonic()
+        calibration = self._calibrated(started, tell, final)
+        most = max(self._config.turns.at_most, self._config.turns.wanted)
+        if calibration.verdict.level == 'weak' and self._places < most and self._has_more():
+            self._places = most
+            calibration = self._calibrated(started, tell, final)
+        return calibration
+
+    def _calibrated(self, started: float, tell: Progress, final: bool) -> Calibration:
+        """Return what the turns that have a place say together."""
         tell('reconstructing turns', 0.0)
         # what is told of turns that are not used must not depend on who is first
         scenes, stored = self._wanted_scenes(tell, everything=final or not self._live)
@@ -166,7 +177,7 @@ class Calibrator:
     def status(self) -> Status:
         """Return where the calibrator stands."""
         with self._lock:
-            built = self._built()[:self._config.turns.wanted]
+            built = self._built()[:self._places]
             stored = len(self._archive.turns)
             return Status(self._frames, len(self._detector.turns()) + stored, len(built),
                           sum(scene.yaw_deg for scene in built), self._detector.magnitude,
@@ -198,7 +209,7 @@ class Calibrator:
                  trace: TracebackType | None) -> None:
         self.close()
 
-    # of these, the first four need the lock
+    # of these, the ranked, built, submit and undecided ones need the lock
 
     def _ranked(self) -> list[int]:
         """Return all turns, the most prominent first: this drive's by their centres."""
@@ -224,7 +235,7 @@ class Calibrator:
         self._archive.drop_repeated(turn.stamp_s for turn in turns.values())
         built = self._workshop.scenes()
         self._workshop.keep_only(set(turns))
-        places = self._config.turns.wanted
+        places = self._places
         for key in self._ranked():
             turn = turns.get(key)
             if turn is not None and (places > 0 or self._live) and turn.frames:
@@ -235,12 +246,17 @@ class Calibrator:
             if not (replace_failed and key in built and built[key] is None):
                 places -= 1
 
+    def _has_more(self) -> bool:
+        """Tell whether there are turns beyond those that have a place."""
+        with self._lock:
+            return len(self._ranked()) > self._places
+
     def _undecided(self) -> bool:
         """Tell whether a turn that is not built yet may be among the best."""
         unbuilt = self._workshop.unbuilt()
         built = {scene.center for scene in self._built()}
         candidates = [key for key in self._ranked() if key in unbuilt or key in built]
-        return any(key in unbuilt for key in candidates[:self._config.turns.wanted])
+        return any(key in unbuilt for key in candidates[:self._places])
 
     def _wanted_scenes(self, tell: Progress, everything: bool
                        ) -> tuple[list[Scene], dict[int, StoredTurn]]:
@@ -268,8 +284,7 @@ class Calibrator:
                 self._archive.drop_repeated((), own)
                 self._submit(replace_failed=True)
                 if not self._undecided() and not (everything and self._workshop.waiting):
-                    return (self._built()[:self._config.turns.wanted],
-                            self._archive.turns.copy())
+                    return self._built()[:self._places], self._archive.turns.copy()
 
     def _reject(self, key: int) -> None:
         """Take out a scene that does not fit the others."""

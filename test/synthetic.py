@@ -1,7 +1,7 @@
 """Turns with exact truth but without pictures: what tests of the geometry are made of."""
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -139,11 +139,3 @@ def longest_runs(visible: np.ndarray) -> np.ndarray:
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
     """Return the angle between two rotations, in degrees."""
     return float(np.degrees(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1, 1))))
-
-
-def only_tracks(turn: SyntheticTurn, chosen: np.ndarray) -> SyntheticTurn:
-    """Return the turn with some of its tracks."""
-    return SyntheticTurn(
-        replace(turn.tracks, xy=turn.tracks.xy[:, chosen]),
-        replace(turn.structure, points=turn.structure.points[chosen],
-                used=turn.structure.used[:, chosen]))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import LENS, SIZE, SyntheticTurn, angle_deg, only_tracks, synthetic_turn
+from synthetic import LENS, SIZE, SyntheticTurn, angle_deg, synthetic_turn
 
 from dashcalib_ros.config import SceneConfig, TracksConfig
 from dashcalib_ros.frames import Frame
@@ -191,7 +191,7 @@ def test_the_profile_finds_a_barrel_lens(turn):
     # a chain that starts without distortion registers 6 of 20 images here, at the true focal
     # length too; the profile's minimum then was at 1.9 times the truth
     config = replace(CONFIG, profile_tracks=200)
-    sample = build._longest(thinned(turn.tracks, 16), config.profile_tracks)
+    sample = build._spread(thinned(turn.tracks, 16), config.profile_tracks)
     trials = build._profile_trials(sample, 0, config, 0)
     profile = build._profile_of(trials)
     truth = LENS.fx / SIZE[0]
@@ -586,10 +586,17 @@ def test_thinned(turn):
         assert any(same)
 
 
-def test_longest_tracks_are_kept_in_their_order(turn):
-    lengths = turn.tracks.seen.sum(axis=0)
-    few = build._longest(turn.tracks, 50)
-    assert few.xy.shape[1] == 50
-    assert few.seen.sum(axis=0).min() >= np.sort(lengths)[-50]
-    chosen = only_tracks(turn, np.sort(np.argsort(-lengths, kind='stable')[:50]))
-    np.testing.assert_array_equal(few.xy, chosen.tracks.xy)
+def test_tracks_are_chosen_where_others_are_few(turn):
+    seen = turn.tracks.seen
+    longest = np.sort(np.argsort(-seen.sum(axis=0), kind='stable')[:80])
+    few = build._spread(turn.tracks, 80)
+    assert few.xy.shape[1] == 80
+    # the image with the fewest tracks has more than the longest tracks alone give it
+    assert few.seen.sum(axis=1).min() > seen[:, longest].sum(axis=1).min()
+    # in their order
+    where = [np.flatnonzero([np.array_equal(track, each, equal_nan=True)
+                             for each in turn.tracks.xy.transpose(1, 0, 2)])[0]
+             for track in few.xy.transpose(1, 0, 2)]
+    assert where == sorted(where)
+    every = build._spread(turn.tracks, 10**6)
+    np.testing.assert_array_equal(every.xy, turn.tracks.xy)

@@ -12,8 +12,9 @@ import yaml
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError
 
-FLAGS = {'turns': 'turns.wanted', 'seed': 'seed', 'threads': 'threads',
-         'segmentation': 'mask.segmentation'}
+# who asks for a number of turns gets that number
+FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads': ('threads',),
+         'segmentation': ('mask.segmentation',)}
 EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+')  # 1e-3, a word to YAML 1.1
 
 
@@ -22,7 +23,7 @@ def read_config(args: argparse.Namespace) -> Config:
     path: Path | None = getattr(args, 'config', None)
     config = Config() if path is None else Config.from_mapping(_read_yaml(path))
     changes = parse_settings(getattr(args, 'set', []))
-    changes.update({name: getattr(args, flag) for flag, name in FLAGS.items()
+    changes.update({name: getattr(args, flag) for flag, names in FLAGS.items() for name in names
                     if getattr(args, flag, None) is not None})
     return config.replace(changes)
 

@@ -7,11 +7,11 @@ zero: p1, p2, k3. Of the variances that follow, the largest counts in each param
 
 - H^-1 times the noise of the residuals: right if each were independent and the model exact;
 - H^-1 (sum over tracks s s') H^-1: residuals of one track may share an error (drift, a car);
-- H^-1 (sum over turns g g') H^-1: whatever makes turns disagree (rolling shutter, a bad scene).
+- H^-1 (sum over turns g g') H^-1: whatever makes turns disagree (rolling shutter, a bad scene),
+  corrected for how few turns there are and for those that dominate: between_turns().
 
-The last two are the sandwich estimator with clusters; over turns it is the first-order jackknife.
-To them comes, squared, what the six would move by if p1, p2 and k3 were free: the error of a model
-that real lenses do not quite follow.
+The last two are the sandwich estimator with clusters. To them comes, squared, what the six would
+move by if p1, p2 and k3 were free: the error of a model that real lenses do not quite follow.
 """
 from __future__ import annotations
 
@@ -20,15 +20,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from dashcalib_ros.reconstruction.camera import Camera
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.reconstruction.scene import Scene, residuals_px
 
 Array = npt.NDArray[np.float64]
 # fx fy cx cy k1 k2, and p1 p2 k3, which the model holds at zero
 LENS = 9
 # what p1, p2 and k3 of real lenses are like
 EXTRA_SIGMA = np.array([1e-3, 1e-3, 0.1])
+# of its information; a turn that knows a parameter alone still leaves so much to the others
+LEAST_RESIDUAL = 0.01
 
 
 @dataclass(frozen=True)
@@ -104,15 +107,33 @@ def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
                  - by_point @ point_follow[point])
     scores = np.zeros((points, LENS))
     np.add.at(scores, point, np.einsum('nic,ni->nc', effective, residual))
-    freedom = max(2 * len(rows) - 3 * points - nuisance + 7 - 6, 1)
-    pull = np.sum((residual * weight[:, None])**2) / np.mean(weight**2)
-    return Information(hessian, scores.sum(axis=0), scores.T @ scores, float(pull),
-                       float(freedom))
+    return Information(hessian, scores.sum(axis=0), scores.T @ scores,
+                       *_squares_and_freedom(structure.used, residual, weight))
 
 
 def noise_of(parts: Sequence[Information]) -> float:
     """Return the variance of a residual, px^2, from all turns."""
     return sum(part.squares for part in parts) / sum(part.freedom for part in parts)
+
+
+def noise_in(scenes: Sequence[Scene], camera: Camera, loss_px: float) -> float:
+    """Return noise_of() the scenes' information, without the rest of it."""
+    squares = freedom = 0.0
+    for scene in scenes:
+        used = scene.structure.used
+        residual = residuals_px(scene, camera)[used]
+        more = _squares_and_freedom(
+            used, residual, 1 / (1 + np.sum(residual**2, axis=1) / loss_px**2))
+        squares, freedom = squares + more[0], freedom + more[1]
+    return squares / freedom
+
+
+def _squares_and_freedom(used: npt.NDArray[np.bool_], residual: Array, weight: Array
+                         ) -> tuple[float, float]:
+    observations, points, poses = used.sum(), used.any(axis=0).sum(), used.any(axis=1).sum()
+    # the scene's own frame and scale are free: seven; the lens takes six
+    freedom = max(2 * observations - 3 * points - 6 * poses + 7 - 6, 1)
+    return float(np.sum((residual * weight[:, None])**2) / np.mean(weight**2)), float(freedom)
 
 
 def covariance(parts: Sequence[Information], prior: Array) -> Array:
@@ -123,22 +144,55 @@ def covariance(parts: Sequence[Information], prior: Array) -> Array:
     """
     noise = noise_of(parts)
     whole = sum((part.hessian for part in parts), np.zeros((LENS, LENS))) / noise
-    inverse = np.linalg.inv(whole[:6, :6] + prior)
+    inverse = np.asarray(np.linalg.inv(whole[:6, :6] + prior), np.float64)
     by_track = sum((part.by_track[:6, :6] for part in parts), np.zeros((6, 6))) / noise**2
     estimates = [np.diag(inverse), np.diag(inverse @ by_track @ inverse)]
     if len(parts) > 1:
-        scores = np.array([part.score[:6] for part in parts]) / noise
-        scores = scores - scores.mean(axis=0)
-        count = len(parts)
-        # few turns know their own scatter badly: Student's t instead of the normal's width
-        tails = (count - 1) / (count - 3) if count > 3 else 3.0
-        by_turn = scores.T @ scores * count / (count - 1) * tails
-        estimates.append(np.diag(inverse @ by_turn @ inverse))
+        estimates.append(between_turns(
+            np.array([part.hessian[:6, :6] for part in parts]) / noise,
+            np.array([part.score[:6] for part in parts]) / noise, inverse))
     # without evidence rounding can make a variance negative: such scenes know nothing
     variance = np.where(np.min(estimates, axis=0) >= 0, np.max(estimates, axis=0), np.inf)
     sigma = np.sqrt(variance + model_error(parts, prior) ** 2)
     correlation = inverse / np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
     return np.asarray(correlation * np.outer(sigma, sigma))
+
+
+def between_turns(hessians: Array, scores: Array, inverse: Array) -> Array:
+    """Return (6,) variances from the scatter between turns.
+
+    hessians: (n, 6, 6), scores: (n, 6) of n >= 2 turns at unit noise. inverse: (6, 6) of their sum
+    with the prior.
+
+    A turn that dominates draws the result to itself and leaves itself no residual: each score is
+    first scaled back to what it would be without its own pull (CR2, Bell and McCaffrey 2002). Few
+    turns know their own scatter badly: by the degrees of freedom that are left (Satterthwaite)
+    Student's t takes the place of the normal, so that 2 sigma hold 95 %.
+    """
+    adjusted, maps = [], []
+    for hessian, score in zip(hessians, scores, strict=True):
+        values, vectors = np.linalg.eigh(hessian)
+        # a turn may know nothing of a direction, or nothing at all
+        values = np.maximum(values, 1e-12 * max(values[-1], 1e-12))
+        root = vectors * np.sqrt(values) @ vectors.T
+        leverage, axes = np.linalg.eigh(root @ inverse @ root)
+        relieved = axes / np.sqrt(np.maximum(1 - leverage, LEAST_RESIDUAL)) @ axes.T
+        maps.append(root @ relieved @ np.linalg.inv(root))
+        adjusted.append(maps[-1] @ score)
+    count = len(hessians)
+    pulls = np.array([inverse @ score for score in adjusted])
+    variance = np.sum(pulls**2, axis=0)
+    # what the pulls' covariance is if the model holds: (6,) matrices n x n
+    expected = np.zeros((6, count, count))
+    for i in range(count):
+        for j in range(count):
+            own = hessians[i] if i == j else np.zeros((6, 6))
+            middle = maps[i] @ (own - hessians[i] @ inverse @ hessians[j]) @ maps[j].T
+            expected[:, i, j] = np.diag(inverse @ middle @ inverse)
+    freedom = (np.trace(expected, axis1=1, axis2=2)**2
+               / np.maximum(np.sum(expected**2, axis=(1, 2)), 1e-300))
+    tails = stats.t.ppf(0.975, np.maximum(freedom, 1.0)) / stats.norm.ppf(0.975)
+    return np.asarray(variance * tails**2)
 
 
 def model_error(parts: Sequence[Information], prior: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.config import IntrinsicsConfig, SceneConfig
-from dashcalib_ros.intrinsics.information import covariance, information, noise_of
+from dashcalib_ros.intrinsics.information import covariance, information, noise_in
 from dashcalib_ros.intrinsics.solution import Solution
 from dashcalib_ros.reconstruction.adjust import Prior, Solver, adjust_step1, adjust_step2
 from dashcalib_ros.reconstruction.build import chain_scene
@@ -16,6 +16,7 @@ from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.scene import (
     Profile,
     Scene,
+    errors_px,
     retriangulated,
     truncated_cost,
 )
@@ -23,6 +24,8 @@ from dashcalib_ros.reconstruction.scene import (
 Array = npt.NDArray[np.float64]
 # the focal length is held at these times the result to see what the turns know of it
 PROBES = (0.8, 1.0, 1.25)
+# rendered images without noise would make the loss cut off everything
+LEAST_LOSS_PX = 0.05
 Progress = Callable[[str, float], None]
 
 
@@ -34,41 +37,62 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     it is chained anew, and one that the shared camera does not explain is dropped. None when that
     becomes of all.
     """
-    solver = Solver(scene_config.loss_px, scene_config.iterations)
     profile = summed([scene.profile for scene in scenes])
     start = _start(scenes, profile)
-    together = [_brought_to(scene, start, scene_config, seed) for scene in scenes]
+    # a part of the tracks is enough to come near the result, at a third of the time
+    few = [_brought_to(_every(scene, config.first_tracks), start, scene_config, seed)
+           for scene in scenes]
+    solver = Solver(scene_config.loss_px, scene_config.iterations)
     reach = (start.fx / config.focal_reach, start.fx * config.focal_reach)
     camera = start
     for n in range(config.rounds):
         progress('step 1: one focal length', n / config.rounds)
-        together, camera = adjust_step1(together, camera, solver, reach)
-        together = _all_again(together, camera, scene_config)
-    together = _explained(together, camera, scene_config, seed)
-    if not together:
+        few, camera = adjust_step1(few, camera, solver, reach)
+        few = _all_again(few, camera, scene_config)
+    few = _explained(few, camera, scene_config, seed)
+    if not few:
         return None
     step1 = camera
-    known = [information(scene, camera, scene_config.loss_px) for scene in together]
-    prior = _prior(step1, config, noise_of(known))
+    prior = _prior(step1, config, noise_in(few, camera, solver.loss_px))
     bounds = _bounds(step1, config)
-    for n in range(config.rounds):
-        progress('step 2: all six', n / config.rounds)
-        together, camera = adjust_step2(together, camera, solver, prior, bounds)
-        together = _all_again(together, camera, scene_config)
-    together = _explained(together, camera, scene_config, seed)
+    progress('step 2: all six', 0.0)
+    few, camera = adjust_step2(few, camera, solver, prior, bounds)
+    by_center = {scene.center: scene for scene in scenes}
+    together = [_posed_as(by_center[scene.center], scene) for scene in few]
+    together = _explained(_all_again(together, camera, scene_config), camera, scene_config, seed)
     if not together:
         return None
+    for n in range(config.rounds):
+        progress('step 2: all six', (n + 1) / (config.rounds + 1))
+        solver = replace(solver, loss_px=_loss_px(together, camera, config))
+        prior = _prior(step1, config, noise_in(together, camera, solver.loss_px))
+        together, camera = adjust_step2(together, camera, solver, prior, bounds)
+        if n < config.rounds - 1:
+            together = _all_again(together, camera, scene_config)
     progress('sigma', 0.0)
-    together, camera = adjust_step2(together, camera, solver, prior, bounds)
-    parts = tuple(information(scene, camera, scene_config.loss_px) for scene in together)
+    parts = tuple(information(scene, camera, solver.loss_px) for scene in together)
     spread = covariance(parts, np.asarray(
         np.linalg.inv(_prior(step1, config, 1.0).covariance), np.float64))
-    floor = np.square([config.focal_floor * camera.fx] * 2 + [0.0] * 4)
-    spread += np.diag(floor)
+    spread += np.diag(np.square([config.focal_floor * camera.fx] * 2
+                                + [config.centre_floor * camera.image_size[0]] * 2 + [0.0] * 2))
     progress('focal profile', 0.0)
     around = _profile_around(together, camera, profile, config, scene_config, seed)
     return Solution(camera, spread, step1, tuple(together), parts, profile, around,
                     np.array(bounds))
+
+
+def _loss_px(scenes: Sequence[Scene], camera: Camera, config: IntrinsicsConfig) -> float:
+    """Return the scale of the Cauchy loss: as wide as this drive's residuals are."""
+    errors = np.concatenate([errors_px(scene, camera)[scene.structure.used] for scene in scenes])
+    return max(config.loss * float(np.median(errors)), LEAST_LOSS_PX)
+
+
+def _posed_as(scene: Scene, part: Scene) -> Scene:
+    """Return the scene with the poses that a part of its tracks has led to."""
+    structure = part.structure
+    return replace(scene, camera=part.camera, structure=replace(
+        scene.structure, rotations=structure.rotations, translations=structure.translations,
+        registered=structure.registered))
 
 
 def _profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,

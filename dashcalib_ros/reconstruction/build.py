@@ -28,6 +28,8 @@ Mask = npt.NDArray[np.bool_]
 RATIOS = tuple(0.256 * 1.25**n for n in range(10))
 COARSE = (1, 3, 5, 7, 9)
 COMPLETIONS = 2
+# columns and rows in which tracks are to be seen in each keyframe
+GRID = (6, 3)
 
 
 def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
@@ -39,13 +41,13 @@ def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
     tracks = track_turn(turn, tracks_config, valid)
     if tracks.xy.shape[1] < config.min_tracks or len(tracks.frames) < config.min_images:
         return None
-    sample = _longest(thinned(tracks, config.profile_keyframes), config.profile_tracks)
+    sample = _spread(thinned(tracks, config.profile_keyframes), config.profile_tracks)
     trials = _profile_trials(sample, turn.center, config, seed)
     if not trials:
         return None
     profile = _profile_of(trials)
     start = trials[profile.best].camera
-    chosen = _longest(thinned(tracks, config.keyframes), config.tracks)
+    chosen = _spread(thinned(tracks, config.keyframes), config.tracks)
     scene = chain_scene(chosen, turn.center, start, profile, config, seed)
     if scene is None:
         return None
@@ -139,8 +141,31 @@ def _profile_of(trials: dict[float, Scene]) -> Profile:
                    next(iter(trials.values())).profile.observations)
 
 
-def _longest(tracks: Tracks, wanted: int) -> Tracks:
-    """Return the tracks seen in the most keyframes, in their order."""
-    length = tracks.seen.sum(axis=0)
-    chosen = np.sort(np.argsort(-length, kind='stable')[:wanted])
-    return replace(tracks, xy=tracks.xy[:, chosen])
+def _spread(tracks: Tracks, wanted: int) -> Tracks:
+    """Return the longest tracks, but those first that are seen where others are few.
+
+    Keyframes lie closest in the middle of a turn, and so the longest tracks do: without this the
+    turn's ends hang on a few points each.
+    """
+    seen = tracks.seen
+    width, height = tracks.image_size
+    columns, rows = GRID
+    keyframe, track = np.nonzero(seen)
+    x, y = tracks.xy[keyframe, track].T
+    cell = (np.clip(x * columns / width, 0, columns - 1).astype(int)
+            + columns * np.clip(y * rows / height, 0, rows - 1).astype(int))
+    place = keyframe * columns * rows + cell
+    length = seen.sum(axis=0)
+    order = np.argsort(-length, kind='stable')
+    by_track = np.split(place[np.argsort(track, kind='stable')], np.cumsum(length)[:-1])
+    share = wanted * float(np.mean(length)) / (len(seen) * columns * rows)
+    crowd = np.zeros(len(seen) * columns * rows)
+    chosen: list[int] = []
+    for n in order:
+        if len(chosen) < wanted and np.mean(crowd[by_track[n]] < share) >= 0.5:
+            crowd[by_track[n]] += 1
+            chosen.append(int(n))
+    spare = np.setdiff1d(order, chosen, assume_unique=True)
+    spare = spare[np.argsort(-length[spare], kind='stable')]
+    kept = np.sort([*chosen, *spare[:wanted - len(chosen)]]).astype(int)
+    return replace(tracks, xy=tracks.xy[:, kept])

@@ -99,7 +99,8 @@ def percent(health: Health) -> int:
 
 def _summary(health: Health) -> tuple[bytes, str]:
     status = health.status
-    turns = (f'{status.built} of {health.wanted} turns, {status.yaw_deg:.0f}° of yaw')
+    turns = (f'{min(status.built, health.wanted)} of {health.wanted} turns, '
+             f'{status.yaw_deg:.0f}° of yaw')
     if health.silent_s is None or health.silent_s > SILENT_S:
         since = 'yet' if health.silent_s is None else f'for {health.silent_s:.0f} s'
         return STALE, f'no image on {health.topic} {since}'
