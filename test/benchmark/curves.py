@@ -41,14 +41,14 @@ MARKS = {'accepted': 'o', 'weak': '^'}
 def over_turns(frames: Iterable[Frame], counts: Sequence[int], seed: int,
                truth: Mapping[str, float]) -> dict[int, dict[str, Any]]:
     """Solve with so many turns each, best first; a turn's scene is built for the first only."""
-    config = Config(seed=seed).replace({'turns.wanted': max(counts)})
+    config = Config(seed=seed).replace({'turns.wanted': 1, 'turns.at_most': 1})
     detected = detect(frames, config)
     found = {}
     with given(detected, detected.turns, config) as calibrator:
         # a scene that did not fit two others may well fit nine
         calibrator._workshop.reject = lambda center: None  # type: ignore[method-assign]
         for count in sorted(counts):
-            calibrator._config = config.replace({'turns.wanted': count})
+            calibrator._places = count
             found[count] = summarised(calibrator.calibrate(final=False), truth)
     return found
 

@@ -260,7 +260,8 @@ def main() -> None:
 
 def _task(name: str, seed: int, arguments: argparse.Namespace, passing: Path) -> Task:
     """Render or open a drive."""
-    config = Config(seed=seed).replace({'turns.wanted': arguments.turns})
+    config = Config(seed=seed).replace(
+        {'turns.wanted': arguments.turns, 'turns.at_most': arguments.turns})
     if name in RECORDED:
         folder = arguments.data / name
         frames: Iterable[Frame] = open_frames(folder / RECORDED[name])

@@ -170,7 +170,7 @@ def whole(pictures: Pictures, times: int, turns: int) -> dict[str, Any]:
               for frame in pictures]
     frames = (replace(frame, image=np.asarray(cv2.imdecode(frame.image, 0), np.uint8))
               for frame in there_and_back(images, times * len(images), 10.0))
-    config = Config().replace({'turns.wanted': turns})
+    config = Config().replace({'turns.wanted': turns, 'turns.at_most': turns})
     result, seconds = calibrate(frames, config)
     return {'times': times, 'wanted': turns, 'frames': result.frames, 'seconds': seconds,
             'used': sum(turn.used for turn in result.turns), 'verdict': result.verdict.level}
