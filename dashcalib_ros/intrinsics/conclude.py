@@ -12,11 +12,13 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.intrinsics.calibration import (
     Calibration,
     Intrinsics,
+    StoredTurnSummary,
     TurnSummary,
     Verdict,
 )
 from dashcalib_ros.intrinsics.solution import Solution
 from dashcalib_ros.intrinsics.verdict import focal_disagreement, judge, profile_contrast
+from dashcalib_ros.reconstruction.archive import StoredTurn
 from dashcalib_ros.reconstruction.scene import Scene, errors_px
 from dashcalib_ros.turns.turn import Turn
 
@@ -28,7 +30,8 @@ class Evidence:
     """What the drive has shown, beside the solution.
 
     image_size: of the input; shrink: by what factor the images were made smaller for all that is
-    in a scene. built: scenes by their turn's centre, None where there is none.
+    in a scene. built: scenes by their turn's centre, None where there is none. stored: the turns
+    of earlier drives that were there to choose from.
     """
 
     image_size: tuple[int, int]
@@ -39,6 +42,8 @@ class Evidence:
     mask: npt.NDArray[np.bool_] | None
     shrink: int
     timing: dict[str, float]
+    warnings: tuple[str, ...] = ()
+    stored: tuple[StoredTurn, ...] = ()
 
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
@@ -58,7 +63,8 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
         frames=evidence.frames, reprojection_error_px=error, timing=evidence.timing,
         versions=_versions(), config=config, magnitudes=evidence.magnitudes, mask=evidence.mask,
-        details=details)
+        details=details, warnings=evidence.warnings,
+        stored_turns=tuple(_stored_summary(turn, solution) for turn in evidence.stored))
 
 
 def _nothing(evidence: Evidence) -> Verdict:
@@ -96,6 +102,13 @@ def _summary(turn: Turn, evidence: Evidence, solution: Solution | None) -> TurnS
         registered=int(scene.structure.registered.sum()) if scene else 0,
         used=turn.center in used, yaw_deg=scene.yaw_deg if scene else None,
         reprojection_error_px=error)
+
+
+def _stored_summary(turn: StoredTurn, solution: Solution | None) -> StoredTurnSummary:
+    scene = turn.scene
+    used = {each.center for each in solution.scenes} if solution else set()
+    return StoredTurnSummary(scene.center, turn.stamp_s, turn.prominence, scene.yaw_deg,
+                             len(scene.tracks.frames), scene.center in used)
 
 
 def _details(solution: Solution) -> dict[str, object]:

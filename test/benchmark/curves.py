@@ -25,7 +25,7 @@ from typing import Any
 
 from drives import DEMO, STREET, Setting, drive_of, pictures_of
 from measure import KEYS, calibrate, commit, complain, done, isolated, load, save, summarised
-from stages import detect, given
+from stages import detect, given, with_so_many
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.frames import Frame
@@ -45,11 +45,8 @@ def over_turns(frames: Iterable[Frame], counts: Sequence[int], seed: int,
     detected = detect(frames, config)
     found = {}
     with given(detected, detected.turns, config) as calibrator:
-        # a scene that did not fit two others may well fit nine
-        calibrator._workshop.reject = lambda center: None  # type: ignore[method-assign]
         for count in sorted(counts):
-            calibrator._places = count
-            found[count] = summarised(calibrator.calibrate(final=False), truth)
+            found[count] = summarised(with_so_many(calibrator, count), truth)
     return found
 
 

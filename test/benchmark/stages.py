@@ -85,8 +85,9 @@ def detect(frames: Iterable[Frame], config: Config) -> Detected:
 def given(detected: Detected, turns: Sequence[Turn], config: Config) -> Iterator[Calibrator]:
     """Give a Calibrator that has found these turns, and reconstructed none of them yet."""
     with Calibrator(config) as calibrator:
-        calibrator._motion = detected.motion
-        calibrator._detector = GivenTurns(config, turns)
+        found = GivenTurns(config, turns)
+        calibrator._motion, calibrator._detector = detected.motion, found
+        calibrator._scenes.valid, calibrator._scenes.detector = detected.motion.valid, found
         calibrator._size = detected.size
         calibrator._frames = detected.count
         yield calibrator
@@ -98,6 +99,14 @@ def from_turns(detected: Detected, turns: Sequence[Turn], config: Config
     with given(detected, turns, config) as calibrator:
         started = time.monotonic()
         return calibrator.calibrate(), time.monotonic() - started
+
+
+def with_so_many(calibrator: Calibrator, count: int) -> Calibration:
+    """Return the calibration with the best so many turns; their scenes are built only once."""
+    # a scene that did not fit two others may well fit nine
+    calibrator._scenes.reject = lambda keys: None  # type: ignore[method-assign]
+    calibrator._scenes.places = count
+    return calibrator.calibrate(final=False)
 
 
 def random_windows(detected: Detected, lengths: Sequence[int], seed: int) -> list[Turn]:
