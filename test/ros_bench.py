@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from processes import processes_of
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -72,16 +73,7 @@ class NodeProcess:
 
     def children(self):
         """Return the ids of the living processes that the node started."""
-        found = []
-        for path in Path('/proc').glob('[0-9]*/stat'):
-            try:
-                fields = path.read_text().rpartition(')')[2].split()
-            except OSError:
-                continue  # it ended meanwhile
-            own = int(fields[3]) == self.process.pid and int(path.parent.name) != self.process.pid
-            if own and fields[0] != 'Z':
-                found.append(int(path.parent.name))
-        return found
+        return [pid for pid in processes_of(self.process.pid) if pid != self.process.pid]
 
     def stop(self, *signals, limit=SOON):
         """Send the signals, wait for the end and return the exit code."""

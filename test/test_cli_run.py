@@ -7,13 +7,14 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 pytest.importorskip('dashcalib_ros.calibrator')
+
+from processes import processes_of
 
 from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.report import Camera, compare, load_camera, load_result
@@ -24,19 +25,6 @@ COMMAND = (sys.executable, '-m', 'dashcalib_ros.cli')
 def dashcalib(*args):
     return subprocess.run([*COMMAND, *map(str, args)], capture_output=True, text=True,
                           timeout=600)
-
-
-def processes_of(session):
-    """Return the ids of all living processes of a session."""
-    found = []
-    for path in Path('/proc').glob('[0-9]*/stat'):
-        try:
-            fields = path.read_text().rpartition(')')[2].split()
-        except OSError:
-            continue  # it ended meanwhile
-        if int(fields[3]) == session and fields[0] != 'Z':
-            found.append(int(path.parent.name))
-    return found
 
 
 @pytest.fixture(scope='module')
