@@ -90,7 +90,15 @@ def test_home_is_expanded(make, tmp_path, monkeypatch):
     monkeypatch.setenv('HOME', str(tmp_path / 'home'))
     hold(make(folder='~/turns'), stored())
     assert len(list((tmp_path / 'home' / 'turns').iterdir())) == 1
-    assert make(folder='~nobody-of-this-name/turns').turns == {}
+
+
+def test_the_home_of_nobody_costs_one_warning(make, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    archive = make(folder='~nobody-of-this-name/turns')
+    hold(archive, stored())
+    archive.clear()
+    assert archive.turns == {} and list(tmp_path.iterdir()) == []
+    assert len(archive.said) == 1 and 'set turns.store' in archive.said[0]
 
 
 def test_turns_that_are_gone_from_the_bank_are_gone_from_the_folder(make):

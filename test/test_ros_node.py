@@ -316,6 +316,9 @@ def test_services_say_why_not(plain):
     ({'reliability': 'perfect'}, 'must be one of'),
     ({'camera_name': 'narrow_stereo'}, 'belongs to image_pipeline'),
     ({'mask_file': 'missing.png'}, 'cannot read the mask'),
+    ({'mask_file': '~nobody-of-this-name/mask.png'}, 'cannot read the mask'),
+    ({'mask__segmentation': '~nobody-of-this-name/m.onnx'}, 'there is no segmentation model'),
+    ({'camera_info_file': '~nobody-of-this-name/camera.yaml'}, 'set camera_info_file'),
 ])
 def test_a_bad_parameter_ends_it_with_one_line(start_node, parameters, words):
     node = start_node(**parameters)

@@ -249,10 +249,11 @@ def test_a_model_of_no_use_is_refused_at_the_start(drive, tmp_path, capfd, kind,
     assert shown.out == '' and not list((tmp_path / 'work').iterdir())
 
 
-def test_a_model_that_is_not_there(drive, capfd):
-    assert main(['run', drive, '--segmentation', 'none.onnx']) == 2
+@pytest.mark.parametrize('path', ['none.onnx', '~nobody-of-this-name/none.onnx'])
+def test_a_model_that_is_not_there(drive, capfd, path):
+    assert main(['run', drive, '--segmentation', path]) == 2
     assert capfd.readouterr().err == (
-        'dashcalib: error: there is no segmentation model none.onnx; check the path\n')
+        f'dashcalib: error: there is no segmentation model {path}; check the path\n')
 
 
 def test_without_the_runtime_the_cure_is_named(drive, tmp_path, monkeypatch, capfd):

@@ -6,6 +6,7 @@ is left out. Cars that pass are outvoted. Our images are grey: they go in as thr
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -155,7 +156,9 @@ def _opened(path: str, classes: str) -> SegmentationModel:
 
 def _session(path: str) -> Any:
     """Return an onnxruntime session; raises ConfigError."""
-    file = Path(path).expanduser()
+    file = Path(path)
+    with suppress(RuntimeError):  # there is no such user: there will be no such file
+        file = file.expanduser()
     if not file.is_file():
         raise ConfigError(f'there is no segmentation model {path}; check the path')
     try:

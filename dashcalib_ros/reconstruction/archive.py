@@ -92,9 +92,13 @@ class Archive:
         """
         self.turns: dict[int, StoredTurn] = {}
         self._folder = Path(folder)
-        with suppress(RuntimeError):  # there is no such user: it will not be found
-            self._folder = self._folder.expanduser()
         self._off = not folder
+        try:
+            self._folder = self._folder.expanduser()
+        except RuntimeError:  # no folder named ~user is to be made here
+            self._off = True
+            warn(f'turns cannot be stored in {folder} (there is no such home folder); set '
+                 f'turns.store to a path without ~')
         self._writing = threading.Lock()
         self._capacity = capacity
         self._half_width_s = half_width_s

@@ -38,10 +38,17 @@ class Store:
     """One file. A calibration that another tool left there is set aside, never overwritten."""
 
     def __init__(self, path: str, camera_name: str) -> None:
-        """path: empty for camera_info_manager's place and name."""
-        home = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
-        self.path = (Path(path).expanduser() if path
-                     else home / 'camera_info' / f'{camera_name}.yaml')
+        """path: empty for camera_info_manager's place and name; ~ is expanded.
+
+        Raises InputError for the home of a user that there is not.
+        """
+        place = Path(path) if path else (
+            Path(os.environ.get('ROS_HOME') or '~/.ros', 'camera_info', f'{camera_name}.yaml'))
+        try:
+            self.path = place.expanduser()
+        except RuntimeError as error:  # there is no such user, or nobody knows the own home
+            raise InputError(f'there is no home folder for {place}; set camera_info_file to a '
+                             f'path without ~') from error
         self.previous = self.path.with_suffix('.previous.yaml')
         self._foreign = False
 
