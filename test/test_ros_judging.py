@@ -54,12 +54,12 @@ class Desk:
             return condition()
         return self.bench.until(spun)
 
-    def give(self, level='accepted', complete=True, sigma=SIGMA, **changes):
+    def give(self, level='accepted', complete=True, sigma=SIGMA, warnings=(), **changes):
         """Let the learner's thread come up with a calibration."""
         intrinsics = dataclasses.replace(FIRST, **changes) if level != 'refused' else None
         calibration = Calibration(
             Verdict(level, () if level == 'accepted' else ('few turns',)), (320, 240), intrinsics,
-            sigma if intrinsics else None, (), 10, 0.3, {}, {}, Config())
+            sigma if intrinsics else None, (), 10, 0.3, {}, {}, Config(), warnings=warnings)
         result = Result(calibration, complete, self.node._learner.bank)
         done = []
         self.node._later(lambda: self.node._on_result(result))
@@ -159,6 +159,15 @@ def test_a_disk_that_takes_nothing_is_counted_and_the_calibration_published(make
     assert desk.show() == 400.0
     assert desk.bench.values['unsaved'] == '1'
     assert 'camera_info_file' in desk.node._save(desk.node._publication.kept)
+
+
+def test_each_warning_of_a_calibration_is_logged_once(make_desk, capfd):
+    desk = make_desk()
+    for _ in range(2):
+        desk.give('weak', warnings=('the mask is odd', 'a turn is odd'))
+    logged = capfd.readouterr().err
+    for words in ('the mask is odd', 'a turn is odd'):
+        assert [line.split()[0] for line in logged.splitlines() if words in line] == ['[WARN]']
 
 
 def test_a_file_of_another_tool_is_set_aside(make_desk, tmp_path):

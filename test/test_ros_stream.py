@@ -169,3 +169,14 @@ def test_what_was_not_said_is_told_next_time():
     complaints._every_s = 0.0
     complaints.say('broken', 'c')
     assert said == ['a', 'c (1 more like it)']
+
+
+def test_what_lasts_is_said_once():
+    said = []
+    complaints = Complaints(said.append, every_s=3600.0)
+    complaints.say('store', 'full')
+    complaints.say('store', 'odd')
+    for _ in range(3):
+        for text in ('full', 'odd', 'no mask'):
+            complaints.once(text)
+    assert said == ['full', 'odd', 'no mask'] and complaints.counts == {'store': 2}

@@ -167,6 +167,8 @@ class CalibratorNode(Node):
             return  # a reset came in between
         calibration, complete = result.calibration, result.complete
         self._verdict = calibration.verdict
+        for text in calibration.warnings:
+            self._complaints.once(text)
         trusted = None if self._publication.stale or self._publication.kept is None else (
             self._publication.kept.camera)
         rules = Rules(self._own.better, self._own.contradictions)
