@@ -124,6 +124,9 @@ class SceneConfig:
         12, 'of one adjustment; 60 move fx by 0.02 % at the most, at twice the time', 5, 500)
     min_explained: float = setting(
         0.3, 'of a turn\'s observations; a camera that explains fewer is not its camera', 0.0, 0.9)
+    well_explained: float = setting(
+        0.9, 'of a turn\'s observations; where the common camera explains fewer, the turn is '
+        'chained anew with it: sound scenes have 0.97', 0.0, 1.0)
     patch_half_window: int = setting(7, 'px; of the affine registration', 3, 25)
     max_shift_px: float = setting(
         3.0, 'px; a registration that moves a point farther has lost it', 0.2, 20.0)
@@ -149,6 +152,12 @@ class IntrinsicsConfig:
         120, 'of each turn, for the focal profile around the result', 20, 5000)
     aspect_sigma: float = setting(
         0.003, 'fy / fx is 1 to within this: planar turns know fx but hardly fy', 1e-5, 1.0)
+    shutter_rounds: int = setting(
+        5, 'corrections of a rolling shutter at the most; 0 takes every shutter for global', 0, 20)
+    shutter_sigmas: float = setting(
+        5.0, 'of its readout; less is taken for a global shutter', 1.0, 100.0)
+    least_readout_ms: float = setting(
+        1.0, 'ms; six global shutters came out at 0.0 to 0.5', 0.0, 100.0)
     focal_floor: float = setting(
         0.0005, 'of fx, in every sigma: tracking itself; five rendered lenses came out 0.01 to '
         '0.06 % off', 0.0, 0.1)
@@ -175,6 +184,8 @@ class VerdictConfig:
     refused_sigma: float = setting(0.1, 'of fx; more is no result', 0.0, 1.0)
     max_aspect: float = setting(
         0.015, 'fy / fx farther from 1 is weak; a rolling shutter of 20 ms made it 0.04', 0.0, 1.0)
+    max_readout_ms: float = setting(
+        50.0, 'ms; a rolling shutter that takes longer is weak: one picture at 20 fps', 0.0, 1e4)
     max_disagreement: float = setting(
         0.03, 'of fx; weighted scatter between the turns, more is weak', 0.0, 1.0)
 

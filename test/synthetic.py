@@ -12,6 +12,8 @@ from dashcalib_ros.reconstruction.tracks import Tracks
 
 SIZE = (800, 450)
 LENS = Camera(SIZE, 520.0, 521.0, 407.0, 219.0, -0.28, 0.09)
+# between two keyframes
+KEYFRAME_S = 0.3
 NEAR_M, FAR_M = 2.0, 45.0
 
 
@@ -64,12 +66,13 @@ def poses_of_turn(yaw_deg: float, count: int, seed: int, radius_m: float = 10.0,
 
 def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int = 20,
                    tracks: int = 350, noise_px: float = 0.2, outliers: float = 0.0, seed: int = 0,
-                   world: int = 0, extra: tuple[float, float, float] = (0.0, 0.0, 0.0)
-                   ) -> SyntheticTurn:
+                   world: int = 0, extra: tuple[float, float, float] = (0.0, 0.0, 0.0),
+                   readout_s: float = 0.0) -> SyntheticTurn:
     """Return a turn through random points.
 
     seed: of the noise; world: of the path and the points. outliers: share of the observations that
     are 5 to 40 px off. extra: p1, p2, k3 of the lens that took the pictures.
+    readout_s: of a rolling shutter; keyframes are KEYFRAME_S apart.
     """
     rng = np.random.default_rng([world, 2])
     rotations, translations = poses_of_turn(yaw_deg, keyframes, world)
@@ -81,10 +84,16 @@ def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int 
     local = np.stack([rng.uniform(-0.8, 0.8, many) * depth, rng.uniform(-5, 1.4, many), depth], 1)
     points = np.einsum('nji,nj->ni', rotations[origin], local) + centres[origin]
     seen_from = points @ rotations.transpose(0, 2, 1) + translations[:, None]
+    width, height = camera.image_size
     behind = seen_from[:, :, 2] < NEAR_M
+    global_shutter = seen_from.copy()
     seen_from[behind] = [0, 0, 1]
     xy = project(seen_from, camera, extra)
-    width, height = camera.image_size
+    for _ in range(4 if readout_s else 0):
+        late = ((xy[:, :, 1] + 0.5) / height - 0.5) * readout_s / KEYFRAME_S
+        seen_from = between(global_shutter, np.clip(late, -1.0, 1.0))
+        seen_from[behind] = [0, 0, 1]
+        xy = project(seen_from, camera, extra)
     radius = np.linalg.norm(seen_from[:, :, :2] / seen_from[:, :, 2:], axis=2)
     limit = 0.98 * fold_radius(camera)
     visible = (~behind & (seen_from[:, :, 2] < FAR_M) & (radius < limit)
@@ -100,10 +109,18 @@ def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int 
     measured[wrong] += (noise.uniform(5, 40, wrong.sum())[:, None]
                         * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     measured[~visible[:, chosen]] = np.nan
-    everything = Tracks(np.arange(keyframes) * 3, measured, camera.image_size)
+    everything = Tracks(np.arange(keyframes) * 3, measured, camera.image_size,
+                        np.arange(keyframes) * round(KEYFRAME_S * 1e9))
     structure = Structure(rotations, translations, points[chosen], np.ones(keyframes, bool),
                           visible[:, chosen])
     return SyntheticTurn(everything, structure)
+
+
+def between(local: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return (k, t, 3) points a share (k, t) of the way to the next keyframe, or the last."""
+    step = np.diff(local, axis=0)
+    ahead, back = np.concatenate([step, step[-1:]]), np.concatenate([step[:1], step])
+    return local + share[:, :, None] * np.where(share[:, :, None] > 0, ahead, back)
 
 
 def project(points: np.ndarray, camera: Camera, extra: tuple[float, float, float]) -> np.ndarray:

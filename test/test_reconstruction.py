@@ -94,7 +94,7 @@ def test_chain_gives_the_same_for_the_same_seed(turn):
 
 
 def test_chain_of_nothing():
-    nothing = Tracks(np.arange(8), np.full((8, 60, 2), np.nan), SIZE)
+    nothing = Tracks(np.arange(8), np.full((8, 60, 2), np.nan), SIZE, np.arange(8))
     assert chain(nothing, LENS, 3.2, 1.0) is None
     assert chain(replace(nothing, xy=np.zeros((8, 0, 2))), LENS, 3.2, 1.0) is None
     noise = np.random.default_rng(3).uniform(10, 400, (8, 100, 2))
@@ -314,7 +314,8 @@ def colmap_scene() -> Scene:
         np.array([made.point3D(i).xyz for i in ids]), np.ones(len(images), bool),
         np.isfinite(xy[:, :, 0]))
     camera = Camera((1024, 768), F, F, CX - 0.5, CY - 0.5, K1, K2)
-    return Scene(0, Tracks(np.arange(len(images)), xy, (1024, 768)), structure, camera, NO_PROFILE)
+    tracks = Tracks(np.arange(len(images)), xy, (1024, 768), np.arange(len(images)))
+    return Scene(0, tracks, structure, camera, NO_PROFILE)
 
 
 def test_pixels_are_colmaps_minus_a_half(colmap_scene):
@@ -400,7 +401,7 @@ def registered_case(warps: list[tuple[np.ndarray, np.ndarray]], depths: list[flo
         np.broadcast_to(np.eye(3), (count, 3, 3)).copy(),
         np.stack([np.zeros(count), np.zeros(count), depths], axis=1), np.zeros((len(points), 3)),
         np.ones(count, bool), np.ones((count, len(points)), bool))
-    return Tracks(np.arange(count), xy, (320, 240)), structure, images
+    return Tracks(np.arange(count), xy, (320, 240), np.arange(count)), structure, images
 
 
 STILL = (np.eye(2), np.zeros(2))
@@ -533,7 +534,8 @@ def test_a_track_that_stands_and_hops_is_no_track():
     # from one letter to the next; far away on the right the street hardly moves, but it does
     hopping = np.array([[50.0, 200], *[[50, 200]] * 3, *[[62, 201]] * 6])
     slow = np.stack([300 + 0.5 * np.arange(10), np.full(10, 90.0)], axis=1)
-    tracks = Tracks(np.arange(10), np.stack([moving, hopping, slow], axis=1), (WIDTH, HEIGHT))
+    tracks = Tracks(np.arange(10), np.stack([moving, hopping, slow], axis=1), (WIDTH, HEIGHT),
+                    np.arange(10))
     kept = thinned(tracks, 9)
     np.testing.assert_array_equal(kept.xy[0], [moving[0], slow[0]])
 

@@ -67,6 +67,14 @@ class StoredTurnSummary:
 
 
 @dataclass(frozen=True)
+class Shutter:
+    """A rolling shutter: ms from the first row to the last, and its standard deviation."""
+
+    readout_ms: float
+    sigma_ms: float
+
+
+@dataclass(frozen=True)
 class Calibration:
     """The whole result. intrinsics and sigma are None when the verdict is refused.
 
@@ -74,6 +82,7 @@ class Calibration:
     timing: seconds, keys detect, calibrate, total. versions: package name -> version.
     magnitudes: (n, 2) float64, columns stamp [s] and filtered turning magnitude [of the width].
     mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
+    rolling_shutter: what was found and undone; None for a global one.
     """
 
     verdict: Verdict
@@ -92,6 +101,7 @@ class Calibration:
     mask: npt.NDArray[np.bool_] | None = None
     details: dict[str, Any] = field(default_factory=dict)
     stored_turns: tuple[StoredTurnSummary, ...] = ()
+    rolling_shutter: Shutter | None = None
 
     @property
     def turns_used(self) -> int:

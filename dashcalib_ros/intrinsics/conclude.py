@@ -12,6 +12,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.intrinsics.calibration import (
     Calibration,
     Intrinsics,
+    Shutter,
     StoredTurnSummary,
     TurnSummary,
     Verdict,
@@ -49,7 +50,7 @@ class Evidence:
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
     """Return the calibration; a refused one has no intrinsics, so that nobody takes them."""
     verdict = judge(solution, config.verdict) if solution else _nothing(evidence)
-    intrinsics = sigma = error = None
+    intrinsics = sigma = error = shutter = None
     details: dict[str, object] = {}
     if solution is not None:
         details = _details(solution)
@@ -57,13 +58,15 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
             intrinsics = _full_size(solution.camera.params, evidence.shrink, shift=True)
             sigma = _full_size(solution.sigma, evidence.shrink, shift=False)
             error = solution.reprojection_error_px * evidence.shrink
+            if solution.readout_s:
+                shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
     return Calibration(
         verdict=verdict, image_size=evidence.image_size, intrinsics=intrinsics, sigma=sigma,
         turns=tuple(_summary(turn, evidence, solution)
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
         frames=evidence.frames, reprojection_error_px=error, timing=evidence.timing,
         versions=_versions(), config=config, magnitudes=evidence.magnitudes, mask=evidence.mask,
-        details=details, warnings=evidence.warnings,
+        details=details, rolling_shutter=shutter, warnings=evidence.warnings,
         stored_turns=tuple(_stored_summary(turn, solution) for turn in evidence.stored))
 
 

@@ -38,8 +38,9 @@ LEAST_RESIDUAL = 0.01
 class Information:
     """What one turn contributes, in units of its residuals' weight (px^-2).
 
-    hessian: (9, 9) reduced information of fx, fy, cx, cy, k1, k2, p1, p2, k3. score: (9,) minus
-    the gradient. by_track: (9, 9) sum over tracks of the outer products of their scores.
+    hessian: (9, 9) reduced information of fx, fy, cx, cy, k1, k2, p1, p2, k3; (10, 10) where one
+    more was asked for, a rolling shutter's readout. score: (9,) minus the gradient.
+    by_track: (9, 9) sum over tracks of the outer products of their scores.
     squares: sum of squared residuals, weighted by w^2 over the mean of w^2, px^2: divided by
     freedom (residuals minus parameters) it is the variance that H^-1 is to be multiplied by.
     """
@@ -51,10 +52,12 @@ class Information:
     freedom: float
 
 
-def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
+def information(scene: Scene, camera: Camera, loss_px: float, also: Array | None = None
+                ) -> Information:
     """Return what a scene knows of the camera, at the solution.
 
     loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply.
+    also: (k, t, 2) derivatives of the observations by one more parameter.
     """
     structure = scene.structure
     rows, columns = np.nonzero(structure.used)
@@ -62,6 +65,9 @@ def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
     rotated = np.einsum('nij,nj->ni', rotation, structure.points[columns])
     local = rotated + structure.translations[rows]
     by_camera, by_local, projected = _derivatives(local, camera)
+    if also is not None:
+        by_camera = np.concatenate([by_camera, also[rows, columns, :, None]], axis=2)
+    lens = by_camera.shape[2]
     residual = scene.tracks.xy[rows, columns] - projected
     # the loss pulls with w e, and its curvature is w^2 on average over the directions of e
     weight = 1 / (1 + np.sum(residual**2, axis=1) / loss_px**2)
@@ -75,14 +81,14 @@ def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
     points = int(point.max()) + 1
 
     # global block: all poses of the turn, then the lens
-    size = nuisance + LENS
+    size = nuisance + lens
     normal = np.zeros((size, size))
     mixed = np.zeros((points, size, 3))
     own = np.zeros((points, 3, 3))
     np.add.at(own, point, by_point.transpose(0, 2, 1) @ by_point)
     slots = 6 * pose[:, None] + np.arange(6)
     wide = np.concatenate([by_pose, by_camera], axis=2)
-    last = np.broadcast_to(np.arange(nuisance, size), (len(rows), LENS))
+    last = np.broadcast_to(np.arange(nuisance, size), (len(rows), lens))
     where = np.concatenate([slots, last], axis=1)
     np.add.at(normal, (where[:, :, None], where[:, None, :]), wide.transpose(0, 2, 1) @ wide)
     np.add.at(mixed, (point[:, None], where), wide.transpose(0, 2, 1) @ by_point)
@@ -101,11 +107,11 @@ def information(scene: Scene, camera: Camera, loss_px: float) -> Information:
     hessian = reduced[nuisance:, nuisance:] - reduced[:nuisance, nuisance:].T @ follow
 
     # each track's score, after its poses and its point have followed the lens
-    combine = np.concatenate([-follow, np.eye(LENS)])
+    combine = np.concatenate([-follow, np.eye(lens)])
     point_follow = inverse @ (mixed.transpose(0, 2, 1) @ combine)
     effective = (np.einsum('nij,njc->nic', wide, combine[where])
                  - by_point @ point_follow[point])
-    scores = np.zeros((points, LENS))
+    scores = np.zeros((points, lens))
     np.add.at(scores, point, np.einsum('nic,ni->nc', effective, residual))
     return Information(hessian, scores.sum(axis=0), scores.T @ scores,
                        *_squares_and_freedom(structure.used, residual, weight))
@@ -140,28 +146,34 @@ def covariance(parts: Sequence[Information], prior: Array) -> Array:
     """Return the (6, 6) covariance: the largest of the three estimates in each parameter.
 
     prior: (6, 6) information of the priors, in the same units as the residuals (px^-2 at unit
-    noise). The correlations are those of the first estimate.
+    noise). The correlations are those of the first estimate. Where the parts know of a readout,
+    it is free: (7, 7).
     """
     noise = noise_of(parts)
-    whole = sum((part.hessian for part in parts), np.zeros((LENS, LENS))) / noise
-    inverse = np.asarray(np.linalg.inv(whole[:6, :6] + prior), np.float64)
-    by_track = sum((part.by_track[:6, :6] for part in parts), np.zeros((6, 6))) / noise**2
+    size = len(parts[0].score)
+    free = [*range(6), *range(LENS, size)]
+    block = np.ix_(free, free)
+    whole = sum((part.hessian for part in parts), np.zeros((size, size)))[block] / noise
+    whole[:6, :6] += prior
+    inverse = np.asarray(np.linalg.inv(whole), np.float64)
+    by_track = sum((part.by_track for part in parts), np.zeros((size, size)))[block] / noise**2
     estimates = [np.diag(inverse), np.diag(inverse @ by_track @ inverse)]
     if len(parts) > 1:
         estimates.append(between_turns(
-            np.array([part.hessian[:6, :6] for part in parts]) / noise,
-            np.array([part.score[:6] for part in parts]) / noise, inverse))
+            np.array([part.hessian[block] for part in parts]) / noise,
+            np.array([part.score[free] for part in parts]) / noise, inverse))
     # without evidence rounding can make a variance negative: such scenes know nothing
     variance = np.where(np.min(estimates, axis=0) >= 0, np.max(estimates, axis=0), np.inf)
-    sigma = np.sqrt(variance + model_error(parts, prior) ** 2)
+    variance[:6] += model_error(parts, prior) ** 2
+    sigma = np.sqrt(variance)
     correlation = inverse / np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
     return np.asarray(correlation * np.outer(sigma, sigma))
 
 
 def between_turns(hessians: Array, scores: Array, inverse: Array) -> Array:
-    """Return (6,) variances from the scatter between turns.
+    """Return (p,) variances of p parameters from the scatter between turns.
 
-    hessians: (n, 6, 6), scores: (n, 6) of n >= 2 turns at unit noise. inverse: (6, 6) of their sum
+    hessians: (n, p, p), scores: (n, p) of n >= 2 turns at unit noise. inverse: (p, p) of their sum
     with the prior.
 
     A turn that dominates draws the result to itself and leaves itself no residual: each score is
@@ -179,14 +191,14 @@ def between_turns(hessians: Array, scores: Array, inverse: Array) -> Array:
         relieved = axes / np.sqrt(np.maximum(1 - leverage, LEAST_RESIDUAL)) @ axes.T
         maps.append(root @ relieved @ np.linalg.inv(root))
         adjusted.append(maps[-1] @ score)
-    count = len(hessians)
+    count, size = scores.shape
     pulls = np.array([inverse @ score for score in adjusted])
     variance = np.sum(pulls**2, axis=0)
-    # what the pulls' covariance is if the model holds: (6,) matrices n x n
-    expected = np.zeros((6, count, count))
+    # what the pulls' covariance is if the model holds: p matrices n x n
+    expected = np.zeros((size, count, count))
     for i in range(count):
         for j in range(count):
-            own = hessians[i] if i == j else np.zeros((6, 6))
+            own = hessians[i] if i == j else np.zeros((size, size))
             middle = maps[i] @ (own - hessians[i] @ inverse @ hessians[j]) @ maps[j].T
             expected[:, i, j] = np.diag(inverse @ middle @ inverse)
     freedom = (np.trace(expected, axis1=1, axis2=2)**2
@@ -203,10 +215,11 @@ def model_error(parts: Sequence[Information], prior: Array) -> Array:
     the three pull.
     """
     noise = noise_of(parts)
-    whole = sum((part.hessian for part in parts), np.zeros((LENS, LENS))) / noise
+    # a readout that was asked for is at its optimum
+    whole = sum((part.hessian[:LENS, :LENS] for part in parts), np.zeros((LENS, LENS))) / noise
     whole[:6, :6] += prior
     whole[6:, 6:] += np.diag(1 / np.square(EXTRA_SIGMA))
-    pull = sum((part.score for part in parts), np.zeros(LENS)) / noise
+    pull = sum((part.score[:LENS] for part in parts), np.zeros(LENS)) / noise
     pull[:6] = 0.0
     return np.asarray(np.abs(np.linalg.solve(whole, pull)[:6]))
 

@@ -1,7 +1,7 @@
 """Scenes -> one camera, in the paper's two steps (3.2), with what each turn knows of it."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from dashcalib_ros.config import IntrinsicsConfig, SceneConfig
 from dashcalib_ros.intrinsics.information import covariance, information, noise_in
+from dashcalib_ros.intrinsics.shutter import readout, row_shift, undone
 from dashcalib_ros.intrinsics.solution import Solution
 from dashcalib_ros.reconstruction.adjust import Prior, Solver, adjust_step1, adjust_step2
 from dashcalib_ros.reconstruction.build import chain_scene
@@ -57,9 +58,11 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     bounds = _bounds(step1, config)
     progress('step 2: all six', 0.0)
     few, camera = adjust_step2(few, camera, solver, prior, bounds)
+    few, camera, readout_s = _shutter(few, camera, solver, prior, bounds, config, scene_config)
     by_center = {scene.center: scene for scene in scenes}
-    together = [_posed_as(by_center[scene.center], scene) for scene in few]
-    together = _explained(_all_again(together, camera, scene_config), camera, scene_config, seed)
+    measured = [_posed_as(by_center[scene.center], scene) for scene in few]
+    together = _explained(_without_shutter(measured, camera, readout_s, scene_config), camera,
+                          scene_config, seed)
     if not together:
         return None
     for n in range(config.rounds):
@@ -68,17 +71,68 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
         prior = _prior(step1, config, noise_in(together, camera, solver.loss_px))
         together, camera = adjust_step2(together, camera, solver, prior, bounds)
         if n < config.rounds - 1:
+            if readout_s:
+                readout_s += readout(together, camera, solver.loss_px, _belief(step1, config))[0]
+                together = _undone(together, by_center, camera, readout_s)
             together = _all_again(together, camera, scene_config)
     progress('sigma', 0.0)
-    parts = tuple(information(scene, camera, solver.loss_px) for scene in together)
-    spread = covariance(parts, np.asarray(
-        np.linalg.inv(_prior(step1, config, 1.0).covariance), np.float64))
-    spread += np.diag(np.square([config.focal_floor * camera.fx] * 2
-                                + [config.centre_floor * camera.image_size[0]] * 2 + [0.0] * 2))
+    parts = tuple(information(scene, camera, solver.loss_px,
+                              row_shift(scene, camera) if readout_s else None)
+                  for scene in together)
+    spread = covariance(parts, _belief(step1, config))
+    readout_sigma_s = float(np.sqrt(spread[6, 6])) if readout_s else 0.0
+    spread = spread[:6, :6] + np.diag(np.square(
+        [config.focal_floor * camera.fx] * 2
+        + [config.centre_floor * camera.image_size[0]] * 2 + [0.0] * 2))
     progress('focal profile', 0.0)
     around = _profile_around(together, camera, profile, config, scene_config, seed)
     return Solution(camera, spread, step1, tuple(together), parts, profile, around,
-                    np.array(bounds))
+                    np.array(bounds), readout_s, readout_sigma_s)
+
+
+def _shutter(scenes: list[Scene], camera: Camera, solver: Solver, prior: Prior,
+             bounds: tuple[Array, Array], config: IntrinsicsConfig, scene_config: SceneConfig
+             ) -> tuple[list[Scene], Camera, float]:
+    """Return the scenes as a global shutter would have seen them, the camera, and the readout, s.
+
+    Without clear evidence of a rolling shutter all is as it was, and the readout 0: the global
+    shutters at hand were measured within 1 ms of that.
+    """
+    measured = {scene.center: scene for scene in scenes}
+    total = 0.0
+    for _ in range(config.shutter_rounds):
+        found, sigma = readout(scenes, camera, solver.loss_px, _belief(camera, config))
+        if abs(found) < (sigma if total else max(config.shutter_sigmas * sigma,
+                                                 config.least_readout_ms / 1e3)):
+            break
+        total += found
+        scenes = _undone(scenes, measured, camera, total)
+        scenes = _all_again(scenes, camera, scene_config)
+        scenes, camera = adjust_step2(scenes, camera, solver, prior, bounds)
+        scenes = _all_again(scenes, camera, scene_config)
+    return scenes, camera, total
+
+
+def _without_shutter(scenes: Sequence[Scene], camera: Camera, readout_s: float,
+                     config: SceneConfig) -> list[Scene]:
+    """Return scenes that have poses triangulated, where a rolling shutter left its marks, too."""
+    if not readout_s:
+        return _all_again(scenes, camera, config)
+    # until the points are known, nobody knows how far the shutter has displaced them
+    generous = replace(config, error_px=config.chain_error * camera.image_size[0])
+    rough = _all_again(scenes, camera, generous)
+    return _all_again(_undone(rough, {scene.center: scene for scene in scenes}, camera, readout_s),
+                      camera, config)
+
+
+def _undone(scenes: Sequence[Scene], measured: Mapping[int, Scene], camera: Camera,
+            readout_s: float) -> list[Scene]:
+    return [undone(scene, measured[scene.center], camera, readout_s) for scene in scenes]
+
+
+def _belief(camera: Camera, config: IntrinsicsConfig) -> Array:
+    """Return the prior's information (6, 6) at unit noise."""
+    return np.asarray(np.linalg.inv(_prior(camera, config, 1.0).covariance), np.float64)
 
 
 def _loss_px(scenes: Sequence[Scene], camera: Camera, config: IntrinsicsConfig) -> float:
@@ -120,14 +174,23 @@ def _profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
 
 
 def _held_cost(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> float:
-    """Return the truncated cost over all scenes after adjusting all but the focal length, px^2."""
+    """Return the truncated cost over all scenes after adjusting all but the focal length, px^2.
+
+    The least of what is met on the way: where the scenes lie already, the wide loss leads away.
+    """
+    def cost(moved: Sequence[Scene], camera: Camera) -> float:
+        return float(np.average([truncated_cost(scene, camera, config.error_px)
+                                 for scene in moved],
+                                weights=[int(scene.tracks.seen.sum()) for scene in moved]))
+
     moved = list(scenes)
+    costs = [cost(moved, camera)]
     # the first residuals are large: a loss as wide as they are brings the poses along
     for loss_px in (0.01 * camera.image_size[0], config.loss_px, config.loss_px):
         moved, camera = adjust_step1(moved, camera, Solver(loss_px, config.iterations), None)
         moved = [_again(scene, camera, config) for scene in moved]
-    return float(np.average([truncated_cost(scene, camera, config.error_px) for scene in moved],
-                            weights=[int(scene.tracks.seen.sum()) for scene in moved]))
+        costs.append(cost(moved, camera))
+    return min(costs)
 
 
 def _every(scene: Scene, wanted: int) -> Scene:
@@ -179,15 +242,29 @@ def _all_again(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> 
 
 def _explained(scenes: Sequence[Scene], camera: Camera, config: SceneConfig, seed: int
                ) -> list[Scene]:
-    """Return the scenes that the camera explains, some of them chained anew with it."""
+    """Return the scenes that the camera explains, some of them chained anew with it.
+
+    A chain that was built without knowing the lens may be broken in its middle.
+    """
     kept = []
     for scene in scenes:
-        if scene.explained < config.min_explained:
-            anew = chain_scene(scene.tracks, scene.center, camera, scene.profile, config, seed)
-            scene = _again(anew, camera, config) if anew is not None else scene
+        if scene.explained < config.well_explained:
+            scene = max(scene, _anew(scene, camera, config, seed),
+                        key=lambda candidate: candidate.explained)
         if scene.explained >= config.min_explained:
             kept.append(scene)
     return kept
+
+
+def _anew(scene: Scene, camera: Camera, config: SceneConfig, seed: int) -> Scene:
+    """Return the scene chained anew with a camera that is nearly right, if that can be done."""
+    anew = chain_scene(scene.tracks, scene.center, camera, scene.profile, config, seed)
+    if anew is None:
+        return scene
+    # the centre and the aspect stay, the focal length is held
+    solver = Solver(0.01 * camera.image_size[0], config.iterations)
+    [anew], _ = adjust_step1([_again(anew, camera, config)], camera, solver, None)
+    return _again(anew, camera, config)
 
 
 def _again(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:

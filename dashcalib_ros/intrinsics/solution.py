@@ -21,6 +21,8 @@ class Solution:
     scenes: as adjusted, in the order given; parts: what each knows of the lens.
     coarse: the turns' focal profiles, summed; around: the profile near the result, all together.
     bounds: (2, 6) lowest and highest values that were allowed.
+    readout_s: from the first row to the last of a rolling shutter that was found and undone in the
+    scenes' tracks; 0 for a global one. readout_sigma_s: its standard deviation.
     """
 
     camera: Camera
@@ -31,6 +33,8 @@ class Solution:
     coarse: Profile
     around: Profile
     bounds: Array
+    readout_s: float = 0.0
+    readout_sigma_s: float = 0.0
 
     @property
     def sigma(self) -> Array:

@@ -23,7 +23,7 @@ def judge(solution: Solution, config: VerdictConfig) -> Verdict:
     """Return the verdict on a solution, with every reason against it."""
     rules: tuple[Callable[[Solution, VerdictConfig], tuple[list[str], list[str]]], ...] = (
         _too_few_turns, _too_little_yaw, _flat_profile, _far_from_profile, _sigma_too_large,
-        _turns_disagree, _strange_aspect, _on_bound, _folds_over)
+        _turns_disagree, _strange_aspect, _strange_shutter, _on_bound, _folds_over)
     refused: list[str] = []
     weak: list[str] = []
     for rule in rules:
@@ -127,11 +127,19 @@ def focal_disagreement(solution: Solution) -> float:
 
 
 def _strange_aspect(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
-    """A rolling shutter shears and stretches what passes: fy takes the blame first."""
+    """A rolling shutter that was not undone stretches what passes: fy takes the blame first."""
     aspect = solution.camera.fy / solution.camera.fx
     if abs(aspect - 1) > config.max_aspect:
         return [], [f'fy is {100 * (aspect - 1):+.1f} % off fx, more than pixels are out of '
                     f'square: a strong rolling shutter looks like this']
+    return [], []
+
+
+def _strange_shutter(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    readout_ms = 1e3 * abs(solution.readout_s)
+    if readout_ms > config.max_readout_ms:
+        return [], [f'the rows seem to be exposed over {readout_ms:.0f} ms, longer than rolling '
+                    f'shutters are: are the stamps right?']
     return [], []
 
 

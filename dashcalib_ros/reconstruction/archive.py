@@ -28,7 +28,7 @@ from dashcalib_ros.reconstruction.scene import Profile, Scene
 from dashcalib_ros.reconstruction.tracks import Tracks
 
 # of the files; another layout needs another number
-FORMAT = 1
+FORMAT = 2
 # bytes; a turn has a few hundred thousand
 LARGEST = 16_000_000
 # s; a clock that is past this (in 2001) tells the date: equal times are the same moment
@@ -292,6 +292,7 @@ def _arrays(turn: StoredTurn, origin: Origin) -> dict[str, Any]:
         'format': FORMAT, 'image_size': origin.image_size, 'shrink': origin.shrink,
         'frame_id': origin.frame_id, 'stamp_s': turn.stamp_s, 'prominence': turn.prominence,
         'frames': scene.tracks.frames, 'xy': scene.tracks.xy, 'size': scene.tracks.image_size,
+        'stamps_ns': scene.tracks.stamps_ns,
         'rotations': scene.structure.rotations, 'translations': scene.structure.translations,
         'points': scene.structure.points, 'registered': scene.structure.registered,
         'used': scene.structure.used, 'camera': scene.camera.params,
@@ -348,7 +349,8 @@ def _turn(data: Mapping[str, npt.NDArray[Any]]) -> StoredTurn:
     k, t = xy.shape[:2] if xy.ndim == 3 else (0, 0)
     tracks = Tracks(
         _array(data, 'frames', np.int64, (k,)), _array(data, 'xy', float, (k, t, 2), nan=True),
-        (int(data['size'][0]), int(data['size'][1])))
+        (int(data['size'][0]), int(data['size'][1])),
+        _array(data, 'stamps_ns', np.int64, (k,)))
     structure = Structure(
         _array(data, 'rotations', float, (k, 3, 3)), _array(data, 'translations', float, (k, 3)),
         _array(data, 'points', float, (t, 3), nan=True), _array(data, 'registered', bool, (k,)),

@@ -27,12 +27,13 @@ class Tracks:
 
     frames: (k,) indices of the keyframes among the input's frames.
     xy: (k, t, 2) pixel coordinates (first pixel's centre at 0, 0), NaN where a track is not seen.
-    image_size: (width, height).
+    image_size: (width, height). stamps_ns: (k,) when the keyframes were taken.
     """
 
     frames: npt.NDArray[np.int64]
     xy: Array
     image_size: tuple[int, int]
+    stamps_ns: npt.NDArray[np.int64]
 
     @property
     def seen(self) -> Mask:
@@ -54,7 +55,8 @@ def track_turn(turn: Turn, config: TracksConfig, valid: Mask | None = None) -> T
     table[np.searchsorted(keyframes, frames[rows]), columns] = xy[rows]
     table = table[:, _worth_keeping(table)]
     indices = np.array([turn.frames[k].index for k in keyframes], dtype=np.int64)
-    return Tracks(indices, table, turn.frames[0].size)
+    stamps_ns = np.array([turn.frames[k].stamp_ns for k in keyframes], dtype=np.int64)
+    return Tracks(indices, table, turn.frames[0].size, stamps_ns)
 
 
 def thinned(tracks: Tracks, keyframes: int) -> Tracks:
@@ -64,7 +66,8 @@ def thinned(tracks: Tracks, keyframes: int) -> Tracks:
         return tracks
     kept = np.round(np.linspace(0, count - 1, keyframes)).astype(int)
     xy = tracks.xy[kept]
-    return Tracks(tracks.frames[kept], xy[:, _worth_keeping(xy)], tracks.image_size)
+    return Tracks(tracks.frames[kept], xy[:, _worth_keeping(xy)], tracks.image_size,
+                  tracks.stamps_ns[kept])
 
 
 def _follow(images: list[npt.NDArray[np.uint8]], config: TracksConfig, valid: Mask | None

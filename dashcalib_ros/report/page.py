@@ -16,6 +16,7 @@ from dashcalib_ros.report.wording import (
     PARAMETER_NAMES,
     TURN_COLUMNS,
     parameter_row,
+    shutter_text,
     stored_text,
     turn_row,
 )
@@ -110,6 +111,8 @@ def _drive(c: Calibration) -> str:
         rows.append(('earlier drives', stored_text(c.stored_turns)))
     if c.reprojection_error_px is not None:
         rows.append(('reprojection error', f'{c.reprojection_error_px:.3f} px'))
+    if c.rolling_shutter is not None:
+        rows.append(('shutter', shutter_text(c.rolling_shutter)))
     rows += [(f'time: {name}', f'{seconds:.1f} s') for name, seconds in c.timing.items()]
     return f'<h2>Run</h2>{_table(("", ""), rows)}'
 

@@ -35,6 +35,7 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'versions': c.versions,
         'config': c.config.flat(),
         'stored_turns': [_turn_dict(turn) for turn in c.stored_turns],
+        'rolling_shutter': c.rolling_shutter,
         'input': c.input_name,
         'warnings': c.warnings,
         'masked_fraction': None if c.mask is None else 1.0 - float(np.mean(c.mask)),

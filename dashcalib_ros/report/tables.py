@@ -18,6 +18,7 @@ from dashcalib_ros.report.wording import (
     number,
     optional,
     parameter_row,
+    shutter_text,
     stored_text,
     turn_row,
 )
@@ -95,6 +96,8 @@ def _facts(c: Calibration) -> str:
         facts.append(stored_text(c.stored_turns))
     if c.reprojection_error_px is not None:
         facts.append('reprojection error ' + optional(c.reprojection_error_px, 3, ' px'))
+    if c.rolling_shutter is not None:
+        facts.append(shutter_text(c.rolling_shutter))
     if c.mask is not None:
         facts.append(f'{100 * (1 - float(np.mean(c.mask))):.0f} % masked as ego vehicle')
     if 'total' in c.timing:

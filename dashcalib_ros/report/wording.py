@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 
 from dashcalib_ros.intrinsics import Intrinsics, TurnSummary
-from dashcalib_ros.intrinsics.calibration import StoredTurnSummary
+from dashcalib_ros.intrinsics.calibration import Shutter, StoredTurnSummary
 from dashcalib_ros.report.camera import PARAMETERS
 
 PARAMETER_NAMES = PARAMETERS
@@ -47,6 +47,12 @@ def stored_text(turns: Sequence[StoredTurnSummary]) -> str:
     """Return what became of the turns of earlier drives."""
     used = sum(turn.used for turn in turns)
     return f'{used} of {len(turns)} stored turn{"" if len(turns) == 1 else "s"} used'
+
+
+def shutter_text(shutter: Shutter) -> str:
+    """Return what was found of a rolling shutter."""
+    return (f'rolling shutter of {shutter.readout_ms:.1f} ± {shutter.sigma_ms:.1f} ms found and '
+            'undone')
 
 
 def optional(value: float | None, digits: int, unit: str = '') -> str:
