@@ -588,6 +588,13 @@ def test_thinned(turn):
         assert any(same)
 
 
+def test_the_longest_tracks_are_kept_in_their_order(turn):
+    lengths = turn.tracks.seen.sum(axis=0)
+    few = build._longest(turn.tracks, 50)
+    chosen = np.sort(np.argsort(-lengths, kind='stable')[:50])
+    np.testing.assert_array_equal(few.xy, turn.tracks.xy[:, chosen])
+
+
 def test_tracks_are_chosen_where_others_are_few(turn):
     seen = turn.tracks.seen
     longest = np.sort(np.argsort(-seen.sum(axis=0), kind='stable')[:80])

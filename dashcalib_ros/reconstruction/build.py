@@ -41,14 +41,17 @@ def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
     tracks = track_turn(turn, tracks_config, valid)
     if tracks.xy.shape[1] < config.min_tracks or len(tracks.frames) < config.min_images:
         return None
-    sample = _spread(thinned(tracks, config.profile_keyframes), config.profile_tracks)
+    sample = _longest(thinned(tracks, config.profile_keyframes), config.profile_tracks)
     trials = _profile_trials(sample, turn.center, config, seed)
     if not trials:
         return None
     profile = _profile_of(trials)
     start = trials[profile.best].camera
-    chosen = _spread(thinned(tracks, config.keyframes), config.tracks)
-    scene = chain_scene(chosen, turn.center, start, profile, config, seed)
+    chosen = thinned(tracks, config.keyframes)
+    # few short tracks may leave no pair of images enough in common
+    scene = (chain_scene(_spread(chosen, config.tracks), turn.center, start, profile, config, seed)
+             or chain_scene(_longest(chosen, config.tracks), turn.center, start, profile, config,
+                            seed))
     if scene is None:
         return None
     # the neighbours on the profile's grid bound the focal length: the evidence lies between
@@ -139,6 +142,13 @@ def _profile_of(trials: dict[float, Scene]) -> Profile:
     costs = [float(trials[ratio].profile.costs[0]) for ratio in ratios]
     return Profile(np.array(ratios), np.array(costs),
                    next(iter(trials.values())).profile.observations)
+
+
+def _longest(tracks: Tracks, wanted: int) -> Tracks:
+    """Return the tracks seen in the most keyframes, in their order."""
+    length = tracks.seen.sum(axis=0)
+    chosen = np.sort(np.argsort(-length, kind='stable')[:wanted])
+    return replace(tracks, xy=tracks.xy[:, chosen])
 
 
 def _spread(tracks: Tracks, wanted: int) -> Tracks:
