@@ -124,6 +124,10 @@ class SceneConfig:
         12, 'of one adjustment; 60 move fx by 0.02 % at the most, at twice the time', 5, 500)
     min_explained: float = setting(
         0.3, 'of a turn\'s observations; a camera that explains fewer is not its camera', 0.0, 0.9)
+    good_cost: float = setting(
+        1.2, 'px^2 per observation at the best held focal length, each cut at error_px; where it '
+        'is more the turn is chained with other tracks, too: sound turns have 0.4 to 1.0', 0.0,
+        1e4)
     well_explained: float = setting(
         0.9, 'of a turn\'s observations; where the common camera explains fewer, the turn is '
         'chained anew with it: sound scenes have 0.97', 0.0, 1.0)

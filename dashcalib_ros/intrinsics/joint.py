@@ -41,8 +41,9 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     profile = summed([scene.profile for scene in scenes])
     start = _start(scenes, profile)
     # a part of the tracks is enough to come near the result, at a third of the time
-    few = [_brought_to(_every(scene, config.first_tracks), start, scene_config, seed)
-           for scene in scenes]
+    scenes = [_brought_to(scene, start, scene_config, seed) for scene in scenes]
+    whole = {scene.center: scene for scene in scenes}
+    few = [_every(scene, config.first_tracks) for scene in scenes]
     solver = Solver(scene_config.loss_px, scene_config.iterations)
     reach = (start.fx / config.focal_reach, start.fx * config.focal_reach)
     camera = start
@@ -50,7 +51,8 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
         progress('step 1: one focal length', n / config.rounds)
         few, camera = adjust_step1(few, camera, solver, reach)
         few = _all_again(few, camera, scene_config)
-    few = _explained(few, camera, scene_config, seed)
+    few = [_every(scene, config.first_tracks) for scene in _explained(
+        few, whole, camera, scene_config, seed)]
     if not few:
         return None
     step1 = camera
@@ -59,9 +61,9 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     progress('step 2: all six', 0.0)
     few, camera = adjust_step2(few, camera, solver, prior, bounds)
     few, camera, readout_s = _shutter(few, camera, solver, prior, bounds, config, scene_config)
-    by_center = {scene.center: scene for scene in scenes}
-    measured = [_posed_as(by_center[scene.center], scene) for scene in few]
-    together = _explained(_without_shutter(measured, camera, readout_s, scene_config), camera,
+    together = _without_shutter([_posed_as(whole[scene.center], scene) for scene in few], camera,
+                                readout_s, scene_config)
+    together = _explained(together, {scene.center: scene for scene in together}, camera,
                           scene_config, seed)
     if not together:
         return None
@@ -73,7 +75,7 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
         if n < config.rounds - 1:
             if readout_s:
                 readout_s += readout(together, camera, solver.loss_px, _belief(step1, config))[0]
-                together = _undone(together, by_center, camera, readout_s)
+                together = _undone(together, whole, camera, readout_s)
             together = _all_again(together, camera, scene_config)
     progress('sigma', 0.0)
     parts = tuple(information(scene, camera, solver.loss_px,
@@ -240,16 +242,17 @@ def _all_again(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> 
     return [scene for scene in again if scene.structure.used.any()]
 
 
-def _explained(scenes: Sequence[Scene], camera: Camera, config: SceneConfig, seed: int
-               ) -> list[Scene]:
+def _explained(scenes: Sequence[Scene], whole: Mapping[int, Scene], camera: Camera,
+               config: SceneConfig, seed: int) -> list[Scene]:
     """Return the scenes that the camera explains, some of them chained anew with it.
 
+    whole: the scenes with all their tracks, by centre: a chain of a few of them soon breaks.
     A chain that was built without knowing the lens may be broken in its middle.
     """
     kept = []
     for scene in scenes:
         if scene.explained < config.well_explained:
-            scene = max(scene, _anew(scene, camera, config, seed),
+            scene = max(scene, _anew(whole[scene.center], camera, config, seed),
                         key=lambda candidate: candidate.explained)
         if scene.explained >= config.min_explained:
             kept.append(scene)
@@ -260,7 +263,7 @@ def _anew(scene: Scene, camera: Camera, config: SceneConfig, seed: int) -> Scene
     """Return the scene chained anew with a camera that is nearly right, if that can be done."""
     anew = chain_scene(scene.tracks, scene.center, camera, scene.profile, config, seed)
     if anew is None:
-        return scene
+        return _again(scene, camera, config)
     # the centre and the aspect stay, the focal length is held
     solver = Solver(0.01 * camera.image_size[0], config.iterations)
     [anew], _ = adjust_step1([_again(anew, camera, config)], camera, solver, None)

@@ -41,8 +41,7 @@ def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
     tracks = track_turn(turn, tracks_config, valid)
     if tracks.xy.shape[1] < config.min_tracks or len(tracks.frames) < config.min_images:
         return None
-    sample = _longest(thinned(tracks, config.profile_keyframes), config.profile_tracks)
-    trials = _profile_trials(sample, turn.center, config, seed)
+    trials = _trials(tracks, turn.center, config, seed)
     if not trials:
         return None
     profile = _profile_of(trials)
@@ -85,6 +84,25 @@ def _refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | Non
         [scene], camera = adjust_step1([scene], scene.camera, solver, reach)
         scene = retriangulated(scene, camera, config.error_px, config.min_angle_deg)
     return scene
+
+
+def _trials(tracks: Tracks, center: int, config: SceneConfig, seed: int) -> dict[float, Scene]:
+    """Return the best scene for each held focal length that has one.
+
+    The longest tracks chain best, as a rule. Where no focal length explains much with them, those
+    spread over all keyframes are tried, too.
+    """
+    few = thinned(tracks, config.profile_keyframes)
+    trials = _profile_trials(_longest(few, config.profile_tracks), center, config, seed)
+    if not trials or min(map(_cost_of, trials.values())) > config.good_cost:
+        others = _profile_trials(_spread(few, config.profile_tracks), center, config, seed)
+        for ratio, scene in others.items():
+            trials[ratio] = min(trials.get(ratio, scene), scene, key=_cost_of)
+    return trials
+
+
+def _cost_of(scene: Scene) -> float:
+    return float(scene.profile.costs[0])
 
 
 def _profile_trials(tracks: Tracks, center: int, config: SceneConfig, seed: int
@@ -139,7 +157,7 @@ _NO_PROFILE = Profile(np.zeros(0), np.zeros(0), 0)
 
 def _profile_of(trials: dict[float, Scene]) -> Profile:
     ratios = sorted(trials)
-    costs = [float(trials[ratio].profile.costs[0]) for ratio in ratios]
+    costs = [_cost_of(trials[ratio]) for ratio in ratios]
     return Profile(np.array(ratios), np.array(costs),
                    next(iter(trials.values())).profile.observations)
 
