@@ -15,6 +15,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.frames.shrink import shrink, shrink_factor, shrink_mask
 from dashcalib_ros.intrinsics import Calibration
+from dashcalib_ros.intrinsics.agreement import strangers
 from dashcalib_ros.intrinsics.conclude import Evidence, conclude
 from dashcalib_ros.intrinsics.solution import Solution
 from dashcalib_ros.intrinsics.solve import solve_scenes
@@ -122,12 +123,16 @@ class Calibrator:
         tell('reconstructing turns', 0.0)
         scenes, stored = self._scenes.wanted(tell, final)
         solution: Solution | None = None
+        kept: set[int] = set()
         if scenes:
             # step 1: one focal length; step 2: all six, with priors from step 1
             solution = self._scenes.workshop.run(
                 solve_scenes, scenes, self._config, progress=tell)
-            fitting = {scene.center for scene in solution.scenes} if solution else set()
-            self._scenes.reject({scene.center for scene in scenes} - fitting)
+            if solution is not None:
+                kept = {scene.center for scene in solution.scenes}
+                # a turn of another camera stays: without it nobody would know
+                kept |= strangers(solution, self._config.verdict)
+            self._scenes.reject({scene.center for scene in scenes} - kept)
             self._scenes.store()
         ended = time.monotonic()
         with self._lock:

@@ -232,6 +232,20 @@ def test_two_short_drives_add_up(drive, frames, tmp_path):
     assert len(list(folder.iterdir())) == 2
 
 
+def test_a_stored_turn_of_another_camera_is_told_and_stays(frames, tmp_path):
+    config = QUICK.replace({'turns.store': str(tmp_path)})
+    lens = Camera((640, 360), 460.0, 460.0, 319.5, 179.5, -0.1)
+    archive = Archive(str(tmp_path), 10, 3.0, pytest.fail)
+    archive.load(Origin((640, 360), 1))
+    archive.mirror(lambda: {0: StoredTurn(synthetic_turn(lens).scene(lens), 5.0, 0.001)})
+    result = calibrated(frames[:95], config)
+    assert result.verdict.level != 'accepted' and result.turns[0].used, result.verdict
+    assert any('1 turn of earlier drives fits another camera' in reason
+               for reason in result.verdict.reasons), result.verdict
+    assert result.turns[0].misfit < 1.5 < 2.0 < result.stored_turns[0].misfit
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_stored_turns_of_another_size_are_left_out_and_told(tmp_path):
     config = QUICK.replace({'turns.store': str(tmp_path)})
     archive = Archive(str(tmp_path), 10, 3.0, pytest.fail)

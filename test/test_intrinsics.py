@@ -10,6 +10,7 @@ from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.intrinsics import joint
+from dashcalib_ros.intrinsics.agreement import focal_disagreement, misfits, strangers
 from dashcalib_ros.intrinsics.conclude import Evidence, conclude
 from dashcalib_ros.intrinsics.information import (
     Information,
@@ -23,11 +24,17 @@ from dashcalib_ros.intrinsics.information import (
 from dashcalib_ros.intrinsics.joint import solve, summed
 from dashcalib_ros.intrinsics.solution import Solution
 from dashcalib_ros.intrinsics.solve import solve_scenes
-from dashcalib_ros.intrinsics.verdict import focal_disagreement, judge, profile_contrast
+from dashcalib_ros.intrinsics.verdict import judge, profile_contrast
 from dashcalib_ros.reconstruction import adjust
-from dashcalib_ros.reconstruction.adjust import Prior, Solver, adjust_step2
+from dashcalib_ros.reconstruction.adjust import Prior, Solver, adjust_step1, adjust_step2
 from dashcalib_ros.reconstruction.camera import Camera
-from dashcalib_ros.reconstruction.scene import Profile, Scene, residuals_px, retriangulated
+from dashcalib_ros.reconstruction.scene import (
+    Profile,
+    Scene,
+    residuals_px,
+    retriangulated,
+    truncated_cost,
+)
 from dashcalib_ros.turns.turn import Turn
 
 CONFIG = Config().replace({'intrinsics.profile_tracks': 60})
@@ -466,6 +473,48 @@ def test_turns_through_different_lenses_are_not_accepted():
     scenes = [*scenes_of(2), *scenes_of(4, other, start=second)[2:]]
     verdict = judge(solved(scenes), CONFIG.verdict)
     assert verdict.level != 'accepted', verdict
+
+
+def built(scene: Scene, rounds: int = 3) -> Scene:
+    """Return the scene as build_scene() leaves it: with a focal length and k1, k2 of its own."""
+    reach = (scene.camera.fx / 1.3, scene.camera.fx * 1.3)
+    for _ in range(rounds):
+        [scene], camera = adjust_step1([scene], scene.camera, Solver(0.5), reach)
+        scene = retriangulated(scene, camera, 2.0, 0.3)
+    return scene
+
+
+@pytest.mark.parametrize(('factor', 'least', 'used'), [
+    (0.8, 0.3, 4), (1.1, 0.3, 4), (2.2, 0.6, 3)])
+def test_a_turn_of_another_camera_is_not_outvoted_in_silence(no_profile, factor, least, used):
+    """The loss ignores it, so it causes no scatter; far enough off, it is dropped even."""
+    other = replace(LENS, fx=factor * LENS.fx, fy=factor * LENS.fx)
+    scenes = [built(scene) for scene in
+              [*scenes_of(3, start=LENS), *scenes_of(4, other, start=other)[3:]]]
+    solution = solved(scenes, CONFIG.replace({'scene.min_explained': least}))
+    assert len(solution.scenes) == used
+    assert strangers(solution, CONFIG.verdict) == {3}
+    assert max(solution.misfits[center] for center in range(3)) < 1.5
+    level, reasons = levels(solution)
+    assert level != 'accepted' and 'turn at frame 3 fits another camera' in reasons
+
+
+def test_misfits_are_ratios_of_costs():
+    [first, second] = scenes_of(2, start=LENS)
+    off = replace(LENS, fx=1.05 * LENS.fx)
+    found = misfits([first, second], [replace(first, camera=off)], off, 2.0)
+    assert found[0] > 3 and list(found) == [0, 1]
+    assert found[1] == pytest.approx(4.0 / truncated_cost(second, LENS, 2.0))
+    assert misfits([first], [first], LENS, 2.0) == {0: 1.0}
+
+
+@pytest.mark.parametrize(('misfits', 'text'), [
+    ({5: 1.9, 9: 0.4}, ''), ({5: 2.1}, 'the turn at frame 5 fits'), ({-1: 9.0}, '1 turn of ear'),
+    ({-1: 9.0, -2: np.nan}, '2 turns of earlier drives fit another'),
+    ({9: 3.0, 5: 3.0, -1: 3.0}, 'the turns at frame 5, 9 and 1 turn of earlier drives fit an')])
+def test_who_fits_another_camera_is_named(good, misfits, text):
+    level, reasons = levels(replace(good, misfits=misfits))
+    assert level == ('weak' if text else 'accepted') and text in reasons
 
 
 def test_a_drive_that_is_nearly_straight_is_not_accepted():

@@ -31,6 +31,7 @@ class Core:
         assert live
         self.options, self.stored, self.pushed, self.done = options, (), [], []
         self.centers, self.frames, self.calls = (), 0, 0
+        self.strangers = ()
         self.hold, self.closed = threading.Event(), threading.Event()
         self.hold.set()
         Core.made.append(self)
@@ -53,8 +54,11 @@ class Core:
                 raise WorkerError('the calibrator was closed while it calibrated')
         if Core.failures:
             raise Core.failures.pop()
-        turns = tuple(TurnSummary(c, c, c, 0.0, 0.1, 1, 1, True) for c in centers if c > 0)
-        stored = tuple(StoredTurnSummary(key, 0.0, 0.1, 60.0, 20, True) for key in self.stored)
+        turns = tuple(TurnSummary(c, c, c, 0.0, 0.1, 1, 1, c not in self.strangers,
+                                  misfit=9.0 if c in self.strangers else 1.0)
+                      for c in centers if c > 0)
+        stored = tuple(StoredTurnSummary(key, 0.0, 0.1, 60.0, 20, True, 1.0)
+                       for key in self.stored)
         return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG,
                            stored_turns=stored)
 
@@ -89,6 +93,13 @@ def until(condition):
         time.sleep(0.01)
 
 
+def held(desk, core):
+    """Have a calibration under way until core.hold is set."""
+    core.centers = (10, 20)
+    core.hold.clear()
+    until(lambda: desk.learner.activity().calibrating)
+
+
 def image(width=64):
     data = np.zeros((48, width), np.uint8)
     return types.SimpleNamespace(encoding='mono8', width=width, height=48, step=width,
@@ -107,6 +118,17 @@ def test_it_calibrates_when_enough_turns_are_built_and_again_only_with_others(de
     core.centers = (20, 30)
     until(lambda: len(desk.results) == 2)
     assert core.calls == 2
+
+
+def test_a_turn_that_fits_another_camera_is_not_tried_over_and_over(desk):
+    core = Core.made[0]
+    core.strangers = (20,)
+    core.centers = (10, 20)
+    until(lambda: len(desk.results) == 1)
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 1 and not desk.results[0].complete
+    core.centers = (10, 20, 30)
+    until(lambda: len(desk.results) == 2)
 
 
 def test_a_lower_goal_calibrates_sooner_but_not_completely(desk):
@@ -141,9 +163,7 @@ def test_a_failed_calibration_is_told_and_tried_again(desk):
 
 def test_a_restart_cancels_what_runs_and_its_result_is_out_of_date(desk):
     first = Core.made[0]
-    first.centers = (10, 20)
-    first.hold.clear()
-    until(lambda: desk.learner.activity().calibrating)
+    held(desk, first)
     desk.learner.restart()
     until(first.closed.is_set)
     until(lambda: not desk.learner.activity().calibrating)
@@ -206,9 +226,7 @@ def test_images_that_cannot_be_used_are_told(desk):
 
 def test_closing_ends_both_threads_in_the_middle_of_a_calibration(desk):
     core = Core.made[0]
-    core.centers = (10, 20)
-    core.hold.clear()
-    until(lambda: desk.learner.activity().calibrating)
+    held(desk, core)
     desk.learner.close()
     assert not any(thread.is_alive() for thread in desk.learner._threads)
     assert desk.troubles == []

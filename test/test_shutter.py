@@ -66,6 +66,7 @@ def test_rows_do_not_shift_without_movement():
     still = replace(scene, tracks=replace(
         scene.tracks, stamps_ns=np.zeros_like(scene.tracks.stamps_ns)))
     assert not row_shift(still, LENS).any()
+    assert readout([still], LENS, 0.5, NOTHING) == (0.0, np.inf)
     alone = replace(scene, structure=replace(
         scene.structure, registered=np.arange(len(scene.tracks.frames)) == 3))
     assert not row_shift(alone, LENS).any()

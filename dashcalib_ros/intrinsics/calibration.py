@@ -40,7 +40,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class TurnSummary:
-    """What became of one turn. center, first, last count the input's frames from 0."""
+    """What became of one turn. center, first, last count the input's frames from 0.
+
+    misfit: cost with the common camera over cost with a camera of its own: about 1, or less.
+    """
 
     center: int
     first: int
@@ -52,11 +55,15 @@ class TurnSummary:
     used: bool
     yaw_deg: float | None = None
     reprojection_error_px: float | None = None
+    misfit: float | None = None
 
 
 @dataclass(frozen=True)
 class StoredTurnSummary:
-    """What became of a turn of an earlier drive. key: its negative number in this run."""
+    """What became of a turn of an earlier drive. key: its negative number in this run.
+
+    misfit: as for TurnSummary.
+    """
 
     key: int
     stamp_s: float
@@ -64,6 +71,7 @@ class StoredTurnSummary:
     yaw_deg: float
     images: int
     used: bool
+    misfit: float | None = None
 
 
 @dataclass(frozen=True)

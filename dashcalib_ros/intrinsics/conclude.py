@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.config import Config
+from dashcalib_ros.intrinsics.agreement import focal_disagreement
 from dashcalib_ros.intrinsics.calibration import (
     Calibration,
     Intrinsics,
@@ -18,7 +19,7 @@ from dashcalib_ros.intrinsics.calibration import (
     Verdict,
 )
 from dashcalib_ros.intrinsics.solution import Solution
-from dashcalib_ros.intrinsics.verdict import focal_disagreement, judge, profile_contrast
+from dashcalib_ros.intrinsics.verdict import judge, profile_contrast
 from dashcalib_ros.reconstruction.archive import StoredTurn
 from dashcalib_ros.reconstruction.scene import Scene, errors_px
 from dashcalib_ros.turns.turn import Turn
@@ -104,14 +105,16 @@ def _summary(turn: Turn, evidence: Evidence, solution: Solution | None) -> TurnS
         prominence=turn.prominence, images=len(scene.tracks.frames) if scene else turn.images,
         registered=int(scene.structure.registered.sum()) if scene else 0,
         used=turn.center in used, yaw_deg=scene.yaw_deg if scene else None,
-        reprojection_error_px=error)
+        reprojection_error_px=error,
+        misfit=solution.misfits.get(turn.center) if solution else None)
 
 
 def _stored_summary(turn: StoredTurn, solution: Solution | None) -> StoredTurnSummary:
     scene = turn.scene
     used = {each.center for each in solution.scenes} if solution else set()
     return StoredTurnSummary(scene.center, turn.stamp_s, turn.prominence, scene.yaw_deg,
-                             len(scene.tracks.frames), scene.center in used)
+                             len(scene.tracks.frames), scene.center in used,
+                             solution.misfits.get(scene.center) if solution else None)
 
 
 def _details(solution: Solution) -> dict[str, object]:

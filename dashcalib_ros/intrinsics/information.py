@@ -70,7 +70,7 @@ def information(scene: Scene, camera: Camera, loss_px: float, also: Array | None
     lens = by_camera.shape[2]
     residual = scene.tracks.xy[rows, columns] - projected
     # the loss pulls with w e, and its curvature is w^2 on average over the directions of e
-    weight = 1 / (1 + np.sum(residual**2, axis=1) / loss_px**2)
+    weight = _weights(residual, loss_px)
     by_camera, by_local = by_camera * weight[:, None, None], by_local * weight[:, None, None]
     # a small turn w of the camera moves the local point by w x (R X)
     by_pose = np.concatenate([by_local @ -_cross(rotated), by_local], axis=2)
@@ -128,10 +128,14 @@ def noise_in(scenes: Sequence[Scene], camera: Camera, loss_px: float) -> float:
     for scene in scenes:
         used = scene.structure.used
         residual = residuals_px(scene, camera)[used]
-        more = _squares_and_freedom(
-            used, residual, 1 / (1 + np.sum(residual**2, axis=1) / loss_px**2))
+        more = _squares_and_freedom(used, residual, _weights(residual, loss_px))
         squares, freedom = squares + more[0], freedom + more[1]
     return squares / freedom
+
+
+def _weights(residual: Array, loss_px: float) -> Array:
+    """Return (n,) weights of residuals (n, 2) under the Cauchy loss."""
+    return np.asarray(1 / (1 + np.sum(residual**2, axis=1) / loss_px**2))
 
 
 def _squares_and_freedom(used: npt.NDArray[np.bool_], residual: Array, weight: Array
@@ -142,6 +146,38 @@ def _squares_and_freedom(used: npt.NDArray[np.bool_], residual: Array, weight: A
     return float(np.sum((residual * weight[:, None])**2) / np.mean(weight**2)), float(freedom)
 
 
+@dataclass(frozen=True)
+class Pooled:
+    """All turns' information of the p parameters that are free, at unit noise.
+
+    hessians: (n, p, p), scores: (n, p) of the n turns. inverse: (p, p) of the hessians' sum with
+    the prior.
+    clustered: (p,) variances that take whole tracks as units.
+    """
+
+    hessians: Array
+    scores: Array
+    inverse: Array
+    clustered: Array
+
+
+def pooled(parts: Sequence[Information], prior: Array) -> Pooled:
+    """Return what all parts know of the six, and of a readout where they were asked for it.
+
+    prior: (6, 6) as for covariance().
+    """
+    noise = noise_of(parts)
+    free = [*range(6), *range(LENS, len(parts[0].score))]
+    block = np.ix_(free, free)
+    hessians = np.array([part.hessian[block] for part in parts]) / noise
+    whole = hessians.sum(axis=0)
+    whole[:6, :6] += prior
+    inverse = np.linalg.inv(whole)
+    by_track = np.sum([part.by_track[block] for part in parts], axis=0) / noise**2
+    return Pooled(hessians, np.array([part.score[free] for part in parts]) / noise,
+                  np.asarray(inverse), np.diag(inverse @ by_track @ inverse))
+
+
 def covariance(parts: Sequence[Information], prior: Array) -> Array:
     """Return the (6, 6) covariance: the largest of the three estimates in each parameter.
 
@@ -149,19 +185,11 @@ def covariance(parts: Sequence[Information], prior: Array) -> Array:
     noise). The correlations are those of the first estimate. Where the parts know of a readout,
     it is free: (7, 7).
     """
-    noise = noise_of(parts)
-    size = len(parts[0].score)
-    free = [*range(6), *range(LENS, size)]
-    block = np.ix_(free, free)
-    whole = sum((part.hessian for part in parts), np.zeros((size, size)))[block] / noise
-    whole[:6, :6] += prior
-    inverse = np.asarray(np.linalg.inv(whole), np.float64)
-    by_track = sum((part.by_track for part in parts), np.zeros((size, size)))[block] / noise**2
-    estimates = [np.diag(inverse), np.diag(inverse @ by_track @ inverse)]
+    every = pooled(parts, prior)
+    inverse = every.inverse
+    estimates = [np.diag(inverse), every.clustered]
     if len(parts) > 1:
-        estimates.append(between_turns(
-            np.array([part.hessian[block] for part in parts]) / noise,
-            np.array([part.score[free] for part in parts]) / noise, inverse))
+        estimates.append(between_turns(every.hessians, every.scores, inverse))
     # without evidence rounding can make a variance negative: such scenes know nothing
     variance = np.where(np.min(estimates, axis=0) >= 0, np.max(estimates, axis=0), np.inf)
     variance[:6] += model_error(parts, prior) ** 2

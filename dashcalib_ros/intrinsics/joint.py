@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.config import IntrinsicsConfig, SceneConfig
+from dashcalib_ros.intrinsics.agreement import misfits
 from dashcalib_ros.intrinsics.information import covariance, information, noise_in
 from dashcalib_ros.intrinsics.shutter import readout, row_shift, undone
 from dashcalib_ros.intrinsics.solution import Solution
@@ -30,18 +31,18 @@ LEAST_LOSS_PX = 0.05
 Progress = Callable[[str, float], None]
 
 
-def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: SceneConfig,
+def solve(alone: Sequence[Scene], config: IntrinsicsConfig, scene_config: SceneConfig,
           seed: int = 0, progress: Progress = lambda stage, done: None) -> Solution | None:
     """Adjust all scenes with one shared camera.
 
-    scenes: at least one. The summed focal profile picks the start; a scene that was built far from
-    it is chained anew, and one that the shared camera does not explain is dropped. None when that
-    becomes of all.
+    alone: at least one scene, each as its turn was reconstructed. The summed focal profile picks
+    the start; a scene that was built far from it is chained anew, and one that the shared camera
+    does not explain is dropped. None when that becomes of all.
     """
-    profile = summed([scene.profile for scene in scenes])
-    start = _start(scenes, profile)
+    profile = summed([scene.profile for scene in alone])
+    start = _start(alone, profile)
     # a part of the tracks is enough to come near the result, at a third of the time
-    scenes = [_brought_to(scene, start, scene_config, seed) for scene in scenes]
+    scenes = [_brought_to(scene, start, scene_config, seed) for scene in alone]
     whole = {scene.center: scene for scene in scenes}
     few = [_every(scene, config.first_tracks) for scene in scenes]
     solver = Solver(scene_config.loss_px, scene_config.iterations)
@@ -89,7 +90,8 @@ def solve(scenes: Sequence[Scene], config: IntrinsicsConfig, scene_config: Scene
     progress('focal profile', 0.0)
     around = _profile_around(together, camera, profile, config, scene_config, seed)
     return Solution(camera, spread, step1, tuple(together), parts, profile, around,
-                    np.array(bounds), readout_s, readout_sigma_s)
+                    np.array(bounds), readout_s, readout_sigma_s,
+                    misfits(alone, together, camera, scene_config.error_px))
 
 
 def _shutter(scenes: list[Scene], camera: Camera, solver: Solver, prior: Prior,

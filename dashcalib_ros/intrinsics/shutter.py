@@ -14,13 +14,11 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from dashcalib_ros.intrinsics.information import information, noise_of
+from dashcalib_ros.intrinsics.information import information, pooled
 from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.scene import Scene
 
 Array = npt.NDArray[np.float64]
-# fx fy cx cy k1 k2 and, behind p1 p2 k3, the readout
-FREE = [0, 1, 2, 3, 4, 5, 9]
 STEP_S = 1e-3
 
 
@@ -57,20 +55,17 @@ def readout(scenes: Sequence[Scene], camera: Camera, loss_px: float, prior: Arra
     """Return the readout that the scenes still show, and its sigma, s.
 
     prior: (6, 6) information of the priors, as for covariance(). One Gauss-Newton step from a
-    solution without it; the sigma takes whole tracks as units.
+    solution without it; the sigma takes whole tracks as units, and is inf where nothing moves or
+    the stamps tell no speed.
     """
-    parts = [information(scene, camera, loss_px, row_shift(scene, camera)) for scene in scenes]
-    noise = noise_of(parts)
-    block = np.ix_(FREE, FREE)
-    hessian = np.sum([part.hessian for part in parts], axis=0)[block] / noise
-    hessian[:6, :6] += prior
-    pull = np.sum([part.score for part in parts], axis=0)[FREE] / noise
-    # the six are at their optimum
-    pull[:6] = 0.0
-    by_track = np.sum([part.by_track for part in parts], axis=0)[block] / noise**2
-    inverse = np.linalg.inv(hessian)
-    variance = max(float(inverse[6, 6]), float((inverse @ by_track @ inverse)[6, 6]))
-    return float((inverse @ pull)[6]), float(np.sqrt(variance))
+    shifts = [row_shift(scene, camera) for scene in scenes]
+    if not any(shift.any() for shift in shifts):
+        return 0.0, float(np.inf)
+    every = pooled([information(scene, camera, loss_px, shift)
+                    for scene, shift in zip(scenes, shifts, strict=True)], prior)
+    # the six are at their optimum: only the readout pulls
+    seconds = every.inverse[6, 6] * every.scores[:, 6].sum()
+    return float(seconds), float(np.sqrt(max(every.inverse[6, 6], every.clustered[6])))
 
 
 def undone(scene: Scene, measured: Scene, camera: Camera, readout_s: float) -> Scene:

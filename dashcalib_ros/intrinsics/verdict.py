@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from dashcalib_ros.config import VerdictConfig
+from dashcalib_ros.intrinsics.agreement import focal_disagreement, strangers
 from dashcalib_ros.intrinsics.calibration import Verdict
-from dashcalib_ros.intrinsics.information import noise_of
 from dashcalib_ros.intrinsics.solution import Solution
 
 NAMES = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')
@@ -23,7 +23,7 @@ def judge(solution: Solution, config: VerdictConfig) -> Verdict:
     """Return the verdict on a solution, with every reason against it."""
     rules: tuple[Callable[[Solution, VerdictConfig], tuple[list[str], list[str]]], ...] = (
         _too_few_turns, _too_little_yaw, _flat_profile, _far_from_profile, _sigma_too_large,
-        _turns_disagree, _strange_aspect, _strange_shutter, _on_bound, _folds_over)
+        _turns_disagree, _other_camera, _strange_aspect, _strange_shutter, _on_bound, _folds_over)
     refused: list[str] = []
     weak: list[str] = []
     for rule in rules:
@@ -106,24 +106,24 @@ def _turns_disagree(solution: Solution, config: VerdictConfig) -> tuple[list[str
     return [], []
 
 
-def focal_disagreement(solution: Solution) -> float:
-    """Return the weighted scatter between the turns' own fx, relative to fx."""
-    if len(solution.parts) < 2:
-        return 0.0
-    noise = noise_of(solution.parts)
-    weights, offsets = [], []
-    weak_prior = np.diag(1 / np.square([1e4, 1e4, 0.02 * solution.camera.image_size[0],
-                                        0.02 * solution.camera.image_size[0], 1.0, 1.0]))
-    # square pixels, so that one turn alone has a focal length at all
-    stiff = 1 / (0.003 * solution.camera.fx) ** 2
-    weak_prior[:2, :2] += stiff * np.array([[1, -1], [-1, 1]])
-    for part in solution.parts:
-        inverse = np.linalg.inv(part.hessian[:6, :6] / noise + weak_prior)
-        offsets.append(float((inverse @ part.score[:6])[0] / noise))
-        weights.append(1 / float(inverse[0, 0]))
-    mean = np.average(offsets, weights=weights)
-    scatter = np.average((np.array(offsets) - mean) ** 2, weights=weights)
-    return float(np.sqrt(scatter) / solution.camera.fx)
+def _other_camera(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    centers = sorted(strangers(solution, config))
+    if not centers:
+        return [], []
+    return [], [f'{_named(centers)} another camera far better than the one of the others: was the '
+                f'camera zoomed or exchanged, or its picture cropped?']
+
+
+def _named(centers: list[int]) -> str:
+    """Say which turns fit; those of earlier drives have negative numbers."""
+    own = [str(center) for center in centers if center >= 0]
+    stored = len(centers) - len(own)
+    names = []
+    if own:
+        names.append(f'the turn{"s" * (len(own) > 1)} at frame {", ".join(own)}')
+    if stored:
+        names.append(f'{stored} turn{"s" * (stored > 1)} of earlier drives')
+    return f'{" and ".join(names)} fit{"s" * (len(centers) == 1)}'
 
 
 def _strange_aspect(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:

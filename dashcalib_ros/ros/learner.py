@@ -214,8 +214,10 @@ class Learner:
                 continue
             used = [turn.center for turn in calibration.turns if turn.used]
             used += [turn.key for turn in calibration.stored_turns if turn.used]
+            tried = {turn.center for turn in calibration.turns if turn.misfit is not None}
+            tried |= {turn.key for turn in calibration.stored_turns if turn.misfit is not None}
             with self._changed:
-                bank.tried = frozenset(used)
+                bank.tried = frozenset(tried)
                 self._failures = 0
                 self._activity = replace(self._activity, calibrating=False, stage='')
             complete = len(used) >= self._config.turns.wanted
@@ -228,7 +230,7 @@ class Learner:
             self._note(bank, bank.calibrator.status())
             with self._changed:
                 centers = self._activity.status.centers
-                news = len(centers) >= self.goal and frozenset(centers) != bank.tried
+                news = len(centers) >= self.goal and not bank.tried.issuperset(centers)
                 if (bank is self._bank and (self._requested or news)
                         and time.monotonic() >= self._not_before):
                     self._requested = False

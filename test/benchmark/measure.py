@@ -156,7 +156,7 @@ def summarised(result: Calibration, truth: Mapping[str, float]) -> dict[str, Any
         'verdict': result.verdict.level, 'reasons': list(result.verdict.reasons),
         'frames': result.frames, 'turns_used': sum(turn.used for turn in result.turns),
         'turns': [[turn.center, turn.used, turn.yaw_deg] for turn in result.turns],
-        'timing': result.timing}
+        'misfits': [turn.misfit for turn in result.turns], 'timing': result.timing}
     if result.intrinsics is not None and result.sigma is not None:
         row |= errors(asdict(result.intrinsics), truth, asdict(result.sigma))
     return dict(plain_values(row))

@@ -1,0 +1,62 @@
+"""Are the turns of one camera? What each says when it is asked alone."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dashcalib_ros.config import VerdictConfig
+from dashcalib_ros.intrinsics.information import noise_of
+from dashcalib_ros.intrinsics.solution import Solution
+from dashcalib_ros.reconstruction.camera import Camera
+from dashcalib_ros.reconstruction.scene import Scene, truncated_cost
+
+# px^2; what is explained better than this is explained perfectly
+LEAST_COST = 0.01
+
+
+def misfits(alone: Sequence[Scene], together: Sequence[Scene], camera: Camera, limit_px: float
+            ) -> dict[int, float]:
+    """Return by how much the common camera explains each turn worse than its own, by centre.
+
+    alone: the turns as they were reconstructed, each with a camera of its own (one focal length,
+    k1, k2). together: those that are left, adjusted with the common camera. limit_px: where
+    squared errors are cut. The ratio of the costs over all observations, about 1 or less for a
+    turn of the common camera; one that it does not explain at all costs the limit.
+    """
+    adjusted = {scene.center: scene for scene in together}
+
+    def cost(scene: Scene, camera: Camera) -> float:
+        return max(truncated_cost(scene, camera, limit_px), LEAST_COST)
+
+    return {scene.center: (cost(adjusted[scene.center], camera) if scene.center in adjusted
+                           else limit_px**2) / cost(scene, scene.camera) for scene in alone}
+
+
+def strangers(solution: Solution, config: VerdictConfig) -> set[int]:
+    """Return the centres of the turns that another camera explains far better than the common one.
+
+    A robust loss takes no notice of such turns: they cause no scatter.
+    """
+    return {center for center, misfit in solution.misfits.items()
+            if not misfit <= config.max_misfit}
+
+
+def focal_disagreement(solution: Solution) -> float:
+    """Return the weighted scatter between the turns' own fx, relative to fx."""
+    if len(solution.parts) < 2:
+        return 0.0
+    noise = noise_of(solution.parts)
+    weights, offsets = [], []
+    weak_prior = np.diag(1 / np.square([1e4, 1e4, 0.02 * solution.camera.image_size[0],
+                                        0.02 * solution.camera.image_size[0], 1.0, 1.0]))
+    # square pixels, so that one turn alone has a focal length at all
+    stiff = 1 / (0.003 * solution.camera.fx) ** 2
+    weak_prior[:2, :2] += stiff * np.array([[1, -1], [-1, 1]])
+    for part in solution.parts:
+        inverse = np.linalg.inv(part.hessian[:6, :6] / noise + weak_prior)
+        offsets.append(float((inverse @ part.score[:6])[0] / noise))
+        weights.append(1 / float(inverse[0, 0]))
+    mean = np.average(offsets, weights=weights)
+    scatter = np.average((np.array(offsets) - mean) ** 2, weights=weights)
+    return float(np.sqrt(scatter) / solution.camera.fx)
