@@ -12,7 +12,6 @@ carnd/ (bag or video beside a truth.json). --cache: where rendered pictures are 
 """
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import tempfile
@@ -32,6 +31,7 @@ from measure import (
     error_cells,
     isolated,
     load,
+    parser_with,
     save,
     summarised,
     table,
@@ -120,13 +120,8 @@ def _chosen(wanted: list[str], data: Path | None) -> list[str]:
 
 def main() -> None:
     """Run what is asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
+    parser = parser_with(__doc__, 'seeds', 'data', 'cache', 'out', 'again')
     parser.add_argument('settings', nargs='*', help='default: all')
-    parser.add_argument('--seeds', nargs='+', type=int, default=[0, 1, 2])
-    parser.add_argument('--data', type=Path)
-    parser.add_argument('--cache', type=Path)
-    parser.add_argument('--out', type=Path, default=Path('benchmark'))
-    parser.add_argument('--again', action='store_true', help='run drives that have a row, too')
     parser.add_argument('--list', action='store_true', help='name the settings, and end')
     parser.add_argument('--summary', action='store_true', help='of the rows there are, and end')
     arguments = parser.parse_args()

@@ -24,7 +24,18 @@ from pathlib import Path
 from typing import Any
 
 from drives import DEMO, STREET, Setting, drive_of, pictures_of
-from measure import KEYS, calibrate, commit, complain, done, isolated, load, save, summarised
+from measure import (
+    KEYS,
+    calibrate,
+    commit,
+    complain,
+    done,
+    isolated,
+    load,
+    parser_with,
+    save,
+    summarised,
+)
 from stages import detect, given, with_so_many
 
 from dashcalib_ros import Config, open_frames
@@ -152,13 +163,8 @@ def _points(panel: Any, rows: Sequence[Mapping[str, Any]], key: str, ceiling: fl
 
 def main() -> None:
     """Run what is asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
-    parser.add_argument('--seeds', nargs='+', type=int, default=[0, 1, 2])
+    parser = parser_with(__doc__, 'seeds', 'data', 'cache', 'out', 'again')
     parser.add_argument('--turns', nargs='+', type=int, default=list(range(1, 11)))
-    parser.add_argument('--data', type=Path, help='a folder with kitti03/')
-    parser.add_argument('--cache', type=Path, help='where rendered pictures are kept')
-    parser.add_argument('--out', type=Path, default=Path('benchmark'))
-    parser.add_argument('--again', action='store_true', help='run what has a row, too')
     parser.add_argument('--plot', action='store_true', help='of the rows there are, and end')
     arguments = parser.parse_args()
     path = arguments.out / 'curves.json'

@@ -10,17 +10,15 @@ and begun again where it ends; a table is printed at the end, and kept as DIR/eg
 """
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from measure import KEYS, commit, error_cells, load, save, summarised, table
+from measure import KEYS, commit, error_cells, load, parser_with, save, summarised, table
 
 from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
@@ -94,10 +92,8 @@ def report(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
-    parser.add_argument('--seeds', nargs='+', type=int, default=[0, 1, 2])
+    parser = parser_with(__doc__, 'seeds', 'out')
     parser.add_argument('--lenses', nargs='+', choices=LENSES, default=[*LENSES])
-    parser.add_argument('--out', type=Path, default=Path('benchmark'))
     arguments = parser.parse_args()
     path = arguments.out / 'ego_mask.json'
     rows = load(path)

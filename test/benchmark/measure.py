@@ -1,6 +1,7 @@
 """What every benchmark here needs: errors, a process of its own for each measurement, files."""
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
 import multiprocessing
@@ -25,6 +26,15 @@ from dashcalib_ros.report.result import plain_values
 KEYS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')
 FALSE_PERCENT = 3.0
 SAMPLE_S = 0.25
+
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    'seeds': {'nargs': '+', 'type': int, 'default': [0, 1, 2]},
+    'data': {'type': Path, 'help': 'a folder with kitti03/ (and carnd/)'},
+    'cache': {'type': Path, 'help': 'where rendered pictures are kept'},
+    'out': {'type': Path, 'default': Path('benchmark')},
+    'again': {'action': 'store_true', 'help': 'run what has a row, too'},
+}
 
 
 @dataclass(frozen=True)
@@ -109,30 +119,36 @@ def _descendants(pid: int) -> list[int]:
     return found
 
 
+class Stopwatch:
+    """Seconds by the stage that is under way; the first one has begun."""
+
+    def __init__(self, stage: str) -> None:
+        self.seconds: dict[str, float] = {}
+        self._stage, self._since = stage, time.perf_counter()
+
+    def enter(self, stage: str, share: float = 0.0) -> None:
+        """Begin another stage; takes what a calibration's progress is told."""
+        now = time.perf_counter()
+        self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+        self._stage, self._since = stage, now
+
+
 def calibrate(frames: Iterable[Frame], config: Config) -> tuple[Calibration, dict[str, float]]:
     """Return the calibration, and the seconds of each stage.
 
     decode: getting the frames; push: all of detection, with waiting for scenes; then whatever
     stages calibrate() names. total: without decode.
     """
-    seconds = {'decode': 0.0, 'push': 0.0}
-    stage, since = 'decode', time.monotonic()
-
-    def enter(name: str, done: float = 0.0) -> None:
-        nonlocal stage, since
-        now = time.monotonic()
-        seconds[stage] = seconds.get(stage, 0.0) + now - since
-        stage, since = name, now
-
+    watch = Stopwatch('decode')
     with Calibrator(config) as calibrator:
         for frame in frames:
-            enter('push')
+            watch.enter('push')
             calibrator.push(frame)
-            enter('decode')
-        enter('conclude')
-        result = calibrator.calibrate(enter)
-        enter('closing')
-    seconds['total'] = sum(seconds.values()) - seconds['decode']
+            watch.enter('decode')
+        watch.enter('conclude')
+        result = calibrator.calibrate(watch.enter)
+        watch.enter('closing')
+    seconds = {**watch.seconds, 'total': sum(watch.seconds.values()) - watch.seconds['decode']}
     return result, {name: round(value, 2) for name, value in seconds.items()}
 
 
@@ -203,6 +219,14 @@ def commit() -> str:
     except OSError:
         return ''
     return done.stdout.strip()
+
+
+def parser_with(doc: str, *options: str) -> argparse.ArgumentParser:
+    """Return a parser with some of the OPTIONS that benchmarks share; doc: the module's."""
+    parser = argparse.ArgumentParser(description=doc.split('\n')[0])
+    for option in options:
+        parser.add_argument(f'--{option}', **OPTIONS[option])
+    return parser
 
 
 def complain(error: DashcalibError | str) -> None:

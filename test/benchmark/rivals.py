@@ -34,6 +34,7 @@ from measure import (
     errors,
     isolated,
     load,
+    parser_with,
     save,
     summarised,
     table,
@@ -211,7 +212,7 @@ def rivals_table(rows: Iterable[Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
+    parser = parser_with(__doc__, 'data', 'cache', 'out', 'again')
     parser.add_argument('settings', nargs='*', help=f'default: {OWN[0].name}')
     parser.add_argument('--rivals', nargs='+', choices=list(RIVALS), metavar='NAME',
                         help=f'of {", ".join(RIVALS)}')
@@ -220,10 +221,6 @@ def main() -> None:
     parser.add_argument('--matcher', choices=('sequential', 'exhaustive'), default='sequential')
     parser.add_argument('--whole', action='store_true', help='COLMAP on the whole drive, too')
     parser.add_argument('--limit', type=float, default=1200.0, help='s, for each rival')
-    parser.add_argument('--data', type=Path, help='a folder with kitti03/ and carnd/')
-    parser.add_argument('--cache', type=Path, help='where rendered pictures are kept')
-    parser.add_argument('--out', type=Path, default=Path('benchmark'))
-    parser.add_argument('--again', action='store_true', help='run what has a row, too')
     parser.add_argument('--list', action='store_true', help='name settings and rivals, and end')
     arguments = parser.parse_args()
     if arguments.list:

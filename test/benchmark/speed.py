@@ -14,7 +14,6 @@ take turns in a process each, not side by side. Writes DIR/speed.json and DIR/sp
 """
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 import time
@@ -27,7 +26,18 @@ from typing import Any
 import cv2
 import numpy as np
 from drives import DEMO, FULL_HD, NARROW, STREET, VGA, Pictures, Setting, drive_of, pictures_of
-from measure import calibrate, commit, complain, isolated, load, memory_mb, save, table
+from measure import (
+    Stopwatch,
+    calibrate,
+    commit,
+    complain,
+    isolated,
+    load,
+    memory_mb,
+    parser_with,
+    save,
+    table,
+)
 from stages import detect, given
 
 from dashcalib_ros import Config
@@ -148,20 +158,13 @@ def calibration(pictures: Pictures) -> dict[str, Any]:
     """Reconstruct and solve five turns, stage by stage, all processes starting cold."""
     config = Config()
     detected = detect(pictures, config)
-    seconds: dict[str, float] = {}
-    stage, since = 'begin', time.perf_counter()
-
-    def enter(name: str, done: float = 0.0) -> None:
-        nonlocal stage, since
-        now = time.perf_counter()
-        seconds[stage] = seconds.get(stage, 0.0) + now - since
-        stage, since = name, now
-
+    watch = Stopwatch('begin')
     with given(detected, detected.turns, config) as calibrator:
-        result = calibrator.calibrate(enter)
-        enter('end')
-    return {'detect_s': detected.seconds, 'stages_s': seconds, 'total_s': sum(seconds.values()),
-            'verdict': result.verdict.level, 'turns': sum(turn.used for turn in result.turns)}
+        result = calibrator.calibrate(watch.enter)
+        watch.enter('end')
+    return {'detect_s': detected.seconds, 'stages_s': watch.seconds,
+            'total_s': sum(watch.seconds.values()), 'verdict': result.verdict.level,
+            'turns': sum(turn.used for turn in result.turns)}
 
 
 def whole(pictures: Pictures, times: int, turns: int) -> dict[str, Any]:
@@ -241,12 +244,10 @@ def report(found: dict[str, Any]) -> str:
 def main() -> None:
     """Measure what is asked for."""
     every = ('detection', 'calibration', 'length', 'turns', 'hour')
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
+    parser = parser_with(__doc__, 'cache', 'out')
     parser.add_argument('parts', nargs='*', metavar='PART',
                         help=f'of {", ".join(every)}; default: all')
     parser.add_argument('--minutes', type=float, default=60.0, help='of the long drive')
-    parser.add_argument('--cache', type=Path, help='where rendered pictures are kept')
-    parser.add_argument('--out', type=Path, default=Path('benchmark'))
     arguments = parser.parse_args()
     if unknown := set(arguments.parts) - set(every):
         parser.error(f'there is no part {", ".join(sorted(unknown))}; choose of {every}')
