@@ -4,6 +4,12 @@ Each message is one line that says what is wrong and names the cure.
 """
 
 
+def one_line(error: Exception, limit: int = 160) -> str:
+    """Return what somebody else's error says, or its kind, on one line and short."""
+    text = ' '.join(str(error).split()) or type(error).__name__
+    return text if len(text) <= limit else text[:limit - 1] + '…'
+
+
 class DashcalibError(Exception):
     """Root of all errors that this package raises on purpose."""
 

@@ -19,6 +19,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+from dashcalib_ros.errors import one_line
 from dashcalib_ros.frames.record import Record, ros2_type
 
 Damage = Callable[[str], None]
@@ -73,7 +74,7 @@ def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[M
         try:
             inner = breakup_chunk(record, validate_crc=True)
         except Exception as error:  # also zstandard's and lz4's own errors
-            damage(f'{name} has a broken chunk ({_line(error)})')
+            damage(f'{name} has a broken chunk ({one_line(error)})')
             continue
         yield from inner
 
@@ -97,7 +98,7 @@ def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
             if topic in topics:
                 yield Record(*topics[topic], receive_ns, data)
     except sqlite3.DatabaseError as error:
-        damage(f'{path.name}: {_line(error)}')
+        damage(f'{path.name}: {one_line(error)}')
     finally:
         database.close()
 
@@ -111,7 +112,7 @@ def scan_bag(path: Path, damage: Damage) -> Iterator[Record]:
             yield from _bag_messages(file, connections)
         except (EOFError, struct.error, KeyError, ValueError, OSError, RuntimeError,
                 MemoryError) as error:
-            damage(f'{path.name} is cut off ({_line(error)})')
+            damage(f'{path.name} is cut off ({one_line(error)})')
 
 
 def _bag_messages(file: BinaryIO, connections: dict[int, tuple[str, str]]) -> Iterator[Record]:
@@ -154,7 +155,3 @@ def _exactly(file: BinaryIO, size: int) -> bytes:
     if len(data) < size:
         raise EOFError(f'{size - len(data)} bytes are missing')
     return data
-
-
-def _line(error: Exception) -> str:
-    return ' '.join(str(error).split()) or type(error).__name__

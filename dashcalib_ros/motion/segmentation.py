@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.config import MaskConfig
-from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.errors import ConfigError, one_line
 from dashcalib_ros.motion.mask import LARGEST
 from dashcalib_ros.motion.points import Grey, Mask
 
@@ -69,7 +69,7 @@ class SegmentationModel:
             output = np.asarray(self._session.run(None, {self._input: planes[None]})[0])
         except Exception as error:  # onnxruntime's have no parent in common
             raise ConfigError(f'the segmentation model {self._path} does not run '
-                              f'({_line(error)}); export it anew') from error
+                              f'({one_line(error)}); export it anew') from error
         return self._decided(output)
 
     def _decided(self, output: npt.NDArray[Any]) -> Mask:
@@ -175,16 +175,11 @@ def _session(path: str) -> Any:
     try:
         return onnxruntime.InferenceSession(str(file), options, ['CPUExecutionProvider'])
     except Exception as error:  # onnxruntime's have no parent in common
-        raise ConfigError(f'{path} is no ONNX model that onnxruntime can load ({_line(error)}); '
-                          f'export it anew, or upgrade onnxruntime') from error
+        raise ConfigError(f'{path} is no ONNX model that onnxruntime can load '
+                          f'({one_line(error)}); export it anew, or upgrade onnxruntime'
+                          ) from error
 
 
 def _open(side: Any) -> bool:
     """Tell whether a dimension is left open."""
     return not isinstance(side, int) or side <= 0
-
-
-def _line(error: Exception) -> str:
-    """Return the error's text, short and on one line."""
-    text = ' '.join(str(error).split())
-    return text if len(text) <= 160 else text[:159] + '…'
