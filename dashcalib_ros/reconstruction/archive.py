@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, one_line
 from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.chain import Structure
 from dashcalib_ros.reconstruction.scene import Profile, Scene
@@ -328,9 +328,8 @@ def _read(path: Path) -> tuple[Origin, StoredTurn]:
         raise
     except Exception as error:
         # a file that anything may have happened to: numpy, zipfile and zlib raise all kinds
-        what = error.strerror if isinstance(error, OSError) else error
-        text = ' '.join(str(what or type(error).__name__).split())
-        raise InputError(f'{path.name} cannot be used ({text[:120]})') from error
+        what = error.strerror if isinstance(error, OSError) else None
+        raise InputError(f'{path.name} cannot be used ({what or one_line(error, 120)})') from error
 
 
 def _origin(data: Mapping[str, npt.NDArray[Any]]) -> Origin:

@@ -28,6 +28,8 @@ Mask = npt.NDArray[np.bool_]
 RATIOS = tuple(0.256 * 1.25**n for n in range(10))
 COARSE = (1, 3, 5, 7, 9)
 COMPLETIONS = 2
+# relative change of the cost that ends an adjustment; rough is enough where another follows
+FINE, ROUGH = 1e-5, 1e-3
 # columns and rows in which tracks are to be seen in each keyframe
 GRID = (6, 3)
 
@@ -55,7 +57,7 @@ def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
         return None
     # the neighbours on the profile's grid bound the focal length: the evidence lies between
     reach = (start.fx / 1.3, start.fx * 1.3)
-    scene = _refined(scene, config, reach)
+    scene = _refined(scene, config, reach, tolerance=ROUGH)
     by_index = {frame.index: frame.image for frame in turn.frames}
     images = [by_index[int(index)] for index in scene.tracks.frames]
     registered = register_tracks(
@@ -77,9 +79,9 @@ def chain_scene(tracks: Tracks, center: int, camera: Camera, profile: Profile,
 
 
 def _refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | None,
-             rounds: int = 2) -> Scene:
+             rounds: int = 2, tolerance: float = FINE) -> Scene:
     """Adjust and triangulate again in turn."""
-    solver = Solver(config.loss_px, config.iterations)
+    solver = Solver(config.loss_px, config.iterations, tolerance)
     for _ in range(rounds):
         [scene], camera = adjust_step1([scene], scene.camera, solver, reach)
         scene = retriangulated(scene, camera, config.error_px, config.min_angle_deg)
@@ -118,7 +120,7 @@ def _profile_trials(tracks: Tracks, center: int, config: SceneConfig, seed: int
         camera = Camera.centred(tracks.image_size, RATIOS[n] * tracks.image_size[0])
         scene = chain_scene(tracks, center, camera, _NO_PROFILE, config, seed)
         if scene is not None:
-            scene = _completed(_refined(scene, config, None), config, seed)
+            scene = _completed(_refined(scene, config, None, tolerance=ROUGH), config, seed)
             cost = truncated_cost(scene, scene.camera, config.error_px)
             trials[RATIOS[n]] = replace(scene, profile=Profile(
                 np.array([RATIOS[n]]), np.array([cost]), int(tracks.seen.sum())))
@@ -144,7 +146,7 @@ def _completed(scene: Scene, config: SceneConfig, seed: int) -> Scene:
         again = chain_scene(scene.tracks, scene.center, scene.camera, scene.profile, config, seed)
         if again is None:
             break
-        again = _refined(again, config, None)
+        again = _refined(again, config, None, tolerance=ROUGH)
         if (truncated_cost(again, again.camera, config.error_px)
                 >= truncated_cost(scene, scene.camera, config.error_px)):
             break

@@ -74,8 +74,7 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
         nearest = int(np.argmax(support))
         if support[nearest] < MIN_RESECTION:
             return Structure(rotations, translations, points, registered, used)
-        pose = _resection(rays[nearest], points, known, rotations, translations, registered,
-                          nearest, tolerance)
+        pose = _resection(rays[nearest], points, known, tolerance)
         if pose is None:
             failed[nearest] = True
             continue
@@ -145,17 +144,14 @@ def _initial_pair(rays: Array, tolerance: float) -> tuple[int, int, Array, Array
     return None
 
 
-def _resection(rays: Array, points: Array, known: Mask, rotations: Array, translations: Array,
-               registered: Mask, index: int, tolerance: float) -> tuple[Array, Array] | None:
-    """Return the pose of one image from the points it sees, started from its nearest neighbour."""
+def _resection(rays: Array, points: Array, known: Mask, tolerance: float
+               ) -> tuple[Array, Array] | None:
+    """Return the pose of one image from the points it sees."""
     common = known & np.isfinite(rays[:, 0])
-    neighbours = np.flatnonzero(registered)
-    neighbour = neighbours[np.argmin(np.abs(neighbours - index))]
-    rotvec, _ = cv2.Rodrigues(rotations[neighbour])
+    # three points make a hypothesis in 2/5 of the time that five take, and find as many inliers
     found, rotvec, translation, inliers = cv2.solvePnPRansac(
-        points[common], rays[common], np.eye(3), None, rvec=rotvec,
-        tvec=translations[neighbour].reshape(3, 1).copy(), useExtrinsicGuess=True,
-        reprojectionError=tolerance, iterationsCount=100, flags=cv2.SOLVEPNP_ITERATIVE)
+        points[common], rays[common], np.eye(3), None, reprojectionError=tolerance,
+        iterationsCount=100, flags=cv2.SOLVEPNP_AP3P)
     if not found or inliers is None or len(inliers) < max(12, 0.3 * common.sum()):
         return None
     chosen = inliers.ravel()
