@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from types import TracebackType
 
@@ -15,7 +15,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.frames.shrink import shrink, shrink_factor, shrink_mask
 from dashcalib_ros.intrinsics import Calibration
-from dashcalib_ros.intrinsics.agreement import strangers
+from dashcalib_ros.intrinsics.agreement import evidence_of
 from dashcalib_ros.intrinsics.conclude import Evidence, conclude
 from dashcalib_ros.intrinsics.solution import Solution
 from dashcalib_ros.intrinsics.solve import solve_scenes
@@ -32,9 +32,9 @@ class Status:
     """Where the calibrator stands after a frame.
 
     frames: pushed so far. turns: in the bank and stored. built: how many scenes a calibration
-    would use now, at the most those wanted; centers: of their turns, stored ones have negative
-    numbers. yaw_deg: their sum. stored: how many turns are of earlier drives.
-    magnitude: the newest filtered turning magnitude, of the image width.
+    would begin with now; centers: of their turns, stored ones have negative numbers. yaw_deg:
+    their sum. stored: how many turns are of earlier drives. magnitude: the newest filtered
+    turning magnitude, of the image width.
     """
 
     frames: int
@@ -123,16 +123,12 @@ class Calibrator:
         tell('reconstructing turns', 0.0)
         scenes, stored = self._scenes.wanted(tell, final)
         solution: Solution | None = None
-        kept: set[int] = set()
         if scenes:
             # step 1: one focal length; step 2: all six, with priors from step 1
             solution = self._scenes.workshop.run(
                 solve_scenes, scenes, self._config, progress=tell)
-            if solution is not None:
-                kept = {scene.center for scene in solution.scenes}
-                # a turn of another camera stays: without it nobody would know
-                kept |= strangers(solution, self._config.verdict)
-            self._scenes.reject({scene.center for scene in scenes} - kept)
+            self._scenes.reject({scene.center for scene in scenes}
+                                - evidence_of(solution, self._config.verdict))
             self._scenes.store()
         ended = time.monotonic()
         with self._lock:
@@ -164,6 +160,11 @@ class Calibrator:
             return Status(self._frames, len(self._detector.turns()) + stored, len(chosen),
                           sum(scene.yaw_deg for scene in chosen), self._detector.magnitude,
                           self._standing, tuple(scene.center for scene in chosen), stored)
+
+    def reject(self, keys: Iterable[int]) -> None:
+        """Take turns out, by centre or a stored one's key: they are of a camera that has gone."""
+        self._scenes.reject(keys)
+        self._scenes.store()
 
     def forget_stored(self) -> None:
         """Drop the turns of earlier drives, on disk too: the camera is not what it was."""

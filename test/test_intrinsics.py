@@ -10,7 +10,7 @@ from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.intrinsics import joint
-from dashcalib_ros.intrinsics.agreement import focal_disagreement, misfits, strangers
+from dashcalib_ros.intrinsics.agreement import focal_disagreement, misfits, outdated, strangers
 from dashcalib_ros.intrinsics.conclude import Evidence, conclude
 from dashcalib_ros.intrinsics.information import (
     Information,
@@ -493,10 +493,20 @@ def test_a_turn_of_another_camera_is_not_outvoted_in_silence(no_profile, factor,
               [*scenes_of(3, start=LENS), *scenes_of(4, other, start=other)[3:]]]
     solution = solved(scenes, CONFIG.replace({'scene.min_explained': least}))
     assert len(solution.scenes) == used
-    assert strangers(solution, CONFIG.verdict) == {3}
+    assert strangers(solution.misfits, CONFIG.verdict) == {3}
     assert max(solution.misfits[center] for center in range(3)) < 1.5
     level, reasons = levels(solution)
     assert level != 'accepted' and 'turn at frame 3 fits another camera' in reasons
+
+
+@pytest.mark.parametrize(('turns', 'odd', 'gone'), [
+    (set(), set(), set()), ({5}, {5}, set()),
+    ({0, 1, 2}, set(), set()),
+    ({-1, 0, 1, 2}, {-1, 1}, {-1, 1}),  # the newest turn is as most are
+    ({0, 1, 2}, {2}, set()),  # is it a new camera, or traffic?
+    ({0, 1, 2, 30}, {2, 30}, {0, 1})])  # the camera has changed
+def test_the_newest_turns_tell_which_camera_is_the_present_one(turns, odd, gone):
+    assert outdated(turns, odd) == gone
 
 
 def test_misfits_are_ratios_of_costs():

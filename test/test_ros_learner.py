@@ -62,6 +62,9 @@ class Core:
         return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG,
                            stored_turns=stored)
 
+    def reject(self, keys):
+        self.centers = tuple(center for center in self.centers if center not in keys)
+
     def close(self):
         self.closed.set()
         self.done.append('close')
@@ -127,8 +130,13 @@ def test_a_turn_that_fits_another_camera_is_not_tried_over_and_over(desk):
     until(lambda: len(desk.results) == 1)
     time.sleep(3 * room.LOOK_S)
     assert core.calls == 1 and not desk.results[0].complete
+    assert core.centers == (10, 20)  # the newest: it may be a new camera
+    core.strangers = (20, 30)
     core.centers = (10, 20, 30)
     until(lambda: len(desk.results) == 2)
+    until(lambda: core.centers == (20, 30))
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 2
 
 
 def test_a_lower_goal_calibrates_sooner_but_not_completely(desk):

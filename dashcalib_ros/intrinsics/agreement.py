@@ -1,7 +1,7 @@
 """Are the turns of one camera? What each says when it is asked alone."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
 
@@ -33,13 +33,35 @@ def misfits(alone: Sequence[Scene], together: Sequence[Scene], camera: Camera, l
                            else limit_px**2) / cost(scene, scene.camera) for scene in alone}
 
 
-def strangers(solution: Solution, config: VerdictConfig) -> set[int]:
+def strangers(misfits: Mapping[int, float], config: VerdictConfig) -> set[int]:
     """Return the centres of the turns that another camera explains far better than the common one.
 
     A robust loss takes no notice of such turns: they cause no scatter.
     """
-    return {center for center, misfit in solution.misfits.items()
-            if not misfit <= config.max_misfit}
+    return {center for center, misfit in misfits.items() if not misfit <= config.max_misfit}
+
+
+def evidence_of(solution: Solution | None, config: VerdictConfig) -> set[int]:
+    """Return the turns that keep their places: those used, and those of another camera.
+
+    Without the latter nobody would know of it.
+    """
+    if solution is None:
+        return set()
+    return {scene.center for scene in solution.scenes} | strangers(solution.misfits, config)
+
+
+def outdated(turns: Set[int], odd: Set[int]) -> set[int]:
+    """Return which turns are not of the present camera, as far as the newest ones tell.
+
+    turns: centres in order of time; those of earlier drives are negative. odd: the strangers among
+    them. The newest turn shows the present camera, unless it is odd and alone in that: it may as
+    well have been traffic.
+    """
+    newest = sorted(turns)[-2:]
+    if newest and newest[-1] not in odd:
+        return set(odd)
+    return set(turns - odd) if len(newest) == 2 and odd >= set(newest) else set()
 
 
 def focal_disagreement(solution: Solution) -> float:

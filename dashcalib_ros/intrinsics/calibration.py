@@ -112,6 +112,13 @@ class Calibration:
     rolling_shutter: Shutter | None = None
 
     @property
+    def misfits(self) -> dict[int, float]:
+        """Return the misfits of all turns that were tried, by centre or a stored one's key."""
+        found = {turn.center: turn.misfit for turn in self.turns}
+        found |= {turn.key: turn.misfit for turn in self.stored_turns}
+        return {key: misfit for key, misfit in found.items() if misfit is not None}
+
+    @property
     def turns_used(self) -> int:
         """Return how many turns the result is made of, those of earlier drives included."""
         return sum(turn.used for turn in self.turns) + sum(

@@ -107,7 +107,7 @@ def _turns_disagree(solution: Solution, config: VerdictConfig) -> tuple[list[str
 
 
 def _other_camera(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
-    centers = sorted(strangers(solution, config))
+    centers = sorted(strangers(solution.misfits, config))
     if not centers:
         return [], []
     return [], [f'{_named(centers)} another camera far better than the one of the others: was the '

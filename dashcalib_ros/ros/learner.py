@@ -9,10 +9,11 @@ from typing import Any
 
 from dashcalib_ros.calibrator import Calibrator, Mask, Status
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import DashcalibError, InputError
+from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.frames.decode import BitDepth, decode
 from dashcalib_ros.intrinsics import Calibration
+from dashcalib_ros.intrinsics.agreement import outdated, strangers
 from dashcalib_ros.ros.backlog import Backlog
 
 # s between two looks at whether enough turns are built: their scenes come without a push
@@ -214,10 +215,10 @@ class Learner:
                 continue
             used = [turn.center for turn in calibration.turns if turn.used]
             used += [turn.key for turn in calibration.stored_turns if turn.used]
-            tried = {turn.center for turn in calibration.turns if turn.misfit is not None}
-            tried |= {turn.key for turn in calibration.stored_turns if turn.misfit is not None}
+            odd = strangers(calibration.misfits, self._config.verdict)
+            bank.calibrator.reject(outdated(odd.union(used), odd))
             with self._changed:
-                bank.tried = frozenset(tried)
+                bank.tried = frozenset(calibration.misfits)
                 self._failures = 0
                 self._activity = replace(self._activity, calibrating=False, stage='')
             complete = len(used) >= self._config.turns.wanted
@@ -264,5 +265,5 @@ def _clear(calibrator: Calibrator) -> None:
 
 
 def _named(error: Exception) -> str:
-    text = ' '.join(str(error).split())
+    text = one_line(error, 500)
     return text if isinstance(error, DashcalibError) else f'{type(error).__name__}: {text}'
