@@ -18,6 +18,7 @@ import pytest
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, WorkerError
+from dashcalib_ros.reconstruction import child as child_module
 from dashcalib_ros.reconstruction import workshop as workshop_module
 from dashcalib_ros.reconstruction.child import Child, ChildDiedError
 from dashcalib_ros.reconstruction.workshop import ATTEMPTS, Workshop
@@ -286,18 +287,34 @@ def test_a_turn_whose_child_is_killed_from_outside_is_built_again(
     assert workshop.scenes() == {10: 'scene of 10'}
 
 
-def test_a_turn_that_kills_every_child_is_given_up(workshop, monkeypatch, tmp_path):
-    log = tmp_path / 'log'
+def test_a_turn_that_kills_every_child_is_given_up_and_told(monkeypatch, tmp_path):
+    log, told = tmp_path / 'log', []
     use(monkeypatch, child_tasks.build_dies)
+    workshop = Workshop(Config(), on_lost=told.append)
     workshop.submit(turn(10, log), None)
     wait_until_built(workshop)
     assert workshop.scenes() == {10: None}
+    assert len(told) == 1 and 'turn at frame 10' in told[0]
     assert log.read_text() == '10\n' * ATTEMPTS
     # the others still are built
     use(monkeypatch, child_tasks.build)
     workshop.submit(turn(50), None)
     wait_until_built(workshop)
-    assert workshop.scenes() == {10: None, 50: 'scene of 50'}
+    assert workshop.scenes() == {10: None, 50: 'scene of 50'} and len(told) == 1
+    workshop.close()
+
+
+def test_where_no_child_can_live_the_pictures_are_not_blamed(workshop, monkeypatch):
+    """A broken installation, say, or a library of another processor."""
+    monkeypatch.setattr(workshop_module, 'ATTEMPTS', 2)
+    monkeypatch.setattr(child_module, 'START', 'import sys; sys.exit(7)')
+    workshop.submit(turn(10), None)
+    with pytest.raises(WorkerError, match=r'no reconstruction process .*exit code 7'):
+        wait_until_built(workshop)
+    monkeypatch.undo()
+    use(monkeypatch, child_tasks.build)
+    wait_until_built(workshop)
+    assert workshop.scenes() == {10: 'scene of 10'}
 
 
 def test_an_error_is_told_once_and_the_turn_tried_again(workshop, monkeypatch, tmp_path):

@@ -22,7 +22,8 @@ class SceneCollection:
     """Has the best turns of the detector's bank built, and chooses among them and stored ones.
 
     places: how many turns are used. detector, valid: whose turns, and where their pictures show
-    no ego vehicle; read with the lock only. workshop: builds the scenes. warnings: of turns.store.
+    no ego vehicle; read with the lock only. workshop: builds the scenes. warnings: of turns.store,
+    and of turns that ended the children.
 
     Threads: the Calibrator's lock guards the detector, the places and the archive's turns. It is
     held for moments: push() needs it for each frame. Nobody waits with it for a child, nor for a
@@ -49,7 +50,8 @@ class SceneCollection:
         turns = detector.config
         self._archive = Archive(turns.store, turns.capacity, turns.half_width, self._on_trouble)
         self.workshop = Workshop(config, low_priority=live, verbose=verbose,
-                                 queue=turns.wanted if live else None, on_built=self.store)
+                                 queue=turns.wanted if live else None, on_built=self.store,
+                                 on_lost=self.warnings.append)
 
     # for who has the lock
 

@@ -37,15 +37,17 @@ class Workshop:
     """
 
     def __init__(self, config: Config, low_priority: bool = False, verbose: bool = False,
-                 queue: int | None = None, on_built: Callable[[], None] = lambda: None) -> None:
+                 queue: int | None = None, on_built: Callable[[], None] = lambda: None,
+                 on_lost: Callable[[str], None] = lambda text: None) -> None:
         """queue: how many turns may wait for a child, with their images; None: any number.
 
         With more, the least prominent of them counts as one without a scene.
         on_built: called from a thread of the workshop whenever a turn is settled; raises nothing.
+        on_lost: the same, when a turn is given up because it ends every child; gets one line.
         """
         self._config = config
         self._queue = queue
-        self._on_built = on_built
+        self._on_built, self._on_lost = on_built, on_lost
         self._children = [Child(low_priority, verbose) for _ in range(config.threads)]
         # by the turn's centre; those that a child has begun are in none of the two
         self._jobs: dict[int, _Job] = {}
@@ -196,16 +198,30 @@ class Workshop:
             try:
                 return child.call(build_turn, job.turn, self._config, job.valid), None
             except ChildDiedError:
-                if self._closed or attempt == ATTEMPTS - 1:
-                    break
-                self._ended.wait(BACK_OFF_S * 2**attempt)
+                if self._closed:
+                    return None, None
+                if attempt < ATTEMPTS - 1:
+                    self._ended.wait(BACK_OFF_S * 2**attempt)
             except DashcalibError as error:
                 return None, error
             except Exception as error:
                 return None, WorkerError(f'reconstruction of the turn at frame {job.turn.center} '
                                          f'failed: {type(error).__name__}: {error}')
+        try:
+            child.call(load_all)
+        except ChildDiedError as error:
+            # not the turn is to blame, and neither are the pictures
+            return None, None if self._closed else WorkerError(
+                f'no reconstruction process can live here: {error}; --verbose shows what it says')
         # a turn that kills the child every time is no evidence; the others still are
+        self._on_lost(f'the turn at frame {job.turn.center} ended the reconstruction process '
+                      f'{ATTEMPTS} times and was left out')
         return None, None
+
+
+def load_all() -> None:
+    """Run in the child: load what a turn needs."""
+    import dashcalib_ros.reconstruction.build  # noqa: F401
 
 
 def build_turn(turn: Turn, config: Config, valid: Mask | None) -> Scene | None:
