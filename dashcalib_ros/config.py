@@ -131,6 +131,9 @@ class SceneConfig:
     well_explained: float = setting(
         0.9, 'of a turn\'s observations; where the common camera explains fewer, the turn is '
         'chained anew with it: sound scenes have 0.97', 0.0, 1.0)
+    well_fitting: float = setting(
+        1.25, "times a turn's cost with a camera of its own; where the common camera costs more, "
+        'the poses that the turn had alone are tried: sound turns have 0.5 to 1.2', 1.0, 1e4)
     patch_half_window: int = setting(7, 'px; of the affine registration', 3, 25)
     max_shift_px: float = setting(
         3.0, 'px; a registration that moves a point farther has lost it', 0.2, 20.0)

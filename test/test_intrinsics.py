@@ -509,6 +509,19 @@ def test_the_newest_turns_tell_which_camera_is_the_present_one(turns, odd, gone)
     assert outdated(turns, odd) == gone
 
 
+def test_images_that_went_astray_come_back():
+    alone = [built(scene) for scene in scenes_of(2, start=LENS)]
+    translations = alone[0].structure.translations.copy()
+    translations[-3:] += 2.0
+    astray = [retriangulated(replace(alone[0], structure=replace(
+        alone[0].structure, translations=translations)), LENS, 2.0, 0.3), alone[1]]
+    before, mended = misfits(alone, astray, LENS, 2.0), joint._mended(
+        astray, alone, LENS, CONFIG.scene)
+    after = misfits(alone, mended, LENS, 2.0)
+    assert before[0] > 1.5 and after[0] < 1.1 and after[1] == before[1] < 1.1
+    assert mended[0].explained > 0.98 > 0.9 > astray[0].explained and mended[1] is alone[1]
+
+
 def test_misfits_are_ratios_of_costs():
     [first, second] = scenes_of(2, start=LENS)
     off = replace(LENS, fx=1.05 * LENS.fx)

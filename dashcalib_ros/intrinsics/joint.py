@@ -66,6 +66,7 @@ def solve(alone: Sequence[Scene], config: IntrinsicsConfig, scene_config: SceneC
                                 readout_s, scene_config)
     together = _explained(together, {scene.center: scene for scene in together}, camera,
                           scene_config, seed)
+    together = _mended(together, alone, camera, scene_config)
     if not together:
         return None
     for n in range(config.rounds):
@@ -264,12 +265,32 @@ def _explained(scenes: Sequence[Scene], whole: Mapping[int, Scene], camera: Came
 def _anew(scene: Scene, camera: Camera, config: SceneConfig, seed: int) -> Scene:
     """Return the scene chained anew with a camera that is nearly right, if that can be done."""
     anew = chain_scene(scene.tracks, scene.center, camera, scene.profile, config, seed)
-    if anew is None:
-        return _again(scene, camera, config)
+    return _again(scene, camera, config) if anew is None else _settled(anew, camera, config)
+
+
+def _mended(scenes: Sequence[Scene], alone: Sequence[Scene], camera: Camera, config: SceneConfig
+            ) -> list[Scene]:
+    """Return the scenes, with the poses they had alone where these explain clearly more.
+
+    The first steps have a part of the tracks only: an image that sees few of them may go astray.
+    """
+    found = misfits(alone, scenes, camera, config.error_px)
+    own = {scene.center: scene.structure for scene in alone}
+
+    def cost(scene: Scene) -> float:
+        return truncated_cost(scene, camera, config.error_px)
+
+    return [min(scene, _settled(replace(scene, structure=own[scene.center]), camera, config),
+                key=cost) if found[scene.center] > config.well_fitting else scene
+            for scene in scenes]
+
+
+def _settled(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
+    """Return the scene adjusted to a camera that is nearly right."""
     # the centre and the aspect stay, the focal length is held
     solver = Solver(0.01 * camera.image_size[0], config.iterations)
-    [anew], _ = adjust_step1([_again(anew, camera, config)], camera, solver, None)
-    return _again(anew, camera, config)
+    [moved], _ = adjust_step1([_again(scene, camera, config)], camera, solver, None)
+    return _again(moved, camera, config)
 
 
 def _again(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
