@@ -196,8 +196,8 @@ class VerdictConfig:
     max_disagreement: float = setting(
         0.03, 'of fx; weighted scatter between the turns, more is weak', 0.0, 1.0)
     max_misfit: float = setting(
-        2.0, "times a turn's cost with a camera of its own; more is weak: 35 sound turns have 0.5 "
-        'to 1.1, turns of another lens in the same drive 4.6 to 10', 1.0, 1e4)
+        2.0, "times a turn's cost with a camera of its own; more is weak: sound turns have 0.5 to "
+        '1.3, turns of another lens in the same drive 4.6 to 25', 1.0, 1e4)
 
 
 @dataclass(frozen=True)

@@ -518,8 +518,11 @@ def test_images_that_went_astray_come_back():
     before, mended = misfits(alone, astray, LENS, 2.0), joint._mended(
         astray, alone, LENS, CONFIG.scene)
     after = misfits(alone, mended, LENS, 2.0)
-    assert before[0] > 1.5 and after[0] < 1.1 and after[1] == before[1] < 1.1
-    assert mended[0].explained > 0.98 > 0.9 > astray[0].explained and mended[1] is alone[1]
+    assert before[0] > 5 and max(after.values()) < 1.1
+    assert mended[0].explained > 0.98 > 0.9 > astray[0].explained
+    # what is well is left as it is
+    again = joint._mended(mended, alone, LENS, CONFIG.scene)
+    assert [new is old for new, old in zip(again, mended, strict=True)] == [True, True]
 
 
 def test_misfits_are_ratios_of_costs():
