@@ -266,6 +266,21 @@ def test_stored_turns_of_another_size_are_left_out_and_told(tmp_path):
         assert calibrator.status().turns == 0 and list(tmp_path.iterdir()) == []
 
 
+def test_turns_that_are_rejected_leave_the_store(tmp_path):
+    archive = Archive(str(tmp_path), 10, 3.0, pytest.fail)
+    archive.load(Origin((640, 360), 1))
+    lens = Camera((640, 360), 390.0, 390.0, 325.0, 175.0, -0.2)
+    other = synthetic_turn(lens, keyframes=12, tracks=120, world=1).scene(lens, 9)
+    archive.mirror(lambda: {0: StoredTurn(garbage(), 5.0, 0.9), 9: StoredTurn(other, 50.0, 0.8)})
+    with Calibrator(QUICK.replace({'turns.store': str(tmp_path)}), live=True) as calibrator:
+        first, second = calibrator.push(pictures(1, 640, 360)[0]).centers
+        calibrator.reject([first])
+        assert calibrator.status().centers == (second,) and calibrator.status().turns == 1
+        assert len(list(tmp_path.iterdir())) == 1
+        calibrator.reject([first, 77])  # gone, and never there
+        assert calibrator.status().centers == (second,)
+
+
 # drives that cannot calibrate
 
 def pictures(count: int, width: int, height: int, seed: int | None = None) -> list[Frame]:
