@@ -240,9 +240,10 @@ def test_a_stored_turn_of_another_camera_is_told_and_stays(frames, tmp_path):
     archive.mirror(lambda: {0: StoredTurn(synthetic_turn(lens).scene(lens), 5.0, 0.001)})
     result = calibrated(frames[:95], config)
     assert result.verdict.level != 'accepted' and result.turns[0].used, result.verdict
-    assert any('1 turn of earlier drives fits another camera' in reason
-               for reason in result.verdict.reasons), result.verdict
-    assert result.turns[0].misfit < 1.5 < 2.0 < result.stored_turns[0].misfit
+    # of two turns nobody can tell which one is odd
+    assert any('another camera' in reason for reason in result.verdict.reasons), result.verdict
+    assert max(result.misfits.values()) > 2.0 and set(result.misfits) == {
+        result.turns[0].center, -1}
     assert len(list(tmp_path.iterdir())) == 2
 
 

@@ -21,7 +21,7 @@ SIGMA = Intrinsics(3.5, 3.75, 2.0, 2.25, 0.004, 0.003)
 
 def make_calibration(level='accepted', **changes):
     """Make a small but complete calibration by hand; refused ones have no intrinsics."""
-    turn = TurnSummary(88, 58, 118, 8.8, 0.061, 31, 30, True, 91.5, 0.46)
+    turn = TurnSummary(88, 58, 118, 8.8, 0.061, 31, 30, True, 91.5, 0.46, 1.1)
     unused = TurnSummary(275, 245, 305, 27.5, 0.012, 31, 4, False)
     stamps = np.arange(300) * 0.1
     magnitude = 0.01 + 0.06 * np.exp(-((stamps - 8.8) / 1.5) ** 2)
@@ -40,11 +40,12 @@ def make_calibration(level='accepted', **changes):
 
 
 def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
-    stored = StoredTurnSummary(-1, 1.7e9, 0.05, 88.0, 20, True)
+    stored = StoredTurnSummary(-1, 1.7e9, 0.05, 88.0, 20, True, 0.9)
     calibration = make_calibration(stored_turns=(stored,))
     result = strict(result_json(calibration))
     assert result['stored_turns'] == [{
-        'stamp': 1.7e9, 'prominence': 0.05, 'yaw_deg': 88.0, 'images': 20, 'used': True}]
+        'stamp': 1.7e9, 'prominence': 0.05, 'yaw_deg': 88.0, 'images': 20, 'used': True,
+        'misfit': 0.9}]
     assert len(result['turns']) == 2 and calibration.turns_used == 2
     assert '1 of 1 stored turn used' in report_html(calibration)
     assert result_dict(make_calibration())['stored_turns'] == []
@@ -70,7 +71,7 @@ def test_result_has_the_contract_s_keys_and_values():
     assert result['turns'][0] == {
         'center': 88, 'first': 58, 'last': 118, 'stamp': 8.8, 'prominence': 0.061,
         'images': 31, 'registered': 30, 'used': True, 'yaw_deg': 91.5,
-        'reprojection_error_px': 0.46}
+        'reprojection_error_px': 0.46, 'misfit': 1.1}
     assert result['masked_fraction'] == pytest.approx(75 / 375)
 
 
