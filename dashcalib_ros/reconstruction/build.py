@@ -28,8 +28,8 @@ Mask = npt.NDArray[np.bool_]
 RATIOS = tuple(0.256 * 1.25**n for n in range(10))
 COARSE = (1, 3, 5, 7, 9)
 COMPLETIONS = 2
-# relative change of the cost that ends an adjustment; rough is enough where another follows
-FINE, ROUGH = 1e-5, 1e-3
+# relative change of the cost that ends an adjustment, where another follows
+ROUGH = 1e-3
 # columns and rows in which tracks are to be seen in each keyframe
 GRID = (6, 3)
 
@@ -79,7 +79,7 @@ def chain_scene(tracks: Tracks, center: int, camera: Camera, profile: Profile,
 
 
 def _refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | None,
-             rounds: int = 2, tolerance: float = FINE) -> Scene:
+             rounds: int = 2, tolerance: float = Solver.tolerance) -> Scene:
     """Adjust and triangulate again in turn."""
     solver = Solver(config.loss_px, config.iterations, tolerance)
     for _ in range(rounds):
