@@ -20,24 +20,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = make_parser().parse_args(argv)
     except SystemExit as end:  # argparse's way to end after --help, --version and usage errors
         return end.code if isinstance(end.code, int) else BAD_INPUT
-    with _sigterm_like_ctrl_c():
-        try:
+    # a signal may come while its handler is set or taken back, too
+    try:
+        with _sigterm_like_ctrl_c():
             code: int = args.command(args)
             return code
-        except DashcalibError as error:
-            return _fail(str(error))
-        except KeyboardInterrupt:
-            return _fail('interrupted', INTERRUPTED)
-        except ModuleNotFoundError as error:
-            if not error.name or error.name.startswith('dashcalib_ros'):
-                raise
-            return _fail(f'the Python package {error.name} is missing; install it with pip')
-        except MemoryError:
-            return _fail('out of memory; close other programs or lower turns.capacity')
-        except BrokenPipeError:
-            return _fail('the program that was to read the output has gone')
-        except OSError as error:
-            return _fail(_os_error(error))
+    except DashcalibError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        return _fail('interrupted', INTERRUPTED)
+    except ModuleNotFoundError as error:
+        if not error.name or error.name.startswith('dashcalib_ros'):
+            raise
+        return _fail(f'the Python package {error.name} is missing; install it with pip')
+    except MemoryError:
+        return _fail('out of memory; close other programs or lower turns.capacity')
+    except BrokenPipeError:
+        return _fail('the program that was to read the output has gone')
+    except OSError as error:
+        return _fail(_os_error(error))
 
 
 @contextmanager
