@@ -133,7 +133,7 @@ class SceneConfig:
         'chained anew with it: sound scenes have 0.97', 0.0, 1.0)
     well_fitting: float = setting(
         1.25, "times a turn's cost with a camera of its own; where the common camera costs more, "
-        'the poses that the turn had alone are tried: sound turns have 0.5 to 1.2', 1.0, 1e4)
+        'the poses that the turn had alone are tried: most sound turns have less', 1.0, 1e4)
     patch_half_window: int = setting(7, 'px; of the affine registration', 3, 25)
     max_shift_px: float = setting(
         3.0, 'px; a registration that moves a point farther has lost it', 0.2, 20.0)
@@ -197,7 +197,7 @@ class VerdictConfig:
         0.03, 'of fx; weighted scatter between the turns, more is weak', 0.0, 1.0)
     max_misfit: float = setting(
         2.0, "times a turn's cost with a camera of its own; more is weak: sound turns have 0.5 to "
-        '1.3, turns of another lens in the same drive 4.6 to 25', 1.0, 1e4)
+        '1.5, turns of another lens in the same drive 4.6 to 25', 1.0, 1e4)
 
 
 @dataclass(frozen=True)
