@@ -9,9 +9,10 @@ import pytest
 from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.intrinsics import joint
+from dashcalib_ros.intrinsics import fitting, focal
 from dashcalib_ros.intrinsics.agreement import focal_disagreement, misfits, outdated, strangers
 from dashcalib_ros.intrinsics.conclude import Evidence, conclude
+from dashcalib_ros.intrinsics.focal import summed
 from dashcalib_ros.intrinsics.information import (
     Information,
     between_turns,
@@ -21,7 +22,7 @@ from dashcalib_ros.intrinsics.information import (
     noise_in,
     noise_of,
 )
-from dashcalib_ros.intrinsics.joint import solve, summed
+from dashcalib_ros.intrinsics.joint import solve
 from dashcalib_ros.intrinsics.solution import Solution
 from dashcalib_ros.intrinsics.solve import solve_scenes
 from dashcalib_ros.intrinsics.verdict import judge, profile_contrast
@@ -65,7 +66,7 @@ def z_of(solution: Solution, truth: Camera = LENS) -> np.ndarray:
 @pytest.fixture
 def no_profile(monkeypatch):
     """Leave out the focal profile around the result, which takes most of the time."""
-    monkeypatch.setattr(joint, 'PROBES', (1.0,))
+    monkeypatch.setattr(focal, 'PROBES', (1.0,))
 
 
 @pytest.fixture(scope='module')
@@ -515,13 +516,13 @@ def test_images_that_went_astray_come_back():
     translations[-3:] += 2.0
     astray = [retriangulated(replace(alone[0], structure=replace(
         alone[0].structure, translations=translations)), LENS, 2.0, 0.3), alone[1]]
-    before, mended = misfits(alone, astray, LENS, 2.0), joint._mended(
+    before, mended = misfits(alone, astray, LENS, 2.0), fitting.mended(
         astray, alone, LENS, CONFIG.scene)
     after = misfits(alone, mended, LENS, 2.0)
     assert before[0] > 5 and max(after.values()) < 1.1
     assert mended[0].explained > 0.98 > 0.9 > astray[0].explained
     # what is well is left as it is
-    again = joint._mended(mended, alone, LENS, CONFIG.scene)
+    again = fitting.mended(mended, alone, LENS, CONFIG.scene)
     assert [new is old for new, old in zip(again, mended, strict=True)] == [True, True]
 
 

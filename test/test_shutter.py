@@ -8,7 +8,7 @@ import pytest
 from synthetic import LENS
 from test_intrinsics import CONFIG, NOTHING, adjusted, scenes_of, solved, z_of
 
-from dashcalib_ros.intrinsics import joint
+from dashcalib_ros.intrinsics import focal
 from dashcalib_ros.intrinsics.shutter import readout, row_shift, undone
 from dashcalib_ros.intrinsics.verdict import judge
 
@@ -16,7 +16,7 @@ from dashcalib_ros.intrinsics.verdict import judge
 @pytest.fixture(autouse=True)
 def no_profile(monkeypatch):
     """Leave out the focal profile around the result, which takes most of the time."""
-    monkeypatch.setattr(joint, 'PROBES', (1.0,))
+    monkeypatch.setattr(focal, 'PROBES', (1.0,))
 
 
 @pytest.mark.parametrize('readout_s', [0.03, -0.02])
