@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special
 
 from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.scene import Scene, residuals_px
@@ -231,7 +231,7 @@ def between_turns(hessians: Array, scores: Array, inverse: Array) -> Array:
             expected[:, i, j] = np.diag(inverse @ middle @ inverse)
     freedom = (np.trace(expected, axis1=1, axis2=2)**2
                / np.maximum(np.sum(expected**2, axis=(1, 2)), 1e-300))
-    tails = stats.t.ppf(0.975, np.maximum(freedom, 1.0)) / stats.norm.ppf(0.975)
+    tails = special.stdtrit(np.maximum(freedom, 1.0), 0.975) / special.ndtri(0.975)
     return np.asarray(variance * tails**2)
 
 
