@@ -30,6 +30,11 @@ def niceness():
     return os.nice(0)
 
 
+def threads():
+    import cv2
+    return cv2.getNumThreads()
+
+
 def sleep(seconds, started=None):
     if started is not None:
         Path(started).write_text(str(os.getpid()))

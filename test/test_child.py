@@ -234,6 +234,12 @@ def test_the_child_ends_when_its_parent_is_killed_in_mid_call(tmp_path):
     wait_for(lambda: not is_running(pid), 10.0)
 
 
+def test_opencv_has_as_many_threads_as_allowed():
+    for child, allowed in ((Child(), 1), (Child(threads=2), 2)):
+        assert child.call(child_tasks.threads) == allowed
+        child.close()
+
+
 # the workshop
 
 @pytest.fixture
@@ -264,7 +270,48 @@ def test_turns_become_scenes_once(workshop, monkeypatch):
         workshop.submit(turn(center), None)
     wait_until_built(workshop)
     assert workshop.scenes() == {center: f'scene of {center}' for center in (10, 50, 90)}
-    assert len(workshop.pids()) == 2
+    assert all(child.pid is not None for child in workshop._children)
+
+
+def test_who_has_no_turn_left_starts_the_process_that_comes_next(workshop, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_slowly)
+    workshop.submit(turn(10, tmp_path / 'flag'), None)
+    wait_for((tmp_path / 'flag.10').exists)
+    assert workshop._solver.pid is None
+    use(monkeypatch, child_tasks.build)
+    workshop.submit(turn(50), None)
+    wait_for(lambda: workshop._solver.pid is not None)
+    started = workshop._solver.pid
+    assert workshop.unbuilt() == {10}
+    assert workshop.run(child_tasks.pid) == started
+
+
+def test_where_the_next_process_cannot_start_turns_are_still_built(workshop, monkeypatch):
+    use(monkeypatch, child_tasks.build)
+    monkeypatch.setattr(workshop_module, 'load_all', child_tasks.die)
+    for center in (10, 50, 90):
+        workshop.submit(turn(center), None)
+    wait_until_built(workshop)
+    assert set(workshop.scenes()) == {10, 50, 90}
+    assert workshop.run(child_tasks.add, 1, 2) == 3
+
+
+def test_without_a_queue_the_longest_is_built_first(monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_slowly)
+    workshop = Workshop(Config().replace({'threads': 1}))
+    try:
+        workshop.submit(turn(10, tmp_path / 'flag'), None)
+        wait_for((tmp_path / 'flag.10').exists)
+        use(monkeypatch, child_tasks.build)
+        for center, images in ((20, 2), (30, 9), (40, 5)):
+            workshop.submit(replace(turn(center), frames=('',) * images, prominence=1 / center),
+                            None)
+        workshop.keep_only({20, 30, 40})
+        os.kill(int((tmp_path / 'flag.10').read_text()), signal.SIGKILL)
+        wait_until_built(workshop)
+        assert list(workshop.scenes()) == [30, 40, 20]
+    finally:
+        workshop.close()
 
 
 def test_a_child_that_dies_loses_no_turn(workshop, monkeypatch, tmp_path):

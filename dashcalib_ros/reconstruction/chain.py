@@ -127,8 +127,8 @@ def _initial_pair(rays: Array, tolerance: float) -> tuple[int, int, Array, Array
             if both.sum() >= MIN_SHARED:
                 moved = np.linalg.norm(rays[first, both] - rays[first + gap, both], axis=1)
                 # the spread of the motion, not the motion: a rotation moves all points alike
-                spread = np.percentile(moved, 90) - np.percentile(moved, 10)
-                candidates.append((float(both.sum()) * min(spread, 0.2), first, first + gap))
+                low, high = np.percentile(moved, (10, 90))
+                candidates.append((float(both.sum()) * min(high - low, 0.2), first, first + gap))
     for _, first, second in sorted(candidates, reverse=True)[:5]:
         both = seen[first] & seen[second]
         a, b = rays[first, both], rays[second, both]

@@ -45,8 +45,11 @@ class Child:
     Calls come from one thread at a time; kill() may come from any.
     """
 
-    def __init__(self, low_priority: bool = False, verbose: bool = False) -> None:
+    def __init__(self, low_priority: bool = False, verbose: bool = False, threads: int = 1
+                 ) -> None:
+        """threads: of OpenCV, whose results do not depend on it."""
         self._low_priority = low_priority
+        self._threads = threads
         self._verbose = verbose
         self._process: subprocess.Popen[bytes] | None = None
         self._closed = False
@@ -135,7 +138,7 @@ class Child:
         environment['PYTHONPATH'] = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
         environment.update({name: '1' for name in THREAD_VARIABLES})
         command = [sys.executable, '-c', START, str(LOW_PRIORITY if self._low_priority else 0),
-                   str(os.getpid())]
+                   str(os.getpid()), str(self._threads)]
         try:
             return subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment,
@@ -213,7 +216,7 @@ def main() -> None:
     os.dup2(2, 1)
 
     import cv2
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(int(sys.argv[3]))
 
     def report(stage: str, done: float) -> None:
         _write(answers, _packed(('progress', (stage, done))))

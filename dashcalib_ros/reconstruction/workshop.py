@@ -1,6 +1,7 @@
 """Turns are made into scenes side by side, in child processes, while the drive goes on."""
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Set
 from dataclasses import dataclass
@@ -32,8 +33,8 @@ class _Job:
 class Workshop:
     """Builds scenes in the background. All methods may be called from any thread.
 
-    The most prominent turn is built first. A turn stays until its scene is there: a child that
-    dies loses nothing.
+    Live, the most prominent turn is built first; else the longest, so that the children end at
+    about the same time. A turn stays until its scene is there: a child that dies loses nothing.
     """
 
     def __init__(self, config: Config, low_priority: bool = False, verbose: bool = False,
@@ -41,14 +42,16 @@ class Workshop:
                  on_lost: Callable[[str], None] = lambda text: None) -> None:
         """queue: how many turns may wait for a child, with their images; None: any number.
 
-        With more, the least prominent of them counts as one without a scene.
+        With more, the least prominent of them counts as one without a scene: the drive is live.
         on_built: called from a thread of the workshop whenever a turn is settled; raises nothing.
         on_lost: the same, when a turn is given up because it ends every child; gets one line.
         """
         self._config = config
         self._queue = queue
         self._on_built, self._on_lost = on_built, on_lost
-        self._children = [Child(low_priority, verbose) for _ in range(config.threads)]
+        # the last turn of an odd number has all cores to itself
+        threads = 1 if low_priority else config.threads
+        self._children = [Child(low_priority, verbose, threads) for _ in range(config.threads)]
         # by the turn's centre; those that a child has begun are in none of the two
         self._jobs: dict[int, _Job] = {}
         self._failed: dict[int, _Job] = {}
@@ -61,6 +64,7 @@ class Workshop:
         self._closed = False
         self._ended = threading.Event()
         self._solver = Child(low_priority, verbose)
+        self._solving = threading.Lock()
 
     def submit(self, turn: Turn, valid: Mask | None) -> None:
         """Have a turn built; a turn that was submitted before is not built again."""
@@ -139,7 +143,8 @@ class Workshop:
         """Run a function in a child of its own; a child that dies is tried again."""
         for attempt in range(ATTEMPTS):
             try:
-                return self._solver.call(function, *arguments, progress=progress)
+                with self._solving:
+                    return self._solver.call(function, *arguments, progress=progress)
             except ChildDiedError:
                 if self._closed or attempt == ATTEMPTS - 1:
                     raise
@@ -166,6 +171,14 @@ class Workshop:
         # a thread that waits must not hold the images of the turn before
         while self._begin_next(child):
             self._on_built()
+            if not self._jobs and self._waiting:
+                self._warm()
+
+    def _warm(self) -> None:
+        """Start the process of run() while another child builds the last turn."""
+        with self._solving, contextlib.suppress(DashcalibError):
+            if self._solver.pid is None:
+                self._solver.call(load_all)
 
     def _begin_next(self, child: Child) -> bool:
         """Build the next turn; False when closed."""
@@ -174,7 +187,7 @@ class Workshop:
                 self._changed.wait()
             if self._closed:
                 return False
-            job = max(self._jobs.values(), key=lambda job: job.turn.prominence)
+            job = max(self._jobs.values(), key=self._urgency)
             del self._jobs[job.turn.center]
         scene, error = self._built(child, job)
         with self._changed:
@@ -188,6 +201,9 @@ class Workshop:
             self._changes += 1
             self._changed.notify_all()
         return True
+
+    def _urgency(self, job: _Job) -> float:
+        return job.turn.prominence if self._queue is not None else job.turn.images
 
     def _settle(self, center: int, scene: Scene | None) -> None:
         self._waiting.discard(center)
