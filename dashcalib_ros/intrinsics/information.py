@@ -59,51 +59,18 @@ def information(scene: Scene, camera: Camera, loss_px: float, also: Array | None
     loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply.
     also: (k, t, 2) derivatives of the observations by one more parameter.
     """
-    structure = scene.structure
-    rows, columns = np.nonzero(structure.used)
-    rotation = structure.rotations[rows]
-    rotated = np.einsum('nij,nj->ni', rotation, structure.points[columns])
-    local = rotated + structure.translations[rows]
-    by_camera, by_local, projected = _derivatives(local, camera)
-    if also is not None:
-        by_camera = np.concatenate([by_camera, also[rows, columns, :, None]], axis=2)
-    lens = by_camera.shape[2]
-    residual = scene.tracks.xy[rows, columns] - projected
-    # the loss pulls with w e, and its curvature is w^2 on average over the directions of e
-    weight = _weights(residual, loss_px)
-    by_camera, by_local = by_camera * weight[:, None, None], by_local * weight[:, None, None]
-    # a small turn w of the camera moves the local point by w x (R X)
-    by_pose = np.concatenate([by_local @ -_cross(rotated), by_local], axis=2)
-    by_point = by_local @ rotation
+    used = scene.structure.used
+    wide, by_point, residual, weight = _linearised(scene, camera, loss_px, also)
+    # the poses of the turn come first, six parameters each, then the lens
+    rows, columns = np.nonzero(used)
     _, pose = np.unique(rows, return_inverse=True)
     _, point = np.unique(columns, return_inverse=True)
-    nuisance = 6 * (int(pose.max()) + 1)
-    points = int(point.max()) + 1
+    nuisance, lens = 6 * (int(pose.max()) + 1), wide.shape[2] - 6
+    last = np.broadcast_to(np.arange(nuisance, nuisance + lens), (len(rows), lens))
+    where = np.concatenate([6 * pose[:, None] + np.arange(6), last], axis=1)
 
-    # global block: all poses of the turn, then the lens
-    size = nuisance + lens
-    normal = np.zeros((size, size))
-    mixed = np.zeros((points, size, 3))
-    own = np.zeros((points, 3, 3))
-    np.add.at(own, point, by_point.transpose(0, 2, 1) @ by_point)
-    slots = 6 * pose[:, None] + np.arange(6)
-    wide = np.concatenate([by_pose, by_camera], axis=2)
-    last = np.broadcast_to(np.arange(nuisance, size), (len(rows), lens))
-    where = np.concatenate([slots, last], axis=1)
-    np.add.at(normal, (where[:, :, None], where[:, None, :]), wide.transpose(0, 2, 1) @ wide)
-    np.add.at(mixed, (point[:, None], where), wide.transpose(0, 2, 1) @ by_point)
-    # a point that its rays fix badly gets a little damping instead of a wild inverse
-    damping = 1e-9 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    inverse = np.linalg.inv(own + damping + 1e-12 * np.eye(3))
-    solved = mixed @ inverse
-    reduced = normal - np.tensordot(solved, mixed, axes=([0, 2], [0, 2]))
-
-    # seven directions of the poses (where, how large) are free: the pseudo-inverse leaves them out
-    poses = reduced[:nuisance, :nuisance]
-    scale = 1 / np.sqrt(np.maximum(np.diag(poses), 1e-12))
-    inner = np.linalg.pinv(poses * scale[:, None] * scale, rcond=1e-10, hermitian=True)
-    inner = inner * scale[:, None] * scale
-    follow = inner @ reduced[:nuisance, nuisance:]
+    reduced, inverse, mixed = _without_points(wide, by_point, where, point)
+    follow = _poses_follow(reduced, nuisance)
     hessian = reduced[nuisance:, nuisance:] - reduced[:nuisance, nuisance:].T @ follow
 
     # each track's score, after its poses and its point have followed the lens
@@ -111,10 +78,63 @@ def information(scene: Scene, camera: Camera, loss_px: float, also: Array | None
     point_follow = inverse @ (mixed.transpose(0, 2, 1) @ combine)
     effective = (np.einsum('nij,njc->nic', wide, combine[where])
                  - by_point @ point_follow[point])
-    scores = np.zeros((points, lens))
+    scores = np.zeros((len(mixed), lens))
     np.add.at(scores, point, np.einsum('nic,ni->nc', effective, residual))
     return Information(hessian, scores.sum(axis=0), scores.T @ scores,
-                       *_squares_and_freedom(structure.used, residual, weight))
+                       *_squares_and_freedom(used, residual, weight))
+
+
+def _linearised(scene: Scene, camera: Camera, loss_px: float, also: Array | None
+                ) -> tuple[Array, Array, Array, Array]:
+    """Return the weighted derivatives of each used observation, its residual and its weight.
+
+    By its pose and the lens (n, 2, 6 + 9), by its point (n, 2, 3); residuals (n, 2), px; (n,).
+    """
+    structure = scene.structure
+    rows, columns = np.nonzero(structure.used)
+    rotation = structure.rotations[rows]
+    rotated = np.einsum('nij,nj->ni', rotation, structure.points[columns])
+    by_camera, by_local, projected = _derivatives(rotated + structure.translations[rows], camera)
+    if also is not None:
+        by_camera = np.concatenate([by_camera, also[rows, columns, :, None]], axis=2)
+    residual = scene.tracks.xy[rows, columns] - projected
+    # the loss pulls with w e, and its curvature is w^2 on average over the directions of e
+    weight = _weights(residual, loss_px)
+    by_camera, by_local = by_camera * weight[:, None, None], by_local * weight[:, None, None]
+    # a small turn w of the camera moves the local point by w x (R X)
+    wide = np.concatenate([by_local @ -_cross(rotated), by_local, by_camera], axis=2)
+    return wide, by_local @ rotation, residual, weight
+
+
+def _without_points(wide: Array, by_point: Array, where: npt.NDArray[np.intp],
+                    point: npt.NDArray[np.intp]) -> tuple[Array, Array, Array]:
+    """Return the normal matrix of poses and lens once the points are eliminated (Schur).
+
+    where: (n, 6 + 9) places of an observation's pose and of the lens in it; point: (n,). And what
+    leads back to the points: (t, 3, 3) their inverse blocks, (t, size, 3) the mixed ones.
+    """
+    size, points = int(where.max()) + 1, int(point.max()) + 1
+    normal = np.zeros((size, size))
+    mixed = np.zeros((points, size, 3))
+    own = np.zeros((points, 3, 3))
+    np.add.at(own, point, by_point.transpose(0, 2, 1) @ by_point)
+    np.add.at(normal, (where[:, :, None], where[:, None, :]), wide.transpose(0, 2, 1) @ wide)
+    np.add.at(mixed, (point[:, None], where), wide.transpose(0, 2, 1) @ by_point)
+    # a point that its rays fix badly gets a little damping instead of a wild inverse
+    damping = 1e-9 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    inverse = np.linalg.inv(own + damping + 1e-12 * np.eye(3))
+    return normal - np.tensordot(mixed @ inverse, mixed, axes=([0, 2], [0, 2])), inverse, mixed
+
+
+def _poses_follow(reduced: Array, nuisance: int) -> Array:
+    """Return (nuisance, 9) by how much the poses move, negative, with each number of the lens.
+
+    Seven directions of the poses (where, how large) are free: the pseudo-inverse leaves them out.
+    """
+    poses = reduced[:nuisance, :nuisance]
+    scale = 1 / np.sqrt(np.maximum(np.diag(poses), 1e-12))
+    inner = np.linalg.pinv(poses * scale[:, None] * scale, rcond=1e-10, hermitian=True)
+    return np.asarray((inner * scale[:, None] * scale) @ reduced[:nuisance, nuisance:])
 
 
 def noise_of(parts: Sequence[Information]) -> float:
