@@ -286,6 +286,27 @@ def test_who_has_no_turn_left_starts_the_process_that_comes_next(workshop, monke
     assert workshop.run(child_tasks.pid) == started
 
 
+def test_nobody_waits_for_a_solution_with_turns_to_build(workshop, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_slowly)
+    workshop.submit(turn(10, tmp_path / 'flag'), None)
+    wait_for((tmp_path / 'flag.10').exists)
+
+    def solve() -> None:
+        with contextlib.suppress(WorkerError):
+            workshop.run(child_tasks.sleep, 2 * LIMIT_S, tmp_path / 's')
+
+    solving = threading.Thread(target=solve, daemon=True)
+    solving.start()
+    wait_for((tmp_path / 's').exists)
+    # as between two solutions, when the process of the last has died
+    monkeypatch.setattr(type(workshop._solver), 'pid', None)
+    use(monkeypatch, child_tasks.build)
+    for center in (50, 90):
+        workshop.submit(turn(center), None)
+        wait_for(lambda center=center: center in workshop.scenes())
+    assert workshop.unbuilt() == {10} and solving.is_alive()
+
+
 def test_where_the_next_process_cannot_start_turns_are_still_built(workshop, monkeypatch):
     use(monkeypatch, child_tasks.build)
     monkeypatch.setattr(workshop_module, 'load_all', child_tasks.die)

@@ -176,9 +176,13 @@ class Workshop:
 
     def _warm(self) -> None:
         """Start the process of run() while another child builds the last turn."""
-        with self._solving, contextlib.suppress(DashcalibError):
-            if self._solver.pid is None:
-                self._solver.call(load_all)
+        # who is held by a lock until a solution is there builds no turn meanwhile
+        if self._solver.pid is None and self._solving.acquire(blocking=False):
+            try:
+                with contextlib.suppress(DashcalibError):
+                    self._solver.call(load_all)
+            finally:
+                self._solving.release()
 
     def _begin_next(self, child: Child) -> bool:
         """Build the next turn; False when closed."""
