@@ -8,7 +8,12 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
+
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.reconstruction.camera import Camera
+from dashcalib_ros.reconstruction.scene import Draft, Profile
+from dashcalib_ros.reconstruction.tracks import Tracks
 
 
 class AwkwardError(Exception):
@@ -88,7 +93,7 @@ def die_at_first(flag):
     return 'second time'
 
 
-# stand-ins for workshop.build_turn(turn, config, valid)
+# stand-ins for workshop.draft_turn(turn, config, valid)
 
 def build_dies(turn, config, valid):
     with Path(turn.frames[0]).open('a') as log:
@@ -115,3 +120,29 @@ def build_fails_at_first(turn, config, valid):
 
 def build(turn, config, valid):
     return f'scene of {turn.center}'
+
+
+def draft(turn, config, valid):
+    """Return a draft of every other image; frame_id tells where to write what was done."""
+    noted(turn, f'draft of {turn.center}')
+    frames = np.array([frame.index for frame in turn.frames[::2]])
+    tracks = Tracks(frames, np.zeros((len(frames), 0, 2)), (64, 48), frames)
+    return Draft(tracks, Profile(np.ones(1), np.ones(1), 1), Camera.centred((64, 48), 50.0))
+
+
+# stand-ins for workshop.build_turn(turn, config, draft)
+
+def finish(turn, config, draft):
+    noted(turn, f'scene of {turn.center}')
+    assert draft.start.fx == 50.0
+    return [frame.index for frame in turn.frames]
+
+
+def finish_dies_at_first(turn, config, draft):
+    die_at_first(f'{turn.frames[0].frame_id}.{turn.center}')
+    return finish(turn, config, draft)
+
+
+def noted(turn, text):
+    with Path(turn.frames[0].frame_id).open('a') as log:
+        log.write(f'{text}\n')

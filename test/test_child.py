@@ -18,6 +18,7 @@ import pytest
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, WorkerError
+from dashcalib_ros.frames import Frame
 from dashcalib_ros.reconstruction import child as child_module
 from dashcalib_ros.reconstruction import workshop as workshop_module
 from dashcalib_ros.reconstruction.child import Child, ChildDiedError
@@ -261,7 +262,7 @@ def wait_until_built(workshop: Workshop) -> None:
 
 
 def use(monkeypatch, function: Callable[..., object]) -> None:
-    monkeypatch.setattr(workshop_module, 'build_turn', function)
+    monkeypatch.setattr(workshop_module, 'draft_turn', function)
 
 
 def test_turns_become_scenes_once(workshop, monkeypatch):
@@ -436,6 +437,54 @@ def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch,
         assert not workshop._jobs and workshop.waiting == 0
     finally:
         workshop.close()
+
+
+def filmed(center: int, images: int, log: Path) -> Turn:
+    picture = np.zeros((48, 64), np.uint8)
+    return replace(turn(center), frames=tuple(
+        Frame(center + n, n, picture, str(log)) for n in range(images)), prominence=center / 1e3)
+
+
+@pytest.mark.parametrize('live, done', [
+    (False, ['draft of 20', 'draft of 30', 'draft of 10', 'scene of 20', 'scene of 30',
+             'scene of 10']),
+    (True, ['draft of 30', 'scene of 30', 'draft of 20', 'scene of 20', 'draft of 10',
+            'scene of 10'])])
+def test_a_turn_is_built_in_two_halves(monkeypatch, tmp_path, live, done):
+    """Side by side offline, so that the children end together; one by one live."""
+    log, hold = tmp_path / 'log', tmp_path / 'hold'
+    use(monkeypatch, child_tasks.build_slowly)
+    monkeypatch.setattr(workshop_module, 'build_turn', child_tasks.finish)
+    settled = []
+    workshop = Workshop(Config().replace({'threads': 1}), queue=9 if live else None,
+                        on_built=lambda: settled.append(1))
+    try:
+        workshop.submit(turn(5, hold), None)
+        wait_for((tmp_path / 'hold.5').exists)
+        use(monkeypatch, child_tasks.draft)
+        for center, images in ((10, 3), (20, 9), (30, 5)):
+            workshop.submit(filmed(center, images, log), None)
+        workshop.keep_only({10, 20, 30})
+        os.kill(int((tmp_path / 'hold.5').read_text()), signal.SIGKILL)
+        wait_until_built(workshop)
+        # the second half gets the images of the keyframes only
+        assert workshop.scenes() == {10: [10, 12], 20: [20, 22, 24, 26, 28], 30: [30, 32, 34]}
+        assert log.read_text().split('\n')[-7:-1] == done
+        # for each scene, and for the turn that left; not for drafts
+        wait_for(lambda: len(settled) == 4)
+    finally:
+        workshop.close()
+
+
+def test_a_child_that_dies_in_the_second_half_loses_no_turn(workshop, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.draft)
+    monkeypatch.setattr(workshop_module, 'build_turn', child_tasks.finish_dies_at_first)
+    for center in (10, 50, 90):
+        workshop.submit(filmed(center, 3, tmp_path / 'log'), None)
+    wait_until_built(workshop)
+    assert workshop.scenes() == {center: [center, center + 2] for center in (10, 50, 90)}
+    # and does not do the first half again
+    assert (tmp_path / 'log').read_text().count('draft') == 3
 
 
 def test_what_failed_is_not_kept_for_a_turn_that_left(workshop, monkeypatch, tmp_path):

@@ -116,10 +116,14 @@ def _reconstruction(scenes: Sequence[Scene], camera: pycolmap.Camera) -> pycolma
             pose = pycolmap.Rigid3d(
                 pycolmap.Rotation3d(structure.rotations[k]), structure.translations[k])
             reconstruction.add_image_with_trivial_frame(image, pose)
-        for t in np.flatnonzero(structure.used.any(axis=0)):
+        tracks, keyframes = np.nonzero(structure.used.T)
+        names, places = (first_id + keyframes).tolist(), rank[keyframes, tracks].tolist()
+        points, starts = np.unique(tracks, return_index=True)
+        ends = np.append(starts, len(tracks))[1:].tolist()
+        for t, start, end in zip(points.tolist(), starts.tolist(), ends, strict=True):
             track = pycolmap.Track()
-            for k in np.flatnonzero(structure.used[:, t]):
-                track.add_element(int(first_id + k), int(rank[k, t]))
+            for name, place in zip(names[start:end], places[start:end], strict=True):
+                track.add_element(name, place)
             reconstruction.add_point3D(structure.points[t], track)
     return reconstruction
 

@@ -18,7 +18,13 @@ from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1
 from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.chain import chain
 from dashcalib_ros.reconstruction.register import register_tracks
-from dashcalib_ros.reconstruction.scene import Profile, Scene, retriangulated, truncated_cost
+from dashcalib_ros.reconstruction.scene import (
+    Draft,
+    Profile,
+    Scene,
+    retriangulated,
+    truncated_cost,
+)
 from dashcalib_ros.reconstruction.tracks import Tracks, thinned, track_turn
 from dashcalib_ros.turns.turn import Turn
 
@@ -40,6 +46,13 @@ def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
 
     valid: (h, w), False where the ego vehicle is.
     """
+    draft = draft_scene(turn, tracks_config, config, valid, seed)
+    return None if draft is None else finish_scene(turn, draft, config, seed)
+
+
+def draft_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
+                valid: Mask | None = None, seed: int = 0) -> Draft | None:
+    """Track a turn and find where to begin: the first half of build_scene()."""
     tracks = track_turn(turn, tracks_config, valid)
     if tracks.xy.shape[1] < config.min_tracks or len(tracks.frames) < config.min_images:
         return None
@@ -47,12 +60,20 @@ def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
     if not trials:
         return None
     profile = _profile_of(trials)
-    start = trials[profile.best].camera
-    chosen = thinned(tracks, config.keyframes)
+    return Draft(thinned(tracks, config.keyframes), profile, trials[profile.best].camera)
+
+
+def finish_scene(turn: Turn, draft: Draft, config: SceneConfig, seed: int = 0) -> Scene | None:
+    """Reconstruct a turn from its draft: the second half of build_scene().
+
+    turn: needs the images of the draft's keyframes only.
+    """
+    start, profile = draft.start, draft.profile
     # few short tracks may leave no pair of images enough in common
-    scene = (chain_scene(_spread(chosen, config.tracks), turn.center, start, profile, config, seed)
-             or chain_scene(_longest(chosen, config.tracks), turn.center, start, profile, config,
-                            seed))
+    scene = (chain_scene(_spread(draft.tracks, config.tracks), turn.center, start, profile,
+                         config, seed)
+             or chain_scene(_longest(draft.tracks, config.tracks), turn.center, start, profile,
+                            config, seed))
     if scene is None:
         return None
     # the neighbours on the profile's grid bound the focal length: the evidence lies between

@@ -33,6 +33,15 @@ class Profile:
 
 
 @dataclass(frozen=True)
+class Draft:
+    """A turn half way: its tracks, its focal profile, and the camera to begin with."""
+
+    tracks: Tracks
+    profile: Profile
+    start: Camera
+
+
+@dataclass(frozen=True)
 class Scene:
     """One turn, reconstructed: its tracks, the structure that explains them, and its profile."""
 

@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Set
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import DashcalibError, WorkerError
 from dashcalib_ros.reconstruction.child import Child, ChildDiedError
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.reconstruction.scene import Draft, Scene
 from dashcalib_ros.turns.turn import Turn
 
 Mask = npt.NDArray[np.bool_]
@@ -24,17 +24,28 @@ BACK_OFF_S = 1.0
 
 @dataclass(frozen=True)
 class _Job:
-    """A turn to be built, and where its pictures show no ego vehicle (None: everywhere)."""
+    """A turn to be built, and where its pictures show no ego vehicle (None: everywhere).
+
+    draft: the first half of the work, once it is done.
+    """
 
     turn: Turn
     valid: Mask | None
+    draft: Draft | None = None
+
+    def with_draft(self, draft: Draft) -> _Job:
+        """Return what is left to do, with the images that it needs."""
+        keyframes = set(draft.tracks.frames.tolist())
+        frames = tuple(frame for frame in self.turn.frames if frame.index in keyframes)
+        return _Job(replace(self.turn, frames=frames), self.valid, draft)
 
 
 class Workshop:
     """Builds scenes in the background. All methods may be called from any thread.
 
-    Live, the most prominent turn is built first; else the longest, so that the children end at
-    about the same time. A turn stays until its scene is there: a child that dies loses nothing.
+    A turn is built in two halves, its draft and its scene. Live, the most prominent turn is built
+    first. Else the drafts come first, the longest turn's before others, so that the children end
+    at about the same time. A turn stays until its scene is there: a child that dies loses nothing.
     """
 
     def __init__(self, config: Config, low_priority: bool = False, verbose: bool = False,
@@ -43,7 +54,8 @@ class Workshop:
         """queue: how many turns may wait for a child, with their images; None: any number.
 
         With more, the least prominent of them counts as one without a scene: the drive is live.
-        on_built: called from a thread of the workshop whenever a turn is settled; raises nothing.
+        on_built: called from a thread of the workshop whenever a child is done with a turn; raises
+        nothing.
         on_lost: the same, when a turn is given up because it ends every child; gets one line.
         """
         self._config = config
@@ -169,8 +181,9 @@ class Workshop:
 
     def _work(self, child: Child) -> None:
         # a thread that waits must not hold the images of the turn before
-        while self._begin_next(child):
-            self._on_built()
+        while (built := self._begin_next(child)) is not None:
+            if built:
+                self._on_built()
             if not self._jobs and self._waiting:
                 self._warm()
 
@@ -184,39 +197,47 @@ class Workshop:
             finally:
                 self._solving.release()
 
-    def _begin_next(self, child: Child) -> bool:
-        """Build the next turn; False when closed."""
+    def _begin_next(self, child: Child) -> bool | None:
+        """Do the next half of a turn; return whether it was the second, None when closed."""
         with self._changed:
             while not self._jobs and not self._closed:
                 self._changed.wait()
             if self._closed:
-                return False
+                return None
             job = max(self._jobs.values(), key=self._urgency)
             del self._jobs[job.turn.center]
-        scene, error = self._built(child, job)
+        built, error = self._built(child, job)
+        center = job.turn.center
         with self._changed:
             # it may have left the bank meanwhile
-            if job.turn.center in self._waiting:
+            if center in self._waiting:
                 if error is not None:
                     self._error = error
-                    self._failed[job.turn.center] = job
+                    self._failed[center] = job
+                elif isinstance(built, Draft):
+                    self._jobs[center] = job.with_draft(built)
                 else:
-                    self._settle(job.turn.center, scene)
+                    self._settle(center, built)
             self._changes += 1
             self._changed.notify_all()
-        return True
+        return not isinstance(built, Draft)
 
-    def _urgency(self, job: _Job) -> float:
-        return job.turn.prominence if self._queue is not None else job.turn.images
+    def _urgency(self, job: _Job) -> tuple[float, ...]:
+        if self._queue is not None:
+            return (job.turn.prominence,)
+        return job.draft is None, job.turn.images
 
     def _settle(self, center: int, scene: Scene | None) -> None:
         self._waiting.discard(center)
         self._scenes[center] = scene
 
-    def _built(self, child: Child, job: _Job) -> tuple[Scene | None, Exception | None]:
+    def _built(self, child: Child, job: _Job
+               ) -> tuple[Draft | Scene | None, Exception | None]:
         for attempt in range(ATTEMPTS):
             try:
-                return child.call(build_turn, job.turn, self._config, job.valid), None
+                if job.draft is None:
+                    return child.call(draft_turn, job.turn, self._config, job.valid), None
+                return child.call(build_turn, job.turn, self._config, job.draft), None
             except ChildDiedError:
                 if self._closed:
                     return None, None
@@ -244,13 +265,23 @@ def load_all() -> None:
     import dashcalib_ros.reconstruction.build  # noqa: F401
 
 
-def build_turn(turn: Turn, config: Config, valid: Mask | None) -> Scene | None:
+def draft_turn(turn: Turn, config: Config, valid: Mask | None) -> Draft | None:
     """Run in the child: COLMAP is loaded there only."""
-    import cv2
+    from dashcalib_ros.reconstruction.build import draft_scene
+    with _hopeless_pictures_give_none():
+        return draft_scene(turn, config.tracks, config.scene, valid, config.seed)
 
-    from dashcalib_ros.reconstruction.build import build_scene
-    try:
-        return build_scene(turn, config.tracks, config.scene, valid, config.seed)
-    except (np.linalg.LinAlgError, cv2.error):
-        # hopeless pictures make hopeless equations: such a turn has no scene, the others still may
-        return None
+
+def build_turn(turn: Turn, config: Config, draft: Draft) -> Scene | None:
+    """Run in the child: COLMAP is loaded there only."""
+    from dashcalib_ros.reconstruction.build import finish_scene
+    with _hopeless_pictures_give_none():
+        return finish_scene(turn, draft, config.scene, config.seed)
+
+
+@contextlib.contextmanager
+def _hopeless_pictures_give_none() -> Iterator[None]:
+    """Hopeless pictures make hopeless equations: such a turn has no scene, others may have."""
+    import cv2
+    with contextlib.suppress(np.linalg.LinAlgError, cv2.error):
+        yield
