@@ -1,9 +1,19 @@
 """Fixtures of the tests that talk to the node; they import rclpy only when they are used."""
 import os
+import signal
 
 import pytest
 
 pytest.register_assert_rewrite('ros_bench')
+
+
+def pytest_configure(config):
+    """Let Ctrl-C be heard where the tests run behind a shell's `&` or nohup, which ignore it.
+
+    A program that is started with SIGINT ignored leaves it so, and hands that on.
+    """
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope='module')
