@@ -195,6 +195,10 @@ class VerdictConfig:
         50.0, 'ms; a rolling shutter that takes longer is weak: one picture at 20 fps', 0.0, 1e4)
     max_disagreement: float = setting(
         0.03, 'of fx; weighted scatter between the turns, more is weak', 0.0, 1.0)
+    max_leverage: float = setting(
+        0.9, 'of what is known of fx; where one turn gives more, the others cannot confirm it: '
+        'KITTI 03 has 0.7, and 0.95 without its turn at 753: fx is 1.0 % off then at 0.3 to 0.5 % '
+        'of sigma; rendered drives have 0.2 to 0.5', 0.0, 1.0)
     max_misfit: float = setting(
         2.0, "times a turn's cost with a camera of its own; more is weak: sound turns have 0.5 to "
         '1.5, turns of another lens in the same drive 4.6 to 25', 1.0, 1e4)

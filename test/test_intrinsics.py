@@ -10,7 +10,13 @@ from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.intrinsics import fitting, focal
-from dashcalib_ros.intrinsics.agreement import focal_disagreement, misfits, outdated, strangers
+from dashcalib_ros.intrinsics.agreement import (
+    focal_disagreement,
+    leverages,
+    misfits,
+    outdated,
+    strangers,
+)
 from dashcalib_ros.intrinsics.conclude import Evidence, conclude
 from dashcalib_ros.intrinsics.focal import summed
 from dashcalib_ros.intrinsics.information import (
@@ -434,6 +440,21 @@ def test_sigma_too_large(good, relative, level):
     wide[0, 0] = (relative * good.camera.fx)**2
     found, reasons = levels(replace(good, covariance=wide))
     assert found == level and ('fx is uncertain' in reasons) == (level != 'accepted')
+
+
+@pytest.mark.parametrize('others, level', [(0.5, 'accepted'), (0.01, 'weak')])
+def test_where_one_turn_knows_all_the_others_confirm_nothing(good, others, level):
+    """A sharp turn and gentle bends: what the bends say moves nothing, so nothing scatters."""
+    parts = tuple(replace(part, hessian=part.hessian * (others if n else 1.0))
+                  for n, part in enumerate(good.parts))
+    solution = replace(good, parts=parts)
+    shares = leverages(solution)
+    assert sum(shares.values()) == pytest.approx(1.0)
+    found, reasons = levels(solution)
+    assert found == level and ('of what is known of fx' in reasons) == (level == 'weak')
+    if level == 'weak':
+        center = good.scenes[0].center
+        assert shares[center] > 0.9 and f'the turn at frame {center} alone gives' in reasons
 
 
 def test_turns_that_disagree_are_weak(good):

@@ -4,6 +4,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
+import numpy.typing as npt
 
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.intrinsics.information import noise_of
@@ -13,6 +14,8 @@ from dashcalib_ros.reconstruction.scene import Scene, truncated_cost
 
 # px^2; what is explained better than this is explained perfectly
 LEAST_COST = 0.01
+# turns that know less of fx than this know nothing of it, and none of them more than the others
+LEAST_SHARE = 1e-9
 
 
 def misfits(alone: Sequence[Scene], together: Sequence[Scene], camera: Camera, limit_px: float
@@ -70,11 +73,7 @@ def focal_disagreement(solution: Solution) -> float:
         return 0.0
     noise = noise_of(solution.parts)
     weights, offsets = [], []
-    weak_prior = np.diag(1 / np.square([1e4, 1e4, 0.02 * solution.camera.image_size[0],
-                                        0.02 * solution.camera.image_size[0], 1.0, 1.0]))
-    # square pixels, so that one turn alone has a focal length at all
-    stiff = 1 / (0.003 * solution.camera.fx) ** 2
-    weak_prior[:2, :2] += stiff * np.array([[1, -1], [-1, 1]])
+    weak_prior = _weak_prior(solution.camera)
     for part in solution.parts:
         inverse = np.linalg.inv(part.hessian[:6, :6] / noise + weak_prior)
         offsets.append(float((inverse @ part.score[:6])[0] / noise))
@@ -82,3 +81,25 @@ def focal_disagreement(solution: Solution) -> float:
     mean = np.average(offsets, weights=weights)
     scatter = np.average((np.array(offsets) - mean) ** 2, weights=weights)
     return float(np.sqrt(scatter) / solution.camera.fx)
+
+
+def leverages(solution: Solution) -> dict[int, float]:
+    """Return each turn's share in what the turns know of fx, by centre; together 1."""
+    noise = noise_of(solution.parts)
+    hessians = [part.hessian[:6, :6] / noise for part in solution.parts]
+    inverse = np.linalg.inv(sum(hessians) + _weak_prior(solution.camera))
+    known = [float((inverse @ hessian)[0, 0]) for hessian in hessians]
+    # the prior knows the rest
+    total = max(sum(known), LEAST_SHARE)
+    return {scene.center: share / total
+            for scene, share in zip(solution.scenes, known, strict=True)}
+
+
+def _weak_prior(camera: Camera) -> npt.NDArray[np.float64]:
+    """Return the information (6, 6) with which one turn alone has a focal length at all."""
+    width = camera.image_size[0]
+    prior = np.diag(1 / np.square([1e4, 1e4, 0.02 * width, 0.02 * width, 1.0, 1.0]))
+    # square pixels
+    stiff = 1 / (0.003 * camera.fx) ** 2
+    prior[:2, :2] += stiff * np.array([[1, -1], [-1, 1]])
+    return np.asarray(prior)

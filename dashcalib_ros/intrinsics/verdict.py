@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dashcalib_ros.config import VerdictConfig
-from dashcalib_ros.intrinsics.agreement import focal_disagreement, strangers
+from dashcalib_ros.intrinsics.agreement import focal_disagreement, leverages, strangers
 from dashcalib_ros.intrinsics.calibration import Verdict
 from dashcalib_ros.intrinsics.solution import Solution
 
@@ -23,7 +23,8 @@ def judge(solution: Solution, config: VerdictConfig) -> Verdict:
     """Return the verdict on a solution, with every reason against it."""
     rules: tuple[Callable[[Solution, VerdictConfig], tuple[list[str], list[str]]], ...] = (
         _too_few_turns, _too_little_yaw, _flat_profile, _far_from_profile, _sigma_too_large,
-        _turns_disagree, _other_camera, _strange_aspect, _strange_shutter, _on_bound, _folds_over)
+        _one_knows_all, _turns_disagree, _other_camera, _strange_aspect, _strange_shutter,
+        _on_bound, _folds_over)
     refused: list[str] = []
     weak: list[str] = []
     for rule in rules:
@@ -97,6 +98,16 @@ def _sigma_too_large(solution: Solution, config: VerdictConfig) -> tuple[list[st
     return [], [message] if relative > config.max_sigma else []
 
 
+def _one_knows_all(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
+    """Turns that know little of fx confirm nothing, and their scatter tells nothing of it."""
+    shares = leverages(solution)
+    center = max(shares, key=lambda center: shares[center])
+    if len(shares) > 1 and not shares[center] <= config.max_leverage:
+        return [], [f'{_turns([center])} alone gives {100 * min(shares[center], 1.0):.0f} % of '
+                    f'what is known of fx: drive another turn that is as sharp']
+    return [], []
+
+
 def _turns_disagree(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
     """Each turn alone says what fx it would rather have: compare that with its own sigma."""
     spread = focal_disagreement(solution)
@@ -110,12 +121,13 @@ def _other_camera(solution: Solution, config: VerdictConfig) -> tuple[list[str],
     centers = sorted(strangers(solution.misfits, config))
     if not centers:
         return [], []
-    return [], [f'{_named(centers)} another camera far better than the one of the others: was the '
+    fit = f'{_turns(centers)} fit{"s" * (len(centers) == 1)}'
+    return [], [f'{fit} another camera far better than the one of the others: was the '
                 f'camera zoomed or exchanged, or its picture cropped?']
 
 
-def _named(centers: list[int]) -> str:
-    """Say which turns fit; those of earlier drives have negative numbers."""
+def _turns(centers: list[int]) -> str:
+    """Say which turns; those of earlier drives have negative numbers."""
     own = [str(center) for center in centers if center >= 0]
     stored = len(centers) - len(own)
     names = []
@@ -123,7 +135,7 @@ def _named(centers: list[int]) -> str:
         names.append(f'the turn{"s" * (len(own) > 1)} at frame {", ".join(own)}')
     if stored:
         names.append(f'{stored} turn{"s" * (stored > 1)} of earlier drives')
-    return f'{" and ".join(names)} fit{"s" * (len(centers) == 1)}'
+    return ' and '.join(names)
 
 
 def _strange_aspect(solution: Solution, config: VerdictConfig) -> tuple[list[str], list[str]]:
