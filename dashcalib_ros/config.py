@@ -197,7 +197,7 @@ class VerdictConfig:
         0.03, 'of fx; weighted scatter between the turns, more is weak', 0.0, 1.0)
     max_leverage: float = setting(
         0.9, 'of what is known of fx; where one turn gives more, the others cannot confirm it: '
-        'KITTI 03 has 0.7, and 0.95 without its turn at 753: fx is 1.0 % off then at 0.3 to 0.5 % '
+        'KITTI 03 has 0.7, and 0.95 without its turn at 753: fx is 1.0 % off then at 0.4 to 0.9 % '
         'of sigma; rendered drives have 0.2 to 0.5', 0.0, 1.0)
     max_misfit: float = setting(
         2.0, "times a turn's cost with a camera of its own; more is weak: sound turns have 0.5 to "

@@ -498,7 +498,7 @@ def test_turns_through_different_lenses_are_not_accepted():
 
 
 def built(scene: Scene, rounds: int = 3) -> Scene:
-    """Return the scene as build_scene() leaves it: with a focal length and k1, k2 of its own."""
+    """Return the scene as finish_scene() leaves it: with a focal length and k1, k2 of its own."""
     reach = (scene.camera.fx / 1.3, scene.camera.fx * 1.3)
     for _ in range(rounds):
         [scene], camera = adjust_step1([scene], scene.camera, Solver(0.5), reach)

@@ -561,13 +561,13 @@ def test_black_pictures_at_the_start_do_not_lose_the_turn():
 def test_pictures_without_a_corner_have_no_tracks():
     turn = moving_turn([STEP_PX] * 6, lambda image, n: np.full_like(image, 80))
     assert track_turn(turn, TracksConfig()).xy.shape[1] == 0
-    assert build.build_scene(turn, TracksConfig(), CONFIG) is None
+    assert build.draft_scene(turn, TracksConfig(), CONFIG) is None
 
 
 def test_one_picture_gives_no_scene():
     turn = moving_turn([])
     assert track_turn(turn, TracksConfig()).xy.shape[1] == 0
-    assert build.build_scene(turn, TracksConfig(), CONFIG) is None
+    assert build.draft_scene(turn, TracksConfig(), CONFIG) is None
 
 
 def test_thinned(turn):

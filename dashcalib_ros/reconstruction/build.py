@@ -40,19 +40,12 @@ ROUGH = 1e-3
 GRID = (6, 3)
 
 
-def build_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
-                valid: Mask | None = None, seed: int = 0) -> Scene | None:
-    """Reconstruct one turn; None when no focal length gives a scene.
+def draft_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
+                valid: Mask | None = None, seed: int = 0) -> Draft | None:
+    """Track a turn and find where to begin; None when no focal length gives a scene.
 
     valid: (h, w), False where the ego vehicle is.
     """
-    draft = draft_scene(turn, tracks_config, config, valid, seed)
-    return None if draft is None else finish_scene(turn, draft, config, seed)
-
-
-def draft_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
-                valid: Mask | None = None, seed: int = 0) -> Draft | None:
-    """Track a turn and find where to begin: the first half of build_scene()."""
     tracks = track_turn(turn, tracks_config, valid)
     if tracks.xy.shape[1] < config.min_tracks or len(tracks.frames) < config.min_images:
         return None
@@ -64,7 +57,7 @@ def draft_scene(turn: Turn, tracks_config: TracksConfig, config: SceneConfig,
 
 
 def finish_scene(turn: Turn, draft: Draft, config: SceneConfig, seed: int = 0) -> Scene | None:
-    """Reconstruct a turn from its draft: the second half of build_scene().
+    """Reconstruct a turn from its draft; None when that gives no scene.
 
     turn: needs the images of the draft's keyframes only.
     """
