@@ -9,7 +9,7 @@ import pytest
 from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.intrinsics import fitting, focal
+from dashcalib_ros.intrinsics import fitting, focal, joint
 from dashcalib_ros.intrinsics.agreement import (
     focal_disagreement,
     leverages,
@@ -81,6 +81,22 @@ def good() -> Solution:
 
 
 # the adjustment
+
+@pytest.mark.parametrize(('settled', 'rounds'), [(0.0, 3), (0.5, 1)])
+def test_step_2_ends_where_a_round_would_change_little(monkeypatch, no_profile, settled, rounds):
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return adjust_step2(*arguments)
+
+    monkeypatch.setattr(joint, 'adjust_step2', counted)
+    solution = solved(scenes_of(2, outliers=0.03, tracks=100), CONFIG.replace(
+        {'intrinsics.rounds': 3, 'intrinsics.settled': settled}))
+    # one more with a part of the tracks, where a rolling shutter is looked for
+    assert len(calls) == rounds + 1
+    assert np.abs(z_of(solution)).max() < 4
+
 
 def test_three_turns_give_all_six_within_three_sigma(good):
     assert np.abs(z_of(good)).max() < 3

@@ -125,7 +125,10 @@ def _step2(complete: _Fit, whole: Whole, step1: Camera, config: IntrinsicsConfig
     for n in range(config.rounds):
         progress('step 2: all six', (n + 1) / (config.rounds + 1))
         if n > 0:
-            fit = _ready_again(fit, whole, step1, config, scene_config)
+            ready = _ready_again(fit, whole, step1, config, scene_config)
+            if not fit.readout_s and _changed(fit, ready) < config.settled:
+                break
+            fit = ready
         solver = replace(fit.solver, loss_px=loss_px_of(fit.scenes, fit.camera, config))
         prior = prior_of(step1, config, noise_in(fit.scenes, fit.camera, solver.loss_px))
         scenes, camera = adjust_step2(fit.scenes, fit.camera, solver, prior, bounds)
@@ -141,6 +144,16 @@ def _ready_again(fit: _Fit, whole: Whole, step1: Camera, config: IntrinsicsConfi
         readout_s += readout(scenes, fit.camera, fit.solver.loss_px, belief_of(step1, config))[0]
         scenes = _undone(scenes, whole, fit.camera, readout_s)
     return replace(fit, scenes=all_again(scenes, fit.camera, scene_config), readout_s=readout_s)
+
+
+def _changed(before: _Fit, after: _Fit) -> float:
+    """Return the share of the observations that are used in one of the two only."""
+    used = {scene.center: scene.structure.used for scene in after.scenes}
+    if len(used) < len(before.scenes):
+        return 1.0
+    changed = sum(int(np.sum(scene.structure.used != used[scene.center]))
+                  for scene in before.scenes)
+    return changed / sum(int(scene.structure.used.sum()) for scene in before.scenes)
 
 
 def _known(final: _Fit, step1: Camera, alone: Sequence[Scene],

@@ -59,7 +59,7 @@ def follow_points(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8],
     # cv2's stubs know neither the optional output nor what comes out
     flow: Any = cv2.calcOpticalFlowPyrLK
     settings = {'winSize': (window, window),
-                'criteria': (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)}
+                'criteria': (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)}
     moved, ahead, _ = flow(before, after, points, None, maxLevel=levels, **settings)
     # the way back starts where it should end: a wrong match still leads elsewhere, at a fifth of
     # the time of a search from afar
