@@ -7,8 +7,8 @@
 Runs every setting (or those named; part of a name will do) with every seed. Rows go to
 DIR/accuracy.json after each drive, and one that is there is not run again (--again: it is);
 DIR/accuracy.md is the table with medians, bars and honesty. --data: a folder with kitti03/ and
-carnd/ (bag or video beside a truth.json). --cache: where rendered pictures are kept, about
-100 MB a drive; a second run renders nothing.
+carnd/ (bag or video beside a truth.json); kitti03 is seen through other lenses, too (views.py).
+--cache: where rendered pictures are kept, about 100 MB a drive; a second run renders nothing.
 """
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ from measure import (
     table,
 )
 from summary import summary
+from views import BY_VIEW, Viewed
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.frames import Frame
@@ -48,6 +49,13 @@ RECORDED = {'kitti03': 'bag', 'carnd': 'drive.mp4'}
 def rendered(pictures: Pictures, seed: int, truth: Mapping[str, float]) -> dict[str, Any]:
     """Calibrate a rendered drive (in a process of its own)."""
     return _row(pictures, Config(seed=seed), truth)
+
+
+def viewed(name: str, data: Path) -> dict[str, Any]:
+    """Calibrate a real drive as another camera would have seen it (in a process of its own)."""
+    frames = Viewed(BY_VIEW[name], data / 'kitti03' / RECORDED['kitti03'],
+                    data / 'kitti03' / 'truth.json')
+    return _row(frames, Config(), frames.truth)
 
 
 def recorded(name: str, data: Path) -> dict[str, Any]:
@@ -90,7 +98,7 @@ def run_recorded(name: str, data: Path) -> dict[str, Any]:
     """Calibrate a real drive."""
     about = {'setting': name, 'seed': 0, 'must': 'accept' if name == 'kitti03' else 'judge',
              'counts': False, 'recorded': True}
-    return _finished(isolated(recorded, name, data), about)
+    return _finished(isolated(viewed if name in BY_VIEW else recorded, name, data), about)
 
 
 def drives_table(rows: Iterable[Mapping[str, Any]]) -> str:
@@ -110,12 +118,14 @@ def drives_table(rows: Iterable[Mapping[str, Any]]) -> str:
 
 def _chosen(wanted: list[str], data: Path | None) -> list[str]:
     real = [name for name in RECORDED if data is not None and (data / name).is_dir()]
-    names = [*real, *BY_NAME]
+    names = [*real, *BY_NAME, *(BY_VIEW if 'kitti03' in real else ())]
     for part in wanted:
         if not any(part in name for name in names):
             raise SystemExit(f'no setting has {part!r} in its name; --list shows them all')
     return [name for name in names
-            if not wanted or name in wanted or any(part in name for part in wanted)]
+            if not wanted or name in wanted
+            # a whole name means that one, not those that begin with it
+            or any(part in name for part in set(wanted) - set(names))]
 
 
 def main() -> None:
@@ -126,7 +136,7 @@ def main() -> None:
     parser.add_argument('--summary', action='store_true', help='of the rows there are, and end')
     arguments = parser.parse_args()
     if arguments.list:
-        print('\n'.join(f'{setting.name} ({setting.must})' for setting in SETTINGS))
+        print('\n'.join([*(f'{setting.name} ({setting.must})' for setting in SETTINGS), *BY_VIEW]))
         return
     path = arguments.out / 'accuracy.json'
     rows = load(path)
@@ -134,14 +144,14 @@ def main() -> None:
         names = _chosen(arguments.settings, arguments.data)
         # one seed of everything before the next seed: an interrupted run covers all settings
         jobs = [(name, seed) for seed in arguments.seeds for name in names
-                if name not in RECORDED or seed == arguments.seeds[0]]
+                if name in BY_NAME or seed == arguments.seeds[0]]
         with tempfile.TemporaryDirectory() as passing:
             for number, (name, seed) in enumerate(jobs, 1):
-                seed = 0 if name in RECORDED else seed
+                seed = seed if name in BY_NAME else 0
                 key = f'{name}, seed {seed}'
                 if done(rows.get(key)) and not arguments.again:
                     continue
-                if name in RECORDED:
+                if name not in BY_NAME:
                     row = run_recorded(name, arguments.data)
                 else:
                     row = run_rendered(name, seed, arguments.cache or Path(passing) / str(number))
@@ -158,7 +168,7 @@ def main() -> None:
 
 
 def _ordered(rows: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    order = [*RECORDED, *BY_NAME]
+    order = [*RECORDED, *BY_NAME, *BY_VIEW]
     known = [row for row in rows.values() if row['setting'] in order]
     return sorted(known, key=lambda row: (order.index(row['setting']), row['seed']))
 
