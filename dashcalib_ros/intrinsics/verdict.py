@@ -143,7 +143,7 @@ def _strange_aspect(solution: Solution, config: VerdictConfig) -> tuple[list[str
     aspect = solution.camera.fy / solution.camera.fx
     if abs(aspect - 1) > config.max_aspect:
         return [], [f'fy is {100 * (aspect - 1):+.1f} % off fx, more than pixels are out of '
-                    f'square: a strong rolling shutter looks like this']
+                    f'square: a decentred lens or a strong rolling shutter looks like this']
     return [], []
 
 

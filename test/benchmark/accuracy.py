@@ -37,7 +37,7 @@ from measure import (
     table,
 )
 from summary import summary
-from views import BY_VIEW, Viewed
+from views import BY_VIEW, INEXACT, Viewed, inexact_view, recorded_view
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.frames import Frame
@@ -51,11 +51,9 @@ def rendered(pictures: Pictures, seed: int, truth: Mapping[str, float]) -> dict[
     return _row(pictures, Config(seed=seed), truth)
 
 
-def viewed(name: str, data: Path) -> dict[str, Any]:
-    """Calibrate a real drive as another camera would have seen it (in a process of its own)."""
-    frames = Viewed(BY_VIEW[name], data / 'kitti03' / RECORDED['kitti03'],
-                    data / 'kitti03' / 'truth.json')
-    return _row(frames, Config(), frames.truth)
+def viewed(drive: Viewed, seed: int) -> dict[str, Any]:
+    """Calibrate a drive as another camera would have seen it (in a process of its own)."""
+    return _row(drive, Config(seed=seed), drive.truth)
 
 
 def recorded(name: str, data: Path) -> dict[str, Any]:
@@ -98,7 +96,17 @@ def run_recorded(name: str, data: Path) -> dict[str, Any]:
     """Calibrate a real drive."""
     about = {'setting': name, 'seed': 0, 'must': 'accept' if name == 'kitti03' else 'judge',
              'counts': False, 'recorded': True}
-    return _finished(isolated(viewed if name in BY_VIEW else recorded, name, data), about)
+    if name in RECORDED:
+        return _finished(isolated(recorded, name, data), about)
+    drive = recorded_view(name, data / 'kitti03' / RECORDED['kitti03'],
+                          data / 'kitti03' / 'truth.json')
+    return _finished(isolated(viewed, drive, 0), about)
+
+
+def run_inexact(name: str, seed: int, cache: Path) -> dict[str, Any]:
+    """Calibrate a rendered drive whose lens has p1, p2 or k3."""
+    about = {'setting': name, 'seed': seed, 'must': 'judge', 'counts': False}
+    return _finished(isolated(viewed, inexact_view(name, seed, cache), seed), about)
 
 
 def drives_table(rows: Iterable[Mapping[str, Any]]) -> str:
@@ -118,7 +126,7 @@ def drives_table(rows: Iterable[Mapping[str, Any]]) -> str:
 
 def _chosen(wanted: list[str], data: Path | None) -> list[str]:
     real = [name for name in RECORDED if data is not None and (data / name).is_dir()]
-    names = [*real, *BY_NAME, *(BY_VIEW if 'kitti03' in real else ())]
+    names = [*real, *BY_NAME, *INEXACT, *(BY_VIEW if 'kitti03' in real else ())]
     for part in wanted:
         if not any(part in name for name in names):
             raise SystemExit(f'no setting has {part!r} in its name; --list shows them all')
@@ -126,6 +134,10 @@ def _chosen(wanted: list[str], data: Path | None) -> list[str]:
             if not wanted or name in wanted
             # a whole name means that one, not those that begin with it
             or any(part in name for part in set(wanted) - set(names))]
+
+
+def _real(name: str) -> bool:
+    return name in RECORDED or name in BY_VIEW
 
 
 def main() -> None:
@@ -136,7 +148,8 @@ def main() -> None:
     parser.add_argument('--summary', action='store_true', help='of the rows there are, and end')
     arguments = parser.parse_args()
     if arguments.list:
-        print('\n'.join([*(f'{setting.name} ({setting.must})' for setting in SETTINGS), *BY_VIEW]))
+        print('\n'.join([*(f'{setting.name} ({setting.must})' for setting in SETTINGS),
+                         *INEXACT, *BY_VIEW]))
         return
     path = arguments.out / 'accuracy.json'
     rows = load(path)
@@ -144,17 +157,17 @@ def main() -> None:
         names = _chosen(arguments.settings, arguments.data)
         # one seed of everything before the next seed: an interrupted run covers all settings
         jobs = [(name, seed) for seed in arguments.seeds for name in names
-                if name in BY_NAME or seed == arguments.seeds[0]]
+                if seed == arguments.seeds[0] or not _real(name)]
         with tempfile.TemporaryDirectory() as passing:
             for number, (name, seed) in enumerate(jobs, 1):
-                seed = seed if name in BY_NAME else 0
+                seed = 0 if _real(name) else seed
                 key = f'{name}, seed {seed}'
                 if done(rows.get(key)) and not arguments.again:
                     continue
-                if name not in BY_NAME:
-                    row = run_recorded(name, arguments.data)
-                else:
-                    row = run_rendered(name, seed, arguments.cache or Path(passing) / str(number))
+                cache = arguments.cache or Path(passing) / str(number)
+                row = (run_recorded(name, arguments.data) if _real(name)
+                       else run_inexact(name, seed, cache) if name in INEXACT
+                       else run_rendered(name, seed, cache))
                 rows[key] = row
                 save(path, rows)
                 complain(f'{number} of {len(jobs)}, rendered in {row.get("render_s", 0)} s')
@@ -168,7 +181,7 @@ def main() -> None:
 
 
 def _ordered(rows: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    order = [*RECORDED, *BY_NAME, *BY_VIEW]
+    order = [*RECORDED, *BY_NAME, *INEXACT, *BY_VIEW]
     known = [row for row in rows.values() if row['setting'] in order]
     return sorted(known, key=lambda row: (order.index(row['setting']), row['seed']))
 

@@ -1,20 +1,22 @@
-"""A recorded drive as another camera in its place would have seen it: real pictures, known lens.
+"""A drive as another camera in its place would have seen it: its pictures, another known lens.
 
-The pictures are resampled for another lens, mirrored, cropped, halved, darkened or cut in time.
-What the recording's own calibration is off shows in every view alike: KITTI's nominal one has no
-distortion, its pictures have k1 = 0.017.
+The pictures are resampled for another lens, mirrored, cropped, halved, darkened or cut in time. A
+recorded drive keeps its real pictures so. What its own calibration is off shows in every view
+alike: KITTI's nominal one has no distortion, its pictures have k1 = 0.017. A rendered drive gets
+what the renderer has not: p1, p2 and k3, which real lenses have and the calibration holds at zero.
 """
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from drives import BY_NAME, drive_of, pictures_of
 
 from dashcalib_ros import open_frames
 from dashcalib_ros.demo import Lens
@@ -27,14 +29,15 @@ Grey = npt.NDArray[np.uint8]
 class View:
     """What becomes of each picture.
 
-    lens: of the camera that looks in the same direction from the same place; None: the recording's
-    own. mirrored: left is right, before that. light: the grey values are multiplied by it. noise:
-    added, in grey values; blur: sigma, px; jpeg_quality: 0 for none. frames: the first one and the
-    one after the last.
+    lens: of the camera that looks in the same direction from the same place; None: the drive's
+    own. extra: its p1, p2, k3. mirrored: left is right, before that. light: the grey values are
+    multiplied by it. noise: added, in grey values; blur: sigma, px; jpeg_quality: 0 for none.
+    frames: the first one and the one after the last.
     """
 
     name: str
     lens: Lens | None = None
+    extra: tuple[float, float, float] = (0.0, 0.0, 0.0)
     mirrored: bool = False
     light: float = 1.0
     noise: float = 0.0
@@ -71,20 +74,40 @@ VIEWS = tuple(View(f'kitti03, {name}', **options) for name, options in (
 BY_VIEW = {view.name: view for view in VIEWS}
 
 
+# k1, k2 and p1, p2, k3 of lenses that are not quite what the calibration takes them for
+INEXACT = {
+    'p1, p2 0.001': (-0.30, 0.10, (0.001, -0.001, 0.0)),
+    'p1, p2 0.003': (-0.30, 0.10, (-0.003, 0.003, 0.0)),
+    'k3 -0.03': (-0.30, 0.10, (0.0, 0.0, -0.03)),
+    "KITTI's raw lens with p1, p2, k3": (-0.3729, 0.2037, (0.0022, 0.0014, -0.0723)),
+}
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recorded drive that can be gone through again, in another process too."""
+
+    path: Path
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames in order."""
+        yield from open_frames(self.path)
+
+
 @dataclass(frozen=True)
 class Viewed:
-    """A recording through a view: iterable over its frames. truth_path: of the recording."""
+    """A drive through a view: iterable over its frames. own: the drive's lens, undistorted."""
 
     view: View
-    recording: Path
-    truth_path: Path
+    frames: Iterable[Frame]
+    own: Lens
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames in order."""
         view, rng = self.view, np.random.default_rng(0)
         maps = self._maps()
-        for frame in open_frames(self.recording):
-            first, end = view.frames
+        first, end = view.frames
+        for frame in self.frames:
             if frame.index < first or (end is not None and frame.index >= end):
                 continue
             image = np.ascontiguousarray(frame.image[:, ::-1]) if view.mirrored else frame.image
@@ -95,30 +118,51 @@ class Viewed:
 
     @property
     def truth(self) -> dict[str, float]:
-        """Return fx .. k2, width and height of the camera whose pictures these would be."""
-        lens = self.view.lens
-        return asdict(self._own() if lens is None else lens)
+        """Return fx .. k2, p1, p2, k3, width and height of the camera with these pictures."""
+        lens = self.view.lens or self._turned()
+        return {**asdict(lens), **dict(zip(('p1', 'p2', 'k3'), self.view.extra, strict=True))}
 
-    def _own(self) -> Lens:
-        """Return the recording's lens, mirrored where the pictures are."""
-        truth: Mapping[str, Any] = json.loads(self.truth_path.read_text())
-        lens = Lens(**{key: truth[key] for key in Lens.__dataclass_fields__})
+    def _turned(self) -> Lens:
+        """Return the drive's lens, mirrored where the pictures are."""
         if not self.view.mirrored:
-            return lens
-        return Lens(**{**asdict(lens), 'cx': lens.width - 1 - lens.cx})
+            return self.own
+        return replace(self.own, cx=self.own.width - 1 - self.own.cx)
 
     def _maps(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]] | None:
-        """Return where in the recording, which has no distortion, each pixel of the lens lies."""
-        lens, own = self.view.lens, self._own()
+        """Return where in the drive's pictures each pixel of the lens lies."""
+        lens, own = self.view.lens, self._turned()
         if lens is None:
             return None
         grid = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1)
+        distortion = np.array([lens.k1, lens.k2, *self.view.extra])
         rays = cv2.undistortPoints(
-            grid.reshape(-1, 1, 2).astype(np.float64), lens.matrix, lens.distortion,
+            grid.reshape(-1, 1, 2).astype(np.float64), lens.matrix, distortion,
             criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12))
         x, y = np.moveaxis(rays.reshape(lens.height, lens.width, 2), -1, 0)
-        return ((own.fx * x + own.cx).astype(np.float32),
-                (own.fy * y + own.cy).astype(np.float32))
+        column, row = own.fx * x + own.cx, own.fy * y + own.cy
+        outside = ((column < -0.5) | (column > own.width - 0.5)
+                   | (row < -0.5) | (row > own.height - 0.5)).mean()
+        if outside > 0.002:
+            raise ValueError(f'{self.view.name}: {100 * outside:.1f} % lie outside the pictures')
+        return column.astype(np.float32), row.astype(np.float32)
+
+
+def recorded_view(name: str, recording: Path, truth_path: Path) -> Viewed:
+    """Return a view of a recorded drive. truth_path: of its calibration, without distortion."""
+    truth: Mapping[str, Any] = json.loads(truth_path.read_text())
+    own = Lens(**{key: truth[key] for key in Lens.__dataclass_fields__})
+    return Viewed(BY_VIEW[name], Recording(recording), own)
+
+
+def inexact_view(name: str, seed: int, cache: Path) -> Viewed:
+    """Return a rendered drive through one of the INEXACT lenses; it is rendered on the way."""
+    drive = drive_of(BY_NAME['no distortion'], seed)
+    k1, k2, extra = INEXACT[name]
+    width, height = 730, 390
+    # as large as the rendered pictures can fill
+    lens = Lens(width, height, drive.lens.fx, 1.002 * drive.lens.fx, (width - 1) / 2 + 4.0,
+                (height - 1) / 2 - 3.0, k1, k2)
+    return Viewed(View(name, lens, extra), pictures_of(drive, cache), drive.lens)
 
 
 def _worse(image: Grey, view: View, rng: np.random.Generator) -> Grey:
