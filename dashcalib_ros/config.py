@@ -203,6 +203,10 @@ class VerdictConfig:
         0.9, 'of what is known of fx; where one turn gives more, the others cannot confirm it: '
         'KITTI 03 has 0.7, and 0.95 without its turn at 753: fx is 1.0 % off then at 0.4 to 0.9 % '
         'of sigma; rendered drives have 0.2 to 0.5', 0.0, 1.0)
+    told_model_error: float = setting(
+        0.005, 'of fx, for fx and fy, or of the width, for cx and cy; where p1, p2 and k3 would '
+        'move one of them by more, a warning says so: KITTI 03 has 0.009, p1 and p2 of 0.001 make '
+        '0.01, rendered lenses without them have 0.001', 0.0, 1.0)
     max_misfit: float = setting(
         2.0, "times a turn's cost with a camera of its own; more is weak: sound turns have 0.5 to "
         '1.5, turns of another lens in the same drive 4.6 to 25', 1.0, 1e4)

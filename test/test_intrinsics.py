@@ -23,6 +23,7 @@ from dashcalib_ros.intrinsics.information import (
     Information,
     between_turns,
     covariance,
+    freed,
     information,
     model_error,
     noise_in,
@@ -378,6 +379,11 @@ def test_the_models_error_shows_in_sigma():
         scenes, camera = adjusted(scenes, 0.5)
         parts = [information(scene, camera, 0.5) for scene in scenes]
         errors[name] = model_error(parts, NOTHING)
+        found = freed(parts, NOTHING)
+        np.testing.assert_array_equal(np.abs(found[:6]), errors[name])
+        # as they are, though only one step away
+        np.testing.assert_allclose(found[6:8], extra[:2], rtol=0.25, atol=4e-4)
+        assert found[8] == pytest.approx(extra[2], abs=0.02)
     assert (errors['p'][2:4] > 3 * errors['none'][2:4]).all()
     assert errors['k3'][5] > 3 * errors['none'][5]
     assert errors['none'][0] < 0.005 * LENS.fx
@@ -620,6 +626,21 @@ def test_a_refused_solution_gives_no_numbers(good):
     assert calibration.verdict.level == 'refused'
     assert calibration.intrinsics is None and calibration.sigma is None
     assert calibration.reprojection_error_px is None
+
+
+def test_a_lens_that_the_six_do_not_describe_is_told_of(good):
+    assert not conclude(good, evidence_for(good), CONFIG).warnings
+    freed = np.array([0.3, -2.0, 0.02 * SIZE[0], -4.0, 0.0, 0.0, 0.0012, -0.001, 0.02])
+    calibration = conclude(replace(good, freed=freed), evidence_for(good, 2), CONFIG)
+    [warning] = calibration.warnings
+    assert 'p1 +0.0012, p2 -0.0010 and k3 +0.020' in warning
+    # in px of the input
+    assert f'fx by +0.6, fy by -4.0, cx by {0.04 * SIZE[0]:+.1f}, cy by -8.0 px' in warning
+    assert calibration.details['left_out'] == {'p1': 0.0012, 'p2': -0.001, 'k3': 0.02}
+    assert calibration.verdict.level == 'accepted'
+    refused = replace(good, freed=freed,
+                      around=replace(good.around, costs=np.ones_like(good.around.costs)))
+    assert not conclude(refused, evidence_for(refused), CONFIG).warnings
 
 
 @pytest.mark.parametrize(('turns', 'frames', 'text'), [

@@ -53,12 +53,14 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     verdict = judge(solution, config.verdict) if solution else _nothing(evidence)
     intrinsics = sigma = error = shutter = None
     details: dict[str, object] = {}
+    warnings = evidence.warnings
     if solution is not None:
         details = _details(solution)
         if verdict.level != 'refused':
             intrinsics = _full_size(solution.camera.params, evidence.shrink, shift=True)
             sigma = _full_size(solution.sigma, evidence.shrink, shift=False)
             error = solution.reprojection_error_px * evidence.shrink
+            warnings += _left_out(solution, evidence.shrink, config)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
     return Calibration(
@@ -67,8 +69,20 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
         frames=evidence.frames, reprojection_error_px=error, timing=evidence.timing,
         versions=_versions(), config=config, magnitudes=evidence.magnitudes, mask=evidence.mask,
-        details=details, rolling_shutter=shutter, warnings=evidence.warnings,
+        details=details, rolling_shutter=shutter, warnings=warnings,
         stored_turns=tuple(_stored_summary(turn, solution) for turn in evidence.stored))
+
+
+def _left_out(solution: Solution, shrink: int, config: Config) -> tuple[str, ...]:
+    """Return a warning where the lens is clearly not quite what the six parameters describe."""
+    moves, (p1, p2, k3) = solution.freed[:4], solution.freed[6:]
+    scale = np.repeat([solution.camera.fx, solution.camera.image_size[0]], 2)
+    if not np.max(np.abs(moves) / scale) > config.verdict.told_model_error:
+        return ()
+    told = ', '.join(f'{name} by {shrink * move:+.1f}'
+                     for name, move in zip(('fx', 'fy', 'cx', 'cy'), moves, strict=True))
+    return (f'the lens seems to have p1 {p1:+.4f}, p2 {p2:+.4f} and k3 {k3:+.3f}, which are not '
+            f'calibrated: they would move {told} px; sigma allows for that',)
 
 
 def _nothing(evidence: Evidence) -> Verdict:
@@ -126,6 +140,7 @@ def _details(solution: Solution) -> dict[str, object]:
                           'cost_px2': solution.around.costs.tolist()},
         'profile_contrast': profile_contrast(solution),
         'turns_disagree_fx': focal_disagreement(solution),
+        'left_out': dict(zip(('p1', 'p2', 'k3'), solution.freed[6:].tolist(), strict=True)),
         'correlation': (solution.covariance / np.outer(solution.sigma, solution.sigma)).tolist(),
     }
 

@@ -256,7 +256,12 @@ def between_turns(hessians: Array, scores: Array, inverse: Array) -> Array:
 
 
 def model_error(parts: Sequence[Information], prior: Array) -> Array:
-    """Return (6,) by how much each parameter would move if p1, p2 and k3 were free.
+    """Return (6,) by how much each parameter would move if p1, p2 and k3 were free."""
+    return np.abs(freed(parts, prior)[:6])
+
+
+def freed(parts: Sequence[Information], prior: Array) -> Array:
+    """Return (9,) how the six would move if p1, p2 and k3 were free, and what these would be.
 
     prior: (6, 6) as for covariance(). p1, p2 and k3 themselves are believed to be as large as real
     lenses have them (EXTRA_SIGMA). One Gauss-Newton step: the six are at their optimum, so only
@@ -269,7 +274,7 @@ def model_error(parts: Sequence[Information], prior: Array) -> Array:
     whole[6:, 6:] += np.diag(1 / np.square(EXTRA_SIGMA))
     pull = sum((part.score[:LENS] for part in parts), np.zeros(LENS)) / noise
     pull[:6] = 0.0
-    return np.asarray(np.abs(np.linalg.solve(whole, pull)[:6]))
+    return np.asarray(np.linalg.solve(whole, pull))
 
 
 def _cross(vectors: Array) -> Array:

@@ -26,6 +26,7 @@ class Solution:
     scenes' tracks; 0 for a global one. readout_sigma_s: its standard deviation.
     misfits: of every turn that was given, by centre: its cost with this camera, over that with one
     of its own.
+    freed: (9,) by how much the six would move if p1, p2 and k3 were free, and what these would be.
     """
 
     camera: Camera
@@ -39,6 +40,7 @@ class Solution:
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     misfits: Mapping[int, float] = field(default_factory=dict)
+    freed: Array = field(default_factory=lambda: np.zeros(9))
 
     @property
     def sigma(self) -> Array:
