@@ -459,6 +459,16 @@ def test_registration_touches_only_what_the_structure_uses():
     np.testing.assert_array_equal(np.isfinite(found.xy[:, :, 0]), used)
 
 
+def test_registration_passes_over_an_image_that_only_unused_tracks_refer_to():
+    tracks, structure, images = registered_case(*CASES['affine'])
+    used, xy = structure.used.copy(), tracks.xy.copy()
+    used[:, :5] = False
+    # the first image is nobody's reference but, for want of another, theirs
+    xy[0, :5] = np.nan
+    found = register_tracks(replace(tracks, xy=xy), replace(structure, used=used), images, 7, 3.0)
+    assert np.isnan(found.xy[:, :5]).all() and np.isfinite(found.xy[:, 5:]).all()
+
+
 def test_registration_on_pictures_without_texture_keeps_nothing_wrong():
     tracks, structure, images = registered_case(*CASES['translation'])
     flat = [np.full_like(image, 90) for image in images]

@@ -88,6 +88,8 @@ def _templates(tracks: Tracks, reference: npt.NDArray[np.int64],
     gradient = np.zeros((count, pixels, 2), np.float32)
     for k in np.unique(reference):
         rows = np.flatnonzero((reference == k) & np.isfinite(tracks.xy[k, :, 0]))
+        if len(rows) == 0:
+            continue  # only of tracks that the structure does not use
         centre = tracks.xy[k, rows][:, None] + grid
         template[rows] = _sample(images[k], centre)
         for axis, kernel in enumerate(((1, 0), (0, 1))):
