@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -179,12 +180,22 @@ def test_launch_files_start_the_node_with_the_same_arguments():
     assert (start.get('pkg'), start.get('exec')) == ('dashcalib_ros', 'calibrator')
 
 
+@pytest.mark.parametrize('command', ['dashcalib', 'calibrator'])
+def test_pip_puts_the_commands_beside_python(command):
+    """An old pip without pyproject.toml puts them where setup.cfg tells colcon to."""
+    places = [Path(str(each.locate_file('')))
+              for each in metadata.distributions(name='dashcalib_ros')]
+    if not any(place.is_relative_to(sys.prefix) for place in places):
+        pytest.skip('pip has not installed it here: the tests run from the sources')
+    assert os.access(Path(sys.executable).parent / command, os.X_OK)
+
+
 @pytest.mark.skipif(COLCON is None, reason='no colcon: pip install colcon-ros and friends')
 def test_colcon_builds_it_and_ros2_run_would_find_it(tmp_path, monkeypatch):
     for name in ('dashcalib_ros', 'config', 'launch', 'resource'):
         shutil.copytree(REPOSITORY / name, tmp_path / 'src' / name,
                         ignore=shutil.ignore_patterns('__pycache__'))
-    for name in ('setup.py', 'setup.cfg', 'package.xml', 'LICENSE', 'README.md'):
+    for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'README.md'):
         if (REPOSITORY / name).exists():
             shutil.copy(REPOSITORY / name, tmp_path / 'src' / name)
     # on an apt ROS, colcon runs in the interpreter that has ROS; here it may have its own
