@@ -168,10 +168,8 @@ def inexact_view(name: str, seed: int, cache: Path) -> Viewed:
 def _worse(image: Grey, view: View, rng: np.random.Generator) -> Grey:
     """Return the picture as a worse camera gives it."""
     made: npt.NDArray[Any] = image
-    # half the size needs a filter against aliasing, too
-    blur = view.blur or (0.8 if view.lens is HALF else 0.0)
-    if blur:
-        made = cv2.GaussianBlur(made, (0, 0), blur)
+    if view.blur:
+        made = cv2.GaussianBlur(made, (0, 0), view.blur)
     if view.light != 1.0 or view.noise:
         made = view.light * made + rng.normal(0.0, view.noise, made.shape)
         made = np.clip(np.rint(made), 0, 255).astype(np.uint8)
