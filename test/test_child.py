@@ -13,12 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import child_tasks
+import cv2
 import numpy as np
 import pytest
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.frames import Frame
+from dashcalib_ros.reconstruction import build
 from dashcalib_ros.reconstruction import child as child_module
 from dashcalib_ros.reconstruction import workshop as workshop_module
 from dashcalib_ros.reconstruction.child import Child, ChildDiedError
@@ -216,6 +218,7 @@ PARENT = """
 import sys
 sys.path[:0] = [{test!r}, {root!r}]
 import child_tasks
+import cv2
 from dashcalib_ros.reconstruction.child import Child
 Child().call(child_tasks.sleep, 60, {flag!r})
 """
@@ -272,6 +275,19 @@ def test_turns_become_scenes_once(workshop, monkeypatch):
     wait_until_built(workshop)
     assert workshop.scenes() == {center: f'scene of {center}' for center in (10, 50, 90)}
     assert all(child.pid is not None for child in workshop._children)
+
+
+@pytest.mark.parametrize('error', [cv2.error('remap: dst is empty'),
+                                   np.linalg.LinAlgError('Singular matrix')])
+def test_a_hopeless_turn_has_no_scene_and_verbose_tells_why(monkeypatch, capsys, error):
+    def fail(*arguments: object) -> None:
+        raise error
+
+    monkeypatch.setattr(build, 'draft_scene', fail)
+    assert workshop_module.draft_turn(turn(10), Config(), None) is None
+    # a child's stderr is the terminal with --verbose, and nowhere else
+    told = capsys.readouterr().err
+    assert 'turn at frame 10' in told and str(error) in told
 
 
 def test_who_has_no_turn_left_starts_the_process_that_comes_next(workshop, monkeypatch, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
-import numpy.typing as npt
 
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.intrinsics.information import noise_of
@@ -73,9 +72,8 @@ def focal_disagreement(solution: Solution) -> float:
         return 0.0
     noise = noise_of(solution.parts)
     weights, offsets = [], []
-    weak_prior = _weak_prior(solution.camera)
     for part in solution.parts:
-        inverse = np.linalg.inv(part.hessian[:6, :6] / noise + weak_prior)
+        inverse = np.linalg.inv(part.hessian[:6, :6] / noise + solution.belief)
         offsets.append(float((inverse @ part.score[:6])[0] / noise))
         weights.append(1 / float(inverse[0, 0]))
     mean = np.average(offsets, weights=weights)
@@ -87,19 +85,9 @@ def leverages(solution: Solution) -> dict[int, float]:
     """Return each turn's share in what the turns know of fx, by centre; together 1."""
     noise = noise_of(solution.parts)
     hessians = [part.hessian[:6, :6] / noise for part in solution.parts]
-    inverse = np.linalg.inv(sum(hessians) + _weak_prior(solution.camera))
+    inverse = np.linalg.inv(sum(hessians) + solution.belief)
     known = [float((inverse @ hessian)[0, 0]) for hessian in hessians]
-    # the prior knows the rest
+    # what is believed beforehand is the rest
     total = max(sum(known), LEAST_SHARE)
     return {scene.center: share / total
             for scene, share in zip(solution.scenes, known, strict=True)}
-
-
-def _weak_prior(camera: Camera) -> npt.NDArray[np.float64]:
-    """Return the information (6, 6) with which one turn alone has a focal length at all."""
-    width = camera.image_size[0]
-    prior = np.diag(1 / np.square([1e4, 1e4, 0.02 * width, 0.02 * width, 1.0, 1.0]))
-    # square pixels
-    stiff = 1 / (0.003 * camera.fx) ** 2
-    prior[:2, :2] += stiff * np.array([[1, -1], [-1, 1]])
-    return np.asarray(prior)

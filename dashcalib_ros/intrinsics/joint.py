@@ -170,7 +170,7 @@ def _known(final: _Fit, step1: Camera, alone: Sequence[Scene],
     floor = np.diag(np.square([config.focal_floor * camera.fx] * 2
                               + [config.centre_floor * camera.image_size[0]] * 2 + [0.0] * 2))
     return Solution(camera, spread[:6, :6] + floor, step1, tuple(scenes), parts, *profiles,
-                    np.array(bounds_of(step1, config)), readout_s, readout_sigma_s,
+                    np.array(bounds_of(step1, config)), belief, readout_s, readout_sigma_s,
                     misfits(alone, scenes, camera, scene_config.error_px),
                     freed(parts, belief))
 

@@ -21,7 +21,8 @@ class Solution:
     camera: the six parameters; covariance: (6, 6) of them; step1: the camera after the first step.
     scenes: as adjusted, in the order given; parts: what each knows of the lens.
     coarse: the turns' focal profiles, summed; around: the profile near the result, all together.
-    bounds: (2, 6) lowest and highest values that were allowed.
+    bounds: (2, 6) lowest and highest values that were allowed; belief: (6, 6) information that the
+    prior adds to theirs.
     readout_s: from the first row to the last of a rolling shutter that was found and undone in the
     scenes' tracks; 0 for a global one. readout_sigma_s: its standard deviation.
     misfits: of every turn that was given, by centre: its cost with this camera, over that with one
@@ -37,6 +38,7 @@ class Solution:
     coarse: Profile
     around: Profile
     bounds: Array
+    belief: Array
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     misfits: Mapping[int, float] = field(default_factory=dict)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 import threading
 from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass, replace
@@ -268,20 +269,23 @@ def load_all() -> None:
 def draft_turn(turn: Turn, config: Config, valid: Mask | None) -> Draft | None:
     """Run in the child: COLMAP is loaded there only."""
     from dashcalib_ros.reconstruction.build import draft_scene
-    with _hopeless_pictures_give_none():
+    with _hopeless_pictures_give_none(turn):
         return draft_scene(turn, config.tracks, config.scene, valid, config.seed)
 
 
 def build_turn(turn: Turn, config: Config, draft: Draft) -> Scene | None:
     """Run in the child: COLMAP is loaded there only."""
     from dashcalib_ros.reconstruction.build import finish_scene
-    with _hopeless_pictures_give_none():
+    with _hopeless_pictures_give_none(turn):
         return finish_scene(turn, draft, config.scene, config.seed)
 
 
 @contextlib.contextmanager
-def _hopeless_pictures_give_none() -> Iterator[None]:
+def _hopeless_pictures_give_none(turn: Turn) -> Iterator[None]:
     """Hopeless pictures make hopeless equations: such a turn has no scene, others may have."""
     import cv2
-    with contextlib.suppress(np.linalg.LinAlgError, cv2.error):
+    try:
         yield
+    except (np.linalg.LinAlgError, cv2.error) as error:
+        # seen with --verbose; anybody else is told which turns were not reconstructed
+        print(f'the turn at frame {turn.center} gives no scene: {error}', file=sys.stderr)
