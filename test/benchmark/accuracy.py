@@ -6,8 +6,8 @@
 
 Runs every setting (or those named; part of a name will do) with every seed. Rows go to
 DIR/accuracy.json after each drive, and one that is there is not run again (--again: it is);
-DIR/accuracy.md is the table with medians, bars and honesty. --data: a folder with kitti03/ and
-carnd/ (bag or video beside a truth.json); kitti03 is seen through other lenses, too (views.py).
+DIR/accuracy.md has each drive, each setting, the bars and honesty. --data: a folder with kitti03/
+and carnd/ (bag or video beside a truth.json); kitti03 is seen through other lenses (views.py).
 --cache: where rendered pictures are kept, about 100 MB a drive; a second run renders nothing.
 """
 from __future__ import annotations

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -20,8 +21,35 @@ HONEST_SHARE = 0.9
 def summary(rows: Iterable[Row]) -> str:
     """Return the whole summary in Markdown."""
     rows = list(rows)
-    parts = [_accuracy(rows), _bars(rows), _honesty(rows), _mistakes(rows), _cost(rows)]
+    parts = [_settings(rows), _accuracy(rows), _bars(rows), _honesty(rows), _mistakes(rows),
+             _cost(rows)]
     return '\n\n'.join(part for part in parts if part)
+
+
+def _settings(rows: Sequence[Row]) -> str:
+    """Return a line for each setting, over its seeds: the README's table."""
+    lines = []
+    for name in dict.fromkeys(row['setting'] for row in rows):
+        drives = [row for row in rows if row['setting'] == name]
+        found = [row for row in drives if 'error' in row]
+        counts = Counter(row['verdict'] for row in drives)
+        verdict = ', '.join(f'{count} {level}' for level, count in sorted(counts.items()))
+        worst = max((abs(z) for row in found for z in row['z'].values()), default=None)
+        lines.append([name, drives[0]['verdict'] if drives[0].get('recorded') else verdict,
+                      *(_median_cell(found, key) for key in KEYS),
+                      '' if worst is None else f'{worst:.1f}'])
+    return ('Each setting: median of its seeds, the worst in sigmas.\n\n'
+            + table(['drive', 'verdict', *(f'{key} %' for key in KEYS),
+                     'worst error in sigmas'], lines))
+
+
+def _median_cell(rows: Sequence[Row], key: str) -> str:
+    """Return the median error: percent of the truth, or 'abs' where that is 0."""
+    if not rows:
+        return ''
+    if any(row['percent'][key] is None for row in rows):
+        return f'{statistics.median(abs(row["error"][key]) for row in rows):.3f} abs'
+    return f'{statistics.median(row["percent"][key] for row in rows):.2f}'
 
 
 def _accuracy(rows: Sequence[Row]) -> str:
@@ -88,7 +116,7 @@ def _honesty(rows: Sequence[Row]) -> str:
         return ''
     return ('Truth within so many sigma, rendered drives (a normal error: 68 % and 95 %, '
             'median 0.67).\n\n'
-            + table(['verdict', '', 'drives', '1 sigma', '2 sigma', 'median |z|', 'worst |z|',
+            + table(['verdict', '', 'drives', '1 sigma', '2 sigma', 'median of z', 'worst z',
                      'bar', ''], lines))
 
 
