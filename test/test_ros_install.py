@@ -22,7 +22,7 @@ from ros_bench import REPOSITORY, SOON, Bench, NodeProcess
 from dashcalib_ros.config import Config
 from dashcalib_ros.ros.sample import sample
 
-COLCON = shutil.which('colcon') or shutil.which('colcon', path='/tmp/colcon/bin')
+COLCON = shutil.which('colcon')
 
 
 @pytest.fixture(scope='module')
