@@ -218,7 +218,6 @@ PARENT = """
 import sys
 sys.path[:0] = [{test!r}, {root!r}]
 import child_tasks
-import cv2
 from dashcalib_ros.reconstruction.child import Child
 Child().call(child_tasks.sleep, 60, {flag!r})
 """

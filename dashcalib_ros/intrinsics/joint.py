@@ -19,7 +19,7 @@ from dashcalib_ros.intrinsics.fitting import (
     posed_as,
 )
 from dashcalib_ros.intrinsics.focal import nearest_start, profile_around, summed
-from dashcalib_ros.intrinsics.information import covariance, freed, information, noise_in
+from dashcalib_ros.intrinsics.information import covariance, information, noise_in
 from dashcalib_ros.intrinsics.shutter import readout, row_shift, undone
 from dashcalib_ros.intrinsics.solution import Solution
 from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1, adjust_step2
@@ -171,8 +171,7 @@ def _known(final: _Fit, step1: Camera, alone: Sequence[Scene],
                               + [config.centre_floor * camera.image_size[0]] * 2 + [0.0] * 2))
     return Solution(camera, spread[:6, :6] + floor, step1, tuple(scenes), parts, *profiles,
                     np.array(bounds_of(step1, config)), belief, readout_s, readout_sigma_s,
-                    misfits(alone, scenes, camera, scene_config.error_px),
-                    freed(parts, belief))
+                    misfits(alone, scenes, camera, scene_config.error_px))
 
 
 def _without_shutter(scenes: Sequence[Scene], camera: Camera, readout_s: float,

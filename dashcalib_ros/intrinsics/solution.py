@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from dashcalib_ros.intrinsics.information import Information
+from dashcalib_ros.intrinsics.information import Information, freed
 from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.scene import Profile, Scene, errors_px
 
@@ -27,7 +27,6 @@ class Solution:
     scenes' tracks; 0 for a global one. readout_sigma_s: its standard deviation.
     misfits: of every turn that was given, by centre: its cost with this camera, over that with one
     of its own.
-    freed: (9,) by how much the six would move if p1, p2 and k3 were free, and what these would be.
     """
 
     camera: Camera
@@ -42,12 +41,16 @@ class Solution:
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     misfits: Mapping[int, float] = field(default_factory=dict)
-    freed: Array = field(default_factory=lambda: np.zeros(9))
 
     @property
     def sigma(self) -> Array:
         """Return the six standard deviations (6,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def freed(self) -> Array:
+        """Return (9,) how the six would move if p1, p2, k3 were free, and what these would be."""
+        return freed(self.parts, self.belief)
 
     @property
     def reprojection_error_px(self) -> float:

@@ -84,17 +84,6 @@ INEXACT = {
 
 
 @dataclass(frozen=True)
-class Recording:
-    """A recorded drive that can be gone through again, in another process too."""
-
-    path: Path
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames in order."""
-        yield from open_frames(self.path)
-
-
-@dataclass(frozen=True)
 class Viewed:
     """A drive through a view: iterable over its frames. own: the drive's lens, undistorted."""
 
@@ -151,7 +140,7 @@ def recorded_view(name: str, recording: Path, truth_path: Path) -> Viewed:
     """Return a view of a recorded drive. truth_path: of its calibration, without distortion."""
     truth: Mapping[str, Any] = json.loads(truth_path.read_text())
     own = Lens(**{key: truth[key] for key in Lens.__dataclass_fields__})
-    return Viewed(BY_VIEW[name], Recording(recording), own)
+    return Viewed(BY_VIEW[name], open_frames(recording), own)
 
 
 def inexact_view(name: str, seed: int, cache: Path) -> Viewed:
