@@ -74,8 +74,8 @@ class TurnsConfig:
         8, 'turns used where those wanted leave the result weak: what is there is taken, before '
         'the driver is asked for more', 1, 50)
     half_width: float = setting(
-        3.0, "s kept on either side of a turn's centre; the paper's k = 30 frames at 10 fps",
-        0.5, 10.0)
+        3.0, "s kept on either side of a turn's centre; the median filter's window is as long in "
+        "all; the paper's k = 30 frames at 10 fps", 0.5, 10.0)
     min_prominence: float = setting(
         0.0025, "of the image width; kitti03's sharp turn has 0.050, its bends of 0.4 to 0.6 deg "
         "per frame 0.003 to 0.008, carnd's bends 0.004, rendered turns 0.02 to 0.06; a rendered "
