@@ -1,21 +1,27 @@
-"""Camera calibration that happens by itself while a car drives."""
+"""Calibrates a dashcam online, from the turns that the car takes."""
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dashcalib_ros.calibrator import Calibrator
     from dashcalib_ros.config import Config
-    from dashcalib_ros.frames import open_frames
+    from dashcalib_ros.inputs import open_frames
+
+from dashcalib_ros.limits import PIXELS
+
+# OpenCV reads it when it is loaded; image headers are checked before decoding, too
+os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(PIXELS))
 
 __all__ = ['Calibrator', 'Config', 'open_frames']
 
-_HOMES = {'Calibrator': 'calibrator', 'Config': 'config', 'open_frames': 'frames'}
+_HOMES = {'Calibrator': 'calibrator', 'Config': 'config', 'open_frames': 'inputs'}
 
 
 def __getattr__(name: str) -> Any:
-    # loaded when first asked for: `dashcalib --help` must not wait for OpenCV
+    # loaded at the first use: `dashcalib --help` must not wait for OpenCV
     if name in _HOMES:
         return getattr(import_module(f'dashcalib_ros.{_HOMES[name]}'), name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

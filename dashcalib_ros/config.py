@@ -1,5 +1,8 @@
 """The one home of every default, each with the reason for its value.
 
+Users set some twenty of them, setting(); the others are for experts, expert(). What was measured
+for a value stands in docs/lessons.md.
+
 A setting's full name is SECTION.NAME ('turns.half_width'): the same in --set, in a configuration
 YAML and as a ROS parameter. Values are checked when a Config is made: one that exists is valid.
 """
@@ -19,12 +22,21 @@ T = TypeVar('T')
 
 
 def setting(default: T, reason: str, minimum: float | None = None, maximum: float | None = None,
-            choices: tuple[str, ...] = (), pattern: str = '') -> T:
-    """Declare a setting: its default, why it has that value, and what else it may be."""
+            choices: tuple[str, ...] = (), pattern: str = '', expert: bool = False) -> T:
+    """Declare a setting: its default, why it has that value in one line, and what else it may be.
+
+    expert: few users set it; such settings are listed after the others. What was measured
+    for a value stands in docs/lessons.md under the setting's name.
+    """
     metadata = {'reason': reason, 'minimum': minimum, 'maximum': maximum, 'choices': choices,
-                'pattern': pattern}
+                'pattern': pattern, 'expert': expert}
     value: T = field(default=default, metadata=metadata)
     return value
+
+
+def expert(default: T, reason: str, minimum: float, maximum: float) -> T:
+    """Declare a setting for experts."""
+    return setting(default, reason, minimum, maximum, expert=True)
 
 
 @dataclass(frozen=True)
@@ -34,16 +46,19 @@ class MotionConfig:
     rate: float = setting(
         10.0, 'Hz; faster cameras are thinned to it: the paper works at 10 fps', 1.0, 60.0)
     width: int = setting(
-        640, 'px; wider images are halved until they fit: epipoles need no more', 64, 8192)
+        640, 'px; wider images are divided by a whole number until they fit', 64, 8192)
     points: int = setting(
-        300, 'points tracked at a time; 400 find the same turns on kitti03 and cost 20 % more',
-        50, 5000)
-    forward_backward_px: float = setting(
+        300, 'points tracked at a time; 400 find the same turns and cost 20 % more', 50, 5000)
+    forward_backward_px: float = expert(
         0.5, 'px; a point that does not track back to within this is dropped', 0.05, 5.0)
-    standing_px: float = setting(
+    standing_px: float = expert(
         0.3, 'px at the working width; the car stands when the median point moves less', 0.0, 5.0)
-    epipolar_px: float = setting(
+    epipolar_px: float = expert(
         0.5, 'px at the working width; inlier threshold of the fundamental matrix', 0.05, 5.0)
+    spacing_s: float = expert(
+        0.3, 's between the images of a triplet; few points survive a sharp turn', 0.05, 2.0)
+    replenish: float = expert(
+        0.65, 'of points; where fewer are left, new ones are looked for', 0.1, 1.0)
 
 
 @dataclass(frozen=True)
@@ -54,14 +69,22 @@ class MaskConfig:
     """
 
     enabled: bool = setting(True, 'bonnet, pillars and burnt-in text spoil the matches (paper)')
-    cell: int = setting(16, 'px at the working width; resolution of the mask', 4, 64)
     segmentation: str = setting(
-        '', 'path of an ONNX model that knows the own car; empty: none, the drive itself tells. '
-        'It sees 15 images, 2 s apart, in the thread that finds turns: up to 1 s each drops none')
+        '', 'path of an ONNX model that finds the own car; empty: only the automatic mask')
     segmentation_classes: str = setting(
-        '63,64', 'what is left out: car mount and ego vehicle of Mapillary Vistas 1.2, as in the '
-        "paper; Cityscapes' 19 classes have no such: try 13, car. Other cars are outvoted",
+        '63,64', "the own car's classes; these are car mount and ego vehicle of Mapillary Vistas",
         pattern=r'\d{1,4}(, ?\d{1,4})*')
+    cell: int = expert(16, 'px at the working width; resolution of the mask', 4, 64)
+    period_s: float = expert(
+        3.0, 's between two updates of the mask that the tracking uses', 0.1, 600.0)
+    stays: float = expert(
+        0.4, "coherence of a cell's gradient: the world's is about 0, the vehicle's 0.7", 0.0, 1.0)
+    largest: float = expert(
+        0.4, 'of the picture; a mask of the vehicle that hides more is not used', 0.01, 1.0)
+    segmentation_images: int = expert(
+        15, 'images that vote; there is a mask from the first on', 1, 1000)
+    segmentation_period_s: float = expert(
+        2.0, 's of driving between two votes: the traffic has changed', 0.0, 600.0)
 
 
 @dataclass(frozen=True)
@@ -71,110 +94,106 @@ class TurnsConfig:
     wanted: int = setting(
         5, 'turns; the paper: focal lengths settle at 2, the centre at 4, distortion at 5', 1, 20)
     at_most: int = setting(
-        8, 'turns used where those wanted leave the result weak: what is there is taken, before '
-        'the driver is asked for more', 1, 50)
+        8, 'turns used where those wanted leave the result weak', 1, 50)
     half_width: float = setting(
-        3.0, "s kept on either side of a turn's centre; the median filter's window is as long in "
-        "all; the paper's k = 30 frames at 10 fps", 0.5, 10.0)
-    min_prominence: float = setting(
-        0.0025, "of the image width; kitti03's sharp turn has 0.050, its bends of 0.4 to 0.6 deg "
-        "per frame 0.003 to 0.008, carnd's bends 0.004, rendered turns 0.02 to 0.06; a rendered "
-        'straight street has no peak of 0.0015', 0.0, 1.0)
-    capacity: int = setting(10, 'turns kept at the most: twice those wanted', 1, 50)
+        3.0, "s kept on either side of a turn's centre: the paper's k = 30 frames at 10 fps",
+        0.5, 10.0)
     store: str = setting(
-        '', 'folder that keeps reconstructed turns, so that short trips add up; one for each '
-        'camera. Empty: turns are forgotten with the drive')
+        '', 'folder for reconstructed turns of one camera: short trips add up; empty: none')
+    capacity: int = expert(10, 'turns kept at the most: twice those wanted', 1, 50)
+    min_prominence: float = expert(
+        0.0025, 'of the image width; lower peaks of the turning magnitude are no turns', 0.0, 1.0)
+    longest: int = expert(
+        4, 'half widths; overlapping turns that are longer together are not joined', 2, 20)
 
 
 @dataclass(frozen=True)
 class TracksConfig:
     """A turn's images -> correspondences between its keyframes."""
 
-    points: int = setting(800, 'points tracked at a time', 100, 10000)
-    window: int = setting(21, 'px; side of the Lucas-Kanade window', 7, 61)
-    forward_backward_px: float = setting(
+    points: int = expert(800, 'points tracked at a time', 100, 10000)
+    window: int = expert(21, 'px; side of the Lucas-Kanade window', 7, 61)
+    forward_backward_px: float = expert(
         0.5, 'px; a point that does not track back to within this is dropped', 0.05, 5.0)
-    keyframe_motion: float = setting(
+    keyframe_motion: float = expert(
         0.03, 'of the image width; the median point moves so far between keyframes', 0.0, 1.0)
-    keyframe_overlap: float = setting(
-        0.6, 'a keyframe comes at the latest when fewer of the last one\'s points live', 0.0, 1.0)
+    keyframe_overlap: float = expert(
+        0.6, "a keyframe comes at the latest when fewer of the last one's points live", 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class SceneConfig:
     """Tracks -> one scene per turn."""
 
-    tracks: int = setting(
-        1000, 'used of a turn, the longest where others are few; with 700 rendered drives are as '
-        'exact, but kitti03 has 1.9 % of sigma in fx instead of 1.5 %', 50, 10000)
-    profile_tracks: int = setting(300, 'longest tracks used for the focal profile', 50, 5000)
-    keyframes: int = setting(
+    tracks: int = expert(
+        1000, 'tracks used of a turn, the longest where others are few', 50, 10000)
+    profile_tracks: int = expert(300, 'longest tracks used for the focal profile', 50, 5000)
+    keyframes: int = expert(
         30, 'of a turn at the most; more cost time and change nothing', 5, 1000)
-    profile_keyframes: int = setting(16, 'of a turn at the most, for the focal profile', 5, 1000)
-    min_tracks: int = setting(80, 'a turn with fewer tracks is not tried', 20, 1000)
-    min_images: int = setting(6, 'a turn with fewer keyframes is not tried', 4, 100)
-    error_px: float = setting(2.0, 'px; an observation farther off is not used', 0.2, 20.0)
-    chain_error: float = setting(
+    profile_keyframes: int = expert(16, 'of a turn at the most, for the focal profile', 5, 1000)
+    min_tracks: int = expert(80, 'a turn with fewer tracks is not tried', 20, 1000)
+    min_images: int = expert(6, 'a turn with fewer keyframes is not tried', 4, 100)
+    error_px: float = expert(2.0, 'px; an observation farther off is not used', 0.2, 20.0)
+    chain_error: float = expert(
         0.004, 'of the width; the same while the lens is still unknown', 0.0005, 0.05)
-    min_angle_deg: float = setting(
-        0.3, 'degrees; rays that meet at less give no point; COLMAP has 1.5, but what is far away '
-        'shows a turn best: with 1.0 cy on kitti03 was 1.4 % off instead of 0.9 %', 0.01, 10.0)
-    loss_px: float = setting(0.5, 'px; scale of the Cauchy loss', 0.05, 10.0)
-    iterations: int = setting(
+    min_angle_deg: float = expert(
+        0.3, 'degrees; rays that meet at less give no point: far points show a turn best',
+        0.01, 10.0)
+    loss_px: float = expert(0.5, 'px; scale of the Cauchy loss', 0.05, 10.0)
+    iterations: int = expert(
         12, 'of one adjustment; 60 move fx by 0.03 % at the most, at twice the time', 5, 500)
-    min_explained: float = setting(
-        0.3, 'of a turn\'s observations; a camera that explains fewer is not its camera', 0.0, 0.9)
-    good_cost: float = setting(
-        1.2, 'px^2 per observation at the best held focal length, each cut at error_px; where it '
-        'is more the turn is chained with other tracks, too: sound turns have 0.7 to 0.9', 0.0,
-        1e4)
-    well_explained: float = setting(
-        0.9, 'of a turn\'s observations; where the common camera explains fewer, the turn is '
-        'chained anew with it: sound scenes have 0.97', 0.0, 1.0)
-    well_fitting: float = setting(
-        1.25, "times a turn's cost with a camera of its own; where the common camera costs more, "
-        'the poses that the turn had alone are tried: most sound turns have less', 1.0, 1e4)
-    patch_half_window: int = setting(7, 'px; of the affine registration', 3, 25)
-    max_shift_px: float = setting(
-        3.0, 'px; a registration that moves a point farther has lost it', 0.2, 20.0)
+    min_explained: float = expert(
+        0.3, "of a turn's observations; a turn of which the camera explains fewer is dropped",
+        0.0, 0.9)
+    good_cost: float = expert(
+        1.2, 'px^2 per observation; a turn that costs more is chained with other tracks, too',
+        0.0, 1e4)
+    well_explained: float = expert(
+        0.9, "of a turn's observations; with fewer it is chained anew with the common camera",
+        0.0, 1.0)
+    well_fitting: float = expert(
+        1.25, "times a turn's cost with its own camera; above it, its own poses are tried, too",
+        1.0, 1e4)
+    patch_half_window: int = expert(7, 'px; of the affine registration', 3, 25)
+    max_shift_px: float = expert(
+        3.0, 'px; a registration that moves a point farther is wrong', 0.2, 20.0)
 
 
 @dataclass(frozen=True)
 class IntrinsicsConfig:
-    """Scenes -> the six parameters: how far each may move, and what is believed of it before."""
+    """Scenes -> the six parameters: their bounds and their priors."""
 
-    rounds: int = setting(
+    rounds: int = expert(
         2, 'adjustments of each step at the most, with new triangulation between', 1, 10)
-    settled: float = setting(
-        0.002, "of the observations; where new triangulation changes fewer, step 2 ends: another "
-        'round moved nothing by more than 0.1 sigma on seven drives', 0.0, 1.0)
-    focal_reach: float = setting(
-        1.35, 'ratio; step 1 looks so far to either side of the profile\'s minimum', 1.0, 3.0)
-    focal_bound: float = setting(
-        0.15, 'of step 1\'s; step 2 moves fx and fy no farther', 0.01, 0.5)
-    centre_bound: float = setting(0.1, 'of the size; AliceVision\'s bound', 0.01, 0.5)
-    k_bound: float = setting(1.0, 'k1 and k2 beyond are no lens', 0.1, 5.0)
-    first_tracks: int = setting(
+    settled: float = expert(
+        0.002, 'of the observations; where new triangulation changes fewer, step 2 ends', 0.0, 1.0)
+    focal_reach: float = expert(
+        1.35, "ratio; step 1 searches this far to either side of the profile's minimum", 1.0, 3.0)
+    focal_bound: float = expert(
+        0.15, "of step 1's; step 2 moves fx and fy no farther", 0.01, 0.5)
+    centre_bound: float = expert(0.1, "of the size; AliceVision's bound", 0.01, 0.5)
+    k_bound: float = expert(1.0, 'no lens has larger k1 and k2', 0.1, 5.0)
+    first_tracks: int = expert(
         200, 'of each turn, until step 2 has begun; then all', 20, 5000)
-    loss: float = setting(
-        1.0, 'times the median reprojection error; scale of the Cauchy loss: with 0.5 px, four '
-        'medians, cy came out twice as far off', 0.1, 100.0)
-    profile_tracks: int = setting(
+    loss: float = expert(
+        1.0, 'times the median reprojection error; scale of the Cauchy loss', 0.1, 100.0)
+    profile_tracks: int = expert(
         120, 'of each turn, for the focal profile around the result', 20, 5000)
-    aspect_sigma: float = setting(
+    aspect_sigma: float = expert(
         0.003, 'fy / fx is 1 to within this: planar turns know fx but hardly fy', 1e-5, 1.0)
-    shutter_rounds: int = setting(
-        5, 'corrections of a rolling shutter at the most; 0 takes every shutter for global', 0, 20)
-    shutter_sigmas: float = setting(
-        5.0, 'of its readout; less is taken for a global shutter', 1.0, 100.0)
-    least_readout_ms: float = setting(
+    shutter_rounds: int = expert(
+        5, 'corrections of a rolling shutter at the most; with 0 every shutter counts as global',
+        0, 20)
+    shutter_sigmas: float = expert(
+        5.0, 'of its readout; a shorter readout counts as a global shutter', 1.0, 100.0)
+    least_readout_ms: float = expert(
         1.0, 'ms; six global shutters came out at 0.0 to 0.5', 0.0, 100.0)
-    focal_floor: float = setting(
-        0.0005, 'of fx, in every sigma: tracking itself; five rendered drives came out 0.01 to '
-        '0.06 % off', 0.0, 0.1)
-    centre_floor: float = setting(
+    focal_floor: float = expert(
+        0.0005, 'of fx, added to the sigma of fx and fy: systematic errors of the tracking',
+        0.0, 0.1)
+    centre_floor: float = expert(
         0.0003, 'of the width, the same for cx and cy', 0.0, 0.1)
-    centre_sigma: float = setting(
+    centre_sigma: float = expert(
         0.02, 'of the width; how far lenses sit off the middle of their sensors', 1e-4, 1.0)
 
 
@@ -182,40 +201,43 @@ class IntrinsicsConfig:
 class VerdictConfig:
     """When a result is weak or refused."""
 
-    min_turns: int = setting(2, 'turns; fewer are weak: focal lengths settle at 2 (paper)', 1, 20)
-    min_yaw_deg: float = setting(
-        60.0, 'degrees over all turns; less is weak', 0.0, 1000.0)
-    refused_yaw_deg: float = setting(
-        10.0, 'degrees over all turns; with less there was no turn', 0.0, 1000.0)
-    min_contrast: float = setting(
+    max_sigma: float = setting(0.015, 'sigma of fx, of fx; more is weak', 0.0, 1.0)
+    min_turns: int = expert(2, 'turns; fewer are weak: focal lengths settle at 2 (paper)', 1, 20)
+    min_yaw_deg: float = expert(60.0, 'degrees over all turns; less is weak', 0.0, 1000.0)
+    refused_yaw_deg: float = expert(
+        10.0, 'degrees over all turns; less is refused', 0.0, 1000.0)
+    min_contrast: float = expert(
         0.05, 'relative rise of the error 25 % off the focal length; less is weak', 0.0, 10.0)
-    refused_contrast: float = setting(
-        0.01, 'the same; with less nothing can be known', 0.0, 10.0)
-    max_sigma: float = setting(0.015, 'of fx; more is weak', 0.0, 1.0)
-    refused_sigma: float = setting(0.1, 'of fx; more is no result', 0.0, 1.0)
-    max_aspect: float = setting(
+    refused_contrast: float = expert(
+        0.01, 'the same; less is refused', 0.0, 10.0)
+    refused_sigma: float = expert(0.1, 'sigma of fx, of fx; more is refused', 0.0, 1.0)
+    max_aspect: float = expert(
         0.015, 'fy / fx farther from 1 is weak; a rolling shutter of 20 ms made it 0.04', 0.0, 1.0)
-    max_readout_ms: float = setting(
+    max_readout_ms: float = expert(
         50.0, 'ms; a rolling shutter that takes longer is weak: one picture at 20 fps', 0.0, 1e4)
-    max_disagreement: float = setting(
+    max_disagreement: float = expert(
         0.03, 'of fx; weighted scatter between the turns, more is weak', 0.0, 1.0)
-    max_leverage: float = setting(
-        0.9, 'of what is known of fx; where one turn gives more, the others cannot confirm it: '
-        'KITTI 03 has 0.7, and 0.95 without its turn at 753: fx is 1.0 % off then at 0.4 to 0.9 % '
-        'of sigma; rendered drives have 0.2 to 0.5', 0.0, 1.0)
-    told_model_error: float = setting(
-        0.005, 'of fx, for fx and fy, or of the width, for cx and cy; where p1, p2 and k3 would '
-        'move one of them by more, a warning says so: KITTI 03 has 0.009, p1 and p2 of 0.001 make '
-        '0.01, rendered lenses without them have 0.001', 0.0, 1.0)
-    max_misfit: float = setting(
-        2.0, "times a turn's cost with a camera of its own; more is weak: sound turns have 0.5 to "
-        '1.5, turns of another lens in the same drive 4.6 to 25', 1.0, 1e4)
+    max_leverage: float = expert(
+        0.9, 'of the information about fx; the others cannot confirm a turn that gives more',
+        0.0, 1.0)
+    max_untold_model_error: float = expert(
+        0.005, 'of fx or the width; a warning comes if p1, p2 and k3 would change more', 0.0, 1.0)
+    max_misfit: float = expert(
+        2.0, "times a turn's cost with a camera of its own; more is weak: another lens", 1.0, 1e4)
 
 
 @dataclass(frozen=True)
 class Config:
     """All settings. Raises ConfigError for a value of the wrong type, NaN or out of range."""
 
+    seed: int = setting(0, 'same input and seed: same result', 0, 2**31 - 1)
+    threads: int = setting(
+        2, 'processes that reconstruct turns side by side; the result is the same with any', 1, 64)
+    model: str = setting(
+        'radial', "of the lens; radial: the paper's fx fy cx cy k1 k2", pattern='[a-z_]+')
+    max_width: int = setting(
+        1440, 'px; wider images are halved until they fit: time and memory fall by four',
+        320, 16384)
     motion: MotionConfig = field(default_factory=MotionConfig)
     mask: MaskConfig = field(default_factory=MaskConfig)
     turns: TurnsConfig = field(default_factory=TurnsConfig)
@@ -223,12 +245,6 @@ class Config:
     scene: SceneConfig = field(default_factory=SceneConfig)
     intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
     verdict: VerdictConfig = field(default_factory=VerdictConfig)
-    seed: int = setting(0, 'same input and seed: same result', 0, 2**31 - 1)
-    threads: int = setting(
-        2, 'processes that reconstruct turns side by side; the result is the same with any', 1, 64)
-    max_width: int = setting(
-        1440, 'px; wider images are halved until they fit: time and memory fall by four',
-        320, 16384)
 
     def __post_init__(self) -> None:
         for name, spec, value in _settings(self):
@@ -272,9 +288,14 @@ class Config:
 
 
 def describe() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
-    """Yield (full name, field) of every setting; field.metadata has reason, minimum, maximum."""
-    for name, spec, _ in _settings(Config()):
-        yield name, spec
+    """Yield (full name, field) of every setting, those for experts after the others.
+
+    field.metadata has reason, minimum, maximum, choices, pattern and expert.
+    """
+    for wanted in (False, True):
+        for name, spec, _ in _settings(Config()):
+            if spec.metadata['expert'] is wanted:
+                yield name, spec
 
 
 def _settings(config: Config) -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:

@@ -5,8 +5,12 @@ Each message is one line that says what is wrong and names the cure.
 
 
 def one_line(error: Exception, limit: int = 160) -> str:
-    """Return what somebody else's error says, or its kind, on one line and short."""
-    text = ' '.join(str(error).split()) or type(error).__name__
+    """Return another library's error message, or else its type, on one short line."""
+    return shortened(' '.join(str(error).split()) or type(error).__name__, limit)
+
+
+def shortened(text: str, limit: int = 160) -> str:
+    """Return the text, or its beginning where it is too long for a message."""
     return text if len(text) <= limit else text[:limit - 1] + '…'
 
 

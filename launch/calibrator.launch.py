@@ -26,6 +26,7 @@ def generate_launch_description():
         Node(
             package='dashcalib_ros', executable='calibrator', name='calibrator',
             namespace=value['namespace'], output='screen',
+            respawn=True, respawn_delay=2.0,
             parameters=[value['config'], {'image_transport': value['image_transport'],
                                           'use_sim_time': value['use_sim_time']}],
             remappings=[('image_raw', value['image']), ('camera_info', value['camera_info'])]),

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dashcalib_ros.camera import Radial
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.reconstruction.camera import Camera
 from dashcalib_ros.reconstruction.scene import Draft, Profile
 from dashcalib_ros.reconstruction.tracks import Tracks
 
@@ -45,6 +45,14 @@ def sleep(seconds, started=None):
         Path(started).write_text(str(os.getpid()))
     time.sleep(seconds)
     return 'slept'
+
+
+def compute(seconds):
+    """Use the processor for so long."""
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+    return 'computed'
 
 
 def echo(value):
@@ -93,7 +101,7 @@ def die_at_first(flag):
     return 'second time'
 
 
-# stand-ins for workshop.draft_turn(turn, config, valid)
+# stand-ins for stages.draft(turn, config, valid)
 
 def build_dies(turn, config, valid):
     with Path(turn.frames[0]).open('a') as log:
@@ -127,20 +135,20 @@ def draft(turn, config, valid):
     noted(turn, f'draft of {turn.center}')
     frames = np.array([frame.index for frame in turn.frames[::2]])
     tracks = Tracks(frames, np.zeros((len(frames), 0, 2)), (64, 48), frames)
-    return Draft(tracks, Profile(np.ones(1), np.ones(1), 1), Camera.centred((64, 48), 50.0))
+    return Draft(tracks, Profile(np.ones(1), np.ones(1), 1), Radial.centred((64, 48), 50.0))
 
 
-# stand-ins for workshop.build_turn(turn, config, draft)
+# stand-ins for stages.finish(turn, config, begun)
 
-def finish(turn, config, draft):
+def finish(turn, config, begun):
     noted(turn, f'scene of {turn.center}')
-    assert draft.start.fx == 50.0
+    assert begun.start.fx == 50.0
     return [frame.index for frame in turn.frames]
 
 
-def finish_dies_at_first(turn, config, draft):
+def finish_dies_at_first(turn, config, begun):
     die_at_first(f'{turn.frames[0].frame_id}.{turn.center}')
-    return finish(turn, config, draft)
+    return finish(turn, config, begun)
 
 
 def noted(turn, text):

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dashcalib_ros.reconstruction.camera import Camera
-from dashcalib_ros.reconstruction.chain import Structure
+from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.reconstruction.scene import Profile, Scene, retriangulated
+from dashcalib_ros.reconstruction.structure import Structure
 from dashcalib_ros.reconstruction.tracks import Tracks
+from dashcalib_ros.turns import TurnId
 
 SIZE = (800, 450)
-LENS = Camera(SIZE, 520.0, 521.0, 407.0, 219.0, -0.28, 0.09)
+LENS = Radial(SIZE, 520.0, 521.0, 407.0, 219.0, -0.28, 0.09)
 # between two keyframes
 KEYFRAME_S = 0.3
 NEAR_M, FAR_M = 2.0, 45.0
@@ -30,7 +31,7 @@ class SyntheticTurn:
         ratios = ratio * np.array([0.64, 0.8, 1.0, 1.25, 1.56])
         costs = 0.1 + np.log(ratios / ratio) ** 2
         profile = Profile(ratios, costs, int(self.tracks.seen.sum()))
-        scene = Scene(center, self.tracks, self.structure, camera, profile)
+        scene = Scene(TurnId.at(center), self.tracks, self.structure, camera, profile)
         return retriangulated(scene, camera, 2.0, 1.0)
 
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -9,23 +10,28 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / 'dashcalib_ros'
-ROOMS = ('frames', 'motion', 'turns', 'reconstruction', 'intrinsics', 'report', 'ros', 'demo',
-         'cli')
-CORE = {'frames', 'motion', 'turns', 'reconstruction', 'intrinsics'}
-EVERYWHERE = {'config', 'errors'}
+# in the order in which data flows: a room imports from those above it
+ROOMS = ('arrays', 'camera', 'frames', 'bags', 'inputs', 'motion', 'turns', 'reconstruction',
+         'solve', 'turn_store', 'judgement', 'stages', 'workers', 'selection', 'calibrator',
+         'report', 'standard_streams', 'ros', 'demo', 'cli')
+EVERYWHERE = {'config', 'errors', 'arrays', 'limits'}
 # what is not simply "all rooms above"
-ALLOWED = {
+ALLOWED: dict[str, set[str]] = {
     'config': {'errors'},
     'errors': set(),
-    'calibrator': CORE,
-    '__init__': {'calibrator', 'frames'},
-    'report': CORE,
-    'ros': CORE | {'report', 'calibrator'},
-    'demo': {'frames', 'intrinsics'},
-    'cli': CORE | {'report', 'demo', 'calibrator'},
+    'limits': {'errors'},
+    'arrays': set(),
+    '__init__': {'calibrator', 'inputs'},
+    'demo': {'camera', 'frames', 'bags', 'judgement'},
 }
-HOMES = {'pycolmap': {'reconstruction', 'intrinsics'}, 'pyceres': {'reconstruction', 'intrinsics'},
+# rooms that nobody but these may import
+BORDERS = {'ros': set(), 'cli': set(), 'demo': {'cli'}}
+HOMES = {'pycolmap': {'reconstruction', 'solve'}, 'pyceres': {'reconstruction', 'solve'},
          'rclpy': {'ros'}, 'onnxruntime': {'motion'}}
+# what geometry has no use for
+MACHINERY = ('threading', 'multiprocessing', 'subprocess', 'concurrent', 'queue', 'signal', 'os',
+             'pathlib', 'shutil', 'tempfile', 'io')
+GEOMETRY = ('camera', 'reconstruction', 'solve')
 MODULES = sorted(PACKAGE.rglob('*.py'))
 
 
@@ -47,14 +53,38 @@ def imports(path: Path) -> list[tuple[str, int]]:
     return found
 
 
+def module_graph(package: Path) -> dict[str, set[str]]:
+    """Return the modules that each module of a package imports, also for type checking only.
+
+    The package's own __init__ is left out: it loads what it re-exports at the first use.
+    """
+    names = {path: '.'.join([package.name, *path.relative_to(package).with_suffix('').parts]
+                            ).removesuffix('.__init__') for path in package.rglob('*.py')}
+    modules = set(names.values()) - {package.name}
+    graph: dict[str, set[str]] = {}
+    for path, module in names.items():
+        found = set()
+        for name, _ in imports(path):
+            # the name of a module, or of something in it
+            owner = next((each for each in (name, name.rpartition('.')[0]) if each in modules), '')
+            found |= {owner} - {'', module}
+        if module in modules:
+            graph[module] = found
+    return graph
+
+
 def may_import(room: str) -> set[str]:
     above = set(ROOMS[:ROOMS.index(room)]) if room in ROOMS else set()
-    return ALLOWED.get(room, above) | (EVERYWHERE if room != 'errors' else set()) | {room}
+    above -= {border for border, users in BORDERS.items() if room not in users}
+    shared = EVERYWHERE if room not in EVERYWHERE else set()
+    return ALLOWED.get(room, above) | shared | {room}
 
 
 def test_every_folder_is_a_known_room():
     folders = {path.name for path in PACKAGE.iterdir() if (path / '__init__.py').exists()}
-    assert folders == set(ROOMS)
+    files = {path.stem for path in PACKAGE.glob('*.py')}
+    files -= {'__init__', 'config', 'errors', 'limits'}
+    assert folders | files == set(ROOMS)
 
 
 @pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
@@ -65,16 +95,44 @@ def test_imports_only_from_rooms_above(path):
         if package != 'dashcalib_ros':
             continue
         other = rest.split('.')[0]
-        if other not in (*ROOMS, *EVERYWHERE, 'calibrator'):
+        if other not in (*ROOMS, *EVERYWHERE):
             other = '__init__'  # a name that the package itself offers
         assert other in may_import(room), f'{path}:{line}: {room} imports {name}'
 
 
+def test_no_module_imports_itself_through_others():
+    graph = module_graph(PACKAGE)
+    assert len(graph) == len(MODULES) - 1 and 'dashcalib_ros.calibrator' in graph
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError with the modules in it
+
+
+def test_a_circle_for_type_checking_would_be_noticed(tmp_path):
+    package = tmp_path / 'example'
+    package.mkdir()
+    for name, text in {
+            '__init__': 'from example.one import f', 'one': 'import example.two',
+            'two': 'from typing import TYPE_CHECKING\n'
+                   'if TYPE_CHECKING:\n    from example.one import f'}.items():
+        (package / f'{name}.py').write_text(text)
+    graph = module_graph(package)
+    assert graph == {'example.one': {'example.two'}, 'example.two': {'example.one'}}
+    with pytest.raises(graphlib.CycleError):
+        graphlib.TopologicalSorter(graph).prepare()
+
+
 def test_the_rules_would_notice():
     assert 'ros' not in may_import('cli') and 'cli' not in may_import('ros')
-    assert 'intrinsics' not in may_import('reconstruction')
-    assert may_import('frames') == {'frames', 'config', 'errors'}
-    assert 'calibrator' not in may_import('report')
+    assert 'demo' in may_import('cli') and 'demo' not in may_import('ros')
+    assert 'solve' not in may_import('reconstruction')
+    assert may_import('frames') == {'frames', 'camera'} | EVERYWHERE
+    assert 'report' not in may_import('calibrator')
+
+
+@pytest.mark.parametrize('room', GEOMETRY)
+def test_geometry_knows_no_threads_processes_or_files(room):
+    for path in (PACKAGE / room).glob('*.py'):
+        for name, line in imports(path):
+            assert name.split('.')[0] not in MACHINERY, f'{path}:{line} imports {name}'
 
 
 @pytest.mark.parametrize('library', HOMES)
@@ -106,10 +164,14 @@ def loaded_by(code: str, *modules: str) -> set[str]:
 
 
 @pytest.mark.parametrize('module', [
-    'dashcalib_ros', 'dashcalib_ros.intrinsics', 'dashcalib_ros.calibrator',
-    'dashcalib_ros.reconstruction.workshop'])
+    'dashcalib_ros', 'dashcalib_ros.judgement', 'dashcalib_ros.calibrator',
+    'dashcalib_ros.workers.pool'])
 def test_colmap_is_loaded_by_the_child_only(module):
     assert loaded_by(f'import {module}', 'pycolmap', 'pyceres', 'rclpy') == set()
+
+
+def test_the_processes_that_reconstruct_turns_load_no_more_than_they_need():
+    assert loaded_by('import dashcalib_ros.stages', 'scipy', 'rosbags', 'rich') == set()
 
 
 def test_colmap_is_loaded_where_it_is_used():

@@ -8,6 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.standard_streams import write_stdout
+
 PROGRAM = 'dashcalib'
 INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, '
               'or a folder of images')
@@ -15,19 +18,27 @@ EXIT_HELP = ('exit codes: 0 accepted; 3 weak or refused (the input was fine, the
              'not enough); 2 bad input or usage')
 
 
+class UsageError(DashcalibError):
+    """The arguments are wrong."""
+
+
 class Parser(argparse.ArgumentParser):
-    """argparse's, with one line for a usage error."""
+    """argparse's parser; usage errors are one line, and an unusable stdout is an error."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
-        """End with exit code 2 and one line that tells where to read on."""
-        self.exit(2, f'{PROGRAM}: error: {message}; see {self.prog} --help\n')
+        """Raise UsageError: one line that names --help."""
+        raise UsageError(f'{message}; see {self.prog} --help')
+
+    def print_help(self, file: Any = None) -> None:
+        """Print the help on stdout. Raises OutputError where it cannot."""
+        write_stdout(self.format_help().rstrip('\n'))
 
 
 class Version(argparse.Action):
-    """--version; looks the version up only when asked."""
+    """--version; looks the version up only when it is used."""
 
     def __init__(self, option_strings: Sequence[str], dest: str) -> None:
         super().__init__(option_strings, dest, nargs=0, help='print the version and exit')
@@ -39,12 +50,12 @@ class Version(argparse.Action):
             found = version('dashcalib_ros')
         except PackageNotFoundError:
             found = 'not installed (running from its sources)'
-        print(f'{PROGRAM} {found}')
+        write_stdout(f'{PROGRAM} {found}')
         parser.exit()
 
 
 def make_parser() -> Parser:
-    """Return the parser; the parsed arguments' command is the function to call with them."""
+    """Return the parser; the parsed arguments have the function to call with them as `command`."""
     parser = Parser(
         prog=PROGRAM, epilog=EXIT_HELP,
         description='Calibrates a dashcam from the turns the car takes anyway.')
@@ -62,9 +73,11 @@ def _add_run(commands: Any) -> None:
                       'Writes calibration.yaml (accepted), result.json and report.html to DIR.')
     _add_drive_arguments(parser)
     parser.add_argument('--threads', type=int, metavar='N',
-                        help='threads of one reconstruction; more than 1 is not reproducible')
+                        help='processes that reconstruct turns side by side; the result is the '
+                             'same with any')
     parser.add_argument('--write-bag', type=Path, metavar='OUT',
-                        help='when accepted: INPUT again, a bag, with camera_info per image')
+                        help='when accepted: write a copy of the bag INPUT with a camera_info for '
+                             'each image')
     _add_out(parser, 'calibration')
 
 
@@ -117,7 +130,8 @@ def _add_drive_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--mask', type=Path, metavar='PNG',
                         help='black pixels are not used; as large as the images')
     parser.add_argument('--segmentation', metavar='MODEL.onnx',
-                        help='a network that sees the own car, asked beside the automatic mask')
+                        help='a segmentation network that finds the own car, used in addition to '
+                             'the automatic mask')
     parser.add_argument('--config', type=Path, metavar='YAML', help='settings from a file')
     parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
                         help='one setting, over those of --config; may be repeated')

@@ -12,23 +12,25 @@ from time import perf_counter
 
 from rich.text import Text
 
+from dashcalib_ros.camera import Radial, camera_of
 from dashcalib_ros.cli import exit_codes
 from dashcalib_ros.cli.drive import calibrate
-from dashcalib_ros.cli.run import now
+from dashcalib_ros.cli.run import now, set_aside_lines
 from dashcalib_ros.cli.settings import read_config
-from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
+from dashcalib_ros.cli.terminal import Stages, show, show_text, summary_of_files, warn
 from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.errors import OutputError
-from dashcalib_ros.frames import open_frames
-from dashcalib_ros.intrinsics import Calibration, Intrinsics
+from dashcalib_ros.inputs import open_frames
+from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.report import (
-    Camera,
-    camera_of,
+    NamedCamera,
+    calibrated_camera,
     compare,
     output_folder,
     write_results,
     write_text,
 )
+from dashcalib_ros.report.files import TRUTH
 from dashcalib_ros.report.tables import against_truth, summary
 
 
@@ -43,14 +45,15 @@ def demo(args: argparse.Namespace) -> int:
             render_to_bag(drive, bag)
             calibration = calibrate(open_frames(bag), config, None, args.verbose, stages)
         calibration = dataclasses.replace(calibration, input_name=f'demo drive {config.seed}')
-        written = (*write_results(calibration, out, created=now()),
-                   _write_truth(out, drive.truth, calibration.image_size))
-    warn(calibration.warnings)
-    show(summary(calibration))
-    _show_errors(calibration, drive.truth)
-    show_text('written: ' + ', '.join(map(str, written))
-              + (f', {out / "bag"}' if args.keep_bag else ''))
-    show_text(f'rendered and calibrated in {perf_counter() - started:.0f} s')
+        written = write_results(calibration, out, created=now())
+        truth = _write_truth(out, drive.truth, calibration.image_size)
+    warn((*calibration.warnings, *set_aside_lines(written)))
+    files = (*written.files, truth, *((out / 'bag',) if args.keep_bag else ()))
+    with summary_of_files():
+        show(summary(calibration))
+        _show_errors(calibration, drive.truth)
+        show_text('written: ' + ', '.join(map(str, files)))
+        show_text(f'rendered and calibrated in {perf_counter() - started:.0f} s')
     return exit_codes.of_verdict(calibration.verdict.level)
 
 
@@ -65,17 +68,18 @@ def _bag_path(out: Path, keep: bool) -> Iterator[Path]:
         yield Path(folder) / 'bag'
 
 
-def _write_truth(out: Path, truth: Intrinsics, size: tuple[int, int]) -> Path:
-    path = out / 'truth.json'
-    values = {**dataclasses.asdict(truth), 'width': size[0], 'height': size[1]}
+def _write_truth(out: Path, truth: dict[str, float], size: tuple[int, int]) -> Path:
+    path = out / TRUTH
+    values = {**truth, 'width': size[0], 'height': size[1]}
     write_text(path, json.dumps(values, allow_nan=False) + '\n')
     return path
 
 
-def _show_errors(calibration: Calibration, truth: Intrinsics) -> None:
-    if calibration.intrinsics is None:
+def _show_errors(calibration: Calibration, truth: dict[str, float]) -> None:
+    if calibration.camera is None:
         show(Text('no estimate to compare with the truth'))
         return
-    reference = Camera('truth', calibration.image_size, truth)
+    reference = NamedCamera('truth', camera_of(
+        Radial.model, calibration.image_size, list(truth.values())))
     show(Text('\nagainst the truth'))
-    show(against_truth(compare(camera_of(calibration), reference)))
+    show(against_truth(compare(calibrated_camera(calibration), reference)))

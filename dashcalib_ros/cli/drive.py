@@ -1,4 +1,4 @@
-"""Feeding a drive to the calibrator, and closing everything whatever happens."""
+"""Feeding a drive to the calibrator, which is closed in any case."""
 from __future__ import annotations
 
 import dataclasses
@@ -6,20 +6,16 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
+from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
-from dashcalib_ros.frames import FrameSource
+from dashcalib_ros.frames import Frame, FrameSource
 from dashcalib_ros.frames.mask_file import check_mask
-from dashcalib_ros.intrinsics import Calibration
-
-if TYPE_CHECKING:
-    Mask = npt.NDArray[np.bool_]
+from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.turns import Turn
 
 
 @contextmanager
@@ -33,18 +29,28 @@ def open_calibrator(config: Config, mask: Mask | None, verbose: bool) -> Iterato
             calibrator.close()
 
 
-def feed(calibrator: Calibrator, source: FrameSource, mask: Mask | None, stages: Stages) -> int:
+class Taker(Protocol):
+    """What frames are pushed into: a Calibrator or a Detection."""
+
+    def push(self, frame: Frame) -> object:
+        """Take the next frame."""
+
+    def turns(self) -> tuple[Turn, ...]:
+        """Return the turns found so far."""
+
+
+def feed(taker: Taker, source: FrameSource, mask: Mask | None, stages: Stages) -> int:
     """Push every frame of the drive; return how many there were."""
     frames = 0
     stages.show('reading', None)
     for frame in source:
         if not frames:
             check_mask(mask, frame.size)
-        status = calibrator.push(frame)
+        taker.push(frame)
         frames += 1
-        turns = '1 turn' if status.turns == 1 else f'{status.turns} turns'
+        count = len(taker.turns())
         stages.show('reading', frames / source.count if source.count else None,
-                    f'frame {frames}, {turns}')
+                    f'frame {frames}, {count} turn{"" if count == 1 else "s"}')
     return frames
 
 
@@ -61,7 +67,7 @@ def calibrate(source: FrameSource, config: Config, mask: Mask | None, verbose: b
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Hold Ctrl-C and SIGTERM off while a child process is being ended."""
+    """Ignore Ctrl-C and SIGTERM while child processes are being ended."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,33 +1,36 @@
-"""main: from arguments to an exit code; the one place where known errors become one line."""
+"""main: from arguments to an exit code; here known errors become one line on stderr."""
 from __future__ import annotations
 
 import errno
 import signal
-import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any
 
 from dashcalib_ros.cli.arguments import PROGRAM, make_parser
 from dashcalib_ros.cli.exit_codes import BAD_INPUT, INTERRUPTED
 from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.standard_streams import open_closed_streams, write_stderr
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code; argv: arguments without the program's name."""
+    open_closed_streams()
+    # the handler is set inside try: a signal may also come while it is set or restored
     try:
         args = make_parser().parse_args(argv)
-    except SystemExit as end:  # argparse's way to end after --help, --version and usage errors
-        return end.code if isinstance(end.code, int) else BAD_INPUT
-    # a signal may come while its handler is set or taken back, too
-    try:
         with _sigterm_like_ctrl_c():
             code: int = args.command(args)
             return code
+    except SystemExit as end:  # argparse's way to end after --help and --version
+        return end.code if isinstance(end.code, int) else BAD_INPUT
     except DashcalibError as error:
         return _fail(str(error))
     except KeyboardInterrupt:
+        # `python -m` ends with SIGINT instead of our exit code when an interrupt, caught or not,
+        # came out of exec('text'), as dataclasses call it on import; the next exec() resets that
+        exec('pass')
         return _fail('interrupted', INTERRUPTED)
     except ModuleNotFoundError as error:
         if not error.name or error.name.startswith('dashcalib_ros'):
@@ -36,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError:
         return _fail('out of memory; close other programs or lower turns.capacity')
     except BrokenPipeError:
-        return _fail('the program that was to read the output has gone')
+        return _fail('the program that reads the output has ended')
     except OSError as error:
         return _fail(_os_error(error))
 
@@ -55,9 +58,7 @@ def _sigterm_like_ctrl_c() -> Iterator[None]:
 
 
 def _fail(message: str, code: int = BAD_INPUT) -> int:
-    line = ' '.join(message.split())
-    with suppress(OSError, ValueError):  # stderr may be closed, too
-        print(f'{PROGRAM}: error: {line}', file=sys.stderr, flush=True)
+    write_stderr(f'{PROGRAM}: error: {" ".join(message.split())}')
     return code
 
 

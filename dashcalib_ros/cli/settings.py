@@ -1,4 +1,4 @@
-"""From --config, --set and the dedicated flags to a Config."""
+"""From --config, --set and the options for single settings to a Config."""
 from __future__ import annotations
 
 import argparse
@@ -7,19 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.errors import ConfigError, InputError, shortened
+from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 
-# who asks for a number of turns gets that number
+# --turns sets both, so that exactly this number of turns is used
 FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads': ('threads',),
          'segmentation': ('mask.segmentation',)}
 EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+')  # 1e-3, a word to YAML 1.1
 
 
 def read_config(args: argparse.Namespace) -> Config:
-    """Return the settings: --config, then --set over it, then the flags of their own."""
+    """Return the settings from --config, --set, and --turns and the like; later ones count."""
     path: Path | None = getattr(args, 'config', None)
     config = Config() if path is None else Config.from_mapping(_read_yaml(path))
     changes = parse_settings(getattr(args, 'set', []))
@@ -34,26 +33,21 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
     for pair in pairs:
         key, equals, text = pair.partition('=')
         if not equals or not key.strip():
-            raise ConfigError(f'--set needs KEY=VALUE (turns.wanted=4), not {pair!r}')
+            raise ConfigError(f'--set needs KEY=VALUE (turns.wanted=4), not {shortened(pair)!r}')
+        what = f'--set {shortened(pair)}: the value'
         try:
-            changes[key.strip()] = _numbers(yaml.safe_load(text))
-        except (yaml.YAMLError, ValueError) as error:
-            raise ConfigError(f'--set {pair}: the value is not valid YAML; '
-                              'write a plain number, true or false') from error
+            changes[key.strip()] = _numbers(parse_yaml(text, what))
+        except InputError as error:
+            raise ConfigError(f'{error}; write a plain number, true or false') from error
     return changes
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
-        data = yaml.safe_load(path.read_bytes())
-    except OSError as error:
-        raise ConfigError(f'cannot read the configuration {path} ({error.strerror}); '
-                          'check the path') from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, 'problem_mark', None)
-        where = f' at line {mark.line + 1}' if mark else ''
-        raise ConfigError(f'the configuration {path} is not valid YAML{where}; '
-                          'write lines like turns.wanted: 4') from error
+        what = f'the configuration {path}'
+        data = parse_yaml(read_text(path, YAML_BYTES, what), what)
+    except InputError as error:
+        raise ConfigError(f'{error}; write lines like turns.wanted: 4') from error
     if data is None:
         return {}
     if not isinstance(data, Mapping):

@@ -2,10 +2,9 @@
 from __future__ import annotations
 
 import io
-import os
 import sys
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 
 from rich.console import Console, RenderableType
@@ -19,13 +18,16 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-PIPE_WIDTH = 100  # columns where there is no terminal to ask
+from dashcalib_ros.errors import OutputError
+from dashcalib_ros.standard_streams import write_stderr, write_stdout
+
+PIPE_WIDTH = 100  # columns where there is no terminal
 STEPS = 1000  # a stage's fraction is shown in thousandths
 
 
 def show(renderable: RenderableType) -> None:
-    """Print a result on stdout."""
-    terminal = sys.stdout.isatty()
+    """Print a result on stdout. Raises OutputError where it is closed or full."""
+    terminal = sys.stdout is not None and sys.stdout.isatty()
     text = io.StringIO()
     console = Console(file=text, force_terminal=terminal, highlight=False,
                       width=None if terminal else PIPE_WIDTH,
@@ -36,22 +38,23 @@ def show(renderable: RenderableType) -> None:
 
 
 def show_text(text: str) -> None:
-    """Print text on stdout. That its reader has gone (head, less) does not change the outcome."""
-    with suppress(AttributeError, ValueError):
-        sys.stdout.reconfigure(errors='replace')  # type: ignore[union-attr]
+    """Print text on stdout. Raises OutputError where it is closed or full."""
+    write_stdout(text)
+
+
+@contextmanager
+def summary_of_files() -> Iterator[None]:
+    """Make an unusable stdout only a warning: the results shown inside are in files already."""
     try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        # the interpreter flushes once more at its end: let it do so into nothing
-        with suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        yield
+    except OutputError as error:
+        warn([str(error)])
 
 
 def warn(lines: Iterable[str]) -> None:
     """Print warnings on stderr, one line each."""
     for line in lines:
-        with suppress(OSError, ValueError):
-            print(f'dashcalib: warning: {" ".join(line.split())}', file=sys.stderr, flush=True)
+        write_stderr(f'dashcalib: warning: {" ".join(line.split())}')
 
 
 class Stages:
@@ -73,11 +76,11 @@ class Stages:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        """Take the drawing away."""
+        """Remove the drawing."""
         self._progress.stop()
 
     def show(self, stage: str, fraction: float | None = None, note: str = '') -> None:
-        """Show a stage at fraction 0..1 (None: nobody knows), and a note beside its name."""
+        """Show a stage at fraction 0..1 (None: unknown), and a note beside its name."""
         if stage != self._stage or self._task is None:
             if self._task is not None:
                 self._progress.remove_task(self._task)

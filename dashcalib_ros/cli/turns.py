@@ -8,32 +8,34 @@ from typing import Any
 from rich.text import Text
 
 from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.drive import feed, open_calibrator
+from dashcalib_ros.cli.drive import feed
 from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
-from dashcalib_ros.frames import open_frames
 from dashcalib_ros.frames.mask_file import read_mask
+from dashcalib_ros.inputs import open_frames
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.tables import text_table
+from dashcalib_ros.turns import Turn
+from dashcalib_ros.turns.detection import Detection
 
 COLUMNS = ('frame', 'from', 'to', 'at s', 'prominence', 'images')
 
 
 def turns(args: argparse.Namespace) -> int:
-    """List the turns found, best first. None found is an answer too: exit code 0."""
-    # detection only: no earlier drive's turns beside these, and none of these kept
-    config = read_config(args).replace({'turns.store': ''})
+    """List the turns found, best first. The exit code is 0, also if there are none."""
+    config = read_config(args)
     mask = None if args.mask is None else read_mask(args.mask)
     source = open_frames(args.input, topic=args.topic, fps=args.fps)
-    with open_calibrator(config, mask, args.verbose) as calibrator:
-        with Stages() as stages:
-            frames = feed(calibrator, source, mask, stages)
-        found = [_row(turn) for turn in calibrator.turns()]
-    warn(source.warnings)
+    detection = Detection(config, mask)
+    with Stages() as stages:
+        frames = feed(detection, source, mask, stages)
+    detection.finish()
+    found = [_row(turn) for turn in detection.turns()]
+    warn((*source.warnings, *detection.warnings()))
     if args.json:
         show_text(json.dumps(plain_values({
             'input': source.name, 'frames': frames, 'turns': found,
-            'warnings': source.warnings}), indent=2, allow_nan=False))
+            'warnings': (*source.warnings, *detection.warnings())}), indent=2, allow_nan=False))
         return exit_codes.ACCEPTED
     if found:
         show(text_table(COLUMNS, [_cells(row) for row in found]))
@@ -41,7 +43,7 @@ def turns(args: argparse.Namespace) -> int:
     return exit_codes.ACCEPTED
 
 
-def _row(turn: Any) -> dict[str, Any]:
+def _row(turn: Turn) -> dict[str, Any]:
     return {'center': turn.center, 'first': turn.first, 'last': turn.last,
             'stamp': turn.stamp_s, 'prominence': turn.prominence, 'images': turn.images}
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from dashcalib_ros.arrays import Floats32, GreyImage
 from dashcalib_ros.errors import ConfigError
 
-Texture = npt.NDArray[np.uint8]
+Texture = GreyImage
 
 LEVELS = 13
 # cv2.remap addresses its source with 16 bit
@@ -26,7 +26,7 @@ class Atlas:
     """
 
     image: Texture
-    table: npt.NDArray[np.float32]
+    table: Floats32
 
 
 def pack(textures: Sequence[Texture]) -> Atlas:

@@ -3,12 +3,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from dashcalib_ros.arrays import Floats, Floats32, GreyImage
 from dashcalib_ros.demo.lens import Lens
 from dashcalib_ros.demo.overlay import Overlay
 from dashcalib_ros.demo.parallel import render_parallel
@@ -16,14 +16,10 @@ from dashcalib_ros.demo.path import Course, course_of
 from dashcalib_ros.demo.quads import QuadList, Quads
 from dashcalib_ros.demo.raycast import Raycaster
 from dashcalib_ros.demo.spec import DriveSpec
-from dashcalib_ros.demo.street import Town, build_town
+from dashcalib_ros.demo.town import Town, build_town
 from dashcalib_ros.demo.traffic import Traffic
 from dashcalib_ros.demo.vehicle import MARGIN_S, Ride, ride_of
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.intrinsics import Intrinsics
-
-Floats = npt.NDArray[np.float64]
-Grey = npt.NDArray[np.uint8]
 
 # 2026-01-05 12:00:00 UTC; the first frame's stamp
 START_NS = 1_767_614_400 * 10**9
@@ -46,9 +42,9 @@ class Drive:
         return int(self.times.size)
 
     @property
-    def truth(self) -> Intrinsics:
+    def truth(self) -> dict[str, float]:
         """Return the lens as a calibration should find it."""
-        return self.lens.intrinsics
+        return self.lens.truth
 
     @cached_property
     def poses(self) -> Floats:
@@ -102,7 +98,7 @@ class Drive:
         return START_NS + round(index * 1e9 / self.spec.rate)
 
     @cached_property
-    def shading(self) -> npt.NDArray[np.float32]:
+    def shading(self) -> Floats32:
         """Return the share of the light that arrives, (height, width)."""
         y, x = np.indices((self.lens.height, self.lens.width), np.float32)
         square = ((x - self.lens.cx) ** 2 + (y - self.lens.cy) ** 2) / (
@@ -129,7 +125,8 @@ class Drive:
         """
         end = len(self) if last is None else min(last, len(self))
         if processes > 1:
-            yield from render_parallel(self.lens, self.spec, first, end, processes)
+            yield from render_parallel(partial(Drive, self.lens, self.spec), first, end,
+                                       processes)
             return
         for index in range(first, end):
             yield self.frame(index)
@@ -150,7 +147,7 @@ class Drive:
         self.traffic.add_to(cars, self.times[index] + MARGIN_S, self.town.cars)
         return Quads.join([self.town.quads, cars.quads()]) if cars.rows else self.town.quads
 
-    def _expose(self, image: npt.NDArray[np.float32], index: int) -> Grey:
+    def _expose(self, image: Floats32, index: int) -> GreyImage:
         """Turn light into grey levels as the camera's electronics would."""
         spec = self.spec
         rng = np.random.default_rng([spec.seed, 5, index])
@@ -169,7 +166,7 @@ class Drive:
         sigma = max(spec.noise, 4.0) if spec.night else spec.noise
         if sigma > 0.0:
             image += np.float32(sigma) * rng.standard_normal(image.shape, np.float32)
-        grey: Grey = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
+        grey: GreyImage = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
         if spec.jpeg_quality is not None:
             _, code = cv2.imencode('.jpg', grey, (cv2.IMWRITE_JPEG_QUALITY, spec.jpeg_quality))
             grey = np.asarray(cv2.imdecode(code, cv2.IMREAD_GRAYSCALE), np.uint8)

@@ -3,20 +3,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from dashcalib_ros.arrays import Floats, Floats32, GreyImage
 from dashcalib_ros.demo.paint import finish, noise
 from dashcalib_ros.demo.path import Course
+from dashcalib_ros.demo.street import Street
 
-if TYPE_CHECKING:
-    from dashcalib_ros.demo.street import Street
-
-Floats = npt.NDArray[np.float64]
-Texture = npt.NDArray[np.uint8]
+Texture = GreyImage
 
 FINEST_M = 0.03
 MAX_TEXELS = 6500
@@ -145,7 +142,7 @@ class _Canvas:
                               float(rng.uniform(165.0, 215.0)))
 
     def shadows(self, shapes: Sequence[Floats], heights: Sequence[float], sun: Floats
-                ) -> npt.NDArray[np.float32]:
+                ) -> Floats32:
         """Return the light on the ground, 1 in the sun."""
         shade = np.ones(self.image.shape, np.float32)
         for shape, height in zip(shapes, heights, strict=True):

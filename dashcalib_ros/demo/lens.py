@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.errors import ConfigError
-from dashcalib_ros.intrinsics import Intrinsics
-
-Floats = npt.NDArray[np.float64]
 
 # normalised radius within which a lens that never folds is taken as valid (about 81 degrees)
 MAX_RADIUS = 6.0
@@ -54,9 +52,10 @@ class Lens:
                    (height - 1) / 2.0 + offset[1], k1, k2)
 
     @property
-    def intrinsics(self) -> Intrinsics:
-        """Return the six parameters that a calibration should find."""
-        return Intrinsics(self.fx, self.fy, self.cx, self.cy, self.k1, self.k2)
+    def truth(self) -> dict[str, float]:
+        """Return what a calibration should find, by the names of result.json."""
+        return {'fx': self.fx, 'fy': self.fy, 'cx': self.cx, 'cy': self.cy, 'k1': self.k1,
+                'k2': self.k2}
 
     @property
     def matrix(self) -> Floats:

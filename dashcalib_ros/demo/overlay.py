@@ -5,12 +5,11 @@ import datetime
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from dashcalib_ros.arrays import Floats, Floats32, Mask
 from dashcalib_ros.demo.paint import noise
 
-Singles = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
+Singles = Floats32
 
 # the bonnet's edge: of the height, in the middle and at the sides
 BONNET_MIDDLE = 0.905
@@ -44,7 +43,7 @@ class Overlay:
         if self.timestamp:
             self._text(image, stamp_ns)
 
-    def _fill(self, polygon: npt.NDArray[np.float64], paint: Singles) -> None:
+    def _fill(self, polygon: Floats, paint: Singles) -> None:
         shape = np.zeros(self.alpha.shape, np.uint8)
         points = np.round(polygon * (1 << SHIFT)).astype(np.int32)
         cv2.fillPoly(shape, [points], 255, cv2.LINE_AA, SHIFT)

@@ -5,10 +5,11 @@ import string
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-Texture = npt.NDArray[np.uint8]
-Singles = npt.NDArray[np.float32]
+from dashcalib_ros.arrays import Floats32, GreyImage
+
+Texture = GreyImage
+Singles = Floats32
 Random = np.random.Generator
 
 FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX,

@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.demo.spec import DriveSpec
-
-Floats = npt.NDArray[np.float64]
 
 STEP_M = 0.05
 # steering takes time: the curvature ramps up over this length

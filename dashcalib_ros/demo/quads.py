@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from dashcalib_ros.arrays import Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Quads:
     origin: Floats
     right: Floats
     down: Floats
-    texture: npt.NDArray[np.int64]
+    texture: Ints
 
     def __len__(self) -> int:
         return int(self.texture.size)

@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from dashcalib_ros.arrays import Floats, Floats32, Ints
 from dashcalib_ros.demo.atlas import LEVELS, Atlas
 from dashcalib_ros.demo.lens import Lens
 from dashcalib_ros.demo.quads import Quads
 
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
+Singles = Floats32
 Integers = npt.NDArray[np.intp]
 
 NEAR_M = 0.05
@@ -265,7 +265,7 @@ class _Planes:
 
     lines: Singles
     scale: Singles
-    texture: npt.NDArray[np.int64]
+    texture: Ints
     boxes: Integers
     nearest: Singles
 

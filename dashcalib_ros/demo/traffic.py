@@ -8,7 +8,7 @@ import numpy as np
 from dashcalib_ros.demo.path import Course
 from dashcalib_ros.demo.quads import QuadList
 from dashcalib_ros.demo.spec import DriveSpec
-from dashcalib_ros.demo.street import LANE_M, car_quads
+from dashcalib_ros.demo.town import LANE_M, car_quads
 from dashcalib_ros.demo.vehicle import Ride
 
 # crossing cars pass this far ahead of one that stands, and come back after this time

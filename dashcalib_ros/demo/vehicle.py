@@ -8,10 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.demo.path import STEP_M, Course
 from dashcalib_ros.demo.spec import DriveSpec
-
-Floats = npt.NDArray[np.float64]
 
 TICK_S = 0.002
 # the camera sits at the windscreen, this far ahead of the rear axle, a little off the middle

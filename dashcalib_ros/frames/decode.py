@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 import dashcalib_ros.frames.quiet  # noqa: F401
+from dashcalib_ros.arrays import GreyImage, Pixels
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames.frame import GreyImage
-
-Pixels = npt.NDArray[Any]
+from dashcalib_ros.frames.header import encoded_size
+from dashcalib_ros.limits import check_pixels
 
 _DEPTHS = (8, 10, 12, 14, 16)
 _JPEG_START, _JPEG_END = b'\xff\xd8', b'\xff\xd9'
@@ -28,8 +28,8 @@ class BitDepth:
 
     Cameras of 10, 12 or 14 bits fill only the lower bits of a 16-bit image, and nothing in the
     message says so. The depth is the smallest of 8, 10, 12, 14, 16 that holds every value seen so
-    far. It never shrinks, so the brightness does not flicker: it steps at most four times in
-    a whole drive, each time because a pixel proved the old depth wrong.
+    far. It never shrinks: the brightness changes at most four times in a drive, each time because
+    a pixel did not fit the old depth.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class _Layout:
 
     channels, bits: of one pixel in a row of the message.
     to_grey: OpenCV's conversion; without one, channel number `luma` is the grey value.
-    planar: the brightness of all pixels comes first, their colours follow below.
+    planar: all pixels' brightness comes first, then their colours.
     """
 
     channels: int
@@ -74,8 +74,8 @@ _LAYOUTS = {
     'yuv422_yuy2': _Layout(2), 'yuyv': _Layout(2), 'yuy2': _Layout(2),
     'nv12': _Layout(1, planar=True), 'nv21': _Layout(1, planar=True),
     'nv24': _Layout(1, planar=True), 'i420': _Layout(1, planar=True),
-    # ROS names the first two rows' colours from the corner on; so do these constants of OpenCV
-    # (its older names, BayerBG for rggb, start one pixel further down the diagonal)
+    # ROS and these constants of OpenCV name the colours of the first two rows, from the corner on
+    # (OpenCV's older names, BayerBG for rggb, start one pixel further down the diagonal)
     **{f'bayer_{name}{bits}': _Layout(1, bits, code)
        for bits in (8, 16)
        for name, code in (('rggb', cv2.COLOR_BayerRGGB2GRAY), ('bggr', cv2.COLOR_BayerBGGR2GRAY),
@@ -91,10 +91,10 @@ def decode(message: Any, depth: BitDepth | None = None) -> GreyImage:
 
 
 def decode_image(message: Any, depth: BitDepth | None = None) -> GreyImage:
-    """Decode a sensor_msgs/Image: (height, width) uint8, a copy that shares nothing with it.
+    """Decode a sensor_msgs/Image: (height, width) uint8, a copy.
 
     message: has encoding, height, width, step, is_bigendian and data.
-    depth: the stream's bit depth, of 16-bit encodings; without it, judged by this image alone.
+    depth: the stream's bit depth, for 16-bit encodings; without it, only this image counts.
 
     Raises InputError for an unknown encoding, or a size that does not fit the data.
     """
@@ -113,50 +113,91 @@ def decode_image(message: Any, depth: BitDepth | None = None) -> GreyImage:
 def decode_compressed(message: Any, depth: BitDepth | None = None) -> GreyImage:
     """Decode a sensor_msgs/CompressedImage: (height, width) uint8.
 
-    message: has format and data: a JPEG, PNG, TIFF, WebP or whatever else OpenCV decodes.
+    message: has format and data: a JPEG, PNG, TIFF, WebP, BMP, PGM or PPM.
     depth: as for decode_image.
 
-    Raises InputError for depth images, video streams, and data that is cut off or damaged.
+    Raises InputError for depth images, video streams, data that is cut off or damaged, and for
+    more pixels than limits allow.
     """
+    return decode_file(memoryview(message.data), depth, _name(message))
+
+
+def message_size(message: Any) -> tuple[int, int]:
+    """Return (width, height) of an Image or CompressedImage message, without decoding it.
+
+    Raises InputError where there is no size in it, or one beyond the limits.
+    """
+    if hasattr(message, 'encoding'):
+        width, height = int(message.width), int(message.height)
+        check_pixels(width, height)
+        return width, height
+    return _encoded_size(memoryview(message.data), _name(message))
+
+
+def _name(message: Any) -> str:
+    """Return a name for messages about a CompressedImage; raises InputError for other formats."""
     name = ' '.join(str(message.format).split())
     if 'compresseddepth' in name.lower():
         raise InputError(f'format {name!r} is a depth image: choose the topic of a camera image')
     if any(video in name.lower() for video in _VIDEO_FORMATS):
         raise InputError(f'format {name!r} is a video stream: republish it as jpeg '
                          f'(image_transport republish)')
-    return decode_file(memoryview(message.data), depth, f'{name or "compressed"} image')
+    return f'{name or "compressed"} image'
 
 
 def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
                 what: str = 'image') -> GreyImage:
     """Decode the bytes of an image file: (height, width) uint8; an EXIF orientation is applied.
 
-    Raises InputError, which calls it `what`, when they are cut off or no image.
+    Raises InputError as decode_pixels does.
     """
+    return _to_8_bits(decode_pixels(data, what), depth)
+
+
+def decode_pixels(data: bytes | memoryview, what: str = 'image') -> Pixels:
+    """Decode the bytes of an image file: (height, width) of 8 or 16 bits.
+
+    what: the image's name in errors. Raises InputError when the bytes are cut off or no image, or
+    have more pixels than limits allow.
+    """
+    _encoded_size(memoryview(data), what)  # check the size before memory is used
     buffer = np.frombuffer(data, np.uint8)
     head, tail = buffer[:2].tobytes(), buffer[-4096:].tobytes()
     if head == _JPEG_START and _JPEG_END not in tail:
-        raise InputError(f'{what} is cut off: record or copy it again')  # OpenCV would fill up
+        # OpenCV would fill the rest with grey
+        raise InputError(f'{what} is cut off: record or copy it again')
     try:
-        image = (cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-                 if buffer.size else None)
+        image = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     except cv2.error:
         image = None
     if image is None:
-        raise InputError(f'{what} is damaged or of an unknown kind ({buffer.size} bytes): '
-                         f'record it again, as jpeg or png')
+        raise _damaged(what, buffer.size)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f'{what} has {image.dtype} pixels: save it with 8 or 16 bits')
-    return _to_8_bits(image, depth)
+    return np.asarray(image)
+
+
+def _encoded_size(data: memoryview, what: str) -> tuple[int, int]:
+    size = encoded_size(data)
+    if size is None:
+        raise _damaged(what, len(data))
+    check_pixels(*size, what)
+    return size
+
+
+def _damaged(what: str, size: int) -> InputError:
+    return InputError(f'{what} is damaged or of an unknown kind ({size} bytes): record it again, '
+                      f'as jpeg or png')
 
 
 def _pixels(message: Any, layout: _Layout) -> Pixels:
     """Return (height, width, channels), a view of the message where its bytes allow."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
+    check_pixels(width, height)
     row = width * layout.channels * layout.bits // 8
     fits = data.size >= step * height if layout.planar else data.size == step * height
-    if width <= 0 or height <= 0 or step < row or not fits:
+    if step < row or not fits:
         raise InputError(
             f'an image says {width}x{height} {message.encoding} with step {step} but has '
             f'{data.size} bytes: the camera driver or the recording is broken')

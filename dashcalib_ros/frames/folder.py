@@ -4,10 +4,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from dashcalib_ros.arrays import GreyImage
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.decode import BitDepth, decode_file
-from dashcalib_ros.frames.frame import GreyImage
 from dashcalib_ros.frames.source import IMAGE_SUFFIXES, FrameSource, Picture, Reading, by_name
+from dashcalib_ros.limits import PICTURE_BYTES, read_file
 
 DEFAULT_FPS = 10.0  # Hz; the rate the paper works at
 
@@ -36,11 +37,11 @@ class FolderSource(FrameSource):
     def _pictures(self, reading: Reading) -> Iterator[Picture]:
         depth = BitDepth()
         for index, name in enumerate(self._names):
-            yield index, round(index * 1e9 / self._fps), self._image(name, depth)
+            yield index, round(index * 1e9 / self._fps), self._image(name, depth), ''
 
     def _image(self, name: str, depth: BitDepth) -> GreyImage | InputError:
         try:
-            return decode_file((self._path / name).read_bytes(), depth, name)
+            return decode_file(read_file(self._path / name, PICTURE_BYTES, name), depth, name)
         except InputError as error:
             return error
 

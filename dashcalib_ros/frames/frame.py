@@ -1,12 +1,9 @@
-"""The one thing that travels from any kind of input into the core."""
+"""An image of the drive, as every kind of input gives it to the core."""
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
-GreyImage = npt.NDArray[np.uint8]
+from dashcalib_ros.arrays import GreyImage
 
 
 @dataclass(frozen=True)
@@ -16,7 +13,7 @@ class Frame:
     index: position among the input's frames, counted from 0.
     stamp_ns: time of exposure in nanoseconds (the message header's stamp, or index / rate).
     image: (height, width) uint8, grey. Never written to after the Frame is made.
-    frame_id: the message header's; empty where nobody knows.
+    frame_id: the message header's; empty where there is none.
     """
 
     index: int

@@ -1,7 +1,7 @@
-"""Importing this keeps OpenCV and FFmpeg from reporting every oddity of a broken file on stderr.
+"""Importing this module silences OpenCV and FFmpeg, which report every defect of a file on stderr.
 
-All that matters comes as our own errors and warnings. Who wants to see the rest sets
-OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL.
+What a user must know comes as our own errors and warnings. Set OPENCV_LOG_LEVEL or
+OPENCV_FFMPEG_LOGLEVEL to see the rest.
 """
 import os
 

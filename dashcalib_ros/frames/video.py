@@ -12,13 +12,14 @@ import numpy as np
 import dashcalib_ros.frames.quiet  # noqa: F401
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.source import FrameSource, Picture, Reading
+from dashcalib_ros.limits import check_pixels
 
 
 class VideoSource(FrameSource):
     """The pictures of a video file, as a player shows them: turned as its metadata says.
 
-    Stamps are index / rate, where fps, if given, stands for the video's own rate.
-    Raises InputError for what is no video, and for a video that does not know its rate.
+    Stamps are index / rate; fps, if given, replaces the video's own rate.
+    Raises InputError for a file that is no video, and for a video without a rate.
     """
 
     def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:
@@ -41,7 +42,7 @@ class VideoSource(FrameSource):
                 if not found:
                     break
                 grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-                yield index, round(index * 1e9 / self._rate), np.asarray(grey, np.uint8)
+                yield index, round(index * 1e9 / self._rate), np.asarray(grey, np.uint8), ''
                 index += 1
         # some containers only estimate how many pictures they hold
         if self.count and index < 0.99 * self.count - 1:
@@ -65,6 +66,8 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
             raise InputError(
                 f'{path} is no video that can be played, or it is cut off: copy it again, '
                 f'or convert it (ffmpeg -i IN -c:v libx264 OUT.mp4)')
+        check_pixels(int(video.get(cv2.CAP_PROP_FRAME_WIDTH)),
+                     int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), str(path))
         yield video
     finally:
         video.release()

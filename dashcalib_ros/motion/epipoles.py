@@ -1,41 +1,42 @@
-"""The epipoles of a pair of images, and what they say about turning (paper, 3.1).
+"""The epipoles of a pair of images, and the turning magnitude from them (paper, 3.1).
 
-The paper takes the epipoles' mean distance from the image centre. That distance is mostly the
-camera's mounting (where straight ahead is in the picture) and its lever arm to the rear axle, and
-a bend adds to it or takes from it, depending on the side. The two epipoles of a pair see the same
-direction, the baseline, from before and from after: e' ~ K R K^-1 e. Half their distance from each
-other is their distance from the pair's own centre, and that is rotation alone, wherever the camera
-points. On kitti03 (triplets over 0.6 s) its median correlates with the true yaw rate by 0.98,
-the distance from the image centre by 0.34.
+The paper takes the epipoles' mean distance from the image centre. That distance depends mostly on
+the camera's mounting (where straight ahead is in the picture) and its lever arm to the rear axle;
+a bend makes it larger or smaller, depending on the side. Here it is half the distance between the
+two epipoles of a pair. Both are images of the same direction, the baseline: e' ~ K R K^-1 e. So
+their distance depends on the rotation only, wherever the camera points. On kitti03 (triplets over
+0.6 s) the median of this magnitude correlates with the true yaw rate by 0.98, the distance from
+the image centre by 0.34.
 """
 from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from dashcalib_ros.motion.points import Points
+from dashcalib_ros.arrays import Floats, Floats32
 
-Floats = npt.NDArray[np.float64]
 # fewer points fit a fundamental matrix by chance
 MIN_POINTS = 30
-# a fundamental matrix that fits fewer than this share describes chance, or one moving car
+# a fundamental matrix with a smaller share of inliers fits by chance, or one moving car
 MIN_INLIERS = 0.4
+# samples drawn at the most: limits the time for a pair of images
 ITERATIONS = 300
+# as exact as MAGSAC and RANSAC on images 0.3 s apart
 METHOD = cv2.USAC_FAST
+# probability of a sample without outliers: OpenCV's default
 CONFIDENCE = 0.99
 
 
-def epipoles_of(before: Points, after: Points, size: tuple[int, int], threshold_px: float
+def epipoles_of(before: Floats32, after: Floats32, size: tuple[int, int], threshold_px: float
                 ) -> Floats | None:
-    """Return the (2, 2) epipoles in the first and the second image, or None if there are none.
+    """Return the (2, 2) epipoles in the first and the second image, None if they are not found.
 
-    before, after: (n, 2) px. size: (width, height). The epipoles are relative to the image centre
-    and the width, and drawn in to a distance of 1 when they lie further out, up to infinity.
+    before, after: (n, 2) px. size: (width, height). The epipoles are relative to the image centre,
+    in image widths; one that is farther than 1 away, up to infinity, is moved to a distance of 1.
     """
     if len(before) < MIN_POINTS:
         return None
-    # the same answer whatever was estimated before: USAC draws from the global generator
+    # USAC draws from OpenCV's global generator: the result must not depend on earlier calls
     cv2.setRNGSeed(1)
     try:
         matrix, inliers = cv2.findFundamentalMat(
@@ -49,11 +50,11 @@ def epipoles_of(before: Points, after: Points, size: tuple[int, int], threshold_
     left, _, right = np.linalg.svd(matrix)
     ends = np.stack([right[2], left[:, 2]])
     width, height = size
-    # homogeneous: from pixels to (centre, width) without dividing by what may be zero
+    # homogeneous coordinates, relative to centre and width: no division by zero
     ends[:, 0] -= ends[:, 2] * (width - 1) / 2
     ends[:, 1] -= ends[:, 2] * (height - 1) / 2
     ends[:, 2] *= width
-    # both seen on the same side, also where they lie at infinity
+    # the same sign for both, also at infinity
     ends *= np.where(ends[:, 2] < 0, -1.0, 1.0)[:, None]
     reach = np.linalg.norm(ends[:, :2], axis=1)
     return np.asarray(ends[:, :2] / np.maximum(ends[:, 2], reach)[:, None], np.float64)

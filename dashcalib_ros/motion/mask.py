@@ -1,9 +1,9 @@
-"""The ego vehicle: what moves with the camera does not move in the picture.
+"""The mask of the ego vehicle: what moves with the camera does not move in the picture.
 
-Instead of the paper's segmentation network, evidence from the drive itself. Image gradients are
-averaged over the drive as vectors: those of the world point here and there and cancel, those of
-bonnet, pillars and burnt-in text stay. Only moments count in which the world would have moved at
-that place: on a straight road the horizon stands still too.
+It replaces the paper's segmentation network by evidence from the drive. Image gradients are summed
+over the drive as vectors: those of the world have changing directions and cancel, those of bonnet,
+pillars and burnt-in text add up. An image counts for a cell only if the world moves there: on a
+straight road the horizon stands still, too.
 """
 from __future__ import annotations
 
@@ -13,32 +13,27 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
 from dashcalib_ros.config import MaskConfig
-from dashcalib_ros.motion.points import Grey, Mask, Points
 
-Singles = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
-# px at the mask's resolution; the world has moved on when its flow is at least this, and
-# when the camera has turned by this much (epipoles are less exact than points)
+# px at the mask's resolution; with less flow the world does not count as moving
 MOVED = 2.5
+# px, the same for flow from rotation, above the horizon: epipoles are less exact than points
 TURNED = 4.0
-# samples a cell needs before anything is said of it
+# samples a cell needs before it is classified
 SAMPLES = 12
-# ... and remembers: then all counts half, so that a camera that was moved is noticed
+# samples of a cell at which all sums are halved: new samples count more than old ones
 REMEMBERED = 2000
-# coherence of a cell's gradient over the drive: the world's is about 0, the vehicle's 0.7
-STAYS = 0.4
-# ... and of a pixel's, of which so many of a cell's must stay (text covers little of a cell); a
-# pixel needs so many independent samples, for few look alike by chance
+# least coherence of a pixel's gradient; mask.stays is that of a cell's
 PIXEL_STAYS = 0.7
+# effective number of samples a pixel needs: a few may be alike by chance
 PIXEL_SAMPLES = 6.0
+# of a cell's pixels that must stay: text covers little of a cell
 PIXELS = 0.06
 # grey levels per px; a gradient below this is noise or a flat place
 FLAT = 1.5
-# of a flat region's outline that must stay, for the region to belong to the vehicle
+# share of a flat region's outline that must be vehicle, for the region to be vehicle, too
 ENCLOSED = 0.6
-# of the picture; a vehicle that hides more is not believed
-LARGEST = 0.4
 
 
 class EgoMask:
@@ -47,6 +42,7 @@ class EgoMask:
     def __init__(self, config: MaskConfig, size: tuple[int, int]) -> None:
         """size: (width, height) at the working resolution."""
         self._size = size[0] // 2, size[1] // 2
+        self._config = config
         self._cell = max(2, config.cell // 2)
         width, height = self._size
         self.grid = -(-height // self._cell), -(-width // self._cell)
@@ -56,8 +52,8 @@ class EgoMask:
         self._weight = np.zeros((height, width), np.float32)
         self._samples = np.zeros(self.grid, np.float32)
 
-    def push(self, image: Grey, before: Points, after: Points, epipoles: Floats) -> None:
-        """Take an image (working resolution) and how the world moved shortly before it.
+    def push(self, image: GreyImage, before: Floats32, after: Floats32, epipoles: Floats) -> None:
+        """Take an image (working resolution) and the points' motion shortly before it.
 
         before, after: (n, 2) px, points in an earlier image and in this one. epipoles: (2, 2) of
         that pair, relative to the image centre and the width.
@@ -70,12 +66,12 @@ class EgoMask:
         if not counts.any():
             return
         half = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        # slow changes are the sky's and the lens's
+        # remove slow changes of brightness: sky and vignetting
         half -= cv2.blur(half, (15, 15))
         x = cv2.Sobel(half, cv2.CV_32F, 1, 0, scale=0.125)
         y = cv2.Sobel(half, cv2.CV_32F, 0, 1, scale=0.125)
         strength = cv2.magnitude(x, y)
-        # an edge along the flow stays where it is though the world moves: lanes, kerbs, roofs
+        # an edge along the flow does not seem to move (lanes, kerbs, roofs): weigh by the angle
         direction = self._spread(flow / np.maximum(moves, 1e-6)[:, :, None])
         across = (x * direction[:, :, 0] + y * direction[:, :, 1]) / np.maximum(strength, 1e-6)
         weight = across * across * self._spread(counts)
@@ -92,17 +88,17 @@ class EgoMask:
                 np.multiply(total, 0.5, out=total)
 
     def cells(self) -> Mask | None:
-        """Return (rows, columns): where the ego vehicle is; None while too little is known."""
+        """Return (rows, columns), True where the ego vehicle is; None before enough samples."""
         known = self._samples >= SAMPLES
         if not known.any():
             return None
         stays, strength, pixels = self._evidence()
         flat = known & (strength < FLAT)
-        ego = known & ~flat & (stays > STAYS) | known & (pixels > PIXELS)
+        ego = known & ~flat & (stays > self._config.stays) | known & (pixels > PIXELS)
         ego = _without_specks(ego)
         filled = _closed(ego | self._enclosed(flat & ~ego, ego))
         for cells in (filled, ego):
-            if cells.mean() <= LARGEST:
+            if cells.mean() <= self._config.largest:
                 return cells
         return None
 
@@ -122,23 +118,23 @@ class EgoMask:
     def _evidence(self) -> tuple[Floats, Floats, Floats]:
         """Return per cell: the gradient's coherence, its strength, the share of pixels that stay.
 
-        Coherence is |sum g|^2 / (sum |g|)^2 without what each sample has in common with itself:
-        0 for directions at random however few the samples are, 1 for what never changes.
+        Coherence is |sum g|^2 / (sum |g|)^2, without the products of each sample with itself:
+        0 for random directions, however few the samples are, and 1 for what never changes.
         """
-        whole = self._strength ** 2
-        together = self._sum[0] ** 2 + self._sum[1] ** 2 - self._squares
-        most = whole - self._squares
-        stays = self._pool(together) / np.maximum(self._pool(most), 1e-6)
+        squared = self._strength ** 2
+        products = self._sum[0] ** 2 + self._sum[1] ** 2 - self._squares
+        most = squared - self._squares
+        stays = self._pool(products) / np.maximum(self._pool(most), 1e-6)
         strength = self._pool(self._strength) / np.maximum(self._pool(self._weight), 1e-6)
-        lasting = ((together > PIXEL_STAYS * most) & (whole > PIXEL_SAMPLES * self._squares)
+        lasting = ((products > PIXEL_STAYS * most) & (squared > PIXEL_SAMPLES * self._squares)
                    & (self._strength > 2 * FLAT * self._weight))
         return stays, strength, self._pool(lasting) / self._cell ** 2
 
-    def _world_flow(self, before: Points, after: Points, epipoles: Floats) -> Singles | None:
-        """Return (rows, columns, 2) px: how the world would have moved in each cell.
+    def _world_flow(self, before: Floats32, after: Floats32, epipoles: Floats) -> Floats32 | None:
+        """Return (rows, columns, 2) px: the flow that the world has in each cell.
 
-        Below the horizon a smooth flow through the tracked points; above it, where things may be
-        as far as the sky, rotation alone: that is what carries one epipole to the other.
+        Below the horizon it is a smooth fit to the tracked points. Above it, where things may be
+        as far as the sky, it is the flow from rotation only: from one epipole to the other.
         """
         width, height = self._size
         flow = after - before
@@ -164,7 +160,7 @@ class EgoMask:
         return np.asarray(world, np.float32)
 
     def _enclosed(self, flat: Mask, ego: Mask) -> Mask:
-        """Return the flat regions at the picture's border whose outline stays."""
+        """Return the flat regions at the picture's border with an outline of vehicle cells."""
         count, labels = cv2.connectedComponents(flat.astype(np.uint8), connectivity=4)
         result = np.zeros_like(flat)
         cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -209,7 +205,7 @@ def _closed(cells: Mask) -> Mask:
     return np.asarray(closed[1:-1, 1:-1] > 0)
 
 
-def _quadratic(xy: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+def _quadratic(xy: npt.NDArray[np.floating]) -> Floats:
     """Return (n, 6) terms of a second-order polynomial in (n, 2) places."""
     x, y = xy[:, 0].astype(np.float64), xy[:, 1].astype(np.float64)
     return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])

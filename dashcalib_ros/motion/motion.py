@@ -1,4 +1,4 @@
-"""What one image tells about how the car moves."""
+"""The car's motion at one image."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -10,10 +10,9 @@ class Motion:
 
     index, stamp_ns: of the image. center, center_ns: index and stamp of the triplet's middle
     image, which the magnitude belongs to; None before there is a triplet.
-    magnitude: turning magnitude, of the image width; 0 when standing, NaN when no epipole can be
-    had (see epipoles.py for what is measured).
-    standing: the picture does not move. moved_px: how far the median point moved since the last
-    processed image, at full resolution. points: how many were followed.
+    magnitude: turning magnitude, of the image width (see epipoles.py); 0 when standing, NaN when
+    no epipole is found. standing: the picture does not move. moved_px: how far the median point
+    moved since the last processed image, at full resolution. points: how many were tracked.
     """
 
     index: int

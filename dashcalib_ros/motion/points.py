@@ -1,24 +1,39 @@
-"""Points: found where the picture has corners, followed from image to image."""
+"""Corner points: found in an image, and tracked from image to image."""
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-Points = npt.NDArray[np.float32]
-Grey = npt.NDArray[np.uint8]
-Mask = npt.NDArray[np.bool_]
-# px; where the tracking window leaves the picture, positions drift
-BORDER = 8
+from dashcalib_ros.arrays import Floats32, GreyImage, Mask
 
 
-def find_corners(image: npt.NDArray[np.uint8], present: npt.NDArray[np.float32], wanted: int,
-                 valid: Mask | None = None) -> npt.NDArray[np.float32]:
-    """Return (n, 2) new corners that bring the picture up to `wanted`, spread over a grid.
+@dataclass(frozen=True)
+class Tracking:
+    """Options of the tracking; the defaults are those of a reconstruction.
 
-    present: (m, 2) points that are tracked already; no corner is put near them.
+    forward_backward_px: a point that does not track back to within this is dropped.
+    window: px, side of the Lucas-Kanade window. levels: of the pyramid, above the full picture.
+    steps, step_px: the iteration ends after this many steps, or with a step this short.
+    border: px; points nearer to it are dropped: where the window leaves the picture, they drift.
+    """
+
+    forward_backward_px: float
+    window: int = 21
+    levels: int = 4
+    steps: int = 10
+    step_px: float = 0.03
+    border: int = 8
+
+
+def find_corners(image: GreyImage, present: Floats32, wanted: int,
+                 valid: Mask | None = None) -> Floats32:
+    """Return (n, 2) new corners, spread over a grid, so that there are about `wanted` points.
+
+    present: (m, 2) points that are tracked already; no new corner is near them. valid: (height,
+    width), False where no corner may be; None: nowhere.
     """
     height, width = image.shape
     columns = max(2, round(np.sqrt(wanted / 25 * width / height)))
@@ -46,9 +61,8 @@ def find_corners(image: npt.NDArray[np.uint8], present: npt.NDArray[np.float32],
     return np.concatenate(found)
 
 
-def follow_points(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8],
-                  points: npt.NDArray[np.float32], forward_backward_px: float, window: int = 21,
-                  levels: int = 4) -> tuple[npt.NDArray[np.float32], Mask]:
+def follow_points(before: GreyImage, after: GreyImage, points: Floats32, tracking: Tracking
+                  ) -> tuple[Floats32, Mask]:
     """Track points from one image to the next by pyramidal Lucas-Kanade, and back as a check.
 
     Returns the (n, 2) positions in `after` and (n,) whether each can be trusted.
@@ -56,18 +70,18 @@ def follow_points(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8],
     if len(points) == 0:
         return points, np.zeros(0, bool)
     height, width = after.shape
-    # cv2's stubs know neither the optional output nor what comes out
+    # cv2's stubs have wrong types for this function
     flow: Any = cv2.calcOpticalFlowPyrLK
-    settings = {'winSize': (window, window),
-                'criteria': (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)}
-    moved, ahead, _ = flow(before, after, points, None, maxLevel=levels, **settings)
-    # the way back starts where it should end: a wrong match still leads elsewhere, at a fifth of
-    # the time of a search from afar
+    ends = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, tracking.steps, tracking.step_px
+    settings = {'winSize': (tracking.window, tracking.window), 'criteria': ends}
+    moved, ahead, _ = flow(before, after, points, None, maxLevel=tracking.levels, **settings)
+    # the backward search starts from the point itself: a wrong match still ends elsewhere, and it
+    # takes a fifth of the time
     back, behind, _ = flow(after, before, moved, points.copy(), maxLevel=0,
                            flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **settings)
-    x, y = moved[:, 0], moved[:, 1]
+    x, y, border = moved[:, 0], moved[:, 1], tracking.border
     trusted = (
         (ahead.ravel() > 0) & (behind.ravel() > 0)
-        & (np.linalg.norm(back - points, axis=1) < forward_backward_px)
-        & (x > BORDER) & (x < width - 1 - BORDER) & (y > BORDER) & (y < height - 1 - BORDER))
+        & (np.linalg.norm(back - points, axis=1) < tracking.forward_backward_px)
+        & (x > border) & (x < width - 1 - border) & (y > border) & (y < height - 1 - border))
     return moved, trusted

@@ -1,1 +1,1 @@
-"""Turns -> tracks -> one scene per turn, and the adjustment of scenes with one shared camera."""
+"""Turns -> tracks -> one scene per turn; the bundle adjustment of scenes that share a camera."""

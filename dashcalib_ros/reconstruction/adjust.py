@@ -1,42 +1,28 @@
-"""Bundle adjustment of scenes that share one camera: the only module that talks to COLMAP.
+"""Bundle adjustment of scenes that share one camera, by COLMAP and Ceres.
 
 COLMAP counts pixels from (0.5, 0.5); everything that enters or leaves here counts from (0, 0).
 """
 from __future__ import annotations
 
-import zlib  # noqa: F401  before pycolmap: its wheel exports zlib symbols of its own
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
-import pyceres  # its import makes the adjuster's problem a pyceres.Problem
-import pycolmap
 
-from dashcalib_ros.reconstruction.camera import Camera
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel
+from dashcalib_ros.camera.prior import Prior
+from dashcalib_ros.reconstruction.colmap import pyceres, pycolmap
 from dashcalib_ros.reconstruction.scene import Scene
 
-Array = npt.NDArray[np.float64]
-
-HALF_PIXEL = 0.5
-# fx fy cx cy k1 k2 p1 p2 of COLMAP's OPENCV model: the last two stay 0
-OPENCV_HELD = [6, 7]
-OPENCV_SIZE = 8
-# k1 and k2 beyond this are no lens but a scene that runs away
-MAX_K = 1.0
-
-
-@dataclass(frozen=True)
-class Prior:
-    """What is believed of the six parameters before any image: mean (6,), covariance (6, 6)."""
-
-    mean: Array
-    covariance: Array
+# no lens has a coefficient beyond this: the scene has diverged
+MAX_DISTORTION = 1.0
 
 
 @dataclass(frozen=True)
 class Solver:
-    """How hard to try. loss_px: scale of the Cauchy loss, about twice the noise of a track."""
+    """Options of Ceres. loss_px: scale of the Cauchy loss, about twice the noise of a track."""
 
     loss_px: float = 1.0
     iterations: int = 30
@@ -46,66 +32,71 @@ class Solver:
 
 def adjust_step1(scenes: Sequence[Scene], camera: Camera, solver: Solver,
                  focal_range: tuple[float, float] | None) -> tuple[list[Scene], Camera]:
-    """Adjust with one focal length, k1 and k2, the centre fixed (paper, 3.2, step 1).
+    """Adjust with one focal length and the distortion, the centre fixed (paper, 3.2, step 1).
 
-    focal_range: px, lowest and highest focal length; None holds it where it is: one point of its
-    profile.
+    focal_range: px, lowest and highest focal length; None holds the focal length, for one point of
+    its profile. Coefficients that the model's step 1 does not have stay 0.
     """
-    params = [camera.fx, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL, camera.k1, camera.k2]
-    colmap = _camera('RADIAL', camera, params)
-    reconstruction = _reconstruction(scenes, colmap)
+    model = camera.step1
+    reconstruction = _reconstruction(scenes, camera, model)
     adjuster = _adjuster(reconstruction, solver, refine_focal=focal_range is not None,
                          refine_centre=False)
     values = reconstruction.cameras[1].params
     if not adjuster.problem.has_parameter_block(values):
-        return list(scenes), camera  # nothing is seen: there is nothing to adjust
+        return list(scenes), camera  # there are no observations
     if focal_range is not None:
-        _bound(adjuster.problem, values, 0, *focal_range)
-    for index in (3, 4):
-        _bound(adjuster.problem, values, index, -MAX_K, MAX_K)
+        _bound(adjuster.problem, values, model.places[0], *focal_range)
+    for place in model.places[4:]:
+        _bound(adjuster.problem, values, place, -MAX_DISTORTION, MAX_DISTORTION)
     adjuster.solve()
-    focal, _, _, k1, k2 = reconstruction.cameras[1].params
-    return (_updated(scenes, reconstruction),
-            replace(camera, fx=float(focal), fy=float(focal), k1=float(k1), k2=float(k2)))
+    found = model.params(reconstruction.cameras[1].params)
+    # the conversion from COLMAP's pixels rounds: keep the centre exact
+    found[2:4] = camera.params[2:4]
+    return _updated(scenes, reconstruction), _completed(camera, found)
 
 
 def adjust_step2(scenes: Sequence[Scene], camera: Camera, solver: Solver, prior: Prior,
-                 bounds: tuple[Array, Array]) -> tuple[list[Scene], Camera]:
-    """Adjust all six parameters within bounds and under a prior (paper, 3.2, step 2).
+                 bounds: tuple[Floats, Floats]) -> tuple[list[Scene], Camera]:
+    """Adjust all n parameters within bounds and under a prior (paper, 3.2, step 2).
 
-    bounds: lowest and highest fx, fy, cx, cy, k1, k2, (6,) each.
+    bounds: lowest and highest values, (n,) each, in the order of camera.names().
     """
-    shift = np.array([0, 0, HALF_PIXEL, HALF_PIXEL, 0, 0])
-    colmap = _camera('OPENCV', camera, [*(camera.params + shift), 0.0, 0.0])
-    reconstruction = _reconstruction(scenes, colmap)
+    model = camera.step2
+    places = list(model.places)
+    reconstruction = _reconstruction(scenes, camera, model)
     adjuster = _adjuster(reconstruction, solver, refine_focal=True, refine_centre=True)
     values = reconstruction.cameras[1].params
     problem = adjuster.problem
     if not problem.has_parameter_block(values):
         return list(scenes), camera
-    problem.set_manifold(values, pyceres.SubsetManifold(OPENCV_SIZE, OPENCV_HELD))
-    for index, (low, high) in enumerate(zip(bounds[0] + shift, bounds[1] + shift, strict=True)):
-        _bound(problem, values, index, low, high)
-    mean = np.zeros(OPENCV_SIZE)
-    mean[:6] = prior.mean + shift
-    covariance = np.eye(OPENCV_SIZE)
-    covariance[:6, :6] = prior.covariance
+    if model.held:
+        problem.set_manifold(values, pyceres.SubsetManifold(model.size, model.held))
+    low, high = (model.values(bound) for bound in bounds)
+    for place in places:
+        _bound(problem, values, place, low[place], high[place])
+    covariance = np.eye(model.size)
+    covariance[np.ix_(places, places)] = prior.covariance
     problem.add_residual_block(
-        pyceres.factors.NormalPrior(mean, covariance), pyceres.TrivialLoss(), [values])
+        pyceres.factors.NormalPrior(model.values(prior.mean), covariance),
+        pyceres.TrivialLoss(), [values])
     adjuster.solve()
-    params = np.array(reconstruction.cameras[1].params)[:6] - shift
-    return _updated(scenes, reconstruction), camera.with_params(params)
+    return (_updated(scenes, reconstruction),
+            camera.with_params(model.params(reconstruction.cameras[1].params)))
 
 
-def _camera(model: str, camera: Camera, params: Sequence[float]) -> pycolmap.Camera:
-    width, height = camera.image_size
-    return pycolmap.Camera(camera_id=1, model=model, width=width, height=height, params=params)
+def _completed(camera: Camera, found: Floats) -> Camera:
+    """Return the camera with the parameters found; those that were not adjusted stay."""
+    return camera.with_params([*found, *camera.params[len(found):]])
 
 
-def _reconstruction(scenes: Sequence[Scene], camera: pycolmap.Camera) -> pycolmap.Reconstruction:
+def _reconstruction(scenes: Sequence[Scene], camera: Camera, model: ColmapModel
+                    ) -> pycolmap.Reconstruction:
     """Return the scenes, side by side, as one COLMAP reconstruction with one camera."""
+    width, height = camera.image_size
     reconstruction = pycolmap.Reconstruction()
-    reconstruction.add_camera_with_trivial_rig(camera)
+    reconstruction.add_camera_with_trivial_rig(pycolmap.Camera(
+        camera_id=1, model=model.name, width=width, height=height,
+        params=model.values(camera.params[:len(model.places)])))
     for scene, first_id in zip(scenes, _first_ids(scenes), strict=True):
         structure = scene.structure
         rank = np.cumsum(structure.used, axis=1) - 1
@@ -151,8 +142,8 @@ def _adjuster(reconstruction: pycolmap.Reconstruction, solver: Solver, refine_fo
     return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
 
 
-def _bound(problem: pyceres.Problem, values: Array, index: int, low: float, high: float) -> None:
-    # a start outside its bounds is an error in Ceres
+def _bound(problem: pyceres.Problem, values: Floats, index: int, low: float, high: float) -> None:
+    # Ceres refuses a start outside its bounds
     values[index] = min(max(values[index], low), high)
     problem.set_parameter_lower_bound(values, index, low)
     problem.set_parameter_upper_bound(values, index, high)

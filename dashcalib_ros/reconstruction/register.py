@@ -1,9 +1,9 @@
-"""Track positions registered once more, each against one reference patch, by affine Lucas-Kanade.
+"""Track positions are registered again, against one reference patch each (affine Lucas-Kanade).
 
 Tracking from image to image drifts: small errors add up along a track, most where a surface comes
-closer and its picture grows. A first scene tells how much larger each patch appears than in its
-reference image; from there an affine registration (Baker and Matthews 2004, inverse compositional)
-brings every observation back to the same world point.
+closer and its picture grows. The first scene gives the scale of each patch relative to its
+reference image. From there an affine registration (Baker and Matthews 2004, inverse compositional)
+moves every observation back to the same world point.
 """
 from __future__ import annotations
 
@@ -12,20 +12,22 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from dashcalib_ros.reconstruction.chain import Structure
+from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
+from dashcalib_ros.reconstruction.structure import Structure
 from dashcalib_ros.reconstruction.tracks import Tracks
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
+# affine steps converge slowly; a patch that has not converged by then is dropped
 ITERATIONS = 10
+# ratio of scales beyond which a patch and its reference look too different
 MAX_SCALE = 3.0
+# a patch with less correlation does not show its reference
 MIN_CORRELATION = 0.85
+# px; a step below this ends the registration of a patch
 SETTLED_PX = 0.01
 
 
-def register_tracks(tracks: Tracks, structure: Structure, images: Sequence[npt.NDArray[np.uint8]],
+def register_tracks(tracks: Tracks, structure: Structure, images: Sequence[GreyImage],
                     half_window: int, max_shift_px: float) -> Tracks:
     """Return the tracks with every used observation registered against its track's reference.
 
@@ -55,21 +57,21 @@ def register_tracks(tracks: Tracks, structure: Structure, images: Sequence[npt.N
     return replace(tracks, xy=xy)
 
 
-def _depths(structure: Structure) -> Array:
+def _depths(structure: Structure) -> Floats:
     """Return (k, t) depths of the points in each image; 0 where not registered or behind."""
     depth = (np.einsum('kj,tj->kt', structure.rotations[:, 2], structure.points)
              + structure.translations[:, 2:])
     return np.asarray(np.where(structure.registered[:, None], np.maximum(depth, 0.0), 0.0))
 
 
-def _reference_rows(used: npt.NDArray[np.bool_], depth: Array) -> npt.NDArray[np.int64]:
+def _reference_rows(used: Mask, depth: Floats) -> Ints:
     """Return (t,) the image of each track where its depth is the median of its observations."""
     order = np.argsort(np.where(used, depth, np.inf), axis=0, kind='stable')
     middle = np.maximum(used.sum(axis=0) - 1, 0) // 2
     return np.asarray(order[middle, np.arange(used.shape[1])], np.int64)
 
 
-def _sample(image: Floats, xy: Array) -> Floats:
+def _sample(image: Floats32, xy: Floats) -> Floats32:
     """Return (n, p) intensities at (n, p, 2) positions.
 
     Lanczos: OpenCV's cubic kernel shifts the picture by up to 0.05 px between the pixels.
@@ -79,9 +81,9 @@ def _sample(image: Floats, xy: Array) -> Floats:
                                 borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
-def _templates(tracks: Tracks, reference: npt.NDArray[np.int64],
-               images: list[Floats], grid: Floats
-               ) -> tuple[Floats, Floats, Floats]:
+def _templates(tracks: Tracks, reference: Ints,
+               images: list[Floats32], grid: Floats32
+               ) -> tuple[Floats32, Floats32, Floats32]:
     """Return normalised patches (t, p), steepest descent (t, p, 6), inverse Hessians (t, 6, 6)."""
     count, pixels = len(reference), len(grid)
     template = np.zeros((count, pixels), np.float32)
@@ -89,7 +91,7 @@ def _templates(tracks: Tracks, reference: npt.NDArray[np.int64],
     for k in np.unique(reference):
         rows = np.flatnonzero((reference == k) & np.isfinite(tracks.xy[k, :, 0]))
         if len(rows) == 0:
-            continue  # only of tracks that the structure does not use
+            continue  # all of them are tracks that the structure does not use
         centre = tracks.xy[k, rows][:, None] + grid
         template[rows] = _sample(images[k], centre)
         for axis, kernel in enumerate(((1, 0), (0, 1))):
@@ -107,9 +109,9 @@ def _templates(tracks: Tracks, reference: npt.NDArray[np.int64],
     return template, descent, inverse
 
 
-def _align(image: Floats, start: Array, scale: Array, template: Floats,
-           descent: Floats, inverse: Floats, grid: Floats
-           ) -> tuple[Array, npt.NDArray[np.bool_]]:
+def _align(image: Floats32, start: Floats, scale: Floats, template: Floats32,
+           descent: Floats32, inverse: Floats32, grid: Floats32
+           ) -> tuple[Floats, Mask]:
     """Return (n, 2) positions where the patches match their templates, and (n,) if they do."""
     linear = scale[:, None, None] * np.eye(2)
     centre = start.copy()

@@ -1,29 +1,27 @@
-"""What a reconstructed turn is."""
+"""A reconstructed turn: its tracks, structure, camera and focal profile."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from dashcalib_ros.reconstruction.camera import Camera
-from dashcalib_ros.reconstruction.chain import Structure, triangulate
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.reconstruction.structure import Structure, triangulate
 from dashcalib_ros.reconstruction.tracks import Tracks
-
-Array = npt.NDArray[np.float64]
+from dashcalib_ros.turns.turn import TurnId
 
 
 @dataclass(frozen=True)
 class Profile:
     """How well a turn can be explained at each focal length held fixed.
 
-    ratios: (n,) focal length over image width, ascending. costs: (n,) px^2 per observation, each
-    observation's squared error cut at a limit, so that nothing is gained by explaining fewer.
-    observations: how many there were.
+    ratios: (n,) focal length over image width, ascending. costs: (n,) truncated_cost(), px^2 per
+    observation. observations: how many there were.
     """
 
-    ratios: Array
-    costs: Array
+    ratios: Floats
+    costs: Floats
     observations: int
 
     @property
@@ -34,7 +32,7 @@ class Profile:
 
 @dataclass(frozen=True)
 class Draft:
-    """A turn half way: its tracks, its focal profile, and the camera to begin with."""
+    """A turn half reconstructed: its tracks, its focal profile, and the camera to start from."""
 
     tracks: Tracks
     profile: Profile
@@ -45,7 +43,7 @@ class Draft:
 class Scene:
     """One turn, reconstructed: its tracks, the structure that explains them, and its profile."""
 
-    center: int
+    turn: TurnId
     tracks: Tracks
     structure: Structure
     camera: Camera
@@ -55,7 +53,7 @@ class Scene:
     def yaw_deg(self) -> float:
         """Return by how much the camera turned about its vertical axis, in degrees."""
         rotations = self.structure.rotations[self.structure.registered]
-        # where each camera looks, seen from the first: pitch and roll are no yaw
+        # the optical axes in the first camera's frame: pitch and roll do not count
         ahead = rotations[:, 2] @ rotations[0].T
         yaw = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))
         return float(np.degrees(np.ptp(yaw)))
@@ -66,7 +64,7 @@ class Scene:
         return float(self.structure.used.sum() / max(int(self.tracks.seen.sum()), 1))
 
 
-def errors_px(scene: Scene, camera: Camera) -> Array:
+def errors_px(scene: Scene, camera: Camera) -> Floats:
     """Return (k, t) reprojection errors in px; inf where the scene does not explain a track."""
     structure = scene.structure
     residual = residuals_px(scene, camera)
@@ -75,12 +73,11 @@ def errors_px(scene: Scene, camera: Camera) -> Array:
     return np.asarray(np.where(explained & np.isfinite(error), error, np.inf))
 
 
-def residuals_px(scene: Scene, camera: Camera) -> Array:
+def residuals_px(scene: Scene, camera: Camera) -> Floats:
     """Return (k, t, 2) projected minus observed, px; NaN where unseen or behind the camera."""
     structure = scene.structure
     local = (structure.points @ structure.rotations.transpose(0, 2, 1)
              + structure.translations[:, None])
-    local[local[:, :, 2] <= 1e-9] = np.nan
     return np.asarray(camera.project(local) - scene.tracks.xy)
 
 
@@ -96,9 +93,9 @@ def truncated_cost(scene: Scene, camera: Camera, limit_px: float) -> float:
 
 
 def retriangulated(scene: Scene, camera: Camera, limit_px: float, min_angle_deg: float) -> Scene:
-    """Return the scene with every track triangulated anew: lost ones come back, bad ones go."""
+    """Return the scene with every track triangulated anew, also those that were not used."""
     structure = scene.structure
     points, used = triangulate(
-        camera.rays(scene.tracks.xy), structure.rotations, structure.translations,
-        structure.registered, limit_px / camera.fx, min_angle_deg)
+        camera, scene.tracks.xy, camera.rays(scene.tracks.xy), structure.rotations,
+        structure.translations, structure.registered, limit_px, min_angle_deg)
     return replace(scene, structure=replace(structure, points=points, used=used), camera=camera)

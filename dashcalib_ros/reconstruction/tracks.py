@@ -1,23 +1,22 @@
 """A turn's images -> tracks: the same world point followed through the keyframes.
 
 Lucas-Kanade tracks replace the paper's SIFT matches: neighbouring images of a drive differ little,
-tracking is sub-pixel exact there, and it takes a tenth of the time.
+so that tracking is exact to a part of a pixel, in a tenth of the time.
 """
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from dashcalib_ros.arrays import Floats, GreyImage, Ints, Mask
 from dashcalib_ros.config import TracksConfig
-from dashcalib_ros.motion.points import find_corners, follow_points
+from dashcalib_ros.motion.points import Tracking, find_corners, follow_points
 from dashcalib_ros.turns.turn import Turn
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+# keyframes; a track seen in fewer is dropped
 MIN_LENGTH = 3
-# between two keyframes
+# px between two keyframes; a track that moves less stands still in the picture
 STANDING_PX = 0.3
 
 
@@ -30,10 +29,10 @@ class Tracks:
     image_size: (width, height). stamps_ns: (k,) when the keyframes were taken.
     """
 
-    frames: npt.NDArray[np.int64]
-    xy: Array
+    frames: Ints
+    xy: Floats
     image_size: tuple[int, int]
-    stamps_ns: npt.NDArray[np.int64]
+    stamps_ns: Ints
 
     @property
     def seen(self) -> Mask:
@@ -60,7 +59,7 @@ def track_turn(turn: Turn, config: TracksConfig, valid: Mask | None = None) -> T
 
 
 def thinned(tracks: Tracks, keyframes: int) -> Tracks:
-    """Return the tracks at no more keyframes than asked for, evenly spread."""
+    """Return the tracks with at most this many keyframes, evenly chosen."""
     count = len(tracks.frames)
     if count <= keyframes:
         return tracks
@@ -70,17 +69,17 @@ def thinned(tracks: Tracks, keyframes: int) -> Tracks:
                   tracks.stamps_ns[kept])
 
 
-def _follow(images: list[npt.NDArray[np.uint8]], config: TracksConfig, valid: Mask | None
-            ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+def _follow(images: list[GreyImage], config: TracksConfig, valid: Mask | None
+            ) -> tuple[Ints, Ints, Floats]:
     """Return the observations as flat arrays: track (n,), image (n,), xy (n, 2)."""
     ids = np.zeros(0, np.int64)
     points = np.zeros((0, 2), np.float32)
     born = 0
     rows = []
+    tracking = Tracking(config.forward_backward_px, config.window)
     for k, image in enumerate(images):
         if k:
-            points, trusted = follow_points(
-                images[k - 1], image, points, config.forward_backward_px, config.window)
+            points, trusted = follow_points(images[k - 1], image, points, tracking)
             if valid is not None and len(points):
                 inside = np.round(points).astype(int)
                 trusted &= valid[np.clip(inside[:, 1], 0, image.shape[0] - 1),
@@ -96,10 +95,13 @@ def _follow(images: list[npt.NDArray[np.uint8]], config: TracksConfig, valid: Ma
     return tracks, frames, xy
 
 
-def _keyframes(ids: npt.NDArray[np.int64], frames: npt.NDArray[np.int64], xy: Array, width: int,
-               config: TracksConfig) -> npt.NDArray[np.int64]:
-    """Choose keyframes by how far the points moved since the last; a standing car adds none."""
-    def observed(k: int) -> tuple[npt.NDArray[np.int64], Array]:
+def _keyframes(ids: Ints, frames: Ints, xy: Floats, width: int,
+               config: TracksConfig) -> Ints:
+    """Return the keyframes: each is chosen by how far the points moved since the last one.
+
+    A standing car adds none.
+    """
+    def observed(k: int) -> tuple[Ints, Floats]:
         rows = frames == k
         return ids[rows], xy[rows]
 
@@ -120,14 +122,14 @@ def _keyframes(ids: npt.NDArray[np.int64], frames: npt.NDArray[np.int64], xy: Ar
     return np.array(chosen, dtype=np.int64)
 
 
-def _worth_keeping(table: Array) -> Mask:
-    """Return (t,): tracks seen in enough keyframes, and that are not fixed to the picture."""
+def _worth_keeping(table: Floats) -> Mask:
+    """Return (t,): True for tracks that are seen in enough keyframes and move in the picture."""
     seen = np.isfinite(table[:, :, 0])
     with np.errstate(all='ignore'):
         low = np.min(np.where(seen[:, :, None], table, np.inf), axis=0)
         high = np.max(np.where(seen[:, :, None], table, -np.inf), axis=0)
     extent = np.linalg.norm(high - low, axis=1)
-    # a track on a burnt-in text stands, and may hop from one letter to the next
+    # a track on burnt-in text stands still, and may jump from one letter to the next
     step = np.linalg.norm(np.diff(table, axis=0), axis=2)
     standing = (step < STANDING_PX).sum(axis=0) > 0.5 * np.isfinite(step).sum(axis=0)
     return np.asarray((seen.sum(axis=0) >= MIN_LENGTH) & (extent > 2.0) & ~standing)

@@ -1,18 +1,28 @@
 """calibration.yaml, result.json, report.html; comparisons; what a terminal shows: tables.py."""
-from dashcalib_ros.report.camera import Camera, camera_of, load_camera
+from dashcalib_ros.report.camera_file import load_camera
 from dashcalib_ros.report.camera_yaml import calibration_yaml, load_calibration_yaml
 from dashcalib_ros.report.compare import Comparison, Difference, compare
-from dashcalib_ros.report.files import check_writable, output_folder, write_results, write_text
+from dashcalib_ros.report.files import (
+    Written,
+    check_writable,
+    output_folder,
+    remove_leftovers,
+    set_aside,
+    write_results,
+    write_text,
+)
 from dashcalib_ros.report.mapping import mapping_error
+from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.result import load_result, result_dict, result_json
 
 __all__ = [
-    'Camera',
     'Comparison',
     'Difference',
+    'NamedCamera',
+    'Written',
+    'calibrated_camera',
     'calibration_yaml',
-    'camera_of',
     'check_writable',
     'compare',
     'load_calibration_yaml',
@@ -20,9 +30,11 @@ __all__ = [
     'load_result',
     'mapping_error',
     'output_folder',
+    'remove_leftovers',
     'report_html',
     'result_dict',
     'result_json',
+    'set_aside',
     'write_results',
     'write_text',
 ]

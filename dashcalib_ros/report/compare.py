@@ -1,4 +1,4 @@
-"""Two calibrations side by side: how far apart, by how many sigmas, and what it does to pixels."""
+"""The comparison of two calibrations: differences, in sigmas too, and the mapping error."""
 from __future__ import annotations
 
 import dataclasses
@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from dashcalib_ros.camera import Camera
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.report.camera import PARAMETERS, Camera
 from dashcalib_ros.report.mapping import mapping_error
+from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.result import plain_values
 
 
@@ -16,8 +17,8 @@ from dashcalib_ros.report.result import plain_values
 class Difference:
     """One parameter of both. difference is a - b; percent is of b, None where b is zero.
 
-    sigma: of the difference, from whichever side knows its own (both: root of the squares' sum).
-    z: difference in those sigmas. Both None when neither side knows a sigma.
+    sigma: of the difference, from the sides that have one (both: the root of the sum of squares).
+    z: difference / sigma. Both are None when neither side has a sigma.
     """
 
     name: str
@@ -33,13 +34,13 @@ class Difference:
 class Comparison:
     """What compare() found. mapping_px: RMS over the image; None where b's model folds over."""
 
-    a: Camera
-    b: Camera
+    a: NamedCamera
+    b: NamedCamera
     differences: tuple[Difference, ...]
     mapping_px: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all of it as strict JSON's values."""
+        """Return the comparison as values of strict JSON."""
         sides = {side: {'name': camera.name, 'verdict': camera.verdict}
                  for side, camera in (('a', self.a), ('b', self.b))}
         rows = {d.name: dataclasses.asdict(d) for d in self.differences}
@@ -51,29 +52,31 @@ class Comparison:
         return plain
 
 
-def compare(a: Camera, b: Camera) -> Comparison:
+def compare(a: NamedCamera, b: NamedCamera) -> Comparison:
     """Compare camera a with the reference b. Raises InputError when the image sizes differ."""
     if a.image_size != b.image_size:
         raise InputError(
             f'{a.name} is for {a.image_size[0]} x {a.image_size[1]} images and {b.name} for '
             f'{b.image_size[0]} x {b.image_size[1]}; compare calibrations of the same image size')
-    rows = tuple(_difference(name, a, b) for name in PARAMETERS)
-    extra = tuple(_difference(name, a, b) for name in ('p1', 'p2', 'k3')
-                  if getattr(a, name) or getattr(b, name))
-    return Comparison(a, b, rows + extra, mapping_error(a, b))
+    names = _common_names(a.camera, b.camera)
+    rows = tuple(_difference(name, a, b) for name in names)
+    return Comparison(a, b, rows, mapping_error(a.camera, b.camera))
 
 
-def _difference(name: str, a: Camera, b: Camera) -> Difference:
-    value, reference = _value(a, name), _value(b, name)
+def _common_names(a: Camera, b: Camera) -> tuple[str, ...]:
+    """Return the parameters to compare: all of the larger model, if both are of one family."""
+    if a.ros_model != b.ros_model:
+        # a distortion coefficient of the same name has another meaning there
+        return a.names()[:4]
+    return max(a.names(), b.names(), key=len)
+
+
+def _difference(name: str, a: NamedCamera, b: NamedCamera) -> Difference:
+    value, reference = (each.camera.named.get(name, 0.0) for each in (a, b))
     difference = value - reference
-    sigmas = [getattr(camera.sigma, name) for camera in (a, b)
-              if camera.sigma is not None and name in PARAMETERS]
+    sigmas = [each.sigma[name] for each in (a, b)
+              if each.sigma is not None and name in each.sigma]
     sigma = math.hypot(*sigmas) if sigmas else None
     return Difference(name, value, reference, difference,
                       100 * difference / abs(reference) if reference else None,
                       sigma, difference / sigma if sigma else None)
-
-
-def _value(camera: Camera, name: str) -> float:
-    value: float = getattr(camera.intrinsics if name in PARAMETERS else camera, name)
-    return value

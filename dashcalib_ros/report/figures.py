@@ -8,16 +8,16 @@ import zlib
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from dashcalib_ros.intrinsics import TurnSummary
+from dashcalib_ros.arrays import Floats, GreyImage, Mask
+from dashcalib_ros.judgement import TurnSummary
 
 WIDTH, HEIGHT = 900, 260  # px of the plot
 LEFT, RIGHT, TOP, BOTTOM = 56, 12, 22, 40  # px of margin
-MASK_WIDTH = 640  # px; a mask has no detail that needs more
+MASK_WIDTH = 640  # px; enough for the details of a mask
 
 
-def magnitude_svg(magnitudes: npt.NDArray[np.float64],
+def magnitude_svg(magnitudes: Floats,
                   turns: Sequence[TurnSummary]) -> str:
     """Plot the turning magnitude over time, turns marked; '' when there is nothing to plot.
 
@@ -43,14 +43,14 @@ def magnitude_svg(magnitudes: npt.NDArray[np.float64],
             f'aria-label="turning magnitude over time">{_axes(span, peak)}{marks}{lines}</svg>')
 
 
-def mask_data_uri(mask: npt.NDArray[np.bool_]) -> str:
+def mask_data_uri(mask: Mask) -> str:
     """Return the mask as a PNG data URI: white is used, black is the ego vehicle."""
     step = max(1, math.ceil(mask.shape[1] / MASK_WIDTH))
     grey = np.where(mask[::step, ::step], 255, 0).astype(np.uint8)
     return 'data:image/png;base64,' + base64.b64encode(png(grey)).decode('ascii')
 
 
-def png(grey: npt.NDArray[np.uint8]) -> bytes:
+def png(grey: GreyImage) -> bytes:
     """Encode an 8-bit grey image as PNG."""
     height, width = grey.shape
     rows = np.zeros((height, width + 1), np.uint8)  # the leading 0: no filter
@@ -94,8 +94,8 @@ def _mark(turn: TurnSummary, x: float) -> str:
             f'<text class="mid" x="{x:.1f}" y="{TOP - 4}">{turn.center}</text>')
 
 
-def _pieces(xy: npt.NDArray[np.float64],
-            finite: npt.NDArray[np.bool_]) -> list[npt.NDArray[np.float64]]:
+def _pieces(xy: Floats,
+            finite: Mask) -> list[Floats]:
     """Cut at gaps, and thin each piece to its extremes per column of pixels."""
     edges = np.flatnonzero(np.diff(finite.astype(np.int8))) + 1
     pieces = [part for part, ok in zip(np.split(xy, edges), np.split(finite, edges), strict=True)
@@ -103,7 +103,7 @@ def _pieces(xy: npt.NDArray[np.float64],
     return [_thin(part) for part in pieces]
 
 
-def _thin(xy: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _thin(xy: Floats) -> Floats:
     columns = np.flatnonzero(np.diff(xy[:, 0].astype(np.int64))) + 1
     if len(xy) < 4 * (len(columns) + 1):
         return xy
@@ -113,5 +113,5 @@ def _thin(xy: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return xy[sorted(keep)]
 
 
-def _points(xy: npt.NDArray[np.float64]) -> str:
+def _points(xy: Floats) -> str:
     return ' '.join(f'{x:.1f},{y:.1f}' for x, y in xy)

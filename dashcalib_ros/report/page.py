@@ -1,4 +1,4 @@
-"""report.html: the calibration on one page that needs nothing but itself."""
+"""report.html: the calibration on one page, without references to other files."""
 from __future__ import annotations
 
 import json
@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from dashcalib_ros.intrinsics import Calibration
+from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.report.figures import magnitude_svg, mask_data_uri
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.wording import (
     ADVICE,
-    PARAMETER_NAMES,
     TURN_COLUMNS,
-    parameter_row,
+    parameter_rows,
     shutter_text,
     stored_text,
     turn_row,
@@ -51,7 +50,7 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem; }
 
 
 def report_html(calibration: Calibration) -> str:
-    """Return the page's text; all that comes from outside is escaped."""
+    """Return the page's text; all text from the input is escaped."""
     c = calibration
     title = f'Calibration of {c.input_name}' if c.input_name else 'Calibration'
     parts = [
@@ -73,12 +72,13 @@ def _verdict(c: Calibration) -> str:
 
 
 def _parameters(c: Calibration) -> str:
-    if c.intrinsics is None:
+    if c.camera is None:
         return ''
-    rows = [parameter_row(name, c.intrinsics, c.sigma) for name in PARAMETER_NAMES]
+    rows = parameter_rows(c)
     size = f'{c.image_size[0]} × {c.image_size[1]} px'
     return (f'<h2>Parameters</h2>{_table(("parameter", "value", "sigma", "relative"), rows)}'
-            f'<p class="note">For images of {size}, full size; plumb_bob, D = [k1, k2, 0, 0, 0]; '
+            f'<p class="note">For images of {size}, full size; {c.camera.model} model, '
+            f'{c.camera.ros_model} in ROS; '
             "the first pixel's centre is (0, 0), as in ROS and OpenCV.</p>")
 
 

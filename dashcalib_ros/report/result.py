@@ -11,22 +11,21 @@ from typing import Any
 import numpy as np
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.intrinsics import Calibration, TurnSummary
-from dashcalib_ros.intrinsics.calibration import StoredTurnSummary
-from dashcalib_ros.report.source_text import read_text
+from dashcalib_ros.judgement import Calibration, TurnSummary
+from dashcalib_ros.judgement.calibration import StoredTurnSummary
+from dashcalib_ros.limits import JSON_BYTES, read_text
+from dashcalib_ros.limits import parse_json as parse_any_json
 
 
 def result_dict(calibration: Calibration) -> dict[str, Any]:
-    """Return what result.json holds: plain dicts, lists, text and finite numbers or None."""
+    """Return the content of result.json: plain dicts, lists, text, and finite numbers or None."""
     c = calibration
-    intrinsics = None if c.intrinsics is None else dataclasses.asdict(c.intrinsics)
-    sigma = None if c.sigma is None else dataclasses.asdict(c.sigma)
     plain: dict[str, Any] = plain_values({
         'verdict': c.verdict.level,
         'reasons': c.verdict.reasons,
         'image_size': c.image_size,
-        'intrinsics': intrinsics,
-        'sigma': sigma,
+        'intrinsics': c.intrinsics,
+        'sigma': c.sigma,
         'turns': [_turn_dict(turn) for turn in c.turns],
         'frames': c.frames,
         'reprojection_error_px': c.reprojection_error_px,
@@ -34,6 +33,7 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'seed': c.config.seed,
         'versions': c.versions,
         'config': c.config.flat(),
+        'camera_model': None if c.camera is None else c.camera.model,
         'stored_turns': [_turn_dict(turn) for turn in c.stored_turns],
         'rolling_shutter': c.rolling_shutter,
         'input': c.input_name,
@@ -51,8 +51,8 @@ def result_json(calibration: Calibration) -> str:
 
 
 def load_result(path: str | Path) -> dict[str, Any]:
-    """Read a result.json back. Raises InputError when it is none."""
-    return parse_result(read_text(path), path)
+    """Read a result.json. Raises InputError if it is not one."""
+    return parse_result(read_text(Path(path), JSON_BYTES), path)
 
 
 def parse_result(text: str, path: str | Path) -> dict[str, Any]:
@@ -67,17 +67,14 @@ def parse_result(text: str, path: str | Path) -> dict[str, Any]:
 
 def parse_json(text: str, path: str | Path) -> dict[str, Any]:
     """Parse the text of a JSON object; raises InputError."""
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f'{path} is not valid JSON ({error}); write it anew') from error
+    data = parse_any_json(text, str(path))
     if not isinstance(data, dict):
         raise InputError(f'{path} holds no JSON object; give a result.json or a truth file')
     return data
 
 
 def plain_values(value: Any) -> Any:
-    """Return value as what strict JSON knows; NaN and infinity become None."""
+    """Return the value as types of strict JSON; NaN and infinity become None."""
     if value is None or isinstance(value, (bool, str)):
         return value
     if isinstance(value, (np.ndarray, np.generic)):
@@ -99,6 +96,6 @@ def plain_values(value: Any) -> Any:
 
 def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
     values = dataclasses.asdict(turn)
-    # a stored turn's key is of this run only
+    # a stored turn's id has a meaning in this run only
     return {('stamp' if key == 'stamp_s' else key): item for key, item in values.items()
-            if key != 'key'}
+            if key != 'id'}

@@ -1,4 +1,4 @@
-"""What a terminal shows of a calibration. Returns rich renderables; prints nothing."""
+"""Results as rich renderables for a terminal; nothing is printed here."""
 from __future__ import annotations
 
 import math
@@ -10,14 +10,13 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dashcalib_ros.intrinsics import Calibration, Verdict
+from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.report.compare import Comparison, Difference
 from dashcalib_ros.report.wording import (
-    PARAMETER_NAMES,
     TURN_COLUMNS,
     number,
     optional,
-    parameter_row,
+    parameter_rows,
     shutter_text,
     stored_text,
     turn_row,
@@ -27,12 +26,11 @@ COLOURS = {'accepted': 'bold green', 'weak': 'bold yellow', 'refused': 'bold red
 
 
 def summary(calibration: Calibration) -> RenderableType:
-    """Return the verdict with its reasons, estimate and sigma, and what became of each turn."""
+    """Return the verdict with its reasons, the estimate with its sigma, and the table of turns."""
     c = calibration
     parts: list[RenderableType] = [verdict_text(c.verdict)]
-    if c.intrinsics is not None:
-        parts.append(text_table(('', 'estimate', 'sigma', ''), [
-            parameter_row(name, c.intrinsics, c.sigma) for name in PARAMETER_NAMES]))
+    if c.camera is not None:
+        parts.append(text_table(('', 'estimate', 'sigma', ''), parameter_rows(c)))
     if c.turns:
         parts.append(text_table(TURN_COLUMNS, [turn_row(turn) for turn in c.turns]))
     parts.append(Text(_facts(c)))
@@ -68,7 +66,7 @@ def against_truth(found: Comparison) -> RenderableType:
 
 
 def mapping_text(found: Comparison) -> Text:
-    """Return the line that tells the mapping error."""
+    """Return the line with the mapping error."""
     if found.mapping_px is None or not math.isfinite(found.mapping_px):
         return Text('mapping error: unknown, a lens model folds over inside the image')
     return Text(f'mapping error: {found.mapping_px:.2f} px')

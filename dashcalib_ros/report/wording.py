@@ -1,14 +1,11 @@
-"""The words and numbers that the page and the terminal share."""
+"""Texts and numbers that the page and the terminal have in common."""
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from dashcalib_ros.intrinsics import Intrinsics, TurnSummary
-from dashcalib_ros.intrinsics.calibration import Shutter, StoredTurnSummary
-from dashcalib_ros.report.camera import PARAMETERS
-
-PARAMETER_NAMES = PARAMETERS
+from dashcalib_ros.judgement import Calibration, TurnSummary
+from dashcalib_ros.judgement.calibration import Shutter, StoredTurnSummary
 
 ADVICE = {
     'accepted': 'Good to use: calibration.yaml was written.',
@@ -16,23 +13,31 @@ ADVICE = {
     'refused': 'There is no calibration: the evidence in this drive was not enough.',
 }
 
+# parameters that are lengths in the picture; the others have no unit
+PIXELS = ('fx', 'fy', 'cx', 'cy')
+
 TURN_COLUMNS = ('frame', 'from', 'to', 'at s', 'prominence', 'yaw °', 'images', 'error px', 'used')
 
 
-def parameter_row(name: str, intrinsics: Intrinsics,
-                  sigma: Intrinsics | None) -> tuple[str, str, str, str]:
-    """Return a parameter's name, value, sigma and sigma in percent, as text."""
-    value = getattr(intrinsics, name)
-    spread = None if sigma is None else getattr(sigma, name)
-    if spread is None or not math.isfinite(spread):
+def parameter_rows(calibration: Calibration) -> list[tuple[str, str, str, str]]:
+    """Return each parameter's name, value, sigma and sigma in percent, as text."""
+    if calibration.camera is None:
+        return []
+    sigma = calibration.sigma or {}
+    return [_parameter_row(name, value, sigma.get(name))
+            for name, value in calibration.camera.named.items()]
+
+
+def _parameter_row(name: str, value: float, sigma: float | None) -> tuple[str, str, str, str]:
+    if sigma is None or not math.isfinite(sigma):
         return name, number(name, value), 'unknown', ''
-    relative = f'{100 * spread / abs(value):.2f} %' if value else ''
-    return name, number(name, value), '± ' + number(name, spread), relative
+    relative = f'{100 * sigma / abs(value):.2f} %' if value else ''
+    return name, number(name, value), '± ' + number(name, sigma), relative
 
 
 def number(name: str, value: float) -> str:
-    """Return a parameter's value with as many digits as it deserves, and its unit."""
-    return f'{value:.4f}' if name in ('k1', 'k2', 'k3', 'p1', 'p2') else f'{value:.2f} px'
+    """Return a parameter's value with its significant digits and its unit."""
+    return f'{value:.2f} px' if name in PIXELS else f'{value:.4f}'
 
 
 def turn_row(turn: TurnSummary) -> tuple[str, ...]:
@@ -44,15 +49,15 @@ def turn_row(turn: TurnSummary) -> tuple[str, ...]:
 
 
 def stored_text(turns: Sequence[StoredTurnSummary]) -> str:
-    """Return what became of the turns of earlier drives."""
+    """Return how many turns of earlier drives were used."""
     used = sum(turn.used for turn in turns)
     return f'{used} of {len(turns)} stored turn{"" if len(turns) == 1 else "s"} used'
 
 
 def shutter_text(shutter: Shutter) -> str:
-    """Return what was found of a rolling shutter."""
+    """Return a line about the rolling shutter that was found."""
     return (f'rolling shutter of {shutter.readout_ms:.1f} ± {shutter.sigma_ms:.1f} ms found and '
-            'undone')
+            'removed')
 
 
 def optional(value: float | None, digits: int, unit: str = '') -> str:

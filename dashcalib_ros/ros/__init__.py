@@ -1,8 +1,9 @@
 """The ROS 2 node; the only room that imports rclpy, and only when the node is started."""
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
+
+from dashcalib_ros.standard_streams import open_closed_streams, write_stderr
 
 INSTALL = ("calibrator: error: the Python package {name} is missing: source your ROS 2 "
            "installation (. /opt/ros/jazzy/setup.sh), or pip install "
@@ -16,6 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # the handlers come first: Ctrl-C may be pressed while the imports still run
     from dashcalib_ros.ros.stopping import Stopping
     stopping = Stopping()
+    open_closed_streams()
     try:
         from dashcalib_ros.ros.program import run
         return run(argv, stopping)
@@ -23,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         missing = (error.name or '').partition('.')[0]
         if missing not in ROS_PACKAGES:
             raise
-        print(INSTALL.format(name=missing), file=sys.stderr)
+        write_stderr(INSTALL.format(name=missing))
         return 2
     finally:
         stopping.ignore_signals()

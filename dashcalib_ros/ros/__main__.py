@@ -1,4 +1,4 @@
-"""python -m dashcalib_ros.ros: the node, also where nothing is installed."""
+"""python -m dashcalib_ros.ros: the node, without the installed command."""
 import sys
 
 from dashcalib_ros.ros import main

@@ -1,4 +1,4 @@
-"""A bounded queue that drops its oldest item: who puts never waits."""
+"""A bounded queue that drops its oldest item when full: put() never waits."""
 from __future__ import annotations
 
 import threading
@@ -9,16 +9,17 @@ T = TypeVar('T')
 
 
 class Backlog(Generic[T]):
-    """Between the image callback and the thread that detects. dropped: items nobody took."""
+    """Between the image callback and the detecting thread. dropped: number of items dropped."""
 
     def __init__(self, capacity: int) -> None:
         self.dropped = 0
         self._items: deque[T] = deque(maxlen=capacity)
+        # the Backlog's own lock: guards dropped, _items and _closed
         self._changed = threading.Condition()
         self._closed = False
 
     def put(self, item: T) -> None:
-        """Append an item; the oldest makes room for it."""
+        """Append an item; drop the oldest if the queue is full."""
         with self._changed:
             if len(self._items) == self._items.maxlen:
                 self.dropped += 1
@@ -33,7 +34,7 @@ class Backlog(Generic[T]):
             return None if self._closed else self._items.popleft()
 
     def clear(self) -> None:
-        """Forget what waits, without counting it as dropped."""
+        """Remove all items, without counting them as dropped."""
         with self._changed:
             self._items.clear()
 

@@ -13,9 +13,9 @@ LOOK_S = 0.1
 
 
 class Commit:
-    """Calls the driver without waiting for it; says in the log what came of it.
+    """Calls the driver's service without waiting for it; logs the outcome.
 
-    Drivers without the service, that never answer, or that die meanwhile all end in one warning.
+    There is one warning if the driver has no service, does not answer, or dies meanwhile.
     """
 
     def __init__(self, node: Node, timeout_s: float, clock: Clock) -> None:
@@ -29,7 +29,7 @@ class Commit:
         self._deadline = 0.0
 
     def call(self, info: CameraInfo) -> None:
-        """Offer a calibration; one that is still on its way is given up."""
+        """Send a calibration; an earlier call that is not answered yet is cancelled."""
         self._forget()
         self._waiting = info
         self._deadline = time.monotonic() + self._timeout_s

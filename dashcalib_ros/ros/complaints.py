@@ -1,23 +1,28 @@
-"""What goes wrong is counted always and logged now and then, each kind by itself."""
+"""Problems are always counted, and logged at most every few seconds for each kind."""
 from __future__ import annotations
 
 import time
+import traceback
 from collections import Counter, deque
 from collections.abc import Callable
 
+from dashcalib_ros.errors import one_line
+
 EVERY_S = 10.0
-# lines that once() compares with
+# last lines that once() compares with
 REMEMBERED = 100
 
 
 class Complaints:
-    """counts: how often each kind was said, whether or not it was logged."""
+    """counts: number of complaints of each kind, logged or not."""
 
     def __init__(self, log: Callable[[str], object], every_s: float = EVERY_S) -> None:
         self.counts: Counter[str] = Counter()
         self._log = log
         self._every_s = every_s
         self._logged: dict[str, tuple[float, int]] = {}
+        # lines of code whose tracebacks were logged
+        self._places: set[str] = set()
         self._said: deque[str] = deque(maxlen=REMEMBERED)
 
     def say(self, kind: str, text: str, times: int = 1) -> None:
@@ -32,13 +37,25 @@ class Complaints:
         self._said.append(text)
         self._log(text + (f' ({unsaid} more like it)' if unsaid > 0 else ''))
 
+    def failure(self, kind: str, error: Exception) -> None:
+        """Count an unexpected exception; log its traceback the first time it comes from there."""
+        where = traceback.extract_tb(error.__traceback__)[-1:]
+        place = f'{type(error).__name__} at {where[0].filename}:{where[0].lineno}' if where else ''
+        text = f'the node goes on after {type(error).__name__}: {one_line(error)}'
+        if place in self._places:
+            self.say(kind, text)
+            return
+        self._places.add(place)
+        self.counts[kind] += 1
+        self._log('\n'.join([text, *traceback.format_exception(error)]).rstrip())
+
     def once(self, text: str) -> None:
-        """Log what holds from now on, unless it was logged before."""
+        """Log a line unless it was logged before."""
         if text not in self._said:
             self._said.append(text)
             self._log(text)
 
     def total(self, kind: str, count: int, text: str) -> None:
-        """Take a count that is kept elsewhere; log when it has grown."""
+        """Take over a count that is kept elsewhere; log when it has grown."""
         if count > self.counts[kind]:
             self.say(kind, text, count - self.counts[kind])

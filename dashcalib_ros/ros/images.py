@@ -13,7 +13,7 @@ from dashcalib_ros.ros.parameters import NodeConfig
 
 # images a subscription holds for a callback that is late
 DEPTH = 5
-# s between two looks at the publishers: what comes before the right subscription is lost
+# s between two checks of the publishers: images before the right subscription are lost
 LOOK_S = 0.25
 NAMED = {'best_effort': ReliabilityPolicy.BEST_EFFORT, 'reliable': ReliabilityPolicy.RELIABLE}
 
@@ -21,8 +21,9 @@ NAMED = {'best_effort': ReliabilityPolicy.BEST_EFFORT, 'reliable': ReliabilityPo
 class ImageInput:
     """Subscribes to the image topic; with reliability 'auto' it follows the publishers.
 
-    A reliable subscription never hears a best-effort camera; a best-effort one hears both, but
-    loses large images that a reliable one would get. So: reliable if all publishers are.
+    A reliable subscription does not match a best-effort camera. A best-effort one matches both,
+    but loses large images that a reliable one would receive. So it is reliable if all publishers
+    are.
     """
 
     def __init__(self, node: Node, config: NodeConfig, callback: Callable[[Any], None],
@@ -41,7 +42,7 @@ class ImageInput:
 
     @property
     def reliability(self) -> str:
-        """Return what is subscribed with now."""
+        """Return the reliability of the present subscription."""
         return self._reliability.name.lower()
 
     def _subscribe(self) -> Any:

@@ -1,22 +1,26 @@
-"""The Calibrator at work beside the executor: one thread detects, another calibrates."""
+"""Runs the Calibrator in two threads beside the executor: one detects, the other calibrates."""
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dashcalib_ros.calibrator import Calibrator, Mask, Status
+from dashcalib_ros.arrays import Mask
+from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.frames.decode import BitDepth, decode
-from dashcalib_ros.intrinsics import Calibration
-from dashcalib_ros.intrinsics.agreement import outdated, strangers
+from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judgement.agreement import outdated, turns_of_another_camera
 from dashcalib_ros.ros.backlog import Backlog
+from dashcalib_ros.turns import TurnId
 
-# s between two looks at whether enough turns are built: their scenes come without a push
+LOG = logging.getLogger(__name__)
+# s between two checks whether enough turns are built: scenes are finished without a push
 LOOK_S = 0.25
 LONGEST_BACK_OFF_S = 60.0
 NOTHING = Status(0, 0, 0, 0.0, 0.0, False)
@@ -43,10 +47,10 @@ class Result:
 
 @dataclass(frozen=True)
 class Listener:
-    """Who is told; each is called from one of the learner's threads and must not wait.
+    """Callbacks of the learner; its threads call them, so they must not wait.
 
-    result: of a calibration. status: after each image. trouble: a kind to count it by, and one
-    line for people.
+    result: called after each calibration. status: after each image. trouble: for each problem,
+    with its kind, for counting, and one line for the log. Their exceptions are logged.
     """
 
     result: Callable[[Result], None]
@@ -55,18 +59,22 @@ class Listener:
 
 
 class _Bank:
-    """A Calibrator and what belongs to its images alone."""
+    """A Calibrator and what belongs to its images only.
+
+    depth: used by the detecting thread only. tried: the turns of the last calibration; used by the
+    calibrating thread only.
+    """
 
     def __init__(self, number: int, calibrator: Calibrator) -> None:
         self.number = number
         self.calibrator = calibrator
         self.depth = BitDepth()
-        self.tried: frozenset[int] = frozenset()
+        self.tried: frozenset[TurnId] = frozenset()
 
 
 @dataclass(frozen=True)
 class _Job:
-    """An image on its way; it keeps to the bank it was taken for."""
+    """An image that waits for detection, and the bank that it is for."""
 
     bank: _Bank
     index: int
@@ -91,6 +99,7 @@ class Learner:
         self._mask = mask
         self._tell = listener
         self._backlog: Backlog[_Job] = Backlog(queue_size)
+        # the Learner's own lock: guards _bank, _activity, _requested and what follows them
         self._changed = threading.Condition()
         self._bank = _Bank(0, self._calibrator(use_stored=True))
         self._activity = Activity()
@@ -120,11 +129,11 @@ class Learner:
         self._backlog.put(_Job(self._bank, index, stamp_ns, message, size, frame_id))
 
     def activity(self) -> Activity:
-        """Return what is going on."""
+        """Return what the learner does now."""
         return self._activity
 
     def request(self) -> str:
-        """Calibrate now, with the turns there are; return why not, or nothing."""
+        """Calibrate now, with the present turns; return why not, '' if it is started."""
         with self._changed:
             activity = self._activity
             if activity.calibrating:
@@ -138,8 +147,8 @@ class Learner:
     def restart(self, keep_stored: bool = False) -> None:
         """Forget all turns and begin with an empty bank; a running calibration is cancelled.
 
-        turns.store is emptied, too. keep_stored: it is not, as another camera comes now: what it
-        has of that one is used.
+        turns.store is emptied, too. keep_stored: turns.store stays and its turns are used, as the
+        images are of another camera now.
         """
         with self._changed:
             if self._closed:
@@ -171,10 +180,11 @@ class Learner:
 
     def _calibrator(self, use_stored: bool) -> Calibrator:
         return Calibrator(self._config, mask=self._mask, live=True, use_stored=use_stored,
-                          warn=lambda text: self._tell.trouble('store', text))
+                          warn=lambda text: self._trouble('store', text),
+                          on_trouble=lambda text: self._trouble('workers', text))
 
     def _aside(self, task: Callable[[], None]) -> None:
-        """Do what takes a moment in a thread of its own, which close() waits for."""
+        """Run a slow task in a thread of its own, for which close() waits."""
         self._closing = [thread for thread in self._closing if thread.is_alive()]
         self._closing.append(threading.Thread(target=task, daemon=True))
         self._closing[-1].start()
@@ -190,13 +200,13 @@ class Learner:
                 status = job.bank.calibrator.push(
                     Frame(job.index, job.stamp_ns, image, job.frame_id))
             except InputError as error:
-                self._tell.trouble('undecodable', str(error))
+                self._trouble('undecodable', str(error))
                 continue
             except Exception as error:
-                self._tell.trouble('failed', f'an image could not be used: {_named(error)}')
+                self._trouble('failed', f'an image could not be used: {_named(error)}')
                 continue
             if self._note(job.bank, status):
-                self._tell.status(status)
+                _call(self._tell.status, status)
 
     def _note(self, bank: _Bank, status: Status) -> bool:
         with self._changed:
@@ -210,28 +220,30 @@ class Learner:
         while (bank := self._wait_until_due()) is not None:
             try:
                 calibration = bank.calibrator.calibrate(self._progress, final=False)
+                of_another = turns_of_another_camera(calibration.misfits, self._config.verdict)
+                bank.calibrator.reject(
+                    outdated(of_another | calibration.used_turns, of_another))
             except Exception as error:
                 self._failed(bank, error)
                 continue
-            used = [turn.center for turn in calibration.turns if turn.used]
-            used += [turn.key for turn in calibration.stored_turns if turn.used]
-            odd = strangers(calibration.misfits, self._config.verdict)
-            bank.calibrator.reject(outdated(odd.union(used), odd))
             with self._changed:
                 bank.tried = frozenset(calibration.misfits)
                 self._failures = 0
                 self._activity = replace(self._activity, calibrating=False, stage='')
-            complete = len(used) >= self._config.turns.wanted
-            self._tell.result(Result(calibration, complete, bank.number))
+            complete = calibration.turns_used >= self._config.turns.wanted
+            _call(self._tell.result, Result(calibration, complete, bank.number))
 
     def _wait_until_due(self) -> _Bank | None:
         """Return the bank to calibrate, None when closed."""
         while not self._closed:
             bank = self._bank
-            self._note(bank, bank.calibrator.status())
+            try:
+                self._note(bank, bank.calibrator.status())
+            except Exception as error:
+                self._trouble('failed', f'the turns could not be counted: {_named(error)}')
             with self._changed:
-                centers = self._activity.status.centers
-                news = len(centers) >= self.goal and not bank.tried.issuperset(centers)
+                ready = self._activity.status.ready
+                news = len(ready) >= self.goal and not bank.tried.issuperset(ready)
                 if (bank is self._bank and (self._requested or news)
                         and time.monotonic() >= self._not_before):
                     self._requested = False
@@ -255,8 +267,18 @@ class Learner:
             self._not_before = time.monotonic() + delay
             # the same turns are tried again
             self._requested = True
-        self._tell.trouble('failed_calibrations', f'a calibration failed ({_named(error)}); the '
-                                                  f'turns are kept, next try in {delay:.0f} s')
+        self._trouble('failed_calibrations', f'a calibration failed ({_named(error)}); the '
+                                             f'turns are kept, next try in {delay:.0f} s')
+
+    def _trouble(self, kind: str, text: str) -> None:
+        _call(self._tell.trouble, kind, text)
+
+
+def _call(listener: Callable[..., None], *news: Any) -> None:
+    try:
+        listener(*news)
+    except Exception:
+        LOG.exception('a listener of the learner failed')
 
 
 def _clear(calibrator: Calibrator) -> None:

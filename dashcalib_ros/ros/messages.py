@@ -1,4 +1,4 @@
-"""What the node publishes, built from what it knows."""
+"""The node's messages: CameraInfo and diagnostics."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -9,7 +9,8 @@ from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from dashcalib_ros.calibrator import Status
-from dashcalib_ros.report import Camera
+from dashcalib_ros.camera import Camera, ros_camera
+from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.learner import NOTHING
 from dashcalib_ros.ros.state import State, sigma_text
 
@@ -18,28 +19,24 @@ OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, Diagnostic
 
 
 def camera_info(camera: Camera, header: Header) -> CameraInfo:
-    """Return the camera as ROS has it: plumb_bob, no rectification, P with K's values."""
-    c = camera.intrinsics
-    width, height = camera.image_size
-    return CameraInfo(
-        header=header, width=width, height=height, distortion_model='plumb_bob',
-        d=[c.k1, c.k2, 0.0, 0.0, 0.0],
-        k=[c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0],
-        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p=[c.fx, 0.0, c.cx, 0.0, 0.0, c.fy, c.cy, 0.0, 0.0, 0.0, 1.0, 0.0])
+    """Return the camera as a message."""
+    c = ros_camera(camera)
+    width, height = c.image_size
+    return CameraInfo(header=header, width=width, height=height,
+                      distortion_model=c.distortion_model, d=c.d, k=c.k, r=c.r, p=c.p)
 
 
 def uncalibrated(header: Header) -> CameraInfo:
-    """Return what sensor_msgs calls uncalibrated: K[0] is 0. It takes a latched one back."""
+    """Return an uncalibrated CameraInfo, K[0] = 0 (sensor_msgs). It replaces a latched one."""
     return CameraInfo(header=header)
 
 
 @dataclass(frozen=True)
 class Health:
-    """All that diagnostics tell. Counts are of images, since the start.
+    """The content of the diagnostics. Counts are of images, since the start.
 
-    published: the camera that is published now. stale: it is contradicted. verdict, reasons: of
-    the last calibration. silent_s: since the last image, None before the first.
+    published: the camera that is published now. stale: it was given up. verdict, reasons: of
+    the last calibration. silent_s: s since the last image, None before the first.
     """
 
     state: State
@@ -48,7 +45,7 @@ class Health:
     reliability: str
     status: Status = NOTHING
     stage: str = ''
-    published: Camera | None = None
+    published: NamedCamera | None = None
     stale: bool = False
     verdict: str = ''
     reasons: tuple[str, ...] = ()
@@ -109,7 +106,7 @@ def _summary(health: Health) -> tuple[bytes, str]:
     if health.warnings:
         return WARN, f'{health.state}: {health.warnings[0]}'
     if health.published is not None:
-        return OK, f'calibrated; {turns} for the next look at it'
+        return OK, f'calibrated; {turns} for the next check of it'
     if health.state == 'calibrating':
         return WARN, f'calibrating with {turns}: {health.stage}'
     if health.state == 'refused_so_far':
@@ -118,5 +115,5 @@ def _summary(health: Health) -> tuple[bytes, str]:
     return WARN, f'not calibrated yet: {turns}'
 
 
-def _sigma(camera: Camera | None) -> str:
-    return '' if camera is None or camera.sigma is None else f'{camera.sigma.fx:.3f}'
+def _sigma(camera: NamedCamera | None) -> str:
+    return '' if camera is None or camera.sigma is None else f'{camera.sigma["fx"]:.3f}'

@@ -1,4 +1,4 @@
-"""The node: images in, one camera_info for each of them out, once the camera is known."""
+"""The node: takes images, and publishes a camera_info for each once the camera is calibrated."""
 from __future__ import annotations
 
 import queue
@@ -18,21 +18,21 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from dashcalib_ros.calibrator import Status
-from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.errors import DashcalibError, InputError, one_line
+from dashcalib_ros.frames.decode import message_size
 from dashcalib_ros.frames.mask_file import check_mask, read_mask
-from dashcalib_ros.intrinsics import Calibration, Verdict
+from dashcalib_ros.frames.stamps import StampGate, live
 from dashcalib_ros.report.camera_yaml import check_camera_name
 from dashcalib_ros.ros.commit import Commit
 from dashcalib_ros.ros.complaints import Complaints
-from dashcalib_ros.ros.image_size import image_size
 from dashcalib_ros.ros.images import ImageInput
+from dashcalib_ros.ros.in_use import CalibrationInUse
 from dashcalib_ros.ros.learner import Learner, Listener, Result
 from dashcalib_ros.ros.messages import Health, diagnostic_status
 from dashcalib_ros.ros.parameters import camera_name, changed, declare, unknown
-from dashcalib_ros.ros.publication import Publication
-from dashcalib_ros.ros.state import Rules, judge, sigma_text, state_of
-from dashcalib_ros.ros.store import Kept, Store
-from dashcalib_ros.ros.stream import Source, SourceWatch, StampWatch, Thinning
+from dashcalib_ros.ros.state import Rules, state_of
+from dashcalib_ros.ros.store import Store
+from dashcalib_ros.ros.stream import Source, SourceWatch
 
 DIAGNOSTICS_S = 1.0
 CURES = {
@@ -47,15 +47,21 @@ CURES = {
     'set_back': 'the stamps were set back (a bag that loops?): tracking begins anew, the turns '
                 'are kept',
 }
-# what else is counted, with a message of its own each time
-TROUBLES = ('undecodable', 'strays', 'failed', 'failed_calibrations', 'unsaved', 'store')
+# further kinds of problems, which come with a message of their own
+TROUBLES = ('undecodable', 'strays', 'failed', 'failed_calibrations', 'unsaved', 'store',
+            'workers', 'failed_callbacks')
+
+
+class SetupError(DashcalibError):
+    """The node's parameters do not fit its images: it ends."""
 
 
 class CalibratorNode(Node):
-    """Wires the camera's topic, the learner's threads and what is published.
+    """Connects the camera's topic, the learner's threads and the calibration in use.
 
-    Every callback runs in the executor's one thread and is short. The learner's threads leave
-    their news in a queue that a guard condition empties in that same thread.
+    Every callback runs in the executor's single thread and is short. The learner's threads put
+    their results into a queue, which a guard condition's callback empties in that same thread: no
+    lock is needed.
     """
 
     def __init__(self) -> None:
@@ -69,19 +75,18 @@ class CalibratorNode(Node):
         for line in unknown(self._parameter_overrides):
             self.get_logger().warning(line)
         self._complaints = Complaints(self.get_logger().warning)
-        self._store = Store(self._own.camera_info_file, self._name)
-        self._publication = Publication(self)
+        self._in_use = CalibrationInUse(
+            self, self._name, Store(self._own.camera_info_file, self._name),
+            Rules(self._own.better, self._own.contradictions), self._complaints)
+        self._publication = self._in_use.publication
         self._magnitude = self.create_publisher(Float64, '~/turn_magnitude', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._commit: Commit | None = None
-        self._verdict: Verdict | None = None
-        self._contradictions = 0
         self._received = 0
         self._last_image: float | None = None
         self._source = SourceWatch()
-        self._stamps = StampWatch()
-        self._thinning = Thinning(self._core.motion.rate)
-        self._load()
+        self._stamps = StampGate(live(self._core.motion.rate))
+        self._in_use.load()
 
         self._news: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake = self.create_guard_condition(self._on_news)
@@ -90,15 +95,14 @@ class CalibratorNode(Node):
             status=lambda status: self._later(lambda: self._on_status(status)),
             trouble=lambda kind, text: self._later(lambda: self._complaints.say(kind, text))),
             self._mask)
-        self._aim()
-        # a paused simulation must not silence the diagnostics
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._steady = steady
+        self._set_goal()
+        # not the ROS clock: diagnostics must also be published while a simulation is paused
+        self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._images = ImageInput(self, self._own, self._on_image, steady)
         self.create_timer(DIAGNOSTICS_S, self._on_tick, clock=steady)
-        self.create_service(Trigger, '~/calibrate', self._on_calibrate)
-        self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_service(Trigger, '~/save', self._on_save)
+        for name, action in (('calibrate', self._calibrate), ('reset', self._reset),
+                             ('save', self._in_use.save)):
+            self.create_service(Trigger, f'~/{name}', self._answering(action))
         self.add_on_set_parameters_callback(self._on_parameters)
         self.get_logger().info(f'learning the camera {self._name!r} from the turns seen on '
                                f'{self._images.topic}')
@@ -108,13 +112,21 @@ class CalibratorNode(Node):
         self._learner.close()
         self.destroy_node()
 
+    def survive(self, error: Exception) -> None:
+        """Log and count what a callback raised."""
+        self._complaints.failure('failed_callbacks', error)
+
+    def blocked(self) -> bool:
+        """Return whether rclpy calls no callback any more, after an exception of its own."""
+        return not self._wake.callback_group.can_execute(self._wake)
+
     # images ----------------------------------------------------------------------------------
 
     def _on_image(self, message: Any) -> None:
         index, self._received = self._received, self._received + 1
         self._last_image = time.monotonic()
         try:
-            source = Source(image_size(message), message.header.frame_id)
+            source = Source(message_size(message), message.header.frame_id)
         except InputError as error:
             self._complaints.say('undecodable', str(error))
             return
@@ -125,36 +137,30 @@ class CalibratorNode(Node):
             return
         if what != 'same':
             self._on_source(source)
-        self._publication.accompany(message.header, source)
+        self._publication.accompany(message.header, source.size)
         stamp = message.header.stamp
         stamp_ns = self._stamps.take(stamp.sec * 10**9 + stamp.nanosec, time.monotonic_ns())
-        if stamp_ns is not None and self._thinning.wants(stamp_ns):
+        if stamp_ns is not None:
             self._learner.offer(index, stamp_ns, message, source.size, source.frame_id)
 
     def _on_source(self, source: Source) -> None:
-        """Take the first image's source, or another one that lasts: all that was learned goes.
+        """Handle the first source, or a change of it, which drops the turns and the calibration.
 
-        Raises InputError, which ends the node, for a mask that does not fit the first image.
+        Raises SetupError, which ends the node, for a mask that does not fit the first image.
         """
-        kept = self._publication.kept
         if self._source.previous is None:
-            check_mask(self._mask, source.size)
+            try:
+                check_mask(self._mask, source.size)
+            except InputError as error:
+                raise SetupError(str(error)) from error
         else:
             self.get_logger().error(
                 f'the camera changes from {self._source.previous} to {source}: the turns and the '
                 f'calibration are dropped')
             self._forget(keep_stored=True)
-            self._load()
-            kept = self._publication.kept
-        if kept is None:
-            return
-        if (kept.camera.image_size, kept.frame_id or source.frame_id) != (source.size,
-                                                                         source.frame_id):
-            of = Source(kept.camera.image_size, kept.frame_id)
-            self.get_logger().warning(f'{self._store.path} is ignored: it is for {of}, the images '
-                                      f'are {source}')
-            self._publication.retract()
-            self._aim()
+            self._in_use.load()
+        self._in_use.check(source)
+        self._set_goal()
 
     # what was learned ------------------------------------------------------------------------
 
@@ -162,122 +168,63 @@ class CalibratorNode(Node):
         self._magnitude.publish(Float64(data=float(status.magnitude)))
 
     def _on_result(self, result: Result) -> None:
-        """Judge a calibration; see state.py for the reasons."""
         if result.bank != self._learner.bank:
             return  # a reset came in between
-        calibration, complete = result.calibration, result.complete
-        self._verdict = calibration.verdict
-        for text in calibration.warnings:
-            self._complaints.once(text)
-        trusted = None if self._publication.stale or self._publication.kept is None else (
-            self._publication.kept.camera)
-        rules = Rules(self._own.better, self._own.contradictions)
-        judged = judge(calibration, complete, trusted, self._contradictions, rules)
-        self._contradictions = judged.contradictions
-        log = self.get_logger()
-        if judged.action in ('adopt', 'replace'):
-            if judged.action == 'replace':
-                log.warning(f'the calibration is replaced: {judged.why}')
-            self._adopt(calibration)
-        elif judged.action == 'give_up':
-            log.error(f'the published calibration is given up: {judged.why}')
-            self._give_up()
-        else:
-            used = calibration.turns_used
-            text = (f'a calibration of {used} turn{"" if used == 1 else "s"} is '
-                    f'{calibration.verdict.level}' + (f': {judged.why}' if judged.why else ''))
-            # rclpy takes one severity for each line of code
-            if judged.contradictions:
-                log.warning(text)
-            else:
-                log.info(text)
-            if trusted is not None and complete:
-                # the next opinion is formed from turns of its own
-                self._learner.restart()
-
-    def _adopt(self, calibration: Calibration) -> None:
-        frame_id = self._source.current.frame_id if self._source.current else ''
-        kept = Kept.of(calibration, self._name, frame_id)
-        info = self._publication.set(kept)
-        self._contradictions = 0
-        self.get_logger().info(f'calibrated: {sigma_text(kept.camera)}')
-        self._save(kept)
-        self._learner.restart()
-        self._aim()
-        if self._own.commit:
-            self._commit = self._commit or Commit(self, self._own.commit_timeout, self._steady)
-            self._commit.call(info)
-
-    def _give_up(self) -> None:
-        """Trust the calibration no more; the turns that contradict it go on to the next one."""
-        self._store.retire()
-        if self._own.publish_stale:
-            self._publication.stale = True
-        else:
-            self._publication.retract()
-        self._learner.forget_stored()
-        self._aim()
+        current = self._source.current
+        action = self._in_use.judge(result.calibration, result.complete,
+                                    current.frame_id if current else '', self._own.publish_stale)
+        if action in ('adopt', 'replace'):
+            self._learner.restart()
+            if self._own.commit:
+                self._commit = self._commit or Commit(self, self._own.commit_timeout,
+                                                      self._steady)
+                self._commit.call(self._publication.info)
+        elif action == 'give_up':
+            # the turns that contradict it stay, and are used for the next one
+            self._learner.forget_stored()
+        elif action == 'keep' and result.complete:
+            # the next calibration must be independent: it uses new turns only
+            self._learner.restart()
+        self._set_goal()
 
     def _forget(self, keep_stored: bool = False) -> None:
-        self._publication.retract()
-        self._verdict, self._contradictions = None, 0
+        self._in_use.drop()
         self._learner.restart(keep_stored)
         self._stamps.forget()
-        self._thinning = Thinning(self._core.motion.rate)
-        self._aim()
+        self._set_goal()
 
-    def _aim(self) -> None:
-        """Tell the learner how many turns are worth a calibration.
+    def _set_goal(self) -> None:
+        """Set the number of turns from which the learner calibrates.
 
-        The first needs all that are wanted; doubts about a published one need only a few.
+        The first calibration needs all turns wanted; to check a published one, a few are enough.
         """
-        trusted = self._publication.kept is not None and not self._publication.stale
         wanted = self._core.turns.wanted
-        self._learner.goal = min(self._core.verdict.min_turns, wanted) if trusted else wanted
-
-    # the file --------------------------------------------------------------------------------
-
-    def _load(self) -> None:
-        try:
-            kept = self._store.load()
-        except InputError as error:
-            self.get_logger().warning(str(error))
-            return
-        if kept is not None:
-            self._publication.set(kept)
-            self.get_logger().info(f'loaded {self._store.path}: {sigma_text(kept.camera)}')
-
-    def _save(self, kept: Kept) -> str:
-        try:
-            self._store.save(kept)
-        except OutputError as error:
-            self._complaints.say('unsaved', str(error))
-            return str(error)
-        return ''
+        self._learner.goal = (wanted if self._in_use.trusted is None
+                              else min(self._core.verdict.min_turns, wanted))
 
     # services and parameters -----------------------------------------------------------------
 
-    def _on_calibrate(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        refusal = self._learner.request()
-        answer.success = not refusal
-        answer.message = refusal or 'started: what comes of it is told in /diagnostics'
+    def _answering(self, action: Callable[[], tuple[bool, str]]) -> Callable[..., Any]:
+        """Return a service's callback; action: returns success and a message."""
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.success, response.message = action()
+            except Exception as error:
+                self.survive(error)
+                response.success = False
+                response.message = f'failed: {one_line(error)}; the log of the node has more'
+            return response
         return answer
 
-    def _on_reset(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+    def _calibrate(self) -> tuple[bool, str]:
+        refusal = self._learner.request()
+        return not refusal, refusal or 'started: /diagnostics will have the result'
+
+    def _reset(self) -> tuple[bool, str]:
         self.get_logger().warning('reset by request: the turns and the calibration are dropped')
         self._forget()
-        self._store.retire()
-        answer.success, answer.message = True, 'collecting; a saved file was moved aside'
-        return answer
-
-    def _on_save(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        kept = self._publication.kept
-        trouble = ('there is no accepted calibration yet' if kept is None
-                   else 'the calibration is contradicted by new turns' if self._publication.stale
-                   else self._save(kept))
-        answer.success = not trouble
-        answer.message = trouble or f'written: {self._store.path}'
-        return answer
+        moved, text = self._in_use.retire()
+        return moved, f'collecting; {text}'
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         self._own, result = changed(self._own, parameters)
@@ -298,24 +245,22 @@ class CalibratorNode(Node):
         self._diagnostics.publish(message)
 
     def _health(self) -> Health:
-        activity, publication = self._learner.activity(), self._publication
-        verdict = self._verdict
-        published = publication.kept is not None
-        state = state_of(published and not publication.stale, activity.calibrating,
+        activity, in_use = self._learner.activity(), self._in_use
+        verdict = in_use.verdict
+        state = state_of(in_use.trusted is not None, activity.calibrating,
                          verdict is not None and verdict.level != 'accepted')
         silent = None if self._last_image is None else time.monotonic() - self._last_image
-        counts = {'received': self._received, 'camera_info published': publication.sent,
+        counts = {'received': self._received, 'camera_info published': self._publication.sent,
                   **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},
-                  'contradictions': self._contradictions}
+                  'contradictions': in_use.contradictions}
         return Health(
             state, self._core.turns.wanted, self._images.topic, self._images.reliability,
-            activity.status, activity.stage,
-            publication.kept.camera if publication.kept else None, publication.stale,
+            activity.status, activity.stage, in_use.camera, in_use.stale,
             verdict.level if verdict else '', verdict.reasons if verdict else (), silent,
-            str(self._store.path), tuple(self._warnings()), counts)
+            in_use.file, tuple(self._warnings()), counts)
 
     def _warnings(self) -> list[str]:
-        warnings = []
+        warnings = self._in_use.warnings()
         if self._images.publishers > 1:
             warnings.append(f'{self._images.publishers} publishers on {self._images.topic}: '
                             f'remap all but one camera')
@@ -327,7 +272,7 @@ class CalibratorNode(Node):
     # between the threads ---------------------------------------------------------------------
 
     def _later(self, action: Callable[[], None]) -> None:
-        """Have the executor's thread do this; called from the learner's threads."""
+        """Let the executor's thread run an action; called from the learner's threads."""
         self._news.put(action)
         with suppress(RuntimeError):  # rclpy's, when the context is shut down already
             self._wake.trigger()
@@ -338,4 +283,8 @@ class CalibratorNode(Node):
                 action = self._news.get_nowait()
             except queue.Empty:
                 return
-            action()
+            try:
+                action()
+            except Exception as error:
+                # the other actions must not wait for the next trigger
+                self.survive(error)

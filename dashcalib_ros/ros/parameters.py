@@ -17,10 +17,10 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dashcalib_ros.config import Config, _check, describe, setting
+from dashcalib_ros.config import Config, _check, describe, expert, setting
 from dashcalib_ros.errors import ConfigError
 
-# those that take effect at once; the others shape what is already learned, so they are read-only
+# these take effect at once; the others affect turns that are already found: they are read-only
 CHANGEABLE = ('commit', 'publish_stale')
 OF_ROS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
@@ -35,27 +35,24 @@ class NodeConfig:
     reliability: str = setting(
         'auto', 'auto does as the publishers do: best effort if any of them does',
         choices=('auto', 'best_effort', 'reliable'))
-    queue_size: int = setting(
-        10, 'images that may wait for detection, a second of them; the oldest is dropped', 1, 1000)
     camera_name: str = setting(
         '', "in the file and its name; empty: the last part of the node's namespace, or dashcam")
     camera_info_file: str = setting(
-        '', 'where the accepted calibration is kept; empty: '
-        '$ROS_HOME/camera_info/CAMERA_NAME.yaml, where camera_info_manager looks')
+        '', 'of the accepted calibration; empty: $ROS_HOME/camera_info/CAMERA_NAME.yaml')
     mask_file: str = setting(
-        '', 'picture as large as the images, black where they are not used, beside the ego '
-        'vehicle that is found by itself; empty: none')
+        '', 'picture as large as the images, black where they are not used; empty: none')
     commit: bool = setting(
         False, 'give an accepted calibration to the camera driver: service set_camera_info')
-    commit_timeout: float = setting(5.0, 's; how long the driver may take to answer', 0.1, 600.0)
     publish_stale: bool = setting(
         False, 'go on publishing a calibration that new turns contradict')
-    better: float = setting(
+    queue_size: int = expert(
+        10, 'images that may wait for detection, a second of them; the oldest is dropped', 1, 1000)
+    commit_timeout: float = expert(5.0, 's; how long the driver may take to answer', 0.1, 600.0)
+    better: float = expert(
         0.7, "ratio; a new calibration replaces the old one when fx's sigma falls to this",
         0.1, 1.0)
-    contradictions: int = setting(
-        3, 'accepted calibrations in a row that contradict the old one before it is given up: one '
-        'or two may be chance', 1, 20)
+    contradictions: int = expert(
+        3, 'in a row, before the old calibration is given up: one or two may be chance', 1, 20)
 
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self):
@@ -106,8 +103,9 @@ def camera_name(config: NodeConfig, namespace: str) -> str:
 def _declared(node: Node, name: str, spec: dataclasses.Field[Any]) -> Any:
     about = spec.metadata
     descriptor = ParameterDescriptor(
-        description=about['reason'], read_only=name not in CHANGEABLE,
-        # typed by the config, which takes 3 for 3.0 and says what is wrong in its own words
+        description=about['reason'] + (' (for experts)' if about['expert'] else ''),
+        read_only=name not in CHANGEABLE,
+        # the config checks the types: it accepts 3 for 3.0, and its messages name the cure
         dynamic_typing=True,
         additional_constraints=f'one of {", ".join(about["choices"])}' if about['choices'] else '')
     low, high = about['minimum'], about['maximum']

@@ -1,20 +1,23 @@
 """From the command line to a spinning node and back to an exit code."""
 from __future__ import annotations
 
-import sys
+import time
 from collections.abc import Sequence
 
 import rclpy
 import rclpy.utilities
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.ros.memory import give_images_back
-from dashcalib_ros.ros.node import CalibratorNode
+from dashcalib_ros.ros.node import CalibratorNode, SetupError
 from dashcalib_ros.ros.stopping import Stopping
+from dashcalib_ros.standard_streams import write_stderr
 
 FAILED = 2
+# s; the wait after a failed callback doubles from the first to the second while all fail
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.01, 1.0
 
 
 def run(argv: Sequence[str] | None, stopping: Stopping) -> int:
@@ -26,11 +29,11 @@ def run(argv: Sequence[str] | None, stopping: Stopping) -> int:
         rclpy.init(args=None if argv is None else ['calibrator', *argv])
         if not stopping.requested:
             node = CalibratorNode()
-            rclpy.spin(node)
+            spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (DashcalibError, ParameterException) as error:
-        print(f'calibrator: error: {" ".join(str(error).split())}', file=sys.stderr)
+        write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
         return FAILED
     except Exception:
         # a context that is shut down in the middle of a call makes rclpy raise nearly anything
@@ -41,3 +44,27 @@ def run(argv: Sequence[str] | None, stopping: Stopping) -> int:
             node.close()
         rclpy.utilities.try_shutdown()
     return 0
+
+
+def spin(node: CalibratorNode) -> None:
+    """Run the node's callbacks until the context is shut down.
+
+    Exceptions of callbacks, and of rclpy itself, are logged and counted, and the node goes on.
+    Raises SetupError, and exceptions after which rclpy calls no callback any more: the node must
+    then be started again, as the launch files do.
+    """
+    with SingleThreadedExecutor() as executor:
+        executor.add_node(node)
+        wait_s = FIRST_WAIT_S
+        while executor.context.ok():
+            try:
+                executor.spin_once()
+                wait_s = FIRST_WAIT_S
+            except (SetupError, ExternalShutdownException):
+                raise
+            except Exception as error:
+                if not executor.context.ok() or node.blocked():
+                    raise
+                node.survive(error)
+                time.sleep(wait_s)
+                wait_s = min(2 * wait_s, LONGEST_WAIT_S)

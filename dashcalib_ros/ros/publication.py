@@ -1,4 +1,4 @@
-"""The calibration that is published: beside each image, latched, and on disk."""
+"""The topics of the calibration: beside each image, and latched."""
 from __future__ import annotations
 
 from rclpy.node import Node
@@ -6,9 +6,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
+from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.messages import camera_info, uncalibrated
-from dashcalib_ros.ros.store import Kept
-from dashcalib_ros.ros.stream import Source
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -17,45 +16,37 @@ BESIDE_IMAGES = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Publication:
-    """Publishes a calibration from set() on until retract(); nothing before, nothing after.
+    """Publishes a camera between set() and retract(), and nothing before or after.
 
-    kept: the calibration. stale: it is contradicted, and published only because the user wants it.
-    sent: how many were published beside images.
+    info: what is published now. sent: how many were published beside images.
     """
 
     def __init__(self, node: Node) -> None:
-        self.kept: Kept | None = None
-        self.stale = False
+        self.info: CameraInfo | None = None
         self.sent = 0
-        self._node = node
-        self._info = CameraInfo()
+        self._clock = node.get_clock()
         self._beside = node.create_publisher(CameraInfo, 'camera_info', BESIDE_IMAGES)
         self._latched = node.create_publisher(CameraInfo, '~/calibration', LATCHED)
+        # the full name of the topic beside the images
+        self.topic = str(self._beside.topic_name)
 
-    @property
-    def topic(self) -> str:
-        """Return the full name of the topic beside the images."""
-        return str(self._beside.topic_name)
-
-    def set(self, kept: Kept) -> CameraInfo:
-        """Publish this one from now on; return it as a message."""
-        self.kept, self.stale = kept, False
-        self._info = camera_info(kept.camera, self._now(kept.frame_id))
-        self._latched.publish(self._info)
-        return self._info
+    def set(self, camera: NamedCamera, frame_id: str) -> None:
+        """Publish this one from now on."""
+        self.info = camera_info(camera.camera, self._now(frame_id))
+        self._latched.publish(self.info)
 
     def retract(self) -> None:
-        """Fall silent; late subscribers of the latched topic get an uncalibrated one."""
-        if self.kept is not None:
-            self._latched.publish(uncalibrated(self._now(self.kept.frame_id)))
-        self.kept, self.stale = None, False
+        """Stop publishing; the latched topic gets an uncalibrated message."""
+        if self.info is not None:
+            self._latched.publish(uncalibrated(self._now(self.info.header.frame_id)))
+        self.info = None
 
-    def accompany(self, header: Header, source: Source) -> None:
-        """Publish for one image, with its header, if the calibration is for such images."""
-        if self.kept is not None and self.kept.camera.image_size == source.size:
-            self._info.header = header
-            self._beside.publish(self._info)
+    def accompany(self, header: Header, size: tuple[int, int]) -> None:
+        """Publish for one image, with its header, if the camera has such images."""
+        if self.info is not None and (self.info.width, self.info.height) == size:
+            self.info.header = header
+            self._beside.publish(self.info)
             self.sent += 1
 
     def _now(self, frame_id: str) -> Header:
-        return Header(stamp=self._node.get_clock().now().to_msg(), frame_id=frame_id)
+        return Header(stamp=self._clock.now().to_msg(), frame_id=frame_id)

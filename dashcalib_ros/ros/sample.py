@@ -11,42 +11,39 @@ from dashcalib_ros.config import describe
 from dashcalib_ros.ros.parameters import CHANGEABLE, NodeConfig
 
 HEAD = """\
-# Every parameter of the node 'calibrator' with its default. Made by dashcalib_ros.ros.sample from
-# the code's own settings; keep only the lines that you change.
+# Every parameter of the node 'calibrator' with its default: first those that users set, then those
+# for experts. Made by dashcalib_ros.ros.sample from the code's own settings; keep only the lines
+# that you change. Names with a dot, seed, threads and max_width are settings of the core, which
+# dashcalib run --set NAME=VALUE takes, too; the others are the node's own.
 # Topics are remapped, not parameters: image_raw in, camera_info out.
 /**:
   ros__parameters:
+"""
+EXPERTS = """
+    # For experts: few users need these. What was measured for them: docs/lessons.md
 """
 
 
 def sample() -> str:
     """Return the file's text."""
-    lines = []
-    for spec in dataclasses.fields(NodeConfig):
-        lines += _setting(spec.name, spec, 4)
-    section = ''
-    for name, spec in describe():
-        outer, _, inner = name.rpartition('.')
-        if outer and outer != section:
-            lines.append(f'    {outer}:')
-        section = outer
-        lines += _setting(inner, spec, 6 if outer else 4)
-    return HEAD + '\n'.join(lines) + '\n'
+    specs = [(spec.name, spec) for spec in dataclasses.fields(NodeConfig)] + list(describe())
+    users = [_setting(*each) for each in specs if not each[1].metadata['expert']]
+    experts = [_setting(*each) for each in specs if each[1].metadata['expert']]
+    return HEAD + ''.join(users) + EXPERTS + ''.join(experts)
 
 
-def _setting(name: str, spec: dataclasses.Field[Any], indent: int) -> list[str]:
+def _setting(name: str, spec: dataclasses.Field[Any]) -> str:
     about = spec.metadata
     note = str(about['reason'])
     if about['choices']:
         note += f'; one of {", ".join(about["choices"])}'
     elif about['minimum'] is not None:
-        note += f'; {about["minimum"]:g} to {about["maximum"]:g}'
+        note += f'; {about["minimum"]:.10g} to {about["maximum"]:.10g}'
     if name in CHANGEABLE:
         note += '; may be changed while the node runs'
-    space = ' ' * indent
     value = yaml.safe_dump(spec.default, default_flow_style=True).split('\n')[0]
-    return [*textwrap.wrap(note, 99, initial_indent=f'{space}# ', subsequent_indent=f'{space}# '),
-            f'{space}{name}: {value}']
+    lines = textwrap.wrap(note, 99, initial_indent='    # ', subsequent_indent='    # ')
+    return '\n'.join([*lines, f'    {name}: {value}', ''])
 
 
 if __name__ == '__main__':

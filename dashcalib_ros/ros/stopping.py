@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM end the node cleanly, however often and whenever they come."""
+"""SIGINT and SIGTERM end the node cleanly, at any time and any number of times."""
 from __future__ import annotations
 
 import signal
@@ -8,7 +8,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stopping:
-    """Takes both signals without raising anything; `requested` tells that one came.
+    """Handles both signals without raising; `requested` is True after one of them.
 
     rclpy's own handlers, installed later by rclpy.init, end the spinning and call these too.
     """
@@ -19,7 +19,7 @@ class Stopping:
             signal.signal(name, self._request)
 
     def ignore_signals(self) -> None:
-        """Let no signal disturb the interpreter's own end, where the default is to die by it."""
+        """Ignore both signals while the interpreter ends: by default they would kill it."""
         for name in SIGNALS:
             signal.signal(name, signal.SIG_IGN)
 

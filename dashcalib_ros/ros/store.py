@@ -1,4 +1,4 @@
-"""The last accepted calibration on disk, where camera_info_manager looks for it too."""
+"""The last accepted calibration on disk, by default where camera_info_manager finds it."""
 from __future__ import annotations
 
 import os
@@ -10,8 +10,16 @@ from pathlib import Path
 import yaml
 
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.intrinsics import Calibration
-from dashcalib_ros.report import Camera, calibration_yaml, camera_of, write_text
+from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
+from dashcalib_ros.report import (
+    NamedCamera,
+    calibrated_camera,
+    calibration_yaml,
+    remove_leftovers,
+    set_aside,
+    write_text,
+)
 from dashcalib_ros.report.camera_yaml import parse_calibration_yaml
 
 
@@ -19,7 +27,7 @@ from dashcalib_ros.report.camera_yaml import parse_calibration_yaml
 class Kept:
     """An accepted calibration: the camera, the frame its images were in, and the file's text."""
 
-    camera: Camera
+    camera: NamedCamera
     frame_id: str
     text: str
 
@@ -31,66 +39,99 @@ class Kept:
         document['dashcalib']['frame_id'] = frame_id
         text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=2**20,
                               allow_unicode=True)
-        return cls(camera_of(calibration, name), frame_id, text)
+        return cls(calibrated_camera(calibration, name), frame_id, text)
 
 
 class Store:
-    """One file. A calibration that another tool left there is set aside, never overwritten."""
+    """One file. If another program has written it, it is set aside, never overwritten."""
 
     def __init__(self, path: str, camera_name: str) -> None:
-        """path: empty for camera_info_manager's place and name; ~ is expanded.
+        """path: empty for camera_info_manager's folder and name; ~ is expanded.
 
-        Raises InputError for the home of a user that there is not.
+        Raises InputError for the home folder of an unknown user.
         """
         place = Path(path) if path else (
             Path(os.environ.get('ROS_HOME') or '~/.ros', 'camera_info', f'{camera_name}.yaml'))
         try:
             self.path = place.expanduser()
-        except RuntimeError as error:  # there is no such user, or nobody knows the own home
+        except RuntimeError as error:  # the user, or the own home folder, is unknown
             raise InputError(f'there is no home folder for {place}; set camera_info_file to a '
                              f'path without ~') from error
-        self.previous = self.path.with_suffix('.previous.yaml')
-        self._foreign = False
+        # the text that this node last read or wrote: a different one is another program's
+        self._text: str | None = None
+        # the text of a calibration that was given up, but could not be moved aside
+        self._given_up: str | None = None
+        remove_leftovers(self.path.parent, (self.path.name,))
+
+    @property
+    def given_up(self) -> bool:
+        """Return whether the file still has a calibration that was given up."""
+        return self._given_up is not None and self._read() == self._given_up
 
     def load(self) -> Kept | None:
         """Return the calibration, None if there is no file.
 
-        Raises InputError when it is damaged or none of ours: another tool's has no sigma to
-        compare with.
+        Raises InputError when it is damaged, was given up, or is another tool's: that has no sigma
+        to compare with.
         """
-        self._foreign = False
-        if not self.path.exists():
-            return None
+        self._text = None
+        with suppress(OSError):  # reading fails, too, and raises InputError below
+            if not self._exists():
+                return None
         try:
-            text = self.path.read_text('utf-8')
+            text = read_text(self.path, YAML_BYTES)
             camera = parse_calibration_yaml(text, self.path)
-        except (OSError, UnicodeDecodeError, InputError) as error:
-            self._foreign = True
-            raise InputError(f'{self.path} is ignored: {_plain(error)}') from error
+        except (InputError, ValueError, OverflowError) as error:
+            raise InputError(f'{self.path} is ignored: {error}') from error
+        if text == self._given_up:
+            raise InputError(f'{self.path} is ignored: it was given up, but could not be moved '
+                             f'aside; remove it')
         if camera.verdict != 'accepted' or camera.sigma is None:
-            self._foreign = True
             raise InputError(f'{self.path} is ignored: it is no accepted calibration of this '
-                             f'node; it is moved to {self.previous.name} when there is one')
-        own = yaml.safe_load(text)['dashcalib']
+                             f'node; it is moved aside when there is one')
+        self._text = text
+        own = parse_yaml(text, str(self.path))['dashcalib']
         return Kept(camera, str(own.get('frame_id', '')), text)
 
-    def save(self, kept: Kept) -> None:
-        """Write it, whole or not at all. Raises OutputError."""
+    def save(self, kept: Kept) -> Path | None:
+        """Write it, completely or not at all. Raises OutputError.
+
+        Returns the new path of another program's file, None if there was none.
+        """
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f'cannot make {self.path.parent}: {error.strerror}; set '
                               f'camera_info_file to a place you may write to') from error
-        if self._foreign:
-            self.retire()
+        ours = self._text is not None and self._read() == self._text
+        moved = None if ours else set_aside(self.path)
         write_text(self.path, kept.text)
-        self._foreign = False
+        self._text, self._given_up = kept.text, None
+        return moved
 
-    def retire(self) -> None:
-        """Move the file out of the way, so that it is not loaded again."""
-        with suppress(OSError):
-            self.path.replace(self.previous)
+    def retire(self) -> Path | None:
+        """Set the file aside, so that it is not loaded again; return its new path.
 
+        None if there was no file. Raises OutputError when it could not be moved: this process
+        does not load it again then, but the next start of the node does.
+        """
+        try:
+            moved = set_aside(self.path)
+        except OutputError:
+            self._given_up = self._read()
+            raise
+        self._text = self._given_up = None
+        return moved
 
-def _plain(error: Exception) -> str:
-    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+    def _exists(self) -> bool:
+        try:
+            self.path.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return True
+
+    def _read(self) -> str | None:
+        try:
+            return read_text(self.path, YAML_BYTES)
+        except InputError:
+            return None

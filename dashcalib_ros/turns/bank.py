@@ -9,17 +9,15 @@ from dashcalib_ros.config import TurnsConfig
 from dashcalib_ros.frames.frame import Frame
 from dashcalib_ros.turns.turn import Turn
 
-# ns; header stamps are rounded, a frame exactly half_width away belongs to the turn
+# ns; header stamps are rounded: a frame exactly half_width away belongs to the turn
 ROUNDING = 1_000_000
-# half widths; a longer turn would cost as much as several and say little more
-LONGEST = 4
-# half widths of frames kept at the most for a peak that may still come (a long plateau)
+# half widths; frames are kept no longer than this for a peak that may still come (on a plateau)
 RECENT = 3
 
 
 @dataclass
 class _Candidate:
-    """A peak that may become a turn; its frames are pinned meanwhile."""
+    """A peak that may become a turn. potential: the highest prominence it can have."""
 
     center: int
     stamp_ns: int
@@ -33,9 +31,9 @@ class _Candidate:
 class _Kept:
     """A turn in the bank, made of one peak or several; first_ns, last_ns: its frames' stamps.
 
-    fixed: its frames are chosen; what overlaps it gives way or is trimmed.
-    height: of its highest peak. It tells which of two turns that overlap is the stronger: the
-    height is final, while a prominence can still grow when that is decided.
+    fixed: its frames do not change any more; turns that overlap it are trimmed or dropped.
+    height: of its highest peak. Of two turns that overlap, the higher one wins: a height is final,
+    while a prominence may still grow.
     """
 
     turn: Turn
@@ -49,8 +47,8 @@ class _Kept:
 class TurnBank:
     """Collects the frames around peaks; keeps the `capacity` most prominent turns.
 
-    Holds references to frames, never copies: those of the last seconds, of the candidates and of
-    the turns that are not released.
+    It holds references to frames, not copies: to those of the last seconds, of the candidates and
+    of the turns that are not released.
     """
 
     def __init__(self, config: TurnsConfig) -> None:
@@ -98,7 +96,7 @@ class TurnBank:
             del self._candidates[min(self._candidates.values(), key=lambda c: c.potential).center]
 
     def rate(self, center: int, prominence: float) -> None:
-        """Take a peak's prominence, which makes it a turn, or lets it grow."""
+        """Set a peak's prominence: it is a turn, or an existing turn has become more prominent."""
         if center in self._candidates:
             self._candidates[center].prominence = prominence
         for kept in self._kept:
@@ -113,7 +111,7 @@ class TurnBank:
                 del self._candidates[center]
 
     def settle(self, now_ns: int | None) -> list[Turn]:
-        """Return the turns that are new, or whose frames changed, now that the stream is there.
+        """Put complete candidates into the bank; return the turns that are new or changed.
 
         now_ns: stamp of the last frame; None: the stretch of the drive ends here.
         """
@@ -130,7 +128,7 @@ class TurnBank:
         return [turn for turn in changed if turn in present]
 
     def fix(self, center: int) -> None:
-        """Change the frames of the turn at this centre no more."""
+        """Keep the frames of the turn at this centre as they are from now on."""
         for kept in self._kept:
             if kept.turn.center == center:
                 kept.fixed = True
@@ -144,7 +142,7 @@ class TurnBank:
                     kept.turn, frames=(), released_images=kept.turn.images)
 
     def _enter(self, candidate: _Candidate) -> list[Turn]:
-        """Put a turn into the bank; turns that overlap it are merged, trimmed or dropped."""
+        """Put a turn into the bank; turns that overlap are merged, trimmed or dropped."""
         assert candidate.prominence is not None
         frames = tuple(candidate.frames)
         turn = Turn(candidate.center, frames[0].index, frames[-1].index,
@@ -157,7 +155,7 @@ class TurnBank:
             if not _overlap(new.turn, other.turn):
                 continue
             span = max(new.last_ns, other.last_ns) - min(new.first_ns, other.first_ns)
-            if not other.fixed and span <= LONGEST * self._half_ns + ROUNDING:
+            if not other.fixed and span <= self.config.longest * self._half_ns + ROUNDING:
                 self._kept.remove(other)
                 new = _merge(new, other)
                 continue
@@ -202,7 +200,7 @@ def _merge(a: _Kept, b: _Kept) -> _Kept:
 
 
 def _trim(weak: _Kept, strong: Turn) -> _Kept | None:
-    """Return what the stronger turn leaves of the weaker, None if that has not its centre."""
+    """Return the weaker turn without the frames of the stronger; None if these have its centre."""
     if strong.first <= weak.turn.center <= strong.last:
         return None
     before = weak.turn.center < strong.first

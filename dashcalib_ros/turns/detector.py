@@ -5,9 +5,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import TurnsConfig
 from dashcalib_ros.frames.frame import Frame
 from dashcalib_ros.motion.motion import Motion
@@ -30,7 +28,7 @@ class _Sample:
 class TurnDetector:
     """Median filter, peaks by prominence, and the bank of the best turns, as a stream.
 
-    A turn counts as soon as the signal has fallen far enough behind its peak, and enters the bank
+    A peak is a turn as soon as the signal has fallen far enough after it. The turn enters the bank
     when the stream is half a width past its centre.
     """
 
@@ -47,13 +45,13 @@ class TurnDetector:
         changed: list[Turn] = []
         if self._last_ns is not None:
             step = frame.stamp_ns - self._last_ns
-            # a turn does not extend over a gap, nor over a clock that was set back
+            # no turn extends over a gap, or over a clock that was set back
             if step < 0 or step > self.config.half_width * 1e9:
                 changed += self._end()
         self._last_ns = frame.stamp_ns
         self.bank.collect(frame, self._needed_ns(frame))
         if motion.center is not None and motion.center_ns is not None:
-            # the paper: where there is no epipole, the car moves straight on
+            # as in the paper: without an epipole the car moves straight on
             value = 0.0 if math.isnan(motion.magnitude) else motion.magnitude
             self._centers.append((motion.center, motion.center_ns))
             for stamp_ns, median in self._median.push(motion.center_ns, value):
@@ -69,14 +67,14 @@ class TurnDetector:
         return self.bank.turns()
 
     def fix(self, center: int) -> None:
-        """Choose a turn's frames for good: turns that overlap it are not merged with it."""
+        """Fix a turn's frames: turns that overlap it are not merged with it."""
         self.bank.fix(center)
 
     def release(self, center: int) -> None:
-        """Drop a turn's frames, once they are handed over; they are chosen for good, too."""
+        """Drop a turn's frames after they were handed over; the turn is fixed, too."""
         self.bank.release(center)
 
-    def magnitudes(self) -> npt.NDArray[np.float64]:
+    def magnitudes(self) -> Floats:
         """Return (n, 2): stamp in s and filtered magnitude of the drive so far, decimated."""
         return self._history.table()
 
@@ -84,7 +82,7 @@ class TurnDetector:
         """Begin a stretch without gaps."""
         self._median = StreamingMedian(self.config.half_width)
         self._peaks = PeakFinder(self.config.min_prominence)
-        # frames whose magnitude waits for the median, and those that may yet be a peak
+        # _centers: frames whose magnitude waits for the median; _samples: those that may be peaks
         self._centers: deque[tuple[int, int]] = deque()
         self._samples: deque[_Sample] = deque()
         self._open: dict[int, int] = {}

@@ -2,11 +2,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
+
+from dashcalib_ros.arrays import Floats
 
 
 class History:
-    """Samples (stamp_s, value); when full, each two become their larger one."""
+    """Samples (stamp_s, value); when too many, each pair is replaced by its larger one."""
 
     def __init__(self, capacity: int = 20000) -> None:
         self.capacity = capacity
@@ -29,7 +30,7 @@ class History:
             pairs = zip(self._samples[::2], self._samples[1::2], strict=True)
             self._samples = [max(pair, key=lambda sample: sample[1]) for pair in pairs]
 
-    def table(self) -> npt.NDArray[np.float64]:
+    def table(self) -> Floats:
         """Return (n, 2): stamp_s, value."""
         last = [] if self._open is None else [self._open]
         return np.array(self._samples + last, dtype=np.float64).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""The paper's median filter of the turning magnitude, as a stream and in time."""
+"""The paper's median filter of the turning magnitude, as a stream; its window is a time."""
 from __future__ import annotations
 
 from bisect import bisect_left, insort
@@ -11,9 +11,9 @@ PAPER_RATE = 10.0
 class StreamingMedian:
     """Median over the samples within half a window of each sample (paper, 3.1).
 
-    The paper's window has 2 * floor(k / 2) - 1 images, k = half_width * 10 fps: 29 for 3 s. In
-    time that is everything within half_width / 2 - 0.05 s: the very same window at a steady
-    10 Hz, and the right one at any other rate. At the ends it has what is there.
+    The paper's window has 2 * floor(k / 2) - 1 images, k = half_width * 10 fps: 29 for 3 s. As a
+    time that is half_width / 2 - 0.05 s to either side: the same window at a steady 10 Hz, and the
+    right one at any other rate. At the ends of the stream the window is shorter.
     """
 
     def __init__(self, half_width: float) -> None:
@@ -37,7 +37,7 @@ class StreamingMedian:
         return ready
 
     def finish(self) -> list[tuple[int, float]]:
-        """Return the rest, and forget everything."""
+        """Return the remaining medians, and begin anew."""
         ready = [self._next() for _ in range(len(self._waiting))]
         self._window.clear()
         self._sorted.clear()

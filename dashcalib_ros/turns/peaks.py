@@ -1,4 +1,4 @@
-"""Peaks and their topographic prominence, while the signal still comes in."""
+"""Peaks of a signal and their topographic prominence, as a stream."""
 from __future__ import annotations
 
 import math
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Peak:
-    """A local maximum that stands out.
+    """A local maximum of enough prominence.
 
     position: of the sample, counted from 0; a plateau's middle, rounded down.
-    prominence: how far one must descend from it before a higher place is reached. Until the peak
-    is settled this is a lower bound: what is still to come can only let it grow.
+    prominence: how far the signal falls, at least, between the peak and any higher place. Until
+    the peak is settled this is a lower bound: later samples can only increase it.
     """
 
     position: int
@@ -22,7 +22,7 @@ class Peak:
 
 @dataclass
 class _Open:
-    """A peak that nothing higher has followed yet; left_min is final, right_min still falls."""
+    """A peak without a higher sample after it; left_min is final, right_min may still fall."""
 
     position: int
     height: float
@@ -36,12 +36,12 @@ class _Open:
 
 
 class PeakFinder:
-    """Streaming twin of scipy.signal.find_peaks(signal, prominence=min_prominence).
+    """As scipy.signal.find_peaks(signal, prominence=min_prominence), for a stream.
 
     Each peak is reported as soon as its prominence so far reaches the minimum, again whenever it
-    has grown, and once more when it is settled; the last reports equal scipy's answer.
-    Open peaks form a stack of falling heights: memory and time per sample are those of the
-    longest staircase downwards, not of the signal.
+    has grown, and once more when it is settled; the last reports equal scipy's result.
+    Open peaks are a stack of decreasing heights: memory and time per sample depend on its depth,
+    not on the length of the signal.
     """
 
     def __init__(self, min_prominence: float) -> None:
@@ -61,7 +61,7 @@ class PeakFinder:
 
     @property
     def newcomer(self) -> Peak | None:
-        """Return the peak the last sample opened, with the highest prominence it may reach."""
+        """Return the peak that the last sample opened, with its highest possible prominence."""
         top = self._open[-1] if self._fresh else None
         if top is None or top.height - top.left_min < self.min_prominence:
             return None
@@ -100,7 +100,7 @@ class PeakFinder:
         return reports
 
     def _rise(self, position: int, height: float) -> None:
-        """Open a peak. What is lower was settled on the way up; equal heights do not end it."""
+        """Open a peak. Lower ones were settled before; those of equal height are still open."""
         left_min = self._lowest
         for peak in reversed(self._open):
             if peak.height > height:
@@ -111,7 +111,7 @@ class PeakFinder:
 
     def _fall(self, value: float) -> list[Peak]:
         reports: list[Peak] = []
-        # the deeper in the stack, the more samples its minimum is of: the first that stays ends it
+        # deeper peaks have a lower or equal right_min: stop at the first that does not change
         for peak in reversed(self._open):
             if peak.right_min <= value:
                 break

@@ -17,7 +17,6 @@ import os
 import tempfile
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +40,7 @@ from views import BY_VIEW, INEXACT, Viewed, inexact_view, recorded_view
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.report import camera_of, compare, load_camera
+from dashcalib_ros.report import calibrated_camera, compare, load_camera
 
 RECORDED = {'kitti03': 'bag', 'carnd': 'drive.mp4'}
 
@@ -69,7 +68,7 @@ def _row(frames: Iterable[Frame], config: Config, truth: Mapping[str, float],
     result, seconds = calibrate(frames, config)
     row = summarised(result, truth)
     if truth_path is not None and result.intrinsics is not None:
-        row['mapping_px'] = compare(camera_of(result), load_camera(truth_path)).mapping_px
+        row['mapping_px'] = compare(calibrated_camera(result), load_camera(truth_path)).mapping_px
     return row | {'truth': dict(truth), 'seconds': seconds}
 
 
@@ -88,7 +87,7 @@ def run_rendered(name: str, seed: int, cache: Path) -> dict[str, Any]:
     about = {'setting': name, 'seed': seed, 'must': setting.must, 'counts': setting.counts,
              'true_turns': list(drive.turn_centers),
              'render_s': round(time.monotonic() - started, 1)}
-    truth = {**asdict(drive.truth), 'width': drive.lens.width, 'height': drive.lens.height}
+    truth = {**drive.truth, 'width': drive.lens.width, 'height': drive.lens.height}
     return _finished(isolated(rendered, pictures, seed, truth), about)
 
 

@@ -18,7 +18,7 @@ import json
 import statistics
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -33,12 +33,13 @@ from measure import (
     isolated,
     load,
     parser_with,
+    reconstructed,
     save,
+    solved,
     summarised,
 )
-from stages import detect, given, with_so_many
 
-from dashcalib_ros import Config, open_frames
+from dashcalib_ros import Config, open_frames, stages
 from dashcalib_ros.frames import Frame
 
 TURNS = Setting('curve over turns', DEMO, replace(STREET, turns=10))
@@ -53,12 +54,10 @@ def over_turns(frames: Iterable[Frame], counts: Sequence[int], seed: int,
                truth: Mapping[str, float]) -> dict[int, dict[str, Any]]:
     """Solve with so many turns each, best first; a turn's scene is built for the first only."""
     config = Config(seed=seed).replace({'turns.wanted': 1, 'turns.at_most': 1})
-    detected = detect(frames, config)
-    found = {}
-    with given(detected, detected.turns, config) as calibrator:
-        for count in sorted(counts):
-            found[count] = summarised(with_so_many(calibrator, count), truth)
-    return found
+    detection = stages.detect(frames, config)
+    scenes, _ = reconstructed(detection, detection.turns(), config)
+    return {count: summarised(solved(detection, scenes[:count], config)[0], truth)
+            for count in sorted(counts)}
 
 
 def at_rate(frames: Iterable[Frame], every: int, seed: int, truth: Mapping[str, float]
@@ -89,14 +88,14 @@ def measure(arguments: argparse.Namespace, rows: dict[str, Any], path: Path, pas
         if counts := missing('turns', arguments.turns, name):
             drive = drive_of(TURNS, seed)
             outcome = isolated(over_turns, pictures_of(drive, arguments.cache or passing), counts,
-                               seed, asdict(drive.truth))
+                               seed, drive.truth)
             for count in counts:
                 keep('turns', count, name, (outcome.value or {}).get(count), outcome.failure)
         if steps := missing('every', EVERY, name):
             drive = drive_of(RATES, seed)
             pictures = pictures_of(drive, arguments.cache or passing)
             for every in steps:
-                outcome = isolated(at_rate, pictures, every, seed, asdict(drive.truth))
+                outcome = isolated(at_rate, pictures, every, seed, drive.truth)
                 keep('every', every, name, outcome.value, outcome.failure)
     if arguments.data is not None:
         folder = arguments.data / 'kitti03'

@@ -12,16 +12,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from dashcalib_ros import Calibrator, Config
+from dashcalib_ros import Calibrator, Config, stages
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.intrinsics import Calibration
+from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judgement.conclude import evidence_of_detection
+from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.turns import Turn
+from dashcalib_ros.turns.detection import Detection
+from dashcalib_ros.workers.child import ChildWorker
+from dashcalib_ros.workers.pool import ScenePool
 
 KEYS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')
 FALSE_PERCENT = 3.0
@@ -152,6 +158,37 @@ def calibrate(frames: Iterable[Frame], config: Config) -> tuple[Calibration, dic
     return result, {name: round(value, 2) for name, value in seconds.items()}
 
 
+def reconstructed(detection: Detection, turns: Sequence[Turn], config: Config
+                  ) -> tuple[list[Scene], float]:
+    """Return the scenes of these turns, and the seconds they took: processes start cold."""
+    started = time.perf_counter()
+    pool = ScenePool(config, lambda: ChildWorker(threads=config.threads))
+    try:
+        for turn in turns:
+            pool.submit(turn, detection.valid())
+        pool.wait(lambda: not pool.unbuilt())
+        built = pool.scenes()
+    finally:
+        pool.close()
+    # the best first, as they were given
+    found = [scene for turn in turns if (scene := built[turn.id]) is not None]
+    return found, time.perf_counter() - started
+
+
+def solved(detection: Detection, scenes: Sequence[Scene], config: Config
+           ) -> tuple[Calibration, dict[str, float]]:
+    """Return what these scenes say together, and the seconds of each stage."""
+    watch = Stopwatch('start')
+    worker = ChildWorker()
+    try:
+        solution = worker.call(stages.solve, scenes, config, progress=watch.enter)
+    finally:
+        worker.close()
+    watch.enter('end')
+    evidence = evidence_of_detection(detection, scenes)
+    return stages.judge(solution, evidence, config), watch.seconds
+
+
 def errors(estimate: Mapping[str, float], truth: Mapping[str, float],
            sigma: Mapping[str, float] | None = None) -> dict[str, Any]:
     """Return error (estimate - truth), percent (absolute, None where the truth is 0) and z."""
@@ -174,7 +211,7 @@ def summarised(result: Calibration, truth: Mapping[str, float]) -> dict[str, Any
         'turns': [[turn.center, turn.used, turn.yaw_deg] for turn in result.turns],
         'misfits': [turn.misfit for turn in result.turns], 'timing': result.timing}
     if result.intrinsics is not None and result.sigma is not None:
-        row |= errors(asdict(result.intrinsics), truth, asdict(result.sigma))
+        row |= errors(result.intrinsics, truth, result.sigma)
     return dict(plain_values(row))
 
 

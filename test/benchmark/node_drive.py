@@ -17,7 +17,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,8 @@ from sensor_msgs.msg import Image
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import demo_drive
-from dashcalib_ros.frames import Frame, open_frames
+from dashcalib_ros.frames import Frame
+from dashcalib_ros.inputs import open_frames
 
 # s; how long to wait for a calibration after the last image
 PATIENCE_S = 180.0
@@ -148,8 +148,8 @@ def against(text: str | None, reference: dict[str, float]) -> None:
     from dashcalib_ros.report.camera_yaml import parse_calibration_yaml
     camera = parse_calibration_yaml(text, 'the node')
     for name, value in reference.items():
-        mine = getattr(camera.intrinsics, name)
-        sigma = getattr(camera.sigma, name)
+        mine = camera.camera.named[name]
+        sigma = (camera.sigma or {})[name]
         print(f'{name}: node {mine:.4f}, reference {value:.4f}, '
               f'difference {100 * (mine / value - 1) if value else 0:+.2f} %, sigma {sigma:.4f}')
 
@@ -166,7 +166,7 @@ def main() -> None:
         seen = drive(frames, list(demo.turn_centers), half_width)
         text = seen.pop('calibration')
         print(json.dumps(seen, indent=1))
-        against(text, asdict(demo.truth))
+        against(text, demo.truth)
         return
     seen = drive(iter(open_frames(args.bag)), [], half_width)
     text = seen.pop('calibration')

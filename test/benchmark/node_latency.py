@@ -67,8 +67,7 @@ def publish(seconds: float, rate: float) -> None:
 
 def keep_calibration(home: Path) -> None:
     """Leave the true calibration where the node looks for it."""
-    truth = LENS.intrinsics
-    fx, fy, cx, cy = (2 * truth.fx, 2 * truth.fy, 2 * truth.cx + 0.5, 2 * truth.cy + 0.5)
+    fx, fy, cx, cy = (2 * LENS.fx, 2 * LENS.fy, 2 * LENS.cx + 0.5, 2 * LENS.cy + 0.5)
     path = home / '.ros' / 'camera_info' / 'dashcam.yaml'
     path.parent.mkdir(parents=True)
     path.write_text(f"""\
@@ -77,7 +76,7 @@ image_height: {SIZE[1]}
 camera_name: dashcam
 camera_matrix: {{rows: 3, cols: 3, data: [{fx}, 0, {cx}, 0, {fy}, {cy}, 0, 0, 1]}}
 distortion_model: plumb_bob
-distortion_coefficients: {{rows: 1, cols: 5, data: [{truth.k1}, {truth.k2}, 0, 0, 0]}}
+distortion_coefficients: {{rows: 1, cols: 5, data: [{LENS.k1}, {LENS.k2}, 0, 0, 0]}}
 dashcalib:
   verdict: accepted
   sigma: {{fx: 2.0, fy: 2.0, cx: 2.0, cy: 2.0, k1: 0.01, k2: 0.01}}

@@ -20,11 +20,12 @@ import tempfile
 import time
 import zlib  # noqa: F401  before pycolmap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 from drives import BY_NAME, DEMO, KITTI_RAW, NARROW, STREET, Setting, drive_of, pictures_of
 from measure import (
     commit,
@@ -35,15 +36,18 @@ from measure import (
     isolated,
     load,
     parser_with,
+    reconstructed,
     save,
+    solved,
     summarised,
     table,
 )
-from stages import Detected, detect, from_turns, random_windows
 
-from dashcalib_ros import Config, open_frames
+from dashcalib_ros import Config, open_frames, stages
 from dashcalib_ros.frames import Frame
+from dashcalib_ros.frames.shrink import shrink, shrink_factor
 from dashcalib_ros.turns import Turn
+from dashcalib_ros.turns.detection import Detection
 
 # straights as long as the turns, so that random windows are not turns by necessity
 LONG = replace(STREET, straight_m=75.0, lead_m=50.0)
@@ -79,32 +83,29 @@ def trivial(task: Task) -> dict[str, Any]:
 
 def ours_on_turns(task: Task) -> dict[str, Any]:
     """dashcalib as it is."""
-    detected = detect(task.frames, task.config)
-    return _ours(task, detected, detected.turns)
+    detection = stages.detect(task.frames, task.config)
+    return _ours(task, detection, _best(task, detection))
 
 
 def ours_on_windows(task: Task) -> dict[str, Any]:
     """dashcalib's reconstruction without its turns."""
-    detected = detect(task.frames, task.config)
-    return _ours(task, detected, _windows(task, detected))
+    detection = stages.detect(task.frames, task.config)
+    return _ours(task, detection, _windows(task, detection))
 
 
 def colmap_on_turns(task: Task) -> dict[str, Any]:
     """COLMAP on the turns that dashcalib used, together."""
-    detected = detect(task.frames, task.config)
-    return _colmap(task, _best(task, detected))
+    return _colmap(task, _best(task, stages.detect(task.frames, task.config)))
 
 
 def colmap_on_windows(task: Task) -> dict[str, Any]:
     """COLMAP on the random windows, together."""
-    detected = detect(task.frames, task.config)
-    return _colmap(task, _windows(task, detected))
+    return _colmap(task, _windows(task, stages.detect(task.frames, task.config)))
 
 
 def colmap_on_all(task: Task) -> dict[str, Any]:
     """COLMAP on every frame of the drive (thinned to the detector's rate)."""
-    frames = detect(task.frames, task.config).frames
-    return _colmap(task, [Turn(0, frames[0].index, frames[-1].index, 0.0, 0.0, frames)])
+    return _colmap(task, [_window(_thinned(task))])
 
 
 RIVALS: dict[str, Callable[[Task], dict[str, Any]]] = {
@@ -117,21 +118,49 @@ RIVALS: dict[str, Callable[[Task], dict[str, Any]]] = {
 }
 
 
-def _best(task: Task, detected: Detected) -> Sequence[Turn]:
-    return detected.turns[:task.config.turns.wanted]
+def _best(task: Task, detection: Detection) -> Sequence[Turn]:
+    return detection.turns()[:task.config.turns.wanted]
 
 
-def _windows(task: Task, detected: Detected) -> list[Turn]:
-    lengths = [turn.images for turn in _best(task, detected)]
-    return random_windows(detected, lengths, task.seed)
+def _windows(task: Task, detection: Detection) -> list[Turn]:
+    """Return as many windows as turns, as long as these, anywhere in the drive, none over another.
+
+    Raises ValueError when the drive has no room for them.
+    """
+    frames = _thinned(task)
+    lengths = [turn.images for turn in _best(task, detection)]
+    rng = np.random.default_rng([task.seed, 8])
+    if sum(lengths) > len(frames):
+        raise ValueError('the drive is too short for so many windows')
+    # the gaps share what the windows leave, each division as likely as the next
+    free = len(frames) - sum(lengths)
+    starts = np.sort(rng.integers(0, free + 1, len(lengths)))
+    starts += np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(int)
+    return [_window(frames[start:start + length])
+            for start, length in zip(starts, lengths, strict=True)]
 
 
-def _ours(task: Task, detected: Detected, turns: Sequence[Turn]) -> dict[str, Any]:
-    result, seconds = from_turns(detected, turns, task.config)
-    used = [turn for turn in result.turns if turn.used]
-    return {'seconds': seconds, 'detect_s': detected.seconds,
-            'images': sum(turn.images for turn in used),
-            'registered': sum(turn.registered for turn in used),
+def _thinned(task: Task) -> tuple[Frame, ...]:
+    """Return the frames at the detector's rate, as large as they are reconstructed."""
+    kept: list[Frame] = []
+    for frame in task.frames:
+        if not kept or frame.stamp_ns - kept[-1].stamp_ns > 0.9e9 / task.config.motion.rate:
+            kept.append(shrink(frame, shrink_factor(frame.size, task.config.max_width)))
+    return tuple(kept)
+
+
+def _window(frames: tuple[Frame, ...]) -> Turn:
+    middle = frames[len(frames) // 2]
+    return Turn(middle.index, frames[0].index, frames[-1].index, middle.stamp_ns / 1e9, 0.0,
+                frames)
+
+
+def _ours(task: Task, detection: Detection, turns: Sequence[Turn]) -> dict[str, Any]:
+    scenes, scenes_s = reconstructed(detection, turns, task.config)
+    result, solving_s = solved(detection, scenes, task.config)
+    return {'seconds': scenes_s + sum(solving_s.values()),
+            'images': sum(len(scene.tracks.frames) for scene in scenes),
+            'registered': sum(int(scene.structure.registered.sum()) for scene in scenes),
             **summarised(result, task.truth)}
 
 
@@ -269,7 +298,7 @@ def _task(name: str, seed: int, arguments: argparse.Namespace, passing: Path) ->
             setting = replace(setting, spec=replace(setting.spec, turns=arguments.turns))
         drive = drive_of(setting, seed)
         frames = pictures_of(drive, arguments.cache or passing)
-        truth = asdict(drive.truth)
+        truth = drive.truth
     return Task(frames, truth, config, seed, arguments.matcher, arguments.limit)
 
 

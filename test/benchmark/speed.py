@@ -35,16 +35,18 @@ from measure import (
     load,
     memory_mb,
     parser_with,
+    reconstructed,
     save,
+    solved,
     table,
 )
-from stages import detect, given
 
 from dashcalib_ros import Config
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.frames.shrink import shrink, shrink_factor
 from dashcalib_ros.motion import MotionEstimator, estimator
 from dashcalib_ros.turns import TurnDetector
+from dashcalib_ros.turns.detection import Detection
 
 ONE_TURN = replace(STREET, turns=1)
 SIZES = tuple(Setting(f'{lens.width}x{lens.height}', lens, ONE_TURN)
@@ -53,7 +55,7 @@ FIVE_TURNS = Setting('five turns', DEMO, replace(STREET, bonnet=True, timestamp=
 EIGHT_TURNS = Setting('eight turns', DEMO, replace(STREET, turns=8))
 RATE = 30.0
 # the estimator's methods, by what they do; one that is gone is not listed
-PARTS = {'shrink': '_shrink', 'track': '_follow', 'epipoles': '_magnitude',
+PARTS = {'track': '_follow', 'epipoles': '_magnitude',
          'new points': '_replenish', 'ego vehicle': '_look_for_ego'}
 PERIOD_S = 60.0
 
@@ -157,13 +159,19 @@ def hour(pictures: Pictures, minutes: float) -> dict[str, Any]:
 def calibration(pictures: Pictures) -> dict[str, Any]:
     """Reconstruct and solve five turns, stage by stage, all processes starting cold."""
     config = Config()
-    detected = detect(pictures, config)
-    watch = Stopwatch('begin')
-    with given(detected, detected.turns, config) as calibrator:
-        result = calibrator.calibrate(watch.enter)
-        watch.enter('end')
-    return {'detect_s': detected.seconds, 'stages_s': watch.seconds,
-            'total_s': sum(watch.seconds.values()), 'verdict': result.verdict.level,
+    watch = Stopwatch('pictures')
+    detection = Detection(config)
+    for frame in pictures:
+        watch.enter('detection')
+        detection.push(frame)
+        watch.enter('pictures')
+    detection.finish()
+    turns = detection.turns()[:config.turns.wanted]
+    scenes, scenes_s = reconstructed(detection, turns, config)
+    result, solving_s = solved(detection, scenes, config)
+    stages_s = {'reconstructing turns': scenes_s, **solving_s}
+    return {'detect_s': watch.seconds['detection'], 'stages_s': stages_s,
+            'total_s': sum(stages_s.values()), 'verdict': result.verdict.level,
             'turns': sum(turn.used for turn in result.turns)}
 
 

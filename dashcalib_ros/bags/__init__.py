@@ -1,0 +1,1 @@
+"""Everything about rosbags: read, salvage, write, add camera_info to images."""

@@ -1,0 +1,191 @@
+"""What every camera model has: parameters, projection, viewing rays, derivatives, limits.
+
+A model is a frozen dataclass that adds its distortion coefficients to fx, fy, cx, cy, and one row
+in models.py. Directions are unit vectors, since a ray may lie beyond 90 degrees; errors are
+pixels. Pixel coordinates are ROS's and OpenCV's: the centre of the first pixel is (0, 0).
+"""
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.arrays import Floats
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+# COLMAP has the centre of the first pixel at (0.5, 0.5)
+HALF_PIXEL = 0.5
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """How COLMAP writes a camera.
+
+    name: of COLMAP's model; size: how many parameters it has. places: the index of each of our
+    parameters among them; two may share one (a single focal length). COLMAP's other parameters
+    are held at 0.
+    """
+
+    name: str
+    size: int
+    places: tuple[int, ...]
+
+    @property
+    def held(self) -> list[int]:
+        """Return the indices of COLMAP's parameters that are held at 0."""
+        return sorted(set(range(self.size)) - set(self.places))
+
+    def values(self, params: npt.ArrayLike) -> Floats:
+        """Return COLMAP's parameters (size,) for ours."""
+        values = np.zeros(self.size)
+        # of two parameters that share a place, the first one counts
+        values[list(reversed(self.places))] = np.asarray(params)[::-1]
+        values[list(self.places[2:4])] += HALF_PIXEL
+        return values
+
+    def params(self, values: npt.ArrayLike) -> Floats:
+        """Return our parameters for COLMAP's (size,)."""
+        params = np.asarray(values, np.float64)[list(self.places)]
+        params[2:4] -= HALF_PIXEL
+        return params
+
+
+@dataclass(frozen=True)
+class Camera(ABC):
+    """image_size: (width, height); fx, fy, cx, cy in pixels; the rest is the model's own.
+
+    model: its name in result.json and --model. ros_model: CameraInfo's distortion_model.
+    step1, step2: how COLMAP adjusts it with one focal length and the centre fixed, and with all
+    parameters (paper, 3.2). spread: prior standard deviation of each distortion coefficient,
+    around 0.
+    """
+
+    image_size: tuple[int, int]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    model: ClassVar[str]
+    ros_model: ClassVar[str]
+    step1: ClassVar[ColmapModel]
+    step2: ClassVar[ColmapModel]
+    spread: ClassVar[tuple[float, ...]]
+
+    @classmethod
+    def centred(cls, image_size: tuple[int, int], focal: float, *distortion: float) -> Self:
+        """Return the camera that the paper's first step starts from: fx = fy, centre fixed.
+
+        distortion: the first coefficients; the others are 0.
+        """
+        width, height = image_size
+        params = np.zeros(len(cls.names()))
+        params[:4] = focal, focal, (width - 1) / 2, (height - 1) / 2
+        params[4:4 + len(distortion)] = distortion
+        return cls.of(image_size, params)
+
+    @classmethod
+    def of(cls, image_size: tuple[int, int], params: npt.ArrayLike) -> Self:
+        """Return the camera with these parameters, in the order of names()."""
+        return cls(image_size, *(float(value) for value in np.asarray(params)))
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the parameters' names: fx, fy, cx, cy, then the distortion coefficients."""
+        return tuple(spec.name for spec in fields(cls))[1:]
+
+    @property
+    def params(self) -> Floats:
+        """Return the parameters (n,) in the order of names()."""
+        return np.array([getattr(self, name) for name in self.names()])
+
+    @property
+    def named(self) -> dict[str, float]:
+        """Return the parameters by name."""
+        return {name: getattr(self, name) for name in self.names()}
+
+    def with_params(self, params: npt.ArrayLike) -> Self:
+        """Return the camera with other parameters (n,)."""
+        return self.of(self.image_size, params)
+
+    def with_focal(self, focal: float) -> Self:
+        """Return the camera with another focal length, fx = fy."""
+        return replace(self, fx=focal, fy=focal)
+
+    def enlarged(self, factor: int, image_size: tuple[int, int]) -> Self:
+        """Return the camera of the full-size images, for one of images shrunk by a factor.
+
+        image_size: of the full-size images; see shrink_image() for how they were shrunk.
+        """
+        offset = (factor - 1) / 2
+        return replace(self, image_size=image_size, fx=self.fx * factor, fy=self.fy * factor,
+                       cx=self.cx * factor + offset, cy=self.cy * factor + offset)
+
+    @property
+    def matrix(self) -> Floats:
+        """Return K (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @abstractmethod
+    def widened(self) -> Camera:
+        """Return the same camera in a wider model: its first parameters are this one's.
+
+        The values that the further coefficients would have show how well this model describes the
+        lens. Returns the camera itself where no model has more.
+        """
+
+    @abstractmethod
+    def ros_distortion(self) -> list[float]:
+        """Return CameraInfo's D."""
+
+    @abstractmethod
+    def project(self, points: Floats) -> Floats:
+        """Return the pixels (..., 2) of points (..., 3) in the camera's frame.
+
+        NaN for points that the model cannot see, such as those behind the camera, and for NaN.
+        """
+
+    @abstractmethod
+    def rays(self, pixels: Floats) -> Floats:
+        """Return the unit viewing rays (..., 3) of pixels (..., 2).
+
+        NaN for NaN, and for pixels beyond the radius at which the model folds over.
+        """
+
+    @abstractmethod
+    def derivatives(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the derivatives of the pixels of visible points (m, 3), and the pixels (m, 2).
+
+        First the derivatives by the parameters (m, 2, n), then those by the points (m, 2, 3).
+        """
+
+    def covers_picture(self) -> bool:
+        """Return whether every pixel has a viewing ray: the model does not fold over inside."""
+        width, height = self.image_size
+        corners = np.array([[x, y] for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])
+        return bool(np.isfinite(self.rays(corners)).all())
+
+
+@dataclass(frozen=True)
+class RosCamera:
+    """CameraInfo's fields, and those of a calibration file: row-major, no rectification."""
+
+    image_size: tuple[int, int]
+    distortion_model: str
+    d: list[float]
+    k: list[float]
+    r: list[float]
+    p: list[float]
+
+
+def ros_camera(camera: Camera) -> RosCamera:
+    """Return the camera as ROS has it: R is the identity, P has K's values."""
+    return RosCamera(
+        camera.image_size, camera.ros_model, [float(value) for value in camera.ros_distortion()],
+        camera.matrix.ravel().tolist(), np.eye(3).ravel().tolist(),
+        np.column_stack([camera.matrix, np.zeros(3)]).ravel().tolist())

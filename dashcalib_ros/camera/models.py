@@ -1,0 +1,51 @@
+"""The table of camera models. A new model is a class in a file of its own and a row here."""
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.camera.camera import Camera
+from dashcalib_ros.camera.plumb_bob import Brown, Radial
+from dashcalib_ros.errors import ConfigError, InputError
+
+MODELS: dict[str, type[Camera]] = {model.model: model for model in (Radial, Brown)}
+
+
+def model_named(name: str) -> type[Camera]:
+    """Return a model by its name; raises ConfigError for one that is not known."""
+    if name not in MODELS:
+        raise ConfigError(f'there is no camera model {name!r}; there are {", ".join(MODELS)}')
+    return MODELS[name]
+
+
+def camera_of(model: str, image_size: tuple[int, int], params: npt.ArrayLike) -> Camera:
+    """Return the camera of a model's name; raises InputError for a model that is not known."""
+    if model not in MODELS:
+        raise InputError(f'the camera model {model!r} is not known here; there are '
+                         f'{", ".join(MODELS)}')
+    return MODELS[model].of(image_size, params)
+
+
+def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.ArrayLike,
+                    d: npt.ArrayLike) -> Camera:
+    """Return the simplest camera that CameraInfo's K (9,) and D (n,) describe.
+
+    Raises InputError where no model here has such a distortion.
+    """
+    fx, _, cx, _, fy, cy = np.asarray(k, np.float64)[:6]
+    wanted = np.trim_zeros(np.asarray(d, np.float64), 'b')
+    # fewer parameters come first in the table
+    for model in MODELS.values():
+        if distortion_model not in (model.ros_model, *SAME.get(model.ros_model, ())):
+            continue
+        size = len(model.names()) - 4
+        camera = model.of(image_size, [fx, fy, cx, cy, *wanted[:size],
+                                       *np.zeros(max(0, size - len(wanted)))])
+        if np.array_equal(np.trim_zeros(np.array(camera.ros_distortion()), 'b'), wanted):
+            return camera
+    raise InputError(f'a camera of {distortion_model} with {len(wanted)} coefficients is none of '
+                     f'the models here: {", ".join(MODELS)}')
+
+
+# other names that ROS has for a model, or for one that contains it
+SAME = {'plumb_bob': ('rational_polynomial',)}

@@ -1,0 +1,149 @@
+"""Pinhole and distortion polynomials: the paper's model, and Brown's with three terms more.
+
+With x, y the point over its depth and s = x^2 + y^2, the pixel is K times
+x (1 + k1 s + k2 s^2 + k3 s^3) + 2 p1 x y + p2 (s + 2 x^2), and for y alike: ROS's plumb_bob.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera.camera import Camera, ColmapModel
+
+# tangent of 85 degrees: no pinhole camera sees farther out
+WIDEST = 11.4
+NEWTON_STEPS = 12
+# of the focal length; a pixel without a solution this exact has no ray
+REACHED = 1e-6
+# points nearer to the plane of the pinhole than this cannot be projected
+NEAREST = 1e-9
+
+
+@dataclass(frozen=True)
+class Radial(Camera):
+    """The paper's six parameters (Eq. 1, 2): two radial terms."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+
+    model: ClassVar[str] = 'radial'
+    ros_model: ClassVar[str] = 'plumb_bob'
+    step1: ClassVar[ColmapModel] = ColmapModel('RADIAL', 5, (0, 0, 1, 2, 3, 4))
+    step2: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4, 5))
+    spread: ClassVar[tuple[float, ...]] = (1.0, 1.0)
+
+    def widened(self) -> Camera:
+        """Return the camera with p1, p2 and k3, which are 0."""
+        return Brown.of(self.image_size, [*self.params, 0.0, 0.0, 0.0])
+
+    def ros_distortion(self) -> list[float]:
+        """Return k1, k2, p1, p2, k3, the order of ROS and OpenCV."""
+        return [self.k1, self.k2, 0.0, 0.0, 0.0]
+
+    def project(self, points: Floats) -> Floats:
+        """Return the pixels (..., 2) of points (..., 3); NaN behind the camera."""
+        depth = points[..., 2]
+        depth = np.where(depth > NEAREST, depth, np.nan)
+        x, y = points[..., 0] / depth, points[..., 1] / depth
+        k1, k2, p1, p2, k3 = self.ros_distortion()
+        square = x * x + y * y
+        scale = 1 + square * (k1 + square * (k2 + square * k3))
+        if p1 or p2:
+            product = 2 * x * y
+            x, y = (x * scale + p1 * product + p2 * (square + 2 * x * x),
+                    y * scale + p1 * (square + 2 * y * y) + p2 * product)
+        else:
+            x, y = x * scale, y * scale
+        return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
+
+    def derivatives(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the derivatives of the pixels of points (m, 3); see Camera."""
+        if len(points) == 0:
+            return np.zeros((0, 2, len(self.names()))), np.zeros((0, 2, 3)), np.zeros((0, 2))
+        # the stubs have wrong types for this function
+        project: Any = cv2.projectPoints
+        origin = np.zeros(3)
+        pixels, jacobian = project(np.ascontiguousarray(points, np.float64), origin, origin,
+                                   self.matrix, np.array(self.ros_distortion()))
+        jacobian = jacobian.reshape(len(points), 2, -1)
+        # OpenCV's columns: rotation, translation (the point's own), fx fy, cx cy, then D
+        return (jacobian[:, :, 6:6 + len(self.names())], jacobian[:, :, 3:6],
+                pixels.reshape(-1, 2))
+
+    def rays(self, pixels: Floats) -> Floats:
+        """Return unit viewing rays (..., 3): Newton's method on the radius."""
+        distorted = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
+        target = np.linalg.norm(distorted, axis=-1)
+        radius = np.minimum(target, self.fold)
+        for _ in range(NEWTON_STEPS):
+            square = radius * radius
+            value = radius * (1 + square * (self.k1 + square * self.k2)) - target
+            slope = 1 + square * (3 * self.k1 + 5 * square * self.k2)
+            radius = np.clip(radius - value / np.maximum(slope, 0.1), 0.0, self.fold)
+        reached = np.where(np.abs(value) < REACHED, radius, np.nan)
+        scale = np.where(target > 1e-12, reached / np.maximum(target, 1e-12), 1.0)
+        return _unit(distorted * scale[..., None])
+
+    @cached_property
+    def fold(self) -> float:
+        """Return the undistorted radius sqrt(x^2 + y^2) at which the model folds over."""
+        k1, k2, _, _, k3 = self.ros_distortion()
+        # there the slope is 0: a polynomial in 1 / (x^2 + y^2), whose first coefficient is 1
+        roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+        real = roots[np.abs(roots.imag) < 1e-9].real
+        return float(1 / np.sqrt(max([*real, WIDEST**-2])))
+
+
+@dataclass(frozen=True)
+class Brown(Radial):
+    """Brown's model: also decentred (p1, p2), and a third radial term."""
+
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    model: ClassVar[str] = 'brown'
+    step2: ClassVar[ColmapModel] = ColmapModel('FULL_OPENCV', 12, (0, 1, 2, 3, 4, 5, 6, 7, 8))
+    spread: ClassVar[tuple[float, ...]] = (1.0, 1.0, 1e-3, 1e-3, 0.1)
+
+    def widened(self) -> Camera:
+        """Return this camera: no model has more."""
+        return self
+
+    def ros_distortion(self) -> list[float]:
+        """Return k1, k2, p1, p2, k3."""
+        return [self.k1, self.k2, self.p1, self.p2, self.k3]
+
+    def rays(self, pixels: Floats) -> Floats:
+        """Return unit viewing rays (..., 3): Newton's method in x and y."""
+        wanted = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
+        plain = type(self)(self.image_size, 1.0, 1.0, 0.0, 0.0, *self.params[4:])
+        xy = np.clip(np.nan_to_num(wanted.reshape(-1, 2)), -self.fold, self.fold)
+        for _ in range(NEWTON_STEPS):
+            _, slopes, bent = plain.derivatives(np.column_stack([xy, np.ones(len(xy))]))
+            step = _solved(slopes[:, :, :2], wanted.reshape(-1, 2) - bent)
+            xy = xy + np.clip(np.nan_to_num(step), -0.5, 0.5)
+        reached = np.linalg.norm(xy, axis=1) <= 1.02 * self.fold
+        missed = np.abs(plain.project(np.column_stack([xy, np.ones(len(xy))]))
+                        - wanted.reshape(-1, 2)).max(axis=1)
+        xy[~(reached & (missed < REACHED))] = np.nan
+        return _unit(xy.reshape(wanted.shape))
+
+
+def _unit(xy: Floats) -> Floats:
+    """Return unit rays (..., 3) through x, y (..., 2) at depth 1."""
+    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+
+def _solved(m: Floats, b: Floats) -> Floats:
+    """Solve the 2 by 2 systems m x = b by Cramer's rule; inf or NaN where m is singular."""
+    with np.errstate(all='ignore'):
+        determinant = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+        return np.stack([b[:, 0] * m[:, 1, 1] - b[:, 1] * m[:, 0, 1],
+                         b[:, 1] * m[:, 0, 0] - b[:, 0] * m[:, 1, 0]], -1) / determinant[:, None]

@@ -1,0 +1,145 @@
+"""Stamps of messages -> increasing times of images, for recordings and live streams."""
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from dataclasses import dataclass
+
+SECOND_NS = 1_000_000_000
+# a stamp further back means a clock that was set back (a bag that loops), not a late image
+SET_BACK_NS = SECOND_NS
+# a longer gap is a camera that paused
+PAUSE_NS = 5 * SECOND_NS
+# of the median period; a longer step means that images are missing
+GAP = 1.5
+# of the period; an image may come this much early: of a camera of up to 13.3 Hz all are used
+EARLY = 0.25
+
+
+def least_step_ns(rate: float) -> float:
+    """Return how far apart images must be to be used when they are thinned to a rate in Hz."""
+    return (1 - EARLY) * 1e9 / rate
+
+
+@dataclass(frozen=True)
+class StampPolicy:
+    """What a gate does differently for recordings and live streams.
+
+    shift: after the clock was set back, later stamps are shifted so that time goes on; else they
+    stay as they are: the core then begins its tracking anew and keeps its turns.
+    skip_zero: an image without a stamp is left out where others have one, also if the first stamp
+    comes late; else the first image decides whether stamps or times of reception are used.
+    rate: Hz that images are thinned to, as in MotionEstimator, but before they are decoded; None:
+    all are used.
+    """
+
+    shift: bool
+    skip_zero: bool
+    rate: float | None = None
+
+
+RECORDED = StampPolicy(shift=True, skip_zero=False)
+
+
+def live(rate: float) -> StampPolicy:
+    """Return the policy of a live stream that is thinned to a rate in Hz."""
+    return StampPolicy(shift=False, skip_zero=True, rate=rate)
+
+
+class StampGate:
+    """Gives each image of a stream its time, and leaves out those that cannot be used.
+
+    The time is the header's stamp; for drivers that set no stamps it is the time of reception. An
+    image that is not later than the one before is a repetition or came late: it is left out.
+
+    unstamped: times of reception are used. repeated: number of images left out as not later than
+    the one before; zero: of those left out as without a stamp. set_back: how often the clock was
+    set back, and furthest_back_ns by how much at the most. lost: images missing between stamps.
+    """
+
+    def __init__(self, policy: StampPolicy) -> None:
+        self.policy = policy
+        self.unstamped = False
+        self.repeated = self.zero = self.lost = self.set_back = 0
+        self.furthest_back_ns = 0
+        self._least_ns = least_step_ns(policy.rate) if policy.rate else 0.0
+        self._steps: deque[int] = deque(maxlen=31)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew with the next image; the counts stay."""
+        self.unstamped = False
+        self._last: int | None = None
+        self._used: int | None = None
+        self._step = self._shift = 0
+        self._steps.clear()
+
+    def take(self, header_ns: int, received_ns: int) -> int | None:
+        """Return the next image's time in ns, or None when it is not to be used."""
+        stamp_ns = self._time(header_ns, received_ns)
+        if stamp_ns is None:
+            return None
+        if self._used is not None and 0 <= stamp_ns - self._used < self._least_ns:
+            return None
+        self._used = stamp_ns
+        return stamp_ns
+
+    def warnings(self) -> list[str]:
+        """Return warnings about a recording's stamps for the user, one line each."""
+        lines = []
+        if self.unstamped:
+            lines.append('the image headers have no stamps: the times of reception were used')
+        if self.repeated:
+            lines.append(f'{self.repeated} images were skipped: their stamps are not later than '
+                         f'those before')
+        if self.set_back:
+            lines.append(f'the clock was set back {self.set_back} times, by up to '
+                         f'{self.furthest_back_ns / 1e9:.1f} s: later stamps were shifted')
+        return lines
+
+    def _time(self, header_ns: int, received_ns: int) -> int | None:
+        """Return the image's time, None if it has no stamp or one that is not later."""
+        if not self._choose_clock(header_ns):
+            self.zero += 1
+            return None
+        now = (received_ns if self.unstamped else header_ns) + self._shift
+        if self._last is None:
+            self._last = now
+            return now
+        step = now - self._last
+        if step < -SET_BACK_NS:
+            self.set_back += 1
+            self.furthest_back_ns = max(self.furthest_back_ns, -step)
+            if not self.policy.shift:
+                self._last = now
+                return now
+            self._shift += self._step - step
+            step = self._step
+        if step <= 0:
+            self.repeated += 1
+            return None
+        self._count_lost(step)
+        self._step = step
+        self._last += step
+        return self._last
+
+    def _choose_clock(self, header_ns: int) -> bool:
+        """Decide between stamps and times of reception; return False to leave the image out."""
+        begun = self._last is not None
+        if begun and not self.policy.skip_zero:
+            return True
+        if begun and header_ns == 0 and not self.unstamped:
+            return False
+        if header_ns and self.unstamped:
+            self._last = None  # the first stamp: it is of another clock
+        self.unstamped = header_ns == 0
+        return True
+
+    def _count_lost(self, step: int) -> None:
+        if step >= PAUSE_NS:
+            return
+        if len(self._steps) >= 5:
+            period = statistics.median(self._steps)
+            if step > GAP * period:
+                self.lost += round(step / period) - 1
+        self._steps.append(step)

@@ -1,0 +1,171 @@
+"""Solution and evidence -> the Calibration that is given to the user."""
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.config import Config
+from dashcalib_ros.judgement.agreement import focal_disagreement
+from dashcalib_ros.judgement.calibration import (
+    Calibration,
+    Shutter,
+    StoredTurnSummary,
+    TurnSummary,
+    Verdict,
+)
+from dashcalib_ros.judgement.verdict import judge, profile_contrast
+from dashcalib_ros.reconstruction.scene import Scene, errors_px
+from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.turn_store import StoredTurn
+from dashcalib_ros.turns.detection import Detection
+from dashcalib_ros.turns.turn import Turn, TurnId
+
+# result.json has their versions: a result's last digits depend on them
+PACKAGES = ('dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'pycolmap', 'pyceres')
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a calibration needs beside the solution.
+
+    image_size: of the input; shrink: the factor by which the images of the scenes were made
+    smaller. built: scenes by their turn. stored: the turns of earlier drives that were available.
+    """
+
+    image_size: tuple[int, int]
+    frames: int
+    turns: tuple[Turn, ...]
+    built: dict[TurnId, Scene]
+    magnitudes: Floats
+    mask: Mask | None
+    shrink: int
+    timing: dict[str, float]
+    warnings: tuple[str, ...] = ()
+    stored: tuple[StoredTurn, ...] = ()
+
+
+def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] = (),
+                          timing: Mapping[str, float] | None = None,
+                          warnings: tuple[str, ...] = (),
+                          stored: tuple[StoredTurn, ...] = ()) -> Evidence:
+    """Return the evidence from the first stage and from the scenes of its turns.
+
+    scenes: in any order; a turn without one is listed as not reconstructed.
+    """
+    return Evidence(
+        image_size=detection.size or (0, 0), shrink=detection.shrink, frames=detection.frames,
+        turns=detection.turns(), magnitudes=detection.magnitudes(), mask=detection.valid(),
+        built={scene.turn: scene for scene in scenes if scene is not None},
+        timing=dict(timing or {}), warnings=(*detection.warnings(), *warnings), stored=stored)
+
+
+def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
+    """Return the calibration; a refused one has no intrinsics, so that they cannot be used."""
+    verdict = judge(solution, config.verdict) if solution else _verdict_without_solution(evidence)
+    camera = sigma = error = shutter = None
+    details: dict[str, object] = {}
+    warnings = evidence.warnings
+    if solution is not None:
+        details = _details(solution)
+        if verdict.level != 'refused':
+            camera = solution.camera.enlarged(evidence.shrink, evidence.image_size)
+            # fx, fy, cx and cy are pixels
+            scale = np.where(np.arange(len(solution.sigma)) < 4, evidence.shrink, 1)
+            sigma = dict(zip(camera.names(), (solution.sigma * scale).tolist(), strict=True))
+            error = solution.reprojection_error_px * evidence.shrink
+            warnings += _model_error_warnings(solution, evidence.shrink, config)
+            if solution.readout_s:
+                shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
+    return Calibration(
+        verdict=verdict, image_size=evidence.image_size, camera=camera, sigma=sigma,
+        turns=tuple(_summary(turn, evidence, solution)
+                    for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
+        frames=evidence.frames, reprojection_error_px=error, timing=evidence.timing,
+        versions=_versions(), config=config, magnitudes=evidence.magnitudes, mask=evidence.mask,
+        details=details, rolling_shutter=shutter, warnings=warnings,
+        stored_turns=tuple(_stored_summary(turn, solution) for turn in evidence.stored))
+
+
+def _model_error_warnings(solution: Solution, shrink: int, config: Config) -> tuple[str, ...]:
+    """Return a warning if a wider model would clearly change fx, fy, cx or cy."""
+    count, names = len(solution.prior_information), solution.camera.widened().names()
+    step = solution.step_to_wider_model
+    shifts, others = step[:4], step[count:]
+    scale = np.repeat([solution.camera.fx, solution.camera.image_size[0]], 2)
+    if not np.max(np.abs(shifts) / scale) > config.verdict.max_untold_model_error:
+        return ()
+    changes = ', '.join(f'{name} by {shrink * shift:+.1f}'
+                        for name, shift in zip(names, shifts, strict=False))
+    found = [f'{name} {value:+.4f}' for name, value in zip(names[count:], others, strict=True)]
+    return (f'the lens seems to have {", ".join(found)}, which are not calibrated: they would '
+            f'change {changes} px; sigma allows for that',)
+
+
+def _verdict_without_solution(evidence: Evidence) -> Verdict:
+    """Return the verdict on a drive that gave no scene."""
+    if evidence.frames < 2:
+        return Verdict('refused', (f'there is only {evidence.frames} image: record a drive with '
+                                   f'turns',))
+    if not evidence.turns:
+        return Verdict('refused', (
+            'no turn was found: the car did not move, or drove straight on, or the pictures show '
+            'too little; record a drive with turns, in daylight',))
+    return Verdict('refused', (
+        f'none of the {len(evidence.turns)} turns could be reconstructed: the pictures are too '
+        f'dark or blurred, or the camera turned without moving',))
+
+
+def _summary(turn: Turn, evidence: Evidence, solution: Solution | None) -> TurnSummary:
+    used = {scene.turn: scene for scene in solution.scenes} if solution else {}
+    scene = used.get(turn.id) or evidence.built.get(turn.id)
+    error = None
+    if scene is not None:
+        camera = solution.camera if solution and turn.id in used else scene.camera
+        squares = errors_px(scene, camera)[scene.structure.used] ** 2
+        error = float(np.sqrt(np.mean(squares))) * evidence.shrink
+    return TurnSummary(
+        center=turn.center, first=turn.first, last=turn.last, stamp_s=turn.stamp_s,
+        prominence=turn.prominence, images=len(scene.tracks.frames) if scene else turn.images,
+        registered=int(scene.structure.registered.sum()) if scene else 0,
+        used=turn.id in used, yaw_deg=scene.yaw_deg if scene else None,
+        reprojection_error_px=error,
+        misfit=solution.misfits.get(turn.id) if solution else None)
+
+
+def _stored_summary(turn: StoredTurn, solution: Solution | None) -> StoredTurnSummary:
+    scene = turn.scene
+    used = {each.turn for each in solution.scenes} if solution else set()
+    return StoredTurnSummary(scene.turn, turn.stamp_s, turn.prominence, scene.yaw_deg,
+                             len(scene.tracks.frames), scene.turn in used,
+                             solution.misfits.get(scene.turn) if solution else None)
+
+
+def _details(solution: Solution) -> dict[str, object]:
+    width = solution.camera.image_size[0]
+    others = len(solution.prior_information)
+    return {
+        'step1': {'f_over_width': solution.step1.fx / width,
+                  **dict(list(solution.step1.named.items())[4:])},
+        'focal_profile': {'f_over_width': solution.around.ratios.tolist(),
+                          'cost_px2': solution.around.costs.tolist()},
+        'profile_contrast': profile_contrast(solution),
+        'turns_disagree_fx': focal_disagreement(solution),
+        'left_out': dict(zip(solution.camera.widened().names()[others:],
+                             solution.step_to_wider_model[others:].tolist(), strict=True)),
+        'correlation': (solution.covariance / np.outer(solution.sigma, solution.sigma)).tolist(),
+    }
+
+
+def _versions() -> dict[str, str]:
+    versions = {'python': platform.python_version()}
+    for name in PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = 'unknown'
+    return versions

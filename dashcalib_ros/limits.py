@@ -1,0 +1,225 @@
+"""Limits for all files and messages from outside: sizes, depths and numbers of values.
+
+All code that reads such input checks it here first. Input beyond a limit raises InputError before
+memory or time is spent on it.
+"""
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import stat
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from dashcalib_ros.errors import InputError
+
+# px; 8K has 33 million
+PIXELS = 50_000_000
+# px; no JPEG has a longer side
+SIDE = 65_535
+# of one encoded picture or one unpacked message: 50 million raw pixels of 4 bytes fit
+PICTURE_BYTES = MESSAGE_BYTES = 2**28
+# of one unpacked chunk of a bag: recorders end it at about 1 MB, or after one large message
+CHUNK_BYTES = 2**29
+# of a calibration, a configuration or the metadata.yaml of 3000 files
+YAML_BYTES = 2**20
+# of a result.json: it has about 100 kB
+JSON_BYTES = 2**22
+# of a segmentation network: ONNX keeps no larger ones in one file
+MODEL_BYTES = 2**31
+# values in a YAML text, repetitions by aliases included: as many as 1 MB can have
+YAML_VALUES = 300_000
+# levels of a YAML text: a metadata.yaml has 6
+YAML_DEPTH = 30
+# digits of a number in a text: a float has 17 digits and at most 308 zeros
+DIGITS = 300
+# text in YAML that may be a number; 1:20:30 is one, too
+NUMBER = re.compile(r'[-+.\d][-+.:\w]*')
+# times the size of a .zstd file, once unpacked: raw pictures have 2 to 10, rendered ones 50
+UNPACKED_RATIO = 200
+# bytes to which any .zstd file may be unpacked, however small it is
+UNPACKED_LEAST = 2**28
+# bytes that unpacking leaves free on the disk
+FREE_BYTES = 2**30
+
+TOO_LARGE = f'more than {PIXELS // 10**6} million pixels are not taken'
+
+
+def check_pixels(width: int, height: int, what: str = 'an image') -> None:
+    """Raise InputError unless a picture of this size is within limits."""
+    if width <= 0 or height <= 0:
+        raise InputError(f'{what} says it is {width}x{height}: the camera driver or the recording '
+                         f'is broken')
+    if width * height > PIXELS or max(width, height) > SIDE:
+        raise InputError(f'{what} says it is {width}x{height}, {TOO_LARGE}: make it smaller')
+
+
+def irregular_entry(path: Path) -> str:
+    """Return what a path is instead of a regular file, '' if it is one; raises OSError."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        if path.is_symlink():
+            return 'a link to nothing'
+        raise
+    except ValueError as error:  # a name with a zero byte in it
+        raise FileNotFoundError(2, 'No such file or directory', str(path)) from error
+    kinds: dict[str, Callable[[int], bool]] = {
+        'a folder': stat.S_ISDIR, 'a named pipe': stat.S_ISFIFO, 'a socket': stat.S_ISSOCK,
+        'a device': lambda m: stat.S_ISCHR(m) or stat.S_ISBLK(m)}
+    return next((kind for kind, fits in kinds.items() if fits(mode)), '')
+
+
+def check_file(path: Path, what: str = '', limit: int | None = None) -> None:
+    """Raise InputError unless this is a regular file, of `limit` bytes at the most; or OSError.
+
+    what: the file's name in errors. Reading a pipe would block, and a device has no end.
+    """
+    kind = irregular_entry(path)
+    if kind:
+        raise InputError(f'cannot read {what or path}: it is {kind}, no regular file; check the '
+                         f'path')
+    if limit is not None and path.stat().st_size > limit:
+        raise _too_large(what or str(path), limit)
+
+
+def read_file(path: Path, limit: int, what: str = '') -> bytes:
+    """Return the bytes of a regular file, `limit` at the most; raises InputError."""
+    what = what or str(path)
+    try:
+        check_file(path, what, limit)
+        with path.open('rb') as file:
+            data = file.read(limit + 1)  # files of /proc have no size, and files may grow
+    except FileNotFoundError as error:
+        raise InputError(f'cannot read {what}: it does not exist; check the path') from error
+    except OSError as error:
+        raise InputError(f'cannot read {what} ({error.strerror}); check the path') from error
+    if len(data) > limit:
+        raise _too_large(what, limit)
+    return data
+
+
+def _too_large(what: str, limit: int) -> InputError:
+    return InputError(f'cannot read {what}: it is too large, more than {limit / 2**20:.0f} MB; is '
+                      f'it the right file?')
+
+
+def read_text(path: Path, limit: int, what: str = '') -> str:
+    """Return the text of a regular file of `limit` bytes at the most; raises InputError."""
+    data = read_file(path, limit, what)
+    try:
+        return data.decode('utf-8-sig')
+    except UnicodeDecodeError as error:
+        raise InputError(f'cannot read {what or path}: it is not a text file (UTF-8); check the '
+                         f'path') from error
+
+
+def parse_yaml(text: str, what: str) -> Any:
+    """Return the content of a YAML text; raises InputError, in which `what` names the text.
+
+    Aliases (*name) may repeat values within limits.
+    """
+    import yaml
+
+    loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # 20 times as fast where libyaml is
+    if len(text) > YAML_BYTES:
+        raise InputError(f'{what} has more than {YAML_BYTES / 2**20:.0f} MB of YAML')
+    try:
+        _check_nesting(yaml.parse(text, Loader=loader), what)
+        return yaml.load(text, Loader=loader)
+    except InputError:
+        raise
+    except Exception as error:  # a wrong tag or number makes PyYAML raise nearly anything
+        mark = getattr(error, 'problem_mark', None)
+        # libyaml calls the end the line after the last
+        where = f' at line {min(mark.line, text.count(chr(10))) + 1}' if mark else ''
+        raise InputError(f'{what} is not valid YAML{where}') from error
+
+
+def _check_nesting(events: Iterable[Any], what: str) -> None:
+    """Raise InputError where a text has too many values or levels, aliases followed."""
+    # named: for each anchor, the number of its values and levels; stack: for each open list or
+    # map, its anchor and the number of its values and levels so far
+    named: dict[str, tuple[int, int]] = {}
+    stack: list[tuple[str | None, int, int]] = [(None, 0, 0)]
+    for event in events:
+        kind = type(event).__name__
+        anchor, values, levels = getattr(event, 'anchor', None), 1, 0
+        if kind in ('MappingStartEvent', 'SequenceStartEvent'):
+            stack.append((anchor, 1, 1))
+            if len(stack) > YAML_DEPTH:
+                raise InputError(f'{what} is no usable YAML: more than {YAML_DEPTH} levels')
+            continue
+        if kind in ('MappingEndEvent', 'SequenceEndEvent'):
+            anchor, values, levels = stack.pop()
+        elif kind == 'AliasEvent':
+            if anchor not in named:
+                raise InputError(f'{what} is no usable YAML: *{anchor} is inside itself')
+            (values, levels), anchor = named[str(anchor)], None
+        elif kind != 'ScalarEvent':
+            continue
+        elif len(event.value) > DIGITS and _is_number(event):
+            raise InputError(f'{what} is no usable YAML: a number has more than {DIGITS} digits')
+        if anchor:
+            named[anchor] = values, levels
+        name, more, deep = stack[-1]
+        stack[-1] = name, more + values, max(deep, levels + 1)
+        if stack[-1][1] > YAML_VALUES or len(stack) + levels > YAML_DEPTH:
+            raise InputError(f'{what} is no usable YAML: more than {YAML_VALUES} values or '
+                             f'{YAML_DEPTH} levels, aliases followed')
+
+
+def _is_number(scalar: Any) -> bool:
+    tagged = str(scalar.tag).endswith((':int', ':float'))
+    return tagged or (not scalar.style and NUMBER.fullmatch(scalar.value) is not None)
+
+
+def parse_json(text: str, what: str) -> Any:
+    """Return the content of a JSON text; raises InputError, in which `what` names the text."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f'{what} is not valid JSON ({error}); write it anew') from error
+
+
+def join_within(chunks: Iterable[bytes], limit: int, what: str) -> bytes:
+    """Join the pieces of unpacked data; raises InputError when they pass the limit."""
+    pieces: list[bytes] = []
+    total = 0
+    for piece in chunks:
+        total += len(piece)
+        if total > limit:
+            raise InputError(f'{what} unpacks to more than {limit / 2**20:.0f} MB')
+        pieces.append(piece)
+    return b''.join(pieces)
+
+
+class UnpackedFile:
+    """The target of unpacking a file: write() raises InputError at a limit.
+
+    A file that becomes too large is no recording, and the disk must not become full.
+    """
+
+    def __init__(self, packed: Path, write: Callable[[bytes], Any], folder: Path | None) -> None:
+        """folder: on the disk that is written to; None where nothing is kept."""
+        self._packed, self._write, self._folder = packed, write, folder
+        self._limit = max(UNPACKED_LEAST, UNPACKED_RATIO * packed.stat().st_size)
+        self._total = self._looked = 0
+
+    def write(self, data: bytes) -> int:
+        """Take the next piece."""
+        self._total += len(data)
+        if self._total > self._limit:
+            raise InputError(
+                f'{self._packed} unpacks to more than {self._limit / 2**20:.0f} MB, which is no '
+                f'recording; if it is one, unpack it first (zstd -d)')
+        if self._folder is not None and self._total - self._looked >= UNPACKED_LEAST:
+            self._looked = self._total
+            if shutil.disk_usage(self._folder).free < FREE_BYTES:
+                raise InputError(
+                    f'no room to unpack {self._packed} in {self._folder}: set TMPDIR to a bigger '
+                    f'disk, or unpack it first (zstd -d)')
+        self._write(data)
+        return len(data)

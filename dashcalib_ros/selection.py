@@ -1,0 +1,225 @@
+"""Which turns are reconstructed, and which scenes a calibration uses."""
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Iterable
+from typing import Any
+
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
+from dashcalib_ros.turns import TurnId
+from dashcalib_ros.turns.detection import Detection
+from dashcalib_ros.workers.child import ChildWorker
+from dashcalib_ros.workers.inline import InlineWorker
+from dashcalib_ros.workers.pool import ScenePool
+from dashcalib_ros.workers.worker import Worker
+
+Progress = Callable[[str, float], None]
+
+
+class SceneSelection:
+    """Lets the pool reconstruct the best turns; chooses scenes among these and stored turns.
+
+    warnings: about turns.store, and about turns that ended the workers.
+
+    Threads: the Calibrator's lock guards the detection, the places and the stored turns. It is
+    held only briefly, as push() needs it for each frame: no thread that holds it waits for a
+    worker or for a file (except in load(), once). load(), submit(), chosen(), built(), stored()
+    and stored_before() must be called with the lock held; all other methods without it, as they
+    take it themselves. Locks are taken in this order: the store's (of its files), this one, the
+    pool's. The pool's threads call _store() without any lock.
+    """
+
+    def __init__(self, config: Config, detection: Detection, lock: threading.Lock,
+                 live: bool = False, verbose: bool = False, use_stored: bool = True,
+                 warn: Callable[[str], None] = lambda text: None, inline: bool = False,
+                 on_trouble: Callable[[str], None] = lambda text: None) -> None:
+        """live, use_stored, warn, inline, on_trouble: as the Calibrator's."""
+        self.warnings: list[str] = []
+        # how many turns are used: more than wanted once these have left a result weak
+        self._places = config.turns.wanted
+        self._config = config
+        self._detection = detection
+        self._lock = lock
+        self._live = live
+        self._use_stored = use_stored
+        self._warn = warn
+        self._on_trouble = on_trouble
+        self._closed = False
+        turns = config.turns
+        self._kept = TurnStore(turns.store, max(turns.capacity, turns.wanted), turns.half_width,
+                               self._store_failed)
+        self._stored_before: tuple[StoredTurn, ...] = ()
+
+        def child() -> Worker:
+            # when the number of turns is odd, the last one can use all cores
+            threads = 1 if live else config.threads
+            return ChildWorker(live, verbose, threads, on_trouble)
+
+        self._pool = ScenePool(config, InlineWorker if inline else child,
+                               queue=turns.wanted if live else None, on_built=self._store,
+                               on_lost=self._lost, on_trouble=on_trouble)
+
+    # with the lock held
+
+    def load(self, frame_id: str) -> None:
+        """Load the turns of earlier drives, at the first frame: they must fit its size and id."""
+        assert self._detection.size is not None
+        self._kept.load(Origin(self._detection.size, self._detection.shrink, frame_id),
+                           self._use_stored)
+
+    def submit(self, replace_failed: bool = False) -> None:
+        """Have the best turns reconstructed; live: all, as a scene is a fiftieth of its images.
+
+        replace_failed: turns that gave no scene are replaced by the next best. Only calibrations
+        do that: which turns are reconstructed must not depend on the speed of the workers.
+        """
+        turns = {turn.id: turn for turn in self._detection.turns()}
+        self._kept.drop_repeated(turn.stamp_s for turn in turns.values())
+        built = self._pool.scenes()
+        self._pool.keep_only(set(turns))
+        places = self._places
+        for key in self._ranked():
+            turn = turns.get(key)
+            if turn is not None and (places > 0 or self._live) and turn.frames:
+                self._pool.submit(turn, self._detection.valid())
+                self._detection.release(turn.center)
+            if not (replace_failed and key in built and built[key] is None):
+                places -= 1
+
+    def chosen(self) -> list[Scene]:
+        """Return the scenes that a calibration would use now, best first."""
+        return self._built()[:self._places]
+
+    def built(self) -> Collection[Scene | None]:
+        """Return the results of this drive's turns: scenes, None for a turn that gave none."""
+        return self._pool.scenes().values()
+
+    def stored_before(self) -> tuple[StoredTurn, ...]:
+        """Return the turns of earlier drives that the last wanted() had to choose from."""
+        return self._stored_before
+
+    def stored(self) -> tuple[StoredTurn, ...]:
+        """Return the turns of earlier drives."""
+        return tuple(self._kept.turns.values())
+
+    def _ranked(self) -> list[TurnId]:
+        """Return all turns, the most prominent first."""
+        found = [(-turn.prominence, turn.id) for turn in self._detection.turns()]
+        found += [(-turn.prominence, key) for key, turn in self._kept.turns.items()]
+        return [key for _, key in sorted(found)]
+
+    def _built(self) -> list[Scene]:
+        """Return all scenes, best first; turns without a scene are left out."""
+        scenes = {**self._pool.scenes(),
+                  **{key: turn.scene for key, turn in self._kept.turns.items()}}
+        return [scene for key in self._ranked() if (scene := scenes.get(key)) is not None]
+
+    def _undecided(self) -> bool:
+        """Return whether a turn that is not built yet may be among the best."""
+        unbuilt = self._pool.unbuilt()
+        built = {scene.turn for scene in self._built()}
+        candidates = [key for key in self._ranked() if key in unbuilt or key in built]
+        return any(key in unbuilt for key in candidates[:self._places])
+
+    # without the lock
+
+    def make_room(self) -> None:
+        """Wait, unless live, until few turns wait in memory; raises what a worker raised."""
+        if not self._live:
+            self._pool.wait(lambda: len(self._pool.unbuilt()) <= 2 * self._config.threads)
+
+    def wanted(self, tell: Progress, final: bool) -> list[Scene]:
+        """Wait for the best turns' scenes and return them.
+
+        final: the drive is over. tell: is called with the stage and the share done. Raises what a
+        worker raised, and WorkerError when closed meanwhile.
+        """
+        # wait for all turns, also those that are not used: the report must not depend on the
+        # speed of the workers
+        everything = final or not self._live
+        while True:
+            total = max(len(self._pool.unbuilt()), 1)
+
+            def ready(total: int = total) -> bool:
+                waiting = len(self._pool.unbuilt())
+                tell('reconstructing turns', max(0.0, 1 - waiting / total))
+                if everything or not waiting:
+                    return waiting == 0
+                with self._lock:
+                    return not self._undecided()
+
+            self._pool.wait(ready)
+            if self._closed:
+                raise WorkerError('the calibrator was closed while it calibrated')
+            with self._lock:
+                # only when all are done: what is submitted must not depend on the workers' speed
+                own = [scene for scene in self._pool.scenes().values() if scene is not None]
+                self._kept.drop_repeated((), own)
+                self.submit(replace_failed=True)
+                if not self._undecided() and not (everything and len(self._pool.unbuilt())):
+                    self._stored_before = self.stored()
+                    return self.chosen()
+
+    def widen(self) -> bool:
+        """Use more turns, up to turns.at_most; return False if there are no more to use."""
+        turns = self._config.turns
+        most = max(turns.at_most, turns.wanted)
+        with self._lock:
+            if self._places >= most or len(self._ranked()) <= self._places:
+                return False
+            self._places = most
+            return True
+
+    def reject(self, keys: Iterable[TurnId]) -> None:
+        """Take out scenes that do not fit the others."""
+        with self._lock:
+            for key in keys:
+                if self._kept.turns.pop(key, None) is None:
+                    self._pool.reject(key)
+        self._store()
+
+    def run(self, function: Callable[..., Any], *arguments: Any, progress: Progress) -> Any:
+        """Run a stage in a worker, as soon as one is free, and return what it returns."""
+        return self._pool.run(function, *arguments, progress=progress)
+
+    def child_pids(self) -> list[int]:
+        """Return the process ids of the children that run now."""
+        return self._pool.pids()
+
+    def _store(self) -> None:
+        """Write the present scenes to turns.store; the pool calls it for each new one."""
+        def snapshot() -> dict[TurnId, StoredTurn]:
+            with self._lock:
+                built = self._pool.scenes()
+                own = {turn.id: StoredTurn(scene, turn.stamp_s, turn.prominence)
+                       for turn in self._detection.turns()
+                       if (scene := built.get(turn.id)) is not None}
+                return {**self._kept.turns, **own}
+
+        self._kept.mirror(snapshot)
+
+    def forget_stored(self) -> None:
+        """Drop the turns of earlier drives, on disk too."""
+        with self._lock:
+            self._kept.turns.clear()
+        self._store()
+
+    def clear_store(self) -> None:
+        """Remove the turns of this drive and the loaded ones from turns.store; store no others."""
+        self._kept.clear()
+
+    def close(self) -> None:
+        """End the workers; a wanted() in another thread raises WorkerError."""
+        self._closed = True
+        self._pool.close()
+
+    def _store_failed(self, text: str) -> None:
+        self.warnings.append(text)
+        self._warn(text)
+
+    def _lost(self, text: str) -> None:
+        self.warnings.append(text)
+        self._on_trouble(text)

@@ -1,0 +1,1 @@
+"""Scenes -> one shared camera, its covariance, and the information that each turn gives."""

@@ -1,0 +1,81 @@
+"""The focal profile of all turns: where to start, and how the cost rises around the result."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.config import Config, SceneConfig
+from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1
+from dashcalib_ros.reconstruction.scene import Profile, Scene, truncated_cost
+from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
+
+# factors of the resulting focal length at which the profile is evaluated
+PROBES = (0.8, 1.0, 1.25)
+
+
+def summed(profiles: Sequence[Profile]) -> Profile:
+    """Return the profiles' sum, in squared error times observations, on a common fine grid."""
+    low = max(profile.ratios[0] for profile in profiles)
+    high = min(profile.ratios[-1] for profile in profiles)
+    if low >= high:
+        low, high = (min(profile.ratios[0] for profile in profiles),
+                     max(profile.ratios[-1] for profile in profiles))
+    ratios = np.geomspace(low, high, 81)
+    total = np.zeros(len(ratios))
+    for profile in profiles:
+        total += profile.observations * np.interp(
+            np.log(ratios), np.log(profile.ratios), profile.costs)
+    observations = sum(profile.observations for profile in profiles)
+    return Profile(ratios, total / observations, observations)
+
+
+def nearest_start(scenes: Sequence[Scene], profile: Profile) -> Camera:
+    """Return, of the scenes' own cameras, the one nearest to the summed profile's minimum."""
+    wanted = np.log(profile.best * scenes[0].camera.image_size[0])
+    return min((scene.camera for scene in scenes),
+               key=lambda camera: abs(float(np.log(camera.fx)) - wanted))
+
+
+def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
+                   config: Config) -> Profile:
+    """Return the cost with the focal length held at PROBES times the result, all else adjusted.
+
+    Each probe is an adjustment that starts from the result, with a part of the tracks. If the
+    coarse profile has its minimum outside the probes, that focal length is probed too, with scenes
+    chained anew: of the two, the one that explains more observations is right.
+    """
+    few = [subsample_tracks(scene, config.intrinsics.profile_tracks) for scene in scenes]
+    width = camera.image_size[0]
+    costs = {}
+    for probe in PROBES:
+        held = camera.with_focal(camera.fx * probe)
+        costs[held.fx / width] = _held_cost(few, held, config.scene)
+    if not PROBES[0] < coarse.best * width / camera.fx < PROBES[-1]:
+        held = type(camera).centred(camera.image_size, coarse.best * width)
+        anew = [rechain(scene, held, config) or scene for scene in few]
+        costs[coarse.best] = _held_cost(anew, held, config.scene)
+    ratios = sorted(costs)
+    observations = sum(int(scene.tracks.seen.sum()) for scene in few)
+    return Profile(np.array(ratios), np.array([costs[ratio] for ratio in ratios]), observations)
+
+
+def _held_cost(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> float:
+    """Return the truncated cost over all scenes after adjusting all but the focal length, px^2.
+
+    The lowest cost met on the way: the wide loss may lead away from a start that is right.
+    """
+    def cost(moved: Sequence[Scene], camera: Camera) -> float:
+        return float(np.average([truncated_cost(scene, camera, config.error_px)
+                                 for scene in moved],
+                                weights=[int(scene.tracks.seen.sum()) for scene in moved]))
+
+    moved = list(scenes)
+    costs = [cost(moved, camera)]
+    # the first residuals are large: the loss must be as wide, or it ignores them
+    for loss_px in (0.01 * camera.image_size[0], config.loss_px, config.loss_px):
+        moved, camera = adjust_step1(moved, camera, Solver(loss_px, config.iterations), None)
+        moved = [retriangulate(scene, camera, config) for scene in moved]
+        costs.append(cost(moved, camera))
+    return min(costs)

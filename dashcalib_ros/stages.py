@@ -1,0 +1,94 @@
+"""The four stages, from images to a calibration; calibrator.py schedules them.
+
+detect: frames -> turns. reconstruct: a turn -> its scene. solve: scenes -> one camera with its
+covariance. judge: that -> a calibration with its verdict. Their results depend on their arguments
+only. reconstruct and solve load COLMAP when they are called.
+"""
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import numpy as np
+
+from dashcalib_ros.arrays import Mask
+from dashcalib_ros.config import Config
+from dashcalib_ros.frames import Frame
+from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judgement.conclude import Evidence, conclude
+from dashcalib_ros.reconstruction.scene import Draft, Scene
+from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.turns import Turn
+from dashcalib_ros.turns.detection import Detection
+
+Progress = Callable[[str, float], None]
+
+
+def detect(frames: Iterable[Frame], config: Config, mask: Mask | None = None) -> Detection:
+    """Find the turns of a drive. For a stream, call Detection.push() for each frame.
+
+    mask: (h, w), False where the ego vehicle is. Raises InputError when the images change size.
+    """
+    detection = Detection(config, mask)
+    for frame in frames:
+        detection.push(frame)
+    detection.finish()
+    return detection
+
+
+def reconstruct(turn: Turn, config: Config, valid: Mask | None = None) -> Scene | None:
+    """Reconstruct one turn; None where its pictures give no scene.
+
+    valid: (h, w), False where the ego vehicle is; None for everywhere.
+    """
+    begun = draft(turn, config, valid)
+    return None if begun is None else finish(turn, config, begun)
+
+
+def draft(turn: Turn, config: Config, valid: Mask | None = None) -> Draft | None:
+    """Do the first half of reconstruct(): the tracks, and the focal length to start from."""
+    from dashcalib_ros.reconstruction.build import draft_scene
+    with _numerical_failures(turn):
+        return draft_scene(turn, config, valid)
+    return None
+
+
+def finish(turn: Turn, config: Config, begun: Draft) -> Scene | None:
+    """Do the second half of reconstruct(); the turn needs the images of begun's keyframes only."""
+    from dashcalib_ros.reconstruction.build import finish_scene
+    with _numerical_failures(turn):
+        return finish_scene(turn, begun, config)
+    return None
+
+
+@contextlib.contextmanager
+def _numerical_failures(turn: Turn) -> Iterator[None]:
+    """Catch numerical failures from bad pictures: such a turn has no scene, others may."""
+    import cv2
+    try:
+        yield
+    except (np.linalg.LinAlgError, cv2.error) as error:
+        # shown with --verbose only; the result lists the turns that were not reconstructed
+        print(f'the turn at frame {turn.center} gives no scene: {error}', file=sys.stderr)
+
+
+def load() -> None:
+    """Import all that reconstruct() and solve() need, such as COLMAP."""
+    import dashcalib_ros.reconstruction.build
+    import dashcalib_ros.solve.joint  # noqa: F401
+
+
+def solve(scenes: Sequence[Scene], config: Config,
+          progress: Progress = lambda stage, done: None) -> Solution | None:
+    """Adjust all scenes with one camera (paper, 3.2); None where it explains none of them.
+
+    scenes: at least one, each as its turn was reconstructed.
+    """
+    from dashcalib_ros.solve import joint
+    return joint.solve(scenes, config, progress)
+
+
+def judge(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
+    """Return the calibration with its verdict; solution: None if there is none."""
+    return conclude(solution, evidence, config)

@@ -1,0 +1,100 @@
+"""Frames -> turns: the first stage, as a stream."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.frames import Frame
+from dashcalib_ros.frames.shrink import shrink, shrink_factor, shrink_mask
+from dashcalib_ros.motion import MotionEstimator
+from dashcalib_ros.turns.detector import TurnDetector
+from dashcalib_ros.turns.turn import Turn
+
+
+class Detection:
+    """Takes the images of one camera; keeps the best turns, with their images.
+
+    size: (width, height) of the images, None before the first. shrink: the factor by which they
+    are made smaller first. frames: how many there were. standing: the car stands now.
+    """
+
+    def __init__(self, config: Config, mask: Mask | None = None) -> None:
+        """mask: (h, w), False where the ego vehicle is."""
+        if mask is not None:
+            size = mask.shape[1], mask.shape[0]
+            mask = shrink_mask(mask, shrink_factor(size, config.max_width))
+        self.size: tuple[int, int] | None = None
+        self.shrink = 1
+        self.frames = 0
+        self.standing = False
+        self._max_width = config.max_width
+        self._motion = MotionEstimator(config.motion, config.mask, mask)
+        # more turns than wanted replace those without a scene; --turns may be above the capacity
+        self._turns = TurnDetector(replace(
+            config.turns, capacity=max(config.turns.capacity, config.turns.wanted)))
+
+    @property
+    def magnitude(self) -> float:
+        """Return the newest filtered turning magnitude, of the image width."""
+        return self._turns.magnitude
+
+    def push(self, frame: Frame) -> list[Turn]:
+        """Take the next frame; return the turns that it completes or changes.
+
+        Raises InputError when its size differs from the first one's.
+        """
+        self._check_size(frame)
+        self.frames += 1
+        small = shrink(frame, self.shrink)
+        motion = self._motion.push(small)
+        if motion is None:
+            return []
+        self.standing = motion.standing
+        return self._fixed(self._turns.push(small, motion))
+
+    def finish(self) -> list[Turn]:
+        """End the drive; return the turns that this completes or changes."""
+        return self._fixed(self._turns.finish())
+
+    def turns(self) -> tuple[Turn, ...]:
+        """Return the turns found so far, the most prominent first."""
+        return self._turns.turns()
+
+    def release(self, center: int) -> None:
+        """Drop a turn's frames, once they are handed over."""
+        self._turns.release(center)
+
+    def magnitudes(self) -> Floats:
+        """Return (n, 2): stamp in s and filtered turning magnitude, decimated."""
+        return self._turns.magnitudes()
+
+    def valid(self) -> Mask | None:
+        """Return (h, w) of the shrunk images, False where the ego vehicle is; None: nowhere."""
+        return self._motion.valid()
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return warnings for the user, one line each."""
+        return tuple(self._motion.warnings())
+
+    def _fixed(self, new: list[Turn]) -> list[Turn]:
+        """Fix the frames of all turns: a later turn that overlaps one of them is trimmed.
+
+        This is done when a turn is confirmed, not when it is reconstructed: the result must not
+        depend on the speed of the workers.
+        """
+        if new:
+            for turn in self.turns():
+                self._turns.fix(turn.center)
+        return new
+
+    def _check_size(self, frame: Frame) -> None:
+        if self.size is None:
+            self.size = frame.size
+            self.shrink = shrink_factor(frame.size, self._max_width)
+        elif frame.size != self.size:
+            raise InputError(
+                f'the image size changes from {self.size[0]}x{self.size[1]} to '
+                f'{frame.size[0]}x{frame.size[1]} at frame {frame.index}: calibrate each size '
+                f'on its own')

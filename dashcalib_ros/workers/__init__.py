@@ -1,0 +1,1 @@
+"""Where stages run: child processes, or this one; with equal results."""

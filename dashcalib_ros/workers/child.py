@@ -1,0 +1,214 @@
+"""A worker in a child process: COLMAP aborts its process when a check fails.
+
+The parent sends (function, arguments) and receives progress, then a result or an exception.
+The child is a plain `python -c`, not multiprocessing: a child that the latter spawns would import
+the user's main script again.
+"""
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import pickle
+import select
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, cast
+
+from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.workers.messages import Parts, pack, receive, send, unpack
+from dashcalib_ros.workers.worker import THREAD_VARIABLES, Progress, WorkerDiedError
+
+# not `-m`: it would import from the current folder first, and a random.py may lie there
+START = ("import sys; sys.path[:1] = [] if sys.path[0] == '' else sys.path[:1]; "
+         'from dashcalib_ros.workers.child_main import main; main()')
+LOW_PRIORITY = 10
+# s between two looks at a child that does not answer
+LOOK_S = 1.0
+# looks without a sign of life: a child of low priority may wait for the processor for seconds
+LOOKS_TO_REPORT = 10
+LOOKS_TO_KILL = 60
+
+
+class ChildWorker:
+    """One child process, started at its first call, and anew at the next call after it died.
+
+    See Worker. A child that uses no processor time during a call hangs: on_trouble is called, and
+    after LOOKS_TO_KILL looks the child is killed. pid, kill() and close() may be used from any
+    thread at any time.
+    """
+
+    def __init__(self, low_priority: bool = False, verbose: bool = False, threads: int = 1,
+                 on_trouble: Callable[[str], None] = lambda text: None) -> None:
+        """threads: of OpenCV, whose results do not depend on it.
+
+        on_trouble: gets one line, in the thread that called.
+        """
+        self._low_priority = low_priority
+        self._threads = threads
+        self._verbose = verbose
+        self._on_trouble = on_trouble
+        self._process: subprocess.Popen[bytes] | None = None
+        self._closed = False
+        # held during a call: it guards the pipes
+        self._calling = threading.Lock()
+        # guards _process and _closed: close() must see every process that is started
+        self._starting = threading.Lock()
+
+    @property
+    def pid(self) -> int | None:
+        """Return the process id of the running child, None if there is none."""
+        process = self._process
+        return process.pid if process is not None and process.poll() is None else None
+
+    def call(self, function: Callable[..., Any], *arguments: Any,
+             progress: Progress | None = None) -> Any:
+        """Run a module-level function in the child; see Worker.call."""
+        # pickle first: an error must not leave a part of the message in the pipe
+        request = pack((function, arguments, progress is not None))
+        with self._calling:
+            process = self._running()
+            try:
+                kind, value = self._answer(process, request, progress)
+            except BaseException:
+                # for example Ctrl-C: the next call must not receive the answer to this one
+                _end(process)
+                raise
+        if kind == 'error':
+            raise value
+        return value
+
+    def kill(self) -> None:
+        """End the child at once; a call that waits for it raises WorkerDiedError."""
+        process = self._process
+        if process is not None:
+            process.kill()
+            process.wait()
+
+    def close(self) -> None:
+        """End the child for good."""
+        with self._starting:
+            self._closed = True
+            self.kill()
+        # if a call is running, it finds its child dead and closes the pipes itself
+        if self._process is not None and self._calling.acquire(blocking=False):
+            _end(self._process)
+            self._calling.release()
+
+    def _answer(self, process: subprocess.Popen[bytes], request: Parts,
+                progress: Progress | None) -> tuple[str, Any]:
+        try:
+            send(_WatchedPipe(process, process.stdin, select.POLLOUT, self._on_trouble), request)
+        except (OSError, ValueError) as error:
+            raise _died(process) from error
+        answers = _WatchedPipe(process, process.stdout, select.POLLIN, self._on_trouble)
+        while True:
+            try:
+                kind, value = unpack(receive(answers))
+            except (EOFError, OSError, ValueError, pickle.UnpicklingError) as error:
+                raise _died(process) from error
+            if kind != 'progress':
+                return kind, value
+            if progress is not None:
+                progress(*value)
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        with self._starting:
+            if self._closed:
+                raise WorkerDiedError('the calibrator is closed')
+            if self._process is not None and self._process.poll() is not None:
+                _end(self._process)
+                self._process = None
+            if self._process is None:
+                self._process = self._start()
+            return self._process
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        environment = dict(os.environ)
+        environment['PYTHONPATH'] = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
+        environment.update({name: '1' for name in THREAD_VARIABLES})
+        command = [sys.executable, '-c', START, str(LOW_PRIORITY if self._low_priority else 0),
+                   str(os.getpid()), str(self._threads)]
+        try:
+            process = subprocess.Popen(
+                command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                env=environment, stderr=None if self._verbose else subprocess.DEVNULL)
+        except OSError as error:
+            raise WorkerError(f'cannot start the reconstruction process: {error}; '
+                              f'check memory and process limits (ulimit -u)') from error
+        assert process.stdin is not None
+        # a child that hangs does not read: writing must not block, so that it can be watched
+        os.set_blocking(process.stdin.fileno(), False)
+        return process
+
+
+class _WatchedPipe:
+    """The parent's end of a pipe: while it waits, it checks that the child uses processor time.
+
+    Checks are counted, not seconds: there are none while this process is stopped or the machine
+    is suspended.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes], pipe: IO[bytes] | None, event: int,
+                 on_trouble: Callable[[str], None]) -> None:
+        # unbuffered, as poll() does not see what was read ahead
+        self._pipe = cast(io.FileIO, pipe)
+        self._pid = process.pid
+        self._poll = select.poll()
+        self._poll.register(self._pipe, event)
+        self._on_trouble = on_trouble
+
+    def readinto(self, view: memoryview, /) -> int | None:
+        self._wait()
+        return self._pipe.readinto(view)
+
+    def write(self, data: memoryview, /) -> int | None:
+        self._wait()
+        return self._pipe.write(data)
+
+    def _wait(self) -> None:
+        """Wait until the pipe is ready; raises WorkerDiedError when the child hangs."""
+        looks, used = 0, None
+        while not self._poll.poll(1000 * LOOK_S):
+            before, used = used, _processor_time(self._pid)
+            looks = looks + 1 if used is not None and used == before else 0
+            silence = f'used no processor time for {looks * LOOK_S:.0f} s'
+            if looks == LOOKS_TO_REPORT:
+                self._on_trouble(
+                    f'the reconstruction process {self._pid} {silence}; after '
+                    f'{LOOKS_TO_KILL * LOOK_S:.0f} s it is ended and its work tried again')
+            elif looks >= LOOKS_TO_KILL:
+                raise WorkerDiedError(f'the reconstruction process {self._pid} {silence} and was '
+                                      f'ended')
+
+
+def _processor_time(pid: int) -> int | None:
+    """Return the processor time of a process's main thread, in ticks; None if unknown.
+
+    Only this thread counts: the one that watches the parent also runs in a hung child.
+    """
+    try:
+        text = Path(f'/proc/{pid}/task/{pid}/stat').read_text('ascii', 'replace')
+    except OSError:
+        return None
+    user, system = text.rpartition(')')[2].split()[11:13]
+    return int(user) + int(system)
+
+
+def _died(process: subprocess.Popen[bytes]) -> WorkerDiedError:
+    _end(process)
+    return WorkerDiedError(
+        f'the reconstruction process died (exit code {process.returncode}); it is started '
+        f'again at the next try. If it dies each time, free memory or set scene.tracks lower')
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with contextlib.suppress(OSError):
+                pipe.close()

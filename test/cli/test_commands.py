@@ -1,0 +1,356 @@
+"""run and turns around a calibrator of our own making: all that the command itself decides."""
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pty
+import re
+import shutil
+import signal
+import sys
+from typing import ClassVar
+from unittest.mock import create_autospec
+
+import cv2
+import numpy as np
+import pytest
+from fakes import called_like, stands_in_for
+from made_calibration import TRUTH, make_calibration
+
+from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.cli import main
+from dashcalib_ros.config import Config
+from dashcalib_ros.demo import demo_drive, render_to_bag
+from dashcalib_ros.demo.drive import Drive
+from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.turns.detection import Detection
+from dashcalib_ros.turns.turn import Turn
+
+
+@stands_in_for(Calibrator)
+class FakeCalibrator:
+    """Answers at once with what the test wants; remembers how it was used."""
+
+    level = 'accepted'
+    failure: BaseException | None = None
+    found = (Turn(center=88, first=58, last=118, stamp_s=8.8, prominence=0.06,
+                  released_images=61),)
+    made: ClassVar[list[FakeCalibrator]] = []
+
+    def __init__(self, config=None, mask=None, verbose=False):
+        self.config, self.mask, self.verbose = config, mask, verbose
+        self.frames, self.closed = 0, False
+        self.made.append(self)
+
+    def push(self, frame):
+        self.frames += 1
+        return Status(frames=self.frames, turns=self.frames // 2, built=0, yaw_deg=0.0,
+                      magnitude=0.0, standing=False)
+
+    def turns(self):
+        return self.found
+
+    def calibrate(self, progress=None):
+        progress('reconstructing', 0.5)
+        if self.failure is not None:
+            raise self.failure
+        return make_calibration(self.level, config=self.config, warnings=('dark',), input_name='')
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Put the fake in the calibrator's place."""
+    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', FakeCalibrator)
+    monkeypatch.setattr(FakeCalibrator, 'made', [])
+    return FakeCalibrator
+
+
+@stands_in_for(Detection)
+class FakeDetection:
+    """Has found what the test wants as soon as the drive is over."""
+
+    found = FakeCalibrator.found
+
+    def __init__(self, config, mask=None):
+        self.finished = False
+
+    def push(self, frame):
+        return []
+
+    def finish(self):
+        self.finished = True
+        return []
+
+    def turns(self):
+        return self.found if self.finished else ()
+
+    def warnings(self):
+        return ()
+
+
+@pytest.fixture
+def fake_detection(monkeypatch):
+    """Put the fake in the place of the first stage; nobody may calibrate."""
+    monkeypatch.setattr('dashcalib_ros.cli.turns.Detection', FakeDetection)
+    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', None)
+    return FakeDetection
+
+
+@pytest.fixture
+def drive(tmp_path, monkeypatch):
+    """Make a folder of four pictures and go to an empty folder beside it."""
+    (tmp_path / 'drive').mkdir()
+    (tmp_path / 'work').mkdir()
+    monkeypatch.chdir(tmp_path / 'work')
+    for i in range(4):
+        picture = np.full((48, 64), 60 + i, np.uint8)
+        cv2.imwrite(str(tmp_path / 'drive' / f'{i}.png'), picture)
+    return str(tmp_path / 'drive')
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize(('level', 'code', 'files'), [
+    ('accepted', 0, ['calibration.yaml', 'report.html', 'result.json']),
+    ('weak', 3, ['calibration.weak.yaml', 'report.html', 'result.json']),
+    ('refused', 3, ['report.html', 'result.json']),
+])
+def test_run_writes_shows_and_says_the_verdict(
+        fake, drive, tmp_path, monkeypatch, capsys, level, code, files):
+    monkeypatch.setattr(fake, 'level', level)
+    assert main(['run', drive, '--fps', '10']) == code
+    assert names(tmp_path / 'work' / 'calibration') == files
+    shown = capsys.readouterr()
+    assert shown.out.startswith(level + '\n') and '\x1b' not in shown.out
+    assert shown.err == 'dashcalib: warning: dark\n'  # no progress in a pipe
+    assert fake.made[0].frames == 4 and fake.made[0].closed
+    result = json.loads((tmp_path / 'work/calibration/result.json').read_text())
+    assert 'drive' in result['input'] and result['warnings'] == ['dark']
+
+
+def test_warnings_about_the_input_reach_the_user_and_the_result(fake, drive, tmp_path, capsys):
+    (tmp_path / 'drive' / '2.png').write_bytes(b'no picture')
+    assert main(['run', drive, '--fps', '10']) == 0
+    warned = capsys.readouterr().err.splitlines()
+    assert len(warned) == 2 and 'skipped' in warned[0]
+    result = json.loads((tmp_path / 'work/calibration/result.json').read_text())
+    assert 'skipped' in result['warnings'][0]
+
+
+@pytest.mark.parametrize('level', ['weak', 'refused'])
+def test_an_earlier_calibration_that_is_moved_aside_is_told(
+        fake, drive, tmp_path, monkeypatch, capsys, level):
+    assert main(['run', drive]) == 0
+    assert 'previous' not in capsys.readouterr().err
+    monkeypatch.setattr(fake, 'level', level)
+    assert main(['run', drive]) == 3
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1] == ('dashcalib: warning: the calibration that was in calibration/'
+                         'calibration.yaml is now calibration/calibration.previous.yaml')
+
+
+def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
+    path = tmp_path / 'config.yaml'
+    path.write_text('turns:\n  wanted: 2\n  half_width: 2\nseed: 3\nmotion.standing_px: 2e-1\n')
+    assert main(['run', drive, '--config', str(path), '--set', 'turns.wanted=3', '--set',
+                 'turns.half_width=1e0', '--turns', '4', '--threads', '2', '--verbose']) == 0
+    wanted = Config().replace({'turns.wanted': 4, 'turns.at_most': 4, 'turns.half_width': 1.0,
+                               'seed': 3, 'motion.standing_px': 0.2, 'threads': 2})
+    assert fake.made[0].config == wanted and fake.made[0].verbose
+
+
+@pytest.mark.parametrize(('args', 'complaint'), [
+    (['--set', 'turns.wantd=3'], 'did you mean turns.wanted?'),
+    (['--set', 'turns.half_width=.nan'], 'finite'),
+    (['--set', 'turns.wanted'], 'KEY=VALUE'),
+    (['--set', 'turns.wanted=[1'], 'not valid YAML'),
+    (['--set', 'turns.wanted=' + '[' * 5000], 'more than 30 levels'),
+    (['--set', 'seed=0x' + 'f' * 5000], 'more than 300 digits'),
+    (['--set', 'seed=0x' + 'f' * 200], 'seed must be between'),
+    (['--set', 'turns.wanted=!!int ""'], 'not valid YAML'),
+    (['--turns', '0'], 'turns.wanted must be between'),
+    (['--seed', '-1'], 'seed must be between'),
+    (['--config', 'missing.yaml'], 'missing.yaml'),
+    (['--config', '.'], 'cannot read the configuration'),
+    (['--config', 'broken.yaml'], 'not valid YAML at line 3'),
+    (['--config', 'list.yaml'], 'no settings'),
+    (['--config', 'pipe'], 'it is a named pipe'),
+    (['--config', '/dev/full'], 'it is a device'),
+    (['--mask', 'pipe'], 'it is a named pipe'),
+    (['--mask', '/dev/full'], 'it is a device'),
+    (['--config', 'binary.yaml'], 'not a text file'),
+    (['--mask', 'missing.png'], 'cannot read the mask'),
+    (['--mask', 'list.yaml'], 'no picture'),
+    (['--mask', 'empty.png'], 'no picture'),
+    (['--mask', 'black.png'], 'all black'),
+    (['--mask', 'small.png'], '32x24 and the images are 64x48'),
+    (['--out', 'list.yaml'], 'choose another output folder'),
+])
+def test_what_is_wrong_is_one_line_and_nothing_is_left(
+        fake, drive, tmp_path, capsys, args, complaint):
+    work = tmp_path / 'work'
+    os.mkfifo(work / 'pipe')
+    (work / 'broken.yaml').write_text('seed: 1\nturns: [\n')
+    (work / 'list.yaml').write_text('- 1\n')
+    (work / 'binary.yaml').write_bytes(b'\xff\x00\x80')
+    (work / 'empty.png').touch()
+    cv2.imwrite(str(work / 'black.png'), np.zeros((48, 64), np.uint8))
+    cv2.imwrite(str(work / 'small.png'), np.full((24, 32), 255, np.uint8))
+    before = names(work)
+    assert main(['run', drive, *args]) == 2
+    shown = capsys.readouterr()
+    assert shown.err.startswith('dashcalib: error: ') and shown.err.count('\n') == 1
+    assert complaint in shown.err and shown.out == ''
+    assert names(work) == before
+    assert all(made.closed for made in fake.made)
+
+
+@pytest.mark.parametrize('path', ['missing', 'missing.mcap', 'empty', 'empty.mcap', 'junk.mp4'])
+@pytest.mark.parametrize('command', ['run', 'turns'])
+def test_input_that_is_none(fake, drive, tmp_path, capfd, command, path):
+    work = tmp_path / 'work'
+    (work / 'empty').mkdir()
+    (work / 'empty.mcap').touch()
+    (work / 'junk.mp4').write_bytes(bytes(range(256)) * 40)
+    before = names(work)
+    assert main([command, path]) == 2
+    shown = capfd.readouterr()  # what native code prints, too
+    assert shown.err.startswith('dashcalib: error: ') and shown.err.count('\n') == 1
+    assert shown.out == '' and names(work) == before
+
+
+def test_a_mask_reaches_the_calibrator(fake, drive, tmp_path):
+    mask = np.full((48, 64), 1, np.uint8)  # dark grey is not black
+    mask[30:] = 0
+    cv2.imwrite(str(tmp_path / 'work' / 'mask.png'), mask)
+    assert main(['run', drive, '--mask', 'mask.png']) == 0
+    assert np.array_equal(fake.made[0].mask, mask > 0)
+
+
+def test_a_sixteen_bit_mask_keeps_its_darkest_grey(fake, drive, tmp_path):
+    mask = np.full((48, 64), 1, np.uint16)
+    cv2.imwrite(str(tmp_path / 'work' / 'mask.png'), mask)
+    assert main(['run', drive, '--mask', 'mask.png']) == 0
+    assert fake.made[0].mask.all()
+
+
+@pytest.mark.parametrize(('failure', 'code', 'complaint'), [
+    (WorkerError('the worker was killed; try again'), 2, 'the worker was killed; try again'),
+    (KeyboardInterrupt(), 130, 'interrupted'),
+    (MemoryError(), 2, 'out of memory'),
+    (OSError(errno.ENOSPC, 'No space left on device', '/tmp/x'), 2, 'free some'),
+    (OSError(errno.EIO, 'Input/output error', '/media/x'), 2, '/media/x'),
+    (ModuleNotFoundError("No module named 'pycolmap'", name='pycolmap'), 2, 'install it'),
+])
+def test_known_failures_close_everything_and_leave_nothing(
+        fake, drive, tmp_path, monkeypatch, capsys, failure, code, complaint):
+    monkeypatch.setattr(fake, 'failure', failure)
+    assert main(['run', drive]) == code
+    error = capsys.readouterr().err
+    assert error.startswith('dashcalib: error: ') and error.count('\n') == 1
+    assert complaint in error
+    assert names(tmp_path / 'work') == []
+
+
+def test_a_bug_is_not_hidden(fake, drive, monkeypatch):
+    monkeypatch.setattr(fake, 'failure', ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        main(['run', drive])
+    assert fake.made[0].closed
+
+
+@pytest.mark.parametrize('name', ['SIGTERM', 'SIGINT'])
+def test_signals_unwind_and_a_second_one_cannot_stop_the_closing(
+        fake, drive, tmp_path, monkeypatch, capsys, name):
+    number = getattr(signal, name)
+    before = signal.getsignal(signal.SIGTERM)
+
+    def calibrate(self, progress=None):
+        os.kill(os.getpid(), number)
+
+    def close(self):
+        os.kill(os.getpid(), number)
+        self.closed = True
+    monkeypatch.setattr(fake, 'calibrate', called_like(Calibrator.calibrate)(calibrate))
+    monkeypatch.setattr(fake, 'close', called_like(Calibrator.close)(close))
+    assert main(['run', drive]) == 130
+    assert capsys.readouterr().err == 'dashcalib: error: interrupted\n'
+    assert names(tmp_path / 'work') == []
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_turns_as_json(fake_detection, drive, tmp_path, capsys):
+    assert main(['turns', drive, '--json']) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data['turns'] == [{'center': 88, 'first': 58, 'last': 118, 'stamp': 8.8,
+                              'prominence': 0.06, 'images': 61}]
+    assert data['frames'] == 4 and 'drive' in data['input']
+    assert names(tmp_path / 'work') == []
+
+
+def test_turns_as_a_table(fake_detection, drive, monkeypatch, capsys):
+    assert main(['turns', drive, '--turns', '3']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2].split() == ['88', '58', '118', '8.8', '0.0600', '61']
+    assert lines[-1] == '1 of 3 turns wanted, in 4 frames'
+    monkeypatch.setattr(fake_detection, 'found', ())
+    assert main(['turns', drive]) == 0
+    assert capsys.readouterr().out == '0 of 5 turns wanted, in 4 frames\n'
+
+
+def test_progress_is_drawn_on_a_terminal(fake, drive, monkeypatch):
+    monkeypatch.setenv('TERM', 'xterm')
+    reader, writer = pty.openpty()
+    with os.fdopen(writer, 'w') as screen:
+        monkeypatch.setattr(sys, 'stderr', screen)
+        assert main(['run', drive]) == 0
+        screen.flush()
+        drawn = os.read(reader, 65536).decode()
+    os.close(reader)
+    assert 'reconstructing' in drawn and '50%' in drawn and '\x1b[' in drawn
+
+
+@pytest.fixture
+def rendered(fake, drive, monkeypatch):
+    """Let the demo's drive be the folder of pictures, and its truth 7 px of fx away."""
+    truth = {**TRUTH.named, 'fx': TRUTH.fx - 7}
+    monkeypatch.setattr('dashcalib_ros.cli.demo.demo_drive', create_autospec(
+        demo_drive, return_value=create_autospec(Drive, instance=True, truth=truth)))
+    monkeypatch.setattr('dashcalib_ros.cli.demo.render_to_bag', create_autospec(
+        render_to_bag, side_effect=lambda rendered, path: shutil.copytree(drive, path)))
+
+
+@pytest.mark.parametrize(('level', 'code'), [('accepted', 0), ('weak', 3), ('refused', 3)])
+def test_demo_compares_with_the_truth(
+        fake, rendered, tmp_path, monkeypatch, capsys, level, code):
+    monkeypatch.setattr(fake, 'level', level)
+    assert main(['demo', '--seed', '5', '--out', 'out']) == code
+    shown = capsys.readouterr().out
+    row = re.search(r'fx +721.54 px +± 3.50 px +714.54 px +\+0.980 % +2.0\n', shown)
+    assert bool(row) == (level != 'refused')
+    assert ('mapping error: ' in shown) == (level != 'refused')
+    assert fake.made[0].config.seed == 5 and fake.made[0].closed
+    truth = json.loads((tmp_path / 'work/out/truth.json').read_text())
+    assert (truth['fx'], truth['width'], truth['height']) == (TRUTH.fx - 7, 1242, 375)
+    assert not (tmp_path / 'work' / 'out' / 'bag').exists()
+
+
+def test_demo_keeps_its_bag_when_asked_and_overwrites_none(fake, rendered, tmp_path, capsys):
+    assert main(['demo', '--keep-bag']) == 0
+    assert len(names(tmp_path / 'work' / 'demo' / 'bag')) == 4
+    assert main(['demo', '--keep-bag']) == 2
+    assert 'exists; remove it' in capsys.readouterr().err
+
+
+def test_demo_leaves_no_temporary_bag(fake, rendered, tmp_path, monkeypatch):
+    (tmp_path / 'tmp').mkdir()
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path / 'tmp'))
+    monkeypatch.setattr(fake, 'failure', KeyboardInterrupt())
+    assert main(['demo']) == 130
+    assert names(tmp_path / 'tmp') == [] and names(tmp_path / 'work') == []

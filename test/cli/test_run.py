@@ -1,0 +1,157 @@
+"""The installed core end to end: the demo's bag through the command, in processes of its own."""
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip('dashcalib_ros.calibrator')
+
+from processes import processes_of
+
+from dashcalib_ros.camera import Radial, camera_of
+from dashcalib_ros.demo import demo_drive, render_to_bag
+from dashcalib_ros.report import NamedCamera, compare, load_camera, load_result
+
+COMMAND = (sys.executable, '-m', 'dashcalib_ros.cli')
+
+
+def dashcalib(*args):
+    return subprocess.run([*COMMAND, *map(str, args)], capture_output=True, text=True,
+                          timeout=600)
+
+
+@pytest.fixture(scope='module')
+def rendered(tmp_path_factory):
+    """Render the demo's drive once; return it and its bag."""
+    drive = demo_drive(0)
+    bag = tmp_path_factory.mktemp('demo') / 'bag'
+    render_to_bag(drive, bag)
+    return drive, bag
+
+
+@pytest.fixture(scope='module')
+def calibrated(rendered, tmp_path_factory):
+    """Calibrate the bag once; return the finished process and the output folder."""
+    out = tmp_path_factory.mktemp('out') / 'calibration'
+    return dashcalib('run', rendered[1], '--out', out), out
+
+
+def test_the_demo_s_bag_is_accepted_and_close_to_the_truth(rendered, calibrated):
+    done, out = calibrated
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert sorted(p.name for p in out.iterdir()) == [
+        'calibration.yaml', 'report.html', 'result.json']
+    estimate = load_camera(out / 'calibration.yaml')
+    truth = camera_of(Radial.model, estimate.image_size, list(rendered[0].truth.values()))
+    rows = {d.name: d for d in compare(estimate, NamedCamera('truth', truth)).differences}
+    assert abs(rows['fx'].percent) < 0.5
+    assert abs(rows['cx'].percent) < 0.6
+    assert abs(rows['k1'].percent) < 2.0
+
+
+def test_a_pipe_gets_plain_text_and_no_progress(calibrated):
+    done, _ = calibrated
+    assert done.stdout.startswith('accepted') and '\x1b' not in done.stdout + done.stderr
+    assert all(line.startswith('dashcalib: warning: ') for line in done.stderr.splitlines())
+
+
+def test_the_result_is_complete(rendered, calibrated):
+    result = load_result(calibrated[1] / 'result.json')
+    assert sum(turn['used'] for turn in result['turns']) >= 2
+    assert all(turn['first'] <= turn['center'] <= turn['last'] for turn in result['turns'])
+    assert set(result['timing']) >= {'detect', 'calibrate', 'total'}
+    assert set(result['sigma']) == {'fx', 'fy', 'cx', 'cy', 'k1', 'k2'}
+    assert all(sigma > 0 for sigma in result['sigma'].values())
+    assert str(rendered[1]) in result['input'] or rendered[1].name in result['input']
+
+
+def test_the_same_input_and_seed_give_the_same_result(rendered, calibrated, tmp_path):
+    done = dashcalib('run', rendered[1], '--out', tmp_path)
+    assert done.returncode == calibrated[0].returncode
+    first, second = load_result(calibrated[1] / 'result.json'), load_result(
+        tmp_path / 'result.json')
+    for key in ('intrinsics', 'sigma', 'turns', 'verdict', 'reasons', 'reprojection_error_px'):
+        assert first[key] == second[key], key
+
+
+def test_turns_lists_those_that_a_run_would_use(rendered, calibrated):
+    done = dashcalib('turns', rendered[1], '--json')
+    assert done.returncode == 0, done.stderr
+    turns = json.loads(done.stdout)['turns']
+    prominences = [turn['prominence'] for turn in turns]
+    assert prominences == sorted(prominences, reverse=True)
+    run = load_result(calibrated[1] / 'result.json')['turns']
+    assert {turn['center'] for turn in run} <= {turn['center'] for turn in turns}
+
+
+def pictures(folder, count, size=(240, 320)):
+    folder.mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (*size, 1), np.uint8)
+    for i in range(count):
+        cv2.imwrite(str(folder / f'{i:03}.png'), noise)
+    return folder
+
+
+def test_a_drive_that_stands_still_is_refused_with_the_reason(tmp_path):
+    done = dashcalib('run', pictures(tmp_path / 'still', 60), '--fps', 10, '--out',
+                     tmp_path / 'out')
+    assert done.returncode == 3, done.stdout + done.stderr
+    result = load_result(tmp_path / 'out' / 'result.json')
+    assert result['verdict'] == 'refused' and result['reasons']
+    assert result['intrinsics'] is None
+    assert not (tmp_path / 'out' / 'calibration.yaml').exists()
+
+
+@pytest.mark.parametrize(('count', 'size'), [(1, (240, 320)), (30, (32, 32))],
+                         ids=['one image', 'tiny images'])
+def test_too_little_to_work_with_is_told_without_a_traceback(tmp_path, count, size):
+    done = dashcalib('run', pictures(tmp_path / 'few', count, size), '--fps', 10, '--out',
+                     tmp_path / 'out')
+    assert done.returncode in (2, 3)
+    assert 'Traceback' not in done.stderr
+    assert not (tmp_path / 'out' / 'calibration.yaml').exists()
+    if done.returncode == 2:
+        assert done.stderr.splitlines()[-1].startswith('dashcalib: error: ')
+
+
+@pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
+@pytest.mark.parametrize('seconds', [1.5, 6, 15])
+def test_a_signal_ends_it_whole(rendered, tmp_path, name, seconds):
+    """Early it hits the reading, later the child's reconstruction."""
+    process = subprocess.Popen([*COMMAND, 'run', rendered[1], '--out', tmp_path / 'out'],
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               start_new_session=True)
+    try:
+        time.sleep(seconds)
+        if process.poll() is not None:
+            pytest.skip('this machine is too quick')
+        process.send_signal(getattr(signal, name))
+        out, error = process.communicate(timeout=60)
+        assert (process.returncode, out) == (130, '')
+        assert error.splitlines()[-1] == 'dashcalib: error: interrupted'
+        assert 'Traceback' not in error
+        assert not (tmp_path / 'out').exists()
+        assert processes_of(process.pid) == []
+    finally:
+        if processes_of(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def test_demo_prints_estimate_sigma_and_truth(tmp_path):
+    done = dashcalib('demo', '--out', tmp_path / 'demo', '--keep-bag')
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert 'estimate' in done.stdout and 'truth' in done.stdout
+    assert 'mapping error: ' in done.stdout
+    assert (tmp_path / 'demo' / 'bag' / 'metadata.yaml').exists()
+    again = dashcalib('compare', tmp_path / 'demo', tmp_path / 'demo' / 'truth.json', '--json')
+    assert json.loads(again.stdout)['mapping_px'] is not None
+    refused = dashcalib('demo', '--out', tmp_path / 'demo', '--keep-bag')
+    assert refused.returncode == 2 and 'exists' in refused.stderr

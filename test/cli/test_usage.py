@@ -1,0 +1,205 @@
+"""The command as a user meets it, in its own process: help, usage, missing input, compare."""
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from made_calibration import TRUTH, make_calibration
+
+from dashcalib_ros.report import write_results
+
+HEAVY = ('numpy', 'cv2', 'scipy', 'yaml', 'rich', 'matplotlib', 'pycolmap', 'rosbags', 'rclpy')
+
+
+def dashcalib(*args, env=None):
+    return subprocess.run([sys.executable, '-m', 'dashcalib_ros.cli', *map(str, args)],
+                          capture_output=True, text=True, env=env, timeout=120)
+
+
+def assert_one_line_error(done, code=2):
+    assert done.returncode == code, done.stderr
+    assert done.stderr.startswith('dashcalib: error: '), done.stderr
+    assert done.stderr.count('\n') == 1, done.stderr
+    assert done.stdout == ''
+
+
+@pytest.fixture
+def results(tmp_path):
+    """Make a folder with an accepted result and a truth."""
+    write_results(make_calibration(), tmp_path / 'a')
+    (tmp_path / 'truth.json').write_text(json.dumps(
+        {**dataclasses.asdict(TRUTH), 'fx': TRUTH.fx - 7, 'width': 1242, 'height': 375}))
+    return tmp_path
+
+
+@pytest.mark.parametrize('command', [[], ['run'], ['turns'], ['demo'], ['compare']])
+def test_help_names_the_exit_codes(command):
+    done = dashcalib(*command, '--help')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.startswith('usage: dashcalib')
+    assert '3 weak or refused' in ' '.join(done.stdout.split())
+
+
+def test_help_imports_nothing_heavy():
+    code = ('import sys; from dashcalib_ros.cli import main; before = main(["run", "--help"]); '
+            f'print(before, [name for name in {HEAVY} if name in sys.modules])')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == '0 []', done.stdout + done.stderr
+
+
+def test_version():
+    done = dashcalib('--version')
+    assert done.returncode == 0 and done.stdout.startswith('dashcalib ')
+
+
+@pytest.mark.parametrize(('args', 'complaint'), [
+    ([], 'COMMAND'),
+    (['calibrate'], "invalid choice: 'calibrate'"),
+    (['run'], 'INPUT'),
+    (['run', 'x', '--fps', '0'], 'positive number'),
+    (['run', 'x', '--fps', 'nan'], 'positive number'),
+    (['run', 'x', '--turns', 'many'], '--turns'),
+    (['run', 'x', '--thread', '2'], 'unrecognized'),
+    (['compare', 'a'], 'B'),
+])
+def test_bad_usage_is_one_line(args, complaint):
+    done = dashcalib(*args)
+    assert_one_line_error(done)
+    assert complaint in done.stderr and '--help' in done.stderr
+
+
+def test_compare_shows_the_difference(results):
+    done = dashcalib('compare', results / 'a', results / 'truth.json')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert re.search(r'fx +721.54 px +714.54 px +\+7.0000 +\+0.980 % +2.0\n', done.stdout)
+    assert 'mapping error: ' in done.stdout
+    assert '\x1b' not in done.stdout
+
+
+def test_compare_as_json(results):
+    done = dashcalib('compare', results / 'a/calibration.yaml', results / 'truth.json', '--json')
+    assert (done.returncode, done.stderr) == (0, '')
+    data = json.loads(done.stdout)
+    assert data['parameters']['fx']['difference'] == pytest.approx(7)
+    assert data['parameters']['fx']['z'] == pytest.approx(2)
+    assert 0 < data['mapping_px'] < 7
+    assert data['a']['verdict'] == 'accepted'
+
+
+@pytest.mark.parametrize('content', [None, b'', b'\x89junk\x00\xff', b'{}', b'fx: 3', b'[[['])
+def test_compare_with_what_is_no_calibration(results, content):
+    if content is not None:
+        (results / 'b').write_bytes(content)
+    assert_one_line_error(dashcalib('compare', results / 'a', results / 'b'))
+
+
+def test_output_that_is_no_longer_read_is_no_error(results):
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run(
+            [sys.executable, '-m', 'dashcalib_ros.cli', 'compare', results / 'a',
+             results / 'truth.json', '--json'], stdout=writer, stderr=subprocess.PIPE, text=True)
+    finally:
+        os.close(writer)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
+def test_a_terminal_that_knows_ascii_only_still_gets_the_numbers(results):
+    done = dashcalib('compare', results / 'a', results / 'truth.json',
+                     env={**os.environ, 'PYTHONIOENCODING': 'ascii'})
+    assert done.returncode == 0 and '721.54 px' in done.stdout
+
+
+# -- standard streams that take nothing --------------------------------------------------------
+
+CLOSED = 'stdout is closed; give it a terminal, a file or a pipe'
+FULL = 'cannot write to stdout: No space left on device; send the output to another place'
+
+
+def redirected(redirection, *args):
+    """Run the command behind a redirection of the shell."""
+    return subprocess.run(
+        ['sh', '-c', f'exec "$@" {redirection}', 'sh', sys.executable, '-m', 'dashcalib_ros.cli',
+         *map(str, args)], capture_output=True, text=True, timeout=120)
+
+
+@pytest.fixture
+def commands(results):
+    """Return each command whose whole result is what it prints."""
+    (results / 'drive').mkdir()
+    for index in range(4):
+        cv2.imwrite(str(results / 'drive' / f'{index}.png'), np.full((48, 64), 60, np.uint8))
+    drive = (results / 'drive', '--fps', 10)
+    return {'help': ['--help'], 'version': ['--version'],
+            'compare': ['compare', results / 'a', results / 'truth.json'],
+            'turns': ['turns', *drive], 'run': ['run', *drive, '--out', results / 'out'],
+            'error': ['compare', results / 'a', results / 'missing']}
+
+
+@pytest.mark.parametrize(('redirection', 'words'), [('>&-', CLOSED), ('>/dev/full', FULL)])
+@pytest.mark.parametrize('name', ['help', 'version', 'compare', 'turns'])
+def test_a_result_that_cannot_be_shown_is_one_line(commands, name, redirection, words):
+    done = redirected(redirection, *commands[name])
+    assert (done.returncode, done.stderr) == (2, f'dashcalib: error: {words}\n')
+
+
+@pytest.mark.parametrize(('redirection', 'words'), [('>&-', CLOSED), ('>/dev/full', FULL)])
+def test_a_run_whose_files_are_written_ends_with_its_verdict(commands, results, redirection,
+                                                             words):
+    done = redirected(redirection, *commands['run'])
+    assert (done.returncode, done.stderr) == (3, f'dashcalib: warning: {words}\n')
+    assert json.loads((results / 'out' / 'result.json').read_text())['verdict'] == 'refused'
+
+
+@pytest.mark.parametrize('redirection', ['2>&-', '2>/dev/full'])
+@pytest.mark.parametrize(('name', 'code'), [
+    ('help', 0), ('version', 0), ('compare', 0), ('turns', 0), ('run', 3), ('error', 2)])
+def test_without_stderr_the_outcome_is_the_same(commands, name, code, redirection):
+    done = redirected(redirection, *commands[name])
+    assert (done.returncode, done.stderr) == (code, '')
+    assert done.stdout == dashcalib(*commands[name]).stdout or name == 'run'
+    assert 'dashcalib: error' not in done.stdout
+
+
+@pytest.mark.parametrize(('name', 'code'), [
+    ('help', 2), ('version', 2), ('compare', 2), ('turns', 2), ('run', 3), ('error', 2)])
+@pytest.mark.parametrize('redirection', ['>&- 2>&-', '<&- >&- 2>&-'])
+def test_without_any_stream_the_exit_code_tells(commands, name, code, redirection):
+    assert redirected(redirection, *commands[name]).returncode == code
+
+
+def test_bad_usage_without_stderr_prints_nothing_on_stdout():
+    done = redirected('2>&-', 'run')
+    assert (done.returncode, done.stdout) == (2, '')
+
+
+def test_a_file_does_not_become_stdout(results):
+    """The first file that is opened would get the number of a stream that is closed."""
+    code = ('import os; from dashcalib_ros.standard_streams import open_closed_streams as f; f(); '
+            'open("file", "w").fileno(); os.write(1, b"native"); os.write(2, b"native")')
+    subprocess.run(['sh', '-c', 'exec "$@" <&- >&- 2>&-', 'sh', sys.executable, '-c', code],
+                   cwd=results, check=True)
+    assert (results / 'file').read_bytes() == b''
+
+
+def test_an_interrupt_while_a_module_is_imported_has_its_own_exit_code(tmp_path):
+    # dataclasses make their methods by exec() of a text; Python remembers an interrupt from there
+    (tmp_path / 'interrupted.py').write_text(
+        'import argparse, sys\n'
+        'from dashcalib_ros.cli import program\n'
+        'def command(args):\n'
+        '    exec("raise KeyboardInterrupt")\n'
+        'program.make_parser = lambda: argparse.ArgumentParser()\n'
+        'argparse.ArgumentParser.parse_args = lambda *_: argparse.Namespace(command=command)\n'
+        'sys.exit(program.main([]))\n')
+    done = subprocess.run([sys.executable, '-m', 'interrupted'], cwd=tmp_path, timeout=60,
+                          capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, 'dashcalib: error: interrupted\n')

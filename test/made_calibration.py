@@ -1,0 +1,34 @@
+"""A small but complete calibration, made by hand."""
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from dashcalib_ros.camera import Radial
+from dashcalib_ros.config import Config
+from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+
+SIZE = (1242, 375)
+TRUTH = Radial(SIZE, 721.5377, 724.25, 609.5593, 172.854, -0.363, 0.151)
+SIGMA = dict(zip(TRUTH.names(), (3.5, 3.75, 2.0, 2.25, 0.004, 0.003), strict=True))
+
+
+def make_calibration(level='accepted', **changes):
+    """Make a small but complete calibration by hand; refused ones have no intrinsics."""
+    turn = TurnSummary(88, 58, 118, 8.8, 0.061, 31, 30, True, 91.5, 0.46, 1.1)
+    unused = TurnSummary(275, 245, 305, 27.5, 0.012, 31, 4, False)
+    stamps = np.arange(300) * 0.1
+    magnitude = 0.01 + 0.06 * np.exp(-((stamps - 8.8) / 1.5) ** 2)
+    mask = np.ones((375, 1242), bool)
+    mask[300:] = False
+    calibration = Calibration(
+        verdict=Verdict(level, () if level == 'accepted' else ('only 1 of 5 turns',)),
+        image_size=SIZE,
+        camera=None if level == 'refused' else TRUTH,
+        sigma=None if level == 'refused' else SIGMA,
+        turns=(turn, unused), frames=300, reprojection_error_px=0.46,
+        timing={'detect': 3.0, 'calibrate': 20.0, 'total': 23.0},
+        versions={'pycolmap': '4.2.1'}, config=Config(seed=7), input_name='drive.mcap',
+        magnitudes=np.column_stack([stamps, magnitude]), mask=mask)
+    return dataclasses.replace(calibration, **changes)

@@ -1,0 +1,182 @@
+"""Comparing calibrations: against numbers of the scoring tool, and by construction."""
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from made_calibration import SIGMA, TRUTH, make_calibration
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from dashcalib_ros.camera import Brown, Radial
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.report import (
+    NamedCamera,
+    calibrated_camera,
+    calibration_yaml,
+    compare,
+    load_camera,
+    mapping_error,
+    result_json,
+)
+
+SIZE = (1242, 375)
+REFERENCE = NamedCamera('truth', TRUTH)
+
+
+def shifted(**changes):
+    """Return TRUTH with some parameters moved by an amount, as a camera."""
+    moved = {key: getattr(TRUTH, key) + value for key, value in changes.items()}
+    return NamedCamera('moved', dataclasses.replace(TRUTH, **moved))
+
+
+def scoring_tool(estimate, truth):
+    """Compute the mapping error the scoring tool's way: point by point, fixed-point rays."""
+    def bend(c, x, y):
+        s = 1 + c.k1 * (x * x + y * y) + c.k2 * (x * x + y * y) ** 2
+        return x * s, y * s
+
+    w, h = SIZE
+    t, e = truth.camera, estimate.camera
+    uv = np.array([(u, v) for v in np.linspace(0, h - 1, 15) for u in np.linspace(0, w - 1, 25)])
+    rays = []
+    for u, v in uv:
+        xd, yd = (u - t.cx) / t.fx, (v - t.cy) / t.fy
+        x, y = xd, yd
+        for _ in range(100):
+            bx, by = bend(t, x, y)
+            x, y = x + xd - bx, y + yd - by
+        rays.append((x, y, 1.0))
+
+    def residual(rotation):
+        q = Rotation.from_rotvec(rotation).apply(rays)
+        x, y = bend(e, q[:, 0] / q[:, 2], q[:, 1] / q[:, 2])
+        return (np.stack([e.fx * x + e.cx, e.fy * y + e.cy], -1) - uv).ravel()
+    fit = least_squares(residual, np.zeros(3))
+    return math.sqrt(np.mean(fit.fun.reshape(-1, 2) ** 2) * 2)
+
+
+@pytest.mark.parametrize('estimate', [
+    shifted(fx=7, fy=4, cx=-5, cy=3, k1=0.01, k2=-0.02),
+    shifted(fx=-60, fy=-60),
+    shifted(cx=20, cy=-12),
+    shifted(k1=0.363, k2=-0.151),
+], ids=['all', 'focal', 'centre', 'distortion'])
+def test_mapping_error_agrees_with_the_scoring_tool(estimate):
+    mine = mapping_error(estimate.camera, TRUTH)
+    assert mine == pytest.approx(scoring_tool(estimate, REFERENCE), abs=1e-4)
+    assert mine > 0.5
+
+
+def test_a_camera_maps_like_itself():
+    assert mapping_error(TRUTH, TRUTH) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_common_rotation_hides_most_of_a_shifted_centre():
+    assert 0 < mapping_error(shifted(cx=2.0).camera, TRUTH) < 1.0
+
+
+@pytest.mark.parametrize('k2', [0.0, 0.1])
+def test_pixels_beyond_a_fold_have_no_ray_and_no_number_is_made_up(k2):
+    # with k2 = 0.1 there is a second, false root far out: the search must not take it
+    for folding in (Radial(SIZE, 300, 300, 621, 187, -0.6, k2),
+                    Brown(SIZE, 300, 300, 621, 187, -0.6, k2, 1e-5)):
+        rays = folding.rays(np.array([[621.0, 187.0], [0.0, 0.0]]))
+        assert rays[0] == pytest.approx([0, 0, 1])
+        assert np.isnan(rays[1]).all()
+        assert mapping_error(TRUTH, folding) is None
+
+
+def test_differences_percent_and_combined_sigmas():
+    estimate = NamedCamera('a', dataclasses.replace(TRUTH, fx=TRUTH.fx * 1.01, k2=0.0), SIGMA)
+    other = NamedCamera('b', dataclasses.replace(TRUTH, k2=0.0), SIGMA)
+    rows = {row.name: row for row in compare(estimate, other).differences}
+    assert list(rows) == ['fx', 'fy', 'cx', 'cy', 'k1', 'k2']
+    assert rows['fx'].difference == pytest.approx(7.215377)
+    assert rows['fx'].percent == pytest.approx(1.0)
+    assert rows['fx'].sigma == pytest.approx(SIGMA['fx'] * math.sqrt(2))
+    assert rows['fx'].z == pytest.approx(7.215377 / (SIGMA['fx'] * math.sqrt(2)))
+    assert rows['k2'].percent is None  # of zero there is no percentage
+    one_sided = compare(estimate, REFERENCE).differences[0]
+    assert one_sided.sigma == SIGMA['fx']
+    assert compare(shifted(fx=1), REFERENCE).differences[0].z is None
+
+
+def test_percent_keeps_the_sign_for_negative_parameters():
+    row = compare(shifted(k1=0.0363), REFERENCE).differences[4]
+    assert row.difference > 0 and row.percent == pytest.approx(10.0)
+
+
+def test_tangential_terms_are_compared_where_there_are_any():
+    other = NamedCamera('decentred', Brown.of(SIZE, [*TRUTH.params, 0.01, 0, 0]))
+    found = compare(REFERENCE, other)
+    assert [row.name for row in found.differences][6:] == ['p1', 'p2', 'k3']
+    assert found.mapping_px > 0.1
+
+
+def test_all_three_formats_say_the_same(tmp_path):
+    calibration = make_calibration()
+    (tmp_path / 'result.json').write_text(result_json(calibration))
+    (tmp_path / 'calibration.yaml').write_text(calibration_yaml(calibration))
+    (tmp_path / 'truth.json').write_text(json.dumps(
+        {**TRUTH.named, 'width': 1242, 'height': 375, 'fps': 10}))
+    result = load_camera(tmp_path)  # a folder stands for its result.json
+    for name in ('result.json', 'calibration.yaml', 'truth.json'):
+        camera = load_camera(tmp_path / name)
+        assert camera.camera == TRUTH
+        assert compare(result, camera).mapping_px == pytest.approx(0, abs=1e-9)
+    assert load_camera(tmp_path / 'calibration.yaml').sigma == result.sigma == SIGMA
+
+
+def test_different_image_sizes_are_an_error():
+    with pytest.raises(InputError, match=r'1242 x 375.*621 x 187'):
+        compare(REFERENCE, NamedCamera('half', dataclasses.replace(TRUTH, image_size=(621, 187))))
+
+
+@pytest.mark.parametrize('number', ['7' * 400, '-' + '7' * 400, '1e999'])
+def test_a_truth_has_numbers_that_a_computer_can_hold(tmp_path, number):
+    path = tmp_path / 'truth.json'
+    path.write_text(f'{{"fx": {number}, "fy": 1, "cx": 1, "cy": 1, "k1": 0, "k2": 0, '
+                    f'"width": 640, "height": 480}}')
+    with pytest.raises(InputError, match='finite numbers') as caught:
+        load_camera(path)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize('missing', ['width', 'height', 'k2'])
+def test_a_truth_must_be_complete(tmp_path, missing):
+    data = {**TRUTH.named, 'width': 1242, 'height': 375}
+    del data[missing]
+    (tmp_path / 'truth.json').write_text(json.dumps(data))
+    with pytest.raises(InputError, match=missing):
+        load_camera(tmp_path / 'truth.json')
+
+
+def test_a_refused_result_cannot_be_compared(tmp_path):
+    (tmp_path / 'result.json').write_text(result_json(make_calibration('refused')))
+    with pytest.raises(InputError, match='refused: only 1 of 5 turns'):
+        load_camera(tmp_path)
+    with pytest.raises(InputError, match='refused: only 1 of 5 turns'):
+        calibrated_camera(make_calibration('refused'))
+
+
+def test_a_bag_given_by_mistake_is_not_read_whole(tmp_path):
+    path = tmp_path / 'drive.mcap'
+    with path.open('wb') as stream:
+        stream.truncate(2**40)  # sparse; reading it all would be noticed
+    with pytest.raises(InputError, match='too large'):
+        load_camera(path)
+
+
+def test_the_comparison_is_strict_json():
+    found = compare(NamedCamera('a', TRUTH, {**SIGMA, 'k1': math.nan}),
+                    dataclasses.replace(REFERENCE, verdict='weak'))
+    data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert data['b'] == {'name': 'truth', 'verdict': 'weak'}
+    assert data['parameters']['k1']['z'] is None
+    assert data['parameters']['fx'] == {
+        'a': TRUTH.fx, 'b': TRUTH.fx, 'difference': 0.0, 'percent': 0.0, 'sigma': SIGMA['fx'],
+        'z': 0.0}

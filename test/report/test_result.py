@@ -1,0 +1,99 @@
+"""result.json: the contract, strict JSON, and reading it back."""
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from made_calibration import SIGMA, TRUTH, make_calibration
+
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.judgement.calibration import StoredTurnSummary
+from dashcalib_ros.report import load_result, result_dict, result_json
+from dashcalib_ros.report.page import report_html
+from dashcalib_ros.turns import TurnId
+
+
+def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
+    stored = StoredTurnSummary(TurnId.stored(0), 1.7e9, 0.05, 88.0, 20, True, 0.9)
+    calibration = make_calibration(stored_turns=(stored,))
+    result = strict(result_json(calibration))
+    assert result['stored_turns'] == [{
+        'stamp': 1.7e9, 'prominence': 0.05, 'yaw_deg': 88.0, 'images': 20, 'used': True,
+        'misfit': 0.9}]
+    assert len(result['turns']) == 2 and calibration.turns_used == 2
+    assert '1 of 1 stored turn used' in report_html(calibration)
+    assert result_dict(make_calibration())['stored_turns'] == []
+
+
+def strict(text):
+    def refuse(word):
+        raise AssertionError(f'{word} is not JSON')
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_result_has_the_contract_s_keys_and_values():
+    result = strict(result_json(make_calibration()))
+    contract = ['verdict', 'reasons', 'image_size', 'intrinsics', 'sigma', 'turns', 'frames',
+                'reprojection_error_px', 'timing', 'seed', 'versions', 'config']
+    assert list(result)[:len(contract)] == contract
+    assert result['verdict'] == 'accepted'
+    assert result['image_size'] == [1242, 375]
+    assert result['intrinsics'] == TRUTH.named  # to the last digit
+    assert result['sigma'] == SIGMA
+    assert result['seed'] == 7
+    assert result['config'] == Config(seed=7).flat()
+    assert result['turns'][0] == {
+        'center': 88, 'first': 58, 'last': 118, 'stamp': 8.8, 'prominence': 0.061,
+        'images': 31, 'registered': 30, 'used': True, 'yaw_deg': 91.5,
+        'reprojection_error_px': 0.46, 'misfit': 1.1}
+    assert result['masked_fraction'] == pytest.approx(75 / 375)
+
+
+def test_a_refused_result_has_null_intrinsics():
+    result = result_dict(make_calibration('refused'))
+    assert result['intrinsics'] is None
+    assert result['sigma'] is None
+    assert result['reasons'] == ['only 1 of 5 turns']
+
+
+def test_numbers_that_json_lacks_become_null():
+    details = {'profile': np.array([[0.5, np.nan], [np.inf, 2.0]], np.float32),
+               'best': np.float64(1.5), 'n': np.int64(3), 4: (math.nan, -math.inf),
+               'turn': SIGMA, 'ok': np.bool_(True)}
+    result = strict(result_json(make_calibration(
+        details=details, sigma={**SIGMA, 'k2': math.nan})))
+    assert result['sigma']['k2'] is None
+    assert result['details'] == {
+        'profile': [[0.5, None], [None, 2.0]], 'best': 1.5, 'n': 3, '4': [None, None],
+        'turn': SIGMA, 'ok': True}
+
+
+def test_a_result_reads_back(tmp_path):
+    path = tmp_path / 'result.json'
+    path.write_text(result_json(make_calibration('weak')), encoding='utf-8')
+    assert load_result(path) == result_dict(make_calibration('weak'))
+
+
+@pytest.mark.parametrize(('content', 'complaint'), [
+    (b'{"verdict": ', 'not valid JSON'),
+    (b'[' * 100000, 'not valid JSON'),
+    (b'[1, 2]', 'no JSON object'),
+    (b'{"verdict": "weak", "image_size": [3, 2]}', "no 'intrinsics'"),
+    (b'\xff\xfe\x00junk', 'not a text file'),
+    (b'{"fx": ' + b'7' * 5000 + b'}', 'not valid JSON'),
+    (b'{"notes": "' + b' ' * 2**22 + b'"}', 'too large'),
+])
+def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, complaint):
+    path = tmp_path / 'result.json'
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=complaint) as caught:
+        load_result(path)
+    assert '\n' not in str(caught.value)
+
+
+def test_a_missing_result_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match='does not exist'):
+        load_result(tmp_path / 'none.json')

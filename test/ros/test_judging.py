@@ -1,0 +1,345 @@
+"""What the node does with a calibration: published, kept on disk, replaced, given up, committed.
+
+The real node in this process, between real publishers; only the calibrations are made up here,
+since a camera that is bumped in the middle of a drive takes fifteen turns to show.
+"""
+from __future__ import annotations
+
+import dataclasses
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from ros_bench import START, Bench, image_message
+from sensor_msgs.srv import SetCameraInfo
+from std_srvs.srv import Trigger
+from synthetic import synthetic_turn
+
+from dashcalib_ros.camera import Radial
+from dashcalib_ros.config import Config
+from dashcalib_ros.judgement import Calibration, Verdict
+from dashcalib_ros.report import load_calibration_yaml
+from dashcalib_ros.ros.learner import Result
+from dashcalib_ros.ros.node import CalibratorNode
+from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
+from dashcalib_ros.turns import TurnId
+
+FIRST = Radial((320, 240), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
+SIGMA = {'fx': 2.0, 'fy': 2.0, 'cx': 2.0, 'cy': 2.0, 'k1': 0.01, 'k2': 0.01}
+STAMPS = iter(range(START, START + 10**12, 10**8))
+
+
+class Desk:
+    """The node and a bench, spun in turns."""
+
+    def __init__(self, context, home, **parameters):
+        arguments = ['--ros-args', '-p', f'camera_info_file:={home}/camera.yaml']
+        for name, value in parameters.items():
+            arguments += ['-p', f'{name}:={value}']
+        rclpy.init(args=['calibrator', *arguments])
+        self.file = home / 'camera.yaml'
+        self.node = CalibratorNode()
+        self.spinner = SingleThreadedExecutor()
+        self.spinner.add_node(self.node)
+        self.bench = Bench(context)
+        self.until(lambda: self.bench.images.get_subscription_count() > 0
+                   and self.bench.values.get('reliability') == 'reliable')
+        self.show()
+
+    def until(self, condition):
+        def spun():
+            self.spinner.spin_once(timeout_sec=0.01)
+            return condition()
+        return self.bench.until(spun)
+
+    def give(self, level='accepted', complete=True, sigma=SIGMA, warnings=(), **changes):
+        """Let the learner's thread come up with a calibration."""
+        camera = dataclasses.replace(FIRST, **changes) if level != 'refused' else None
+        calibration = Calibration(
+            Verdict(level, () if level == 'accepted' else ('few turns',)), (320, 240), camera,
+            sigma if camera else None, (), 10, 0.3, {}, {}, Config(), warnings=warnings)
+        result = Result(calibration, complete, self.node._learner.bank)
+        done = []
+        self.node._later(lambda: self.node._on_result(result))
+        self.node._later(lambda: done.append(True))
+        self.until(lambda: done)
+
+    def show(self):
+        """Publish an image; return the fx of its camera_info, None if there is none."""
+        before, received = len(self.bench.infos), self.bench.count('received')
+        message = image_message(black(), next(STAMPS))
+        self.bench.images.publish(message)
+        self.until(lambda: self.bench.count('received') > received)
+        infos = self.bench.infos[before:]
+        return infos[0].k[0] if infos else None
+
+    def call(self, name):
+        """Call a service of the node."""
+        client = self.bench.node.create_client(Trigger, f'calibrator/{name}')
+        self.until(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
+        self.bench.node.destroy_client(client)
+        return future.result()
+
+    def close(self):
+        self.bench.close()
+        self.spinner.shutdown()
+        self.node.close()
+        rclpy.try_shutdown()
+
+
+def black():
+    import numpy as np
+    return np.zeros((240, 320), np.uint8)
+
+
+@pytest.fixture
+def make_desk(ros_context, tmp_path):
+    made = []
+
+    def make(**parameters):
+        made.append(Desk(ros_context, tmp_path, **parameters))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def test_its_life_with_a_camera_that_is_bumped(make_desk):
+    desk = make_desk()
+    desk.give('weak')
+    assert desk.show() is None and desk.bench.values['state'] == 'refused_so_far'
+    assert desk.bench.values['reasons'] == 'few turns'
+    desk.give()
+    assert desk.show() == 400.0
+    assert load_calibration_yaml(desk.file).camera.fx == 400.0
+    assert desk.bench.values['state'] == 'calibrated'
+    # confirmed, but no better
+    desk.give(fx=401.0)
+    assert desk.show() == 400.0
+    # clearly better
+    desk.give(fx=402.0, sigma={**SIGMA, 'fx': 1.0})
+    assert desk.show() == 402.0
+    assert load_calibration_yaml(desk.file).camera.fx == 402.0
+    # bumped
+    for count in (1, 2):
+        desk.give(complete=False, cx=350.0)
+        assert desk.show() == 402.0 and desk.bench.values['contradictions'] == str(count)
+    desk.give(complete=False, cx=350.0)
+    assert desk.show() is None and desk.bench.values['state'] == 'collecting'
+    desk.until(lambda: desk.bench.latched[-1].k[0] == 0)
+    assert not desk.file.exists()
+    desk.give(fx=403.0, cx=350.0)
+    assert desk.show() == 403.0
+    desk.until(lambda: desk.bench.latched[-1].k[0] == 403.0)
+
+
+def test_a_contradicted_one_goes_on_where_that_is_wanted(make_desk):
+    desk = make_desk(publish_stale='true', contradictions=1)
+    desk.give()
+    desk.give(complete=False, fx=450.0)
+    assert desk.show() == 400.0
+    assert desk.bench.status.level == b'\x02' and not desk.file.exists()
+    assert desk.bench.values['state'] == 'collecting'
+    desk.give(fx=450.0)
+    assert desk.show() == 450.0 and desk.bench.status.level == b'\x00'
+
+
+def test_results_of_forgotten_turns_are_not_used(make_desk):
+    desk = make_desk()
+    result_of_old_bank = desk.node._learner.bank
+    assert desk.call('reset').success
+    assert desk.node._learner.bank == result_of_old_bank + 1
+    calibration = Calibration(Verdict('accepted'), (320, 240), FIRST, SIGMA, (), 10, 0.3, {}, {},
+                              Config())
+    desk.node._on_result(Result(calibration, True, result_of_old_bank))
+    assert desk.show() is None
+
+
+def test_a_disk_that_takes_nothing_is_counted_and_the_calibration_published(make_desk, tmp_path):
+    (tmp_path / 'plain').write_text('a file, no folder')
+    desk = make_desk()
+    desk.node._in_use._store.path = tmp_path / 'plain' / 'camera.yaml'
+    desk.give()
+    assert desk.show() == 400.0
+    assert desk.bench.values['unsaved'] == '1'
+    saved, why = desk.node._in_use.save()
+    assert not saved and 'camera_info_file' in why
+
+
+def test_each_warning_of_a_calibration_is_logged_once(make_desk, capfd):
+    desk = make_desk()
+    for _ in range(2):
+        desk.give('weak', warnings=('the mask is odd', 'a turn is odd'))
+    logged = capfd.readouterr().err
+    for words in ('the mask is odd', 'a turn is odd'):
+        assert [line.split()[0] for line in logged.splitlines() if words in line] == ['[WARN]']
+
+
+def test_a_file_of_another_tool_is_set_aside(make_desk, tmp_path):
+    (tmp_path / 'camera.yaml').write_text('camera_matrix: theirs\n')
+    desk = make_desk()
+    desk.give()
+    assert load_calibration_yaml(desk.file).camera.fx == 400.0
+    assert (tmp_path / 'camera.previous.yaml').read_text() == 'camera_matrix: theirs\n'
+
+
+@pytest.fixture
+def read_only(monkeypatch, tmp_path):
+    """Let no file below tmp_path be made or renamed, for root too."""
+    plain = Path.open
+
+    def refuse(self, mode='r', *args, **options):
+        if tmp_path in self.parents and mode not in ('r', 'rb'):
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
+        return plain(self, mode, *args, **options)
+    monkeypatch.setattr(Path, 'open', refuse)
+
+
+def test_a_reset_on_a_disk_that_is_read_only_does_not_say_it_was_done(make_desk, request, capfd):
+    desk = make_desk()
+    desk.give()
+    request.getfixturevalue('read_only')
+    answer = desk.call('reset')
+    assert not answer.success
+    for text in (answer.message, capfd.readouterr().err):
+        assert 'could not be moved aside: Read-only file system; move it yourself' in text
+        assert 'the next start of the node publishes it again' in text
+    assert desk.file.exists() and desk.show() is None
+    desk.until(lambda: 'could not be moved aside' in desk.bench.values['warnings'])
+    # this process trusts it no more, whatever makes it look again
+    desk.node._in_use.load()
+    assert desk.show() is None
+    desk.file.unlink()
+    desk.until(lambda: desk.bench.values['warnings'] == '')
+    assert desk.call('reset').message == 'collecting; there was no file'
+
+
+def test_one_that_is_given_up_on_a_read_only_disk_is_told(make_desk, request, capfd):
+    desk = make_desk(contradictions=1)
+    desk.give()
+    request.getfixturevalue('read_only')
+    desk.give(complete=False, fx=450.0)
+    assert desk.show() is None and desk.file.exists()
+    assert 'could not be moved aside' in capfd.readouterr().err
+    desk.until(lambda: 'could not be moved aside' in desk.bench.values['warnings'])
+    desk.node._in_use.load()
+    assert desk.show() is None
+
+
+def test_what_was_set_aside_before_is_never_overwritten(make_desk, tmp_path):
+    (tmp_path / 'camera.yaml').write_text('camera_matrix: theirs\n')
+    desk = make_desk()
+    desk.give()
+    first = desk.file.read_text()
+    answer = desk.call('reset')
+    assert answer.success and str(tmp_path / 'camera.previous.2.yaml') in answer.message
+    desk.give()
+    # another program writes it while the node runs
+    desk.file.write_text('camera_matrix: theirs too\n')
+    assert desk.call('save').success
+    assert [(tmp_path / f'camera.previous{number}.yaml').read_text()
+            for number in ('', '.2', '.3')] == [
+                'camera_matrix: theirs\n', first, 'camera_matrix: theirs too\n']
+    assert load_calibration_yaml(desk.file).camera.fx == 400.0
+    assert desk.call('save').success
+    assert not (tmp_path / 'camera.previous.4.yaml').exists()
+
+
+def test_what_a_killed_node_left_is_removed_at_the_start(make_desk, tmp_path):
+    (tmp_path / '.camera.yaml.0123abcd.tmp').touch()
+    (tmp_path / '.other.yaml.0123abcd.tmp').touch()
+    make_desk()
+    assert [path.name for path in tmp_path.glob('.*.tmp')] == ['.other.yaml.0123abcd.tmp']
+
+
+def test_news_that_fail_do_not_hold_back_the_others_and_are_counted(make_desk, capfd):
+    desk = make_desk()
+
+    def fail():
+        raise ZeroDivisionError('odd news')
+    for _ in range(3):
+        desk.node._later(fail)
+    desk.give()
+    assert desk.show() == 400.0
+    desk.until(lambda: desk.bench.count('failed_callbacks') == 3)
+    assert capfd.readouterr().err.count('Traceback') == 1
+
+
+def test_a_service_that_fails_answers(make_desk, monkeypatch):
+    desk = make_desk()
+
+    def fail(*args):
+        raise ZeroDivisionError('odd')
+    monkeypatch.setattr(desk.node._learner, 'restart', fail)
+    answer = desk.call('reset')
+    assert not answer.success and 'odd' in answer.message
+    desk.until(lambda: desk.bench.count('failed_callbacks') == 1)
+
+
+@pytest.mark.parametrize('driver', ['missing', 'hangs', 'refuses'])
+def test_a_driver_that_does_not_take_the_calibration_disturbs_nothing(make_desk, driver, capfd):
+    desk = make_desk(commit='true', commit_timeout=1.0 if driver == 'missing' else 6.0)
+    asked = []
+
+    def refuse(request, response):
+        asked.append(request)
+        response.success, response.status_message = False, 'no flash'
+        return response
+
+    if driver == 'hangs':
+        # a service that is there, in a process that never spins it
+        context = rclpy.Context()
+        rclpy.init(context=context)
+        dead = rclpy.create_node('driver', context=context)
+        dead.create_service(SetCameraInfo, 'set_camera_info', refuse)
+    elif driver == 'refuses':
+        desk.bench.node.create_service(SetCameraInfo, 'set_camera_info', refuse)
+    desk.give()
+    words = {'missing': 'there is no service /set_camera_info',
+             'hangs': 'did not answer within 6 s', 'refuses': 'refused: no flash'}[driver]
+    said = []
+    desk.until(lambda: said.append(capfd.readouterr().err) or words in ''.join(said))
+    assert desk.show() == 400.0 and bool(asked) == (driver == 'refuses')
+    if driver == 'hangs':
+        dead.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+KEPT = """\
+image_width: 320
+image_height: 240
+camera_name: dashcam
+camera_matrix: {rows: 3, cols: 3, data: [400.0, 0.0, 160.0, 0.0, 401.0, 120.0, 0.0, 0.0, 1.0]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.01, 0.0, 0.0, 0.0]}
+dashcalib:
+  verdict: accepted
+  sigma: {fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0, k1: 0.01, k2: 0.01}
+  frame_id: camera
+"""
+
+
+def test_a_camera_that_changed_does_not_learn_from_the_turns_of_earlier_drives(
+        make_desk, tmp_path):
+    (tmp_path / 'camera.yaml').write_text(KEPT)
+    store = TurnStore(str(tmp_path / 'turns'), 10, 3.0, pytest.fail)
+    store.load(Origin((320, 240), 1))
+    lens = Radial((320, 240), 200.0, 201.0, 160.0, 120.0)
+    scene = synthetic_turn(lens, keyframes=8, tracks=60).scene(lens)
+    store.mirror(lambda: {TurnId.at(0): StoredTurn(scene, 5.0, 0.05)})
+    desk = make_desk(contradictions=1, **{'turns.store': tmp_path / 'turns'})
+    assert desk.show() == 400.0
+    desk.until(lambda: desk.bench.count('turns stored') == 1)
+    desk.give(complete=False, fx=450.0)
+    assert desk.show() is None
+    desk.until(lambda: desk.bench.count('turns stored') == 0)
+    desk.until(lambda: list((tmp_path / 'turns').iterdir()) == [])

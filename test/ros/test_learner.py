@@ -1,0 +1,295 @@
+"""The learner's two threads: when it calibrates, what a failure costs, how it ends."""
+from __future__ import annotations
+
+import threading
+import time
+import types
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from fakes import image_message, stands_in_for
+
+from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judgement.calibration import StoredTurnSummary
+from dashcalib_ros.ros import learner as room
+from dashcalib_ros.ros.learner import Learner, Listener
+from dashcalib_ros.turns import TurnId
+
+LIMIT = 20.0
+CONFIG = Config().replace({'turns.wanted': 2})
+
+
+@stands_in_for(Calibrator)
+class Core:
+    """In the Calibrator's place: turns by command, calibrations that fail or last."""
+
+    made: ClassVar[list[Core]] = []
+    failures: ClassVar[list[Exception]] = []
+
+    def __init__(self, config=None, mask=None, verbose=False, live=False, use_stored=True,
+                 warn=None, inline=False, on_trouble=None):
+        assert live and not inline
+        self.options = {'mask': mask, 'use_stored': use_stored, 'warn': warn,
+                        'on_trouble': on_trouble}
+        self.stored, self.pushed, self.done = (), [], []
+        self.ready, self.frames, self.calls = (), 0, 0
+        self.strangers = ()
+        self.hold, self.closed = threading.Event(), threading.Event()
+        self.hold.set()
+        Core.made.append(self)
+
+    def push(self, frame):
+        self.frames += 1
+        self.pushed.append(frame)
+        return self.status()
+
+    def status(self):
+        ready = self.ready + self.stored
+        return Status(self.frames, len(ready), len(ready), 0.0, 0.1, False, ready)
+
+    def calibrate(self, progress=None, final=True):
+        assert not final
+        self.calls += 1
+        ready = self.ready
+        while not self.hold.wait(0.01):
+            if self.closed.is_set():
+                raise WorkerError('the calibrator was closed while it calibrated')
+        if Core.failures:
+            raise Core.failures.pop()
+        turns = tuple(TurnSummary(turn.number, turn.number, turn.number, 0.0, 0.1, 1, 1,
+                                  turn not in self.strangers,
+                                  misfit=9.0 if turn in self.strangers else 1.0)
+                      for turn in ready)
+        stored = tuple(StoredTurnSummary(turn, 0.0, 0.1, 60.0, 20, True, 1.0)
+                       for turn in self.stored)
+        return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG,
+                           stored_turns=stored)
+
+    def reject(self, turns):
+        self.ready = tuple(turn for turn in self.ready if turn not in turns)
+
+    def close(self):
+        self.closed.set()
+        self.done.append('close')
+
+    def clear_store(self):
+        self.done.append('clear')
+
+    def forget_stored(self):
+        self.done.append('forget')
+
+
+@pytest.fixture
+def desk(monkeypatch):
+    """A learner over such cores, and all it tells."""
+    monkeypatch.setattr(room, 'Calibrator', Core)
+    Core.made, Core.failures = [], []
+    heard = types.SimpleNamespace(results=[], troubles=[], statuses=[])
+    heard.learner = Learner(CONFIG, 10, Listener(
+        heard.results.append, heard.statuses.append,
+        lambda kind, text: heard.troubles.append((kind, text))))
+    yield heard
+    heard.learner.close()
+
+
+def at(*centers):
+    return tuple(TurnId.at(center) for center in centers)
+
+
+def until(condition):
+    end = time.monotonic() + LIMIT
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def held(desk, core):
+    """Have a calibration under way until core.hold is set."""
+    core.ready = at(10, 20)
+    core.hold.clear()
+    until(lambda: desk.learner.activity().calibrating)
+
+
+def image(width=64):
+    data = np.zeros((48, width), np.uint8)
+    return image_message(encoding='mono8', width=width, height=48, step=width, is_bigendian=0,
+                         data=data.tobytes())
+
+
+def test_it_calibrates_when_enough_turns_are_built_and_again_only_with_others(desk):
+    core = Core.made[0]
+    core.ready = at(10)
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 0
+    core.ready = at(10, 20)
+    until(lambda: len(desk.results) == 1)
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 1 and desk.results[0].complete
+    core.ready = at(20, 30)
+    until(lambda: len(desk.results) == 2)
+    assert core.calls == 2
+
+
+def test_a_turn_that_fits_another_camera_is_not_tried_over_and_over(desk):
+    core = Core.made[0]
+    core.strangers = at(20)
+    core.ready = at(10, 20)
+    until(lambda: len(desk.results) == 1)
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 1 and not desk.results[0].complete
+    assert core.ready == at(10, 20)  # the newest: it may be a new camera
+    core.strangers = at(20, 30)
+    core.ready = at(10, 20, 30)
+    until(lambda: len(desk.results) == 2)
+    until(lambda: core.ready == at(20, 30))
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 2
+
+
+def test_a_lower_goal_calibrates_sooner_but_not_completely(desk):
+    desk.learner.goal = 1
+    Core.made[0].ready = at(10)
+    until(lambda: desk.results)
+    assert not desk.results[0].complete
+
+
+def test_a_request_needs_turns_and_only_one_runs(desk):
+    core = Core.made[0]
+    assert 'no turn' in desk.learner.request()
+    core.ready = at(10)
+    core.hold.clear()
+    until(lambda: desk.learner.request() == '')
+    until(lambda: desk.learner.activity().calibrating)
+    assert 'running already' in desk.learner.request()
+    core.hold.set()
+    until(lambda: desk.results)
+    assert not desk.learner.activity().calibrating
+
+
+def test_a_failed_calibration_is_told_and_tried_again(desk):
+    Core.failures = [RuntimeError('odd'), WorkerError('the process died')]
+    Core.made[0].ready = at(10, 20)
+    until(lambda: len(desk.results) == 1)
+    assert [kind for kind, _ in desk.troubles] == ['failed_calibrations'] * 2
+    assert 'the process died' in desk.troubles[0][1] and 'in 2 s' in desk.troubles[0][1]
+    assert 'RuntimeError: odd' in desk.troubles[1][1] and 'in 4 s' in desk.troubles[1][1]
+    assert len(Core.made) == 1  # the turns are kept
+
+
+def test_a_restart_cancels_what_runs_and_its_result_is_out_of_date(desk):
+    first = Core.made[0]
+    held(desk, first)
+    desk.learner.restart()
+    until(first.closed.is_set)
+    until(lambda: not desk.learner.activity().calibrating)
+    assert desk.troubles == [] and desk.results == [] and desk.learner.bank == 1
+    Core.made[1].ready = at(30, 40)
+    until(lambda: desk.results)
+    assert desk.results[0].bank == 1
+
+
+def test_stored_turns_count_as_any(desk):
+    core = Core.made[0]
+    assert core.options['use_stored']
+    core.stored = (TurnId.stored(0),)
+    core.ready = at(10)
+    until(lambda: desk.results)
+    assert desk.results[0].complete
+    time.sleep(3 * room.LOOK_S)
+    assert core.calls == 1
+
+
+def test_a_restart_empties_the_store_unless_another_camera_comes(desk):
+    first = Core.made[0]
+    desk.learner.restart()
+    until(lambda: first.done == ['close', 'clear'])
+    second = Core.made[1]
+    assert not second.options['use_stored']
+    desk.learner.restart(keep_stored=True)
+    until(lambda: second.done == ['close'])
+    assert Core.made[2].options['use_stored']
+    desk.learner.forget_stored()
+    until(lambda: Core.made[2].done == ['forget'])
+
+
+def test_troubles_with_the_store_are_told(desk):
+    Core.made[0].options['warn']('no space')
+    assert desk.troubles == [('store', 'no space')]
+
+
+def test_troubles_with_the_workers_are_told(desk):
+    Core.made[0].options['on_trouble']('a turn is tried again')
+    assert desk.troubles == [('workers', 'a turn is tried again')]
+
+
+def test_images_keep_to_the_bank_they_were_taken_for(desk):
+    desk.learner.offer(0, 0, image(), (64, 48), 'front')
+    until(lambda: desk.statuses)
+    assert Core.made[0].pushed[0].frame_id == 'front'
+    desk.learner.restart()
+    desk.learner.offer(1, 1, image(32), (32, 48))
+    until(lambda: len(desk.statuses) == 2)
+    assert [core.frames for core in Core.made] == [1, 1] and desk.troubles == []
+
+
+def test_images_that_cannot_be_used_are_told(desk):
+    desk.learner.offer(0, 0, image(), (640, 480))
+    odd = image()
+    odd.encoding = 'smell'
+    desk.learner.offer(1, 1, odd, (64, 48))
+    desk.learner.offer(2, 2, object(), (64, 48))
+    until(lambda: len(desk.troubles) == 3)
+    assert [kind for kind, _ in desk.troubles] == ['undecodable', 'undecodable', 'failed']
+    desk.learner.offer(3, 3, image(), (64, 48))
+    until(lambda: desk.statuses)
+
+
+def test_a_listener_that_fails_ends_no_thread(desk, monkeypatch, caplog):
+    def fail(*news):
+        raise RuntimeError('a bug of the listener')
+    monkeypatch.setattr(desk.learner, '_tell', Listener(fail, fail, fail))
+    core = Core.made[0]
+    desk.learner.offer(0, 0, image(), (64, 48))
+    desk.learner.offer(1, 1, object(), (64, 48))
+    core.ready = at(10, 20)
+    until(lambda: core.calls == 1 and not desk.learner.activity().calibrating)
+    monkeypatch.setattr(desk.learner, '_tell', Listener(
+        desk.results.append, desk.statuses.append, fail))
+    desk.learner.offer(2, 2, image(), (64, 48))
+    core.ready = at(20, 30)
+    until(lambda: desk.results and desk.statuses)
+    assert 'a bug of the listener' in caplog.text
+
+
+def test_a_failing_core_ends_no_thread(desk, monkeypatch):
+    core = Core.made[0]
+    failures = ['status', 'reject']
+
+    def status():
+        if 'status' in failures:
+            failures.remove('status')
+            raise RuntimeError('status')
+        return Core.status(core)
+
+    def reject(turns):
+        if 'reject' in failures:
+            failures.remove('reject')
+            raise RuntimeError('reject')
+    core.ready = at(10, 20)
+    core.status, core.reject = status, reject
+    until(lambda: desk.results)
+    assert failures == []
+    # the first look at the turns may come before status is replaced, never after two results
+    assert {'failed_calibrations'} <= {kind for kind, _ in desk.troubles}
+
+
+def test_closing_ends_both_threads_in_the_middle_of_a_calibration(desk):
+    core = Core.made[0]
+    held(desk, core)
+    desk.learner.close()
+    assert not any(thread.is_alive() for thread in desk.learner._threads)
+    assert desk.troubles == []

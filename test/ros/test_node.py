@@ -1,0 +1,449 @@
+"""The node between real processes: stopped in every state, fed bad input, asked for services."""
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
+
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from ros_bench import (
+    COMMAND,
+    SECOND,
+    SOON,
+    START,
+    Bench,
+    NodeProcess,
+    compressed_message,
+    image_message,
+    ros_environment,
+)
+from sensor_msgs.msg import CameraInfo, CompressedImage
+
+
+def noise(index, size=(320, 240)):
+    """Return a picture without meaning."""
+    return np.random.default_rng(index).integers(0, 256, size[::-1], np.uint8)
+
+
+def stream(bench, count, first=0, make=image_message, size=(320, 240), **options):
+    """Publish images without meaning at 10 Hz of their own time, faster than that."""
+    for index in range(first, first + count):
+        bench.publish(make(noise(index, size), START + index * SECOND // 10, **options))
+
+
+CAMERA_FILE = """\
+image_width: {width}
+image_height: 240
+camera_name: dashcam
+camera_matrix: {{rows: 3, cols: 3, data: [200.0, 0.0, 160.0, 0.0, 201.0, 120.0, 0.0, 0.0, 1.0]}}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: [-0.1, 0.01, 0.0, 0.0, 0.0]}}
+"""
+OURS = """\
+dashcalib:
+  verdict: accepted
+  sigma: {fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0, k1: 0.01, k2: 0.01}
+  frame_id: camera
+"""
+
+
+def keep_file(home, text, name='dashcam'):
+    path = home / '.ros' / 'camera_info' / f'{name}.yaml'
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+# -- the end ----------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('signals', [
+    (signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT),
+    (signal.SIGTERM, signal.SIGINT)], ids=['SIGINT', 'SIGTERM', 'two SIGINT', 'both'])
+def test_it_ends_cleanly_while_it_collects(start_node, make_bench, signals):
+    node, camera = start_node(), make_bench()
+    camera.connect(node)
+    stream(camera, 5)
+    assert node.stop(*signals) == 0, node.text
+    assert 'Traceback' not in node.text
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('delay', [0.0, 0.2, 0.4])
+def test_it_ends_cleanly_while_it_starts(start_node, number, delay):
+    """From the node's own first line on: before that it is Python that starts."""
+    node = start_node()
+    end = time.monotonic() + SOON
+    while not node.catches(signal.SIGTERM):
+        assert time.monotonic() < end and node.process.poll() is None, node.text
+    time.sleep(delay)
+    assert node.stop(number) == 0, node.text
+    assert 'Traceback' not in node.text
+
+
+# -- the file ---------------------------------------------------------------------------------
+
+def test_a_kept_calibration_is_published_from_the_first_image_on(start_node, make_bench, tmp_path):
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS)
+    node, camera = start_node(), make_bench()
+    camera.connect(node)
+    camera.until(lambda: camera.latched, node=node)
+    sent = [image_message(noise(n), START + n * SECOND) for n in range(3)]
+    camera.publish(*sent)
+    camera.until(lambda: len(camera.infos) == 3, node=node)
+    assert [info.header for info in camera.infos] == [image.header for image in sent]
+    assert camera.infos[0].k[0] == 200.0 and list(camera.infos[0].d) == [-0.1, 0.01, 0, 0, 0]
+    assert camera.latched[0].header.frame_id == 'camera'
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    ('{{{ no yaml', 'is not valid YAML'),
+    ('', 'is no camera calibration'),
+    (CAMERA_FILE.format(width=320), 'no accepted calibration of this node'),
+    (CAMERA_FILE.format(width=640) + OURS, 'it is for 640x240'),
+    ((CAMERA_FILE.format(width=320) + OURS).replace('frame_id: camera', 'frame_id: rear'),
+     "in frame 'rear'"),
+], ids=['corrupt', 'empty', 'foreign', 'other size', 'other frame'])
+def test_a_file_that_does_not_fit_is_ignored_with_a_warning(start_node, make_bench, tmp_path,
+                                                            text, words):
+    path = keep_file(tmp_path, text)
+    node, camera = start_node(), make_bench()
+    camera.connect(node)
+    stream(camera, 5)
+    camera.counted('received', 5, node)
+    node.wait_for(words)
+    assert camera.infos == []
+    assert path.read_text() == text
+    assert not camera.latched or camera.latched[-1].k[0] == 0
+
+
+def test_a_namespace_names_the_camera(start_node, make_bench, tmp_path):
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS, 'front')
+    node, camera = start_node('-r', '__ns:=/front'), make_bench(namespace='/front')
+    camera.connect(node)
+    stream(camera, 2)
+    camera.until(lambda: len(camera.infos) == 2, node=node)
+    assert camera.status.name == 'front/calibrator: camera calibration'
+    assert camera.status.hardware_id == 'front'
+
+
+# -- input ------------------------------------------------------------------------------------
+
+def test_compressed_images_get_their_camera_info(start_node, make_bench, tmp_path):
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS)
+    node = start_node('-r', 'image_raw:=dashcam/image', image_transport='compressed')
+    camera = make_bench(image_type=CompressedImage, topic='dashcam/image/compressed')
+    camera.connect(node)
+    stream(camera, 4, make=compressed_message)
+    stream(camera, 2, 4, make=compressed_message, suffix='.png')
+    camera.until(lambda: len(camera.infos) == 6, node=node)
+    camera.publish(compressed_message(noise(7, (640, 480)), START + 60 * SECOND))
+    corrupt = compressed_message(noise(8), START + 61 * SECOND)
+    del corrupt.data[2000:]
+    camera.publish(corrupt)
+    empty = compressed_message(noise(8), START + 62 * SECOND)
+    del empty.data[:]
+    camera.publish(empty)
+    camera.counted('undecodable', 2, node)
+    camera.counted('strays', 1, node)
+    assert {(info.width, info.height) for info in camera.infos} == {(320, 240)}
+    assert node.stop() == 0
+
+
+def broken_images():
+    """Return what no camera should send; each is later than the one before."""
+    stamps = iter(range(START + 10 * SECOND, START + 100 * SECOND, SECOND))
+    good = noise(0)
+    unknown = image_message(good, next(stamps), encoding='32FC1')
+    step = image_message(good, next(stamps))
+    step.step = 17
+    short = image_message(good, next(stamps))
+    del short.data[1000:]
+    empty = image_message(good, next(stamps))
+    del empty.data[:]
+    none = image_message(good, next(stamps))
+    none.width = none.height = 0
+    odd = image_message(good, next(stamps), encoding='\u00e9 \n' + 'x' * 300)
+    return [unknown, step, short, empty, none, odd]
+
+
+def test_bad_images_are_counted_and_the_node_lives(start_node, make_bench):
+    node, camera = start_node(), make_bench()
+    camera.connect(node)
+    stream(camera, 3)
+    bad = broken_images()
+    camera.publish(*bad)
+    camera.counted('undecodable', len(bad), node)
+    stream(camera, 3, 500)
+    camera.counted('received', 6 + len(bad), node)
+    # one line for all of them within ten seconds, and it names a cure
+    said = [line for line in node.text.splitlines() if 'WARN' in line and 'lost' not in line]
+    assert len(said) == 1, node.text
+    assert 'publish mono8' in said[0] or 'the camera driver is broken' in said[0]
+    assert node.stop() == 0 and 'Traceback' not in node.text
+
+
+def test_odd_stamps_are_counted_and_the_node_lives(start_node, make_bench):
+    node, camera = start_node(), make_bench()
+    camera.connect(node)
+    stream(camera, 20)
+    times = [0, START + SECOND, START + SECOND, START + 4 * SECOND, START + 2 * SECOND,
+             START - 3600 * SECOND, START + 86400 * SECOND]
+    camera.publish(*(image_message(noise(n), stamp) for n, stamp in enumerate(times)))
+    stream(camera, 20, 0)
+    camera.counted('received', 47, node)
+    camera.counted('unstamped', 1, node)
+    camera.counted('repeated', 2, node)
+    camera.counted('set_back', 2, node)
+    camera.counted('lost', 1, node)
+    assert len(camera.infos) == 0
+    assert node.stop() == 0 and 'Traceback' not in node.text
+
+
+def test_a_driver_that_never_stamps_is_learned_from_all_the_same(start_node, make_bench):
+    node, camera = start_node(), make_bench()
+    camera.connect(node)
+    for n in range(10):
+        camera.publish(image_message(noise(n), 0))
+        camera.spin(0.15)
+    camera.until(lambda: len(camera.magnitudes) >= 5, node=node)
+    assert camera.count('unstamped') == 0
+
+
+def test_two_publishers_of_different_sizes_do_not_reset_it(start_node, make_bench, tmp_path):
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS)
+    node, camera = start_node(), make_bench()
+    camera.connect(node)
+    for n in range(15):
+        camera.publish(image_message(noise(n), START + n * SECOND),
+                       image_message(noise(n, (640, 240)), START + n * SECOND + 5))
+    camera.counted('strays', 15, node)
+    camera.until(lambda: len(camera.infos) == 15, node=node)
+    assert {info.width for info in camera.infos} == {320}
+    node.wait_for('is there a second publisher?')
+
+
+@pytest.mark.parametrize('change', [{'size': (640, 240)}, {'frame_id': 'rear'}],
+                         ids=['size', 'frame'])
+def test_a_change_of_size_or_frame_resets_it_loudly(start_node, make_bench, tmp_path, change):
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS)
+    node, camera = start_node(), make_bench()
+    camera.connect(node)
+    stream(camera, 5)
+    camera.until(lambda: len(camera.infos) == 5, node=node)
+    stream(camera, 20, 5, **change)
+    camera.counted('received', 25, node)
+    camera.until(lambda: camera.values['state'] == 'collecting', node=node)
+    assert '[ERROR]' in node.text and 'the camera changes from 320x240' in node.text
+    assert all(info.width == 320 and info.header.frame_id == 'camera' for info in camera.infos)
+    camera.until(lambda: camera.latched[-1].k[0] == 0, node=node)
+    # back again: the file fits once more
+    stream(camera, 20, 25)
+    camera.until(lambda: camera.values['state'] == 'calibrated', node=node)
+
+
+def test_auto_reliability_follows_the_publishers(start_node, make_bench):
+    """Best effort hears both kinds; a reliable subscription would never hear the second."""
+    first = make_bench(reliable=True)
+    node = start_node()
+    first.connect(node)
+    node.wait_for('subscribing reliable')
+    second = make_bench(reliable=False, listen=False)
+    first.until(lambda: 'subscribing best_effort' in node.text, node=node)
+    second.until(lambda: second.images.get_subscription_count() > 0, node=node)
+    before = first.count('received')
+    end = time.monotonic() + SOON
+    while first.count('received') <= before:
+        second.publish(image_message(noise(1), START))
+        first.spin(0.1)
+        assert time.monotonic() < end, node.text
+    first.until(lambda: '2 publishers' in first.values['warnings'], node=node)
+
+
+def test_another_publisher_of_camera_info_is_reported(plain):
+    node, camera = plain
+    assert camera.values['warnings'] == ''
+    other = camera.node.create_publisher(CameraInfo, 'camera_info', 1)
+    camera.until(lambda: 'another node publishes /plain/camera_info' in camera.values['warnings'],
+                 node=node)
+    camera.node.destroy_publisher(other)
+    camera.until(lambda: camera.values['warnings'] == '', node=node)
+
+
+@pytest.fixture(scope='module')
+def plain(ros_context, tmp_path_factory):
+    """One node and its camera, for tests that leave it as it was."""
+    camera = Bench(ros_context, namespace='/plain', topic='/plain_image')
+    node = NodeProcess(tmp_path_factory.mktemp('plain'), '-r', '__ns:=/plain', '-r',
+                       'image_raw:=/plain_image')
+    camera.connect(node)
+    yield node, camera
+    node.kill()
+    camera.close()
+
+
+def test_silence_is_stale(plain):
+    node, camera = plain
+    camera.until(lambda: camera.status.level == b'\x03', node=node)
+    assert camera.status.message == 'no image on /plain_image yet'
+
+
+def test_a_paused_simulation_does_not_silence_the_diagnostics(start_node, make_bench):
+    node, camera = start_node(use_sim_time=True), make_bench()
+    camera.connect(node)
+    stream(camera, 3)
+    camera.counted('received', 3, node)
+    assert node.stop() == 0
+
+
+# -- services and parameters ------------------------------------------------------------------
+
+def test_services_say_why_not(plain):
+    node, camera = plain
+    for name, why in (('calibrate', 'no turn was found'), ('save', 'no accepted calibration')):
+        answer = camera.call(name, node)
+        assert not answer.success and why in answer.message
+
+
+@pytest.mark.parametrize(('parameters', 'words'), [
+    ({'turns__half_width': 99.0}, 'out of range'),
+    ({'turns__wanted': 2.5}, 'must be int'),
+    ({'reliability': 'perfect'}, 'must be one of'),
+    ({'camera_name': 'narrow_stereo'}, 'belongs to image_pipeline'),
+    ({'mask_file': 'missing.png'}, 'cannot read the mask'),
+    ({'mask_file': '~nobody-of-this-name/mask.png'}, 'cannot read the mask'),
+    ({'mask__segmentation': '~nobody-of-this-name/m.onnx'}, 'there is no segmentation model'),
+    ({'camera_info_file': '~nobody-of-this-name/camera.yaml'}, 'set camera_info_file'),
+])
+def test_a_bad_parameter_ends_it_with_one_line(start_node, parameters, words):
+    node = start_node(**parameters)
+    assert node.process.wait(SOON) == 2
+    assert words in node.text and len(node.text.splitlines()) == 1, node.text
+
+
+def test_a_mask_of_another_size_ends_it_at_the_first_image(start_node, make_bench, tmp_path):
+    cv2.imwrite(str(tmp_path / 'mask.png'), np.full((48, 64), 255, np.uint8))
+    node, camera = start_node(mask_file=tmp_path / 'mask.png'), make_bench()
+    camera.connect(node)
+    camera.publish(image_message(noise(0), START))
+    assert node.process.wait(SOON) == 2
+    assert node.text.splitlines()[-1] == (
+        'calibrator: error: the mask is 64x48 and the images are 320x240; '
+        'make the mask as large as the images')
+
+
+def test_a_mask_that_fits_is_taken(start_node, make_bench, tmp_path):
+    cv2.imwrite(str(tmp_path / 'mask.png'), np.full((240, 320), 255, np.uint8))
+    node, camera = start_node(mask_file=tmp_path / 'mask.png'), make_bench()
+    camera.connect(node)
+    stream(camera, 15)
+    camera.until(lambda: len(camera.magnitudes) >= 10, node=node)
+    assert camera.count('undecodable') == camera.count('failed') == 0
+    assert node.stop() == 0
+
+
+def test_a_misspelt_parameter_is_reported(start_node):
+    start_node(turns__half_widht=3).wait_for('did you mean turns.half_width?')
+
+
+def test_a_parameter_of_no_type_is_logged_once_and_the_node_goes_on(start_node, make_bench):
+    """rclpy itself raises for it, before any callback of the node."""
+    node, camera = start_node(), make_bench()
+    camera.connect(node)
+    client = camera.node.create_client(SetParameters, 'calibrator/set_parameters')
+    camera.until(client.service_is_ready, node=node)
+    odd = SetParameters.Request(parameters=[
+        Parameter(name='commit', value=ParameterValue(type=99))])
+    for count in (1, 2, 3):
+        client.call_async(odd)
+        camera.counted('failed_callbacks', count, node)
+    stream(camera, 3)
+    camera.counted('received', 3, node)
+    good = client.call_async(SetParameters.Request(parameters=[Parameter(
+        name='commit', value=ParameterValue(type=ParameterType.PARAMETER_BOOL,
+                                            bool_value=True))]))
+    camera.until(good.done, node=node)
+    assert good.result().results[0].successful
+    assert node.text.count('Traceback') == 1 and node.stop() == 0
+
+
+# callbacks that fail, and an rclpy that is left in the middle of one
+FAILING = '''
+import sys
+from dashcalib_ros.ros import main, node
+kind = sys.argv.pop(1)
+class Node(node.CalibratorNode):
+    def _on_image(self, message):
+        super()._on_image(message)
+        if kind == 'callback' and self._received % 2:
+            raise ZeroDivisionError('odd image')
+        if kind == 'stuck':
+            self._wake.callback_group.ending_execution = lambda entity: None
+            raise ZeroDivisionError('odd image')
+    def _health(self):
+        if kind == 'timer' and self._received == 2:
+            raise ZeroDivisionError('odd tick')
+        return super()._health()
+from dashcalib_ros.ros import program
+program.CalibratorNode = Node
+sys.exit(main(sys.argv[1:]))
+'''
+
+
+@pytest.mark.parametrize('kind', ['callback', 'timer'])
+def test_a_callback_that_fails_is_survived(ros_context, make_bench, tmp_path, kind):
+    node = NodeProcess(tmp_path, command=[sys.executable, '-c', FAILING, kind])
+    try:
+        camera = make_bench()
+        camera.connect(node)
+        stream(camera, 2)
+        node.wait_for('ZeroDivisionError: odd')
+        stream(camera, 2, 2)
+        camera.counted('received', 4, node)
+        camera.counted('failed_callbacks', 1, node)
+        assert node.text.count('Traceback') == 1 and node.stop() == 0
+    finally:
+        node.kill()
+
+
+def test_an_rclpy_that_calls_nothing_any_more_ends_the_process(ros_context, make_bench, tmp_path):
+    node = NodeProcess(tmp_path, command=[sys.executable, '-c', FAILING, 'stuck'])
+    try:
+        camera = make_bench()
+        camera.connect(node)
+        stream(camera, 1)
+        assert node.process.wait(SOON) == 1
+        assert 'ZeroDivisionError' in node.text
+    finally:
+        node.kill()
+
+
+@pytest.mark.parametrize('redirection', ['>&-', '2>&-', '>&- 2>&-'])
+def test_it_runs_and_ends_without_standard_streams(ros_context, make_bench, tmp_path,
+                                                   redirection):
+    node = NodeProcess(tmp_path, command=['sh', '-c', f'exec "$@" {redirection}', 'sh', *COMMAND])
+    try:
+        camera = make_bench()
+        camera.connect(node)
+        stream(camera, 3)
+        camera.counted('received', 3, node)
+        assert node.stop() == 0 and 'Traceback' not in node.text
+    finally:
+        node.kill()
+
+
+def test_without_rclpy_one_line_says_how_to_install_it(tmp_path):
+    code = ("import sys; sys.modules['rclpy'] = None\n"
+            'from dashcalib_ros.ros import main; sys.exit(main([]))')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          timeout=SOON, env={**os.environ, **ros_environment(tmp_path)})
+    assert done.returncode == 2
+    assert 'pip install' in done.stderr and len(done.stderr.splitlines()) == 1

@@ -1,0 +1,83 @@
+"""When a calibration is adopted, kept, replaced or given up: no ROS needed."""
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from dashcalib_ros.camera import Radial
+from dashcalib_ros.config import Config
+from dashcalib_ros.judgement import Calibration, Verdict
+from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.ros.state import Rules, contradicted, judge, state_of
+
+RULES = Rules(replace_ratio=0.7, contradictions=3)
+TRUTH = Radial((640, 360), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
+SIGMA = {'fx': 2.0, 'fy': 2.0, 'cx': 2.0, 'cy': 2.0, 'k1': 0.01, 'k2': 0.01}
+OLD = NamedCamera('old', TRUTH, SIGMA, 'accepted')
+
+
+def calibration(level='accepted', sigma=SIGMA, **changes):
+    camera = dataclasses.replace(TRUTH, **changes) if level != 'refused' else None
+    return Calibration(Verdict(level, () if level == 'accepted' else ('few turns',)), (640, 360),
+                       camera, sigma if camera else None, (), 10, 0.3, {}, {}, Config())
+
+
+def test_the_first_accepted_one_is_adopted_and_no_other():
+    assert judge(calibration(), True, None, 0, RULES).action == 'adopt'
+    assert judge(calibration(), False, None, 0, RULES).action == 'adopt'
+    for level in ('weak', 'refused'):
+        judged = judge(calibration(level), True, None, 0, RULES)
+        assert (judged.action, judged.why) == ('wait', 'few turns')
+
+
+def test_one_that_is_not_accepted_changes_nothing():
+    judged = judge(calibration('weak', fx=500.0), True, OLD, 2, RULES)
+    assert (judged.action, judged.contradictions) == ('keep', 2)
+
+
+@pytest.mark.parametrize(('ratio', 'action'), [(0.69, 'replace'), (0.71, 'keep'), (1.5, 'keep')])
+def test_a_confirming_one_replaces_it_only_when_clearly_better(ratio, action):
+    sigma = {**SIGMA, 'fx': ratio * SIGMA['fx']}
+    assert judge(calibration(sigma=sigma), True, OLD, 0, RULES).action == action
+    # too few turns to replace anything
+    assert judge(calibration(sigma=sigma), False, OLD, 0, RULES).action == 'keep'
+
+
+def test_contradictions_in_a_row_give_it_up():
+    count = 0
+    for expected in ('keep', 'keep', 'give_up'):
+        judged = judge(calibration(fx=440.0), False, OLD, count, RULES)
+        count = judged.contradictions
+        assert judged.action == expected and 'fx 440.0 instead of 400.0' in judged.why
+
+
+def test_a_confirmation_in_between_begins_the_count_anew():
+    assert judge(calibration(), False, OLD, 2, RULES).contradictions == 0
+
+
+def test_the_last_contradiction_replaces_it_when_its_turns_suffice():
+    assert judge(calibration(fx=440.0), True, OLD, 2, RULES).action == 'replace'
+
+
+@pytest.mark.parametrize(('change', 'found'), [
+    ({'fx': 408.0}, False),            # 8 px are less than 3 * hypot(2, 2)
+    ({'fx': 409.0}, True),
+    ({'cx': 330.0}, True),
+    ({'k1': -0.5, 'k2': 0.5}, False),  # they trade with the focal length
+])
+def test_a_contradiction_is_three_combined_sigmas(change, found):
+    assert bool(contradicted(OLD, dataclasses.replace(TRUTH, **change), SIGMA)) == found
+
+
+def test_sigmas_too_good_to_be_true_do_not_contradict():
+    tiny = dict.fromkeys(SIGMA, 1e-6)
+    old = dataclasses.replace(OLD, sigma=tiny)
+    assert not contradicted(old, dataclasses.replace(TRUTH, fx=402.0), tiny)
+
+
+def test_states():
+    assert state_of(True, True, True) == 'calibrated'
+    assert state_of(False, True, True) == 'calibrating'
+    assert state_of(False, False, True) == 'refused_so_far'
+    assert state_of(False, False, False) == 'collecting'

@@ -1,0 +1,404 @@
+"""The pool of workers: every turn once, in order, whatever its worker dies of."""
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import child_tasks
+import cv2
+import numpy as np
+import pytest
+from waiting import LIMIT_S, background, is_running, wait_for
+
+from dashcalib_ros import stages
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.frames import Frame
+from dashcalib_ros.reconstruction import build
+from dashcalib_ros.turns.turn import Turn, TurnId
+from dashcalib_ros.workers import child as child_module
+from dashcalib_ros.workers import jobs
+from dashcalib_ros.workers import pool as pool_module
+from dashcalib_ros.workers.child import ChildWorker
+from dashcalib_ros.workers.inline import InlineWorker
+from dashcalib_ros.workers.pool import ATTEMPTS, ScenePool
+from dashcalib_ros.workers.worker import THREAD_VARIABLES, WorkerDiedError
+
+at = TurnId.at
+
+
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch) -> None:
+    monkeypatch.setattr(jobs, 'BACK_OFF_S', 0.01)
+
+
+@pytest.fixture
+def trouble() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def pool(trouble) -> Iterator[ScenePool]:
+    pool = ScenePool(Config().replace({'threads': 2}), ChildWorker, on_trouble=trouble.append)
+    yield pool
+    pool.close()
+
+
+def turn(center: int, note: Path | str = '') -> Turn:
+    return Turn(center, center - 5, center + 5, center / 10, 0.05, (str(note),))
+
+
+def wait_until_built(pool: ScenePool) -> None:
+    end = time.monotonic() + LIMIT_S
+    pool.wait(lambda: len(pool.unbuilt()) == 0 or time.monotonic() > end)
+    assert len(pool.unbuilt()) == 0, 'waited in vain'
+
+
+def use(monkeypatch, function: Callable[..., object]) -> None:
+    monkeypatch.setattr(stages, 'draft', function)
+
+
+def test_turns_become_scenes_once(pool, monkeypatch):
+    use(monkeypatch, child_tasks.build)
+    for center in (10, 50, 90, 50):
+        pool.submit(turn(center), None)
+    wait_until_built(pool)
+    assert pool.scenes() == {at(center): f'scene of {center}' for center in (10, 50, 90)}
+    assert all(child.pid is not None for child in pool._workers)
+
+
+@pytest.mark.parametrize('error', [cv2.error('remap: dst is empty'),
+                                   np.linalg.LinAlgError('Singular matrix')])
+def test_a_hopeless_turn_has_no_scene_and_verbose_tells_why(monkeypatch, capsys, error):
+    def fail(*arguments: object) -> None:
+        raise error
+
+    monkeypatch.setattr(build, 'draft_scene', fail)
+    assert stages.draft(turn(10), Config(), None) is None
+    # a child's stderr is the terminal with --verbose, and nowhere else
+    told = capsys.readouterr().err
+    assert 'turn at frame 10' in told and str(error) in told
+
+
+def test_without_a_queue_the_longest_is_built_first(monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_slowly)
+    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker)
+    try:
+        pool.submit(turn(10, tmp_path / 'flag'), None)
+        wait_for((tmp_path / 'flag.10').exists)
+        use(monkeypatch, child_tasks.build)
+        for center, images in ((20, 2), (30, 9), (40, 5)):
+            pool.submit(replace(turn(center), frames=('',) * images, prominence=1 / center),
+                            None)
+        pool.keep_only({at(20), at(30), at(40)})
+        os.kill(int((tmp_path / 'flag.10').read_text()), signal.SIGKILL)
+        wait_until_built(pool)
+        assert list(pool.scenes()) == [at(30), at(40), at(20)]
+    finally:
+        pool.close()
+
+
+def test_a_child_that_dies_loses_no_turn(pool, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_dies_at_first)
+    for center in (10, 50, 90):
+        pool.submit(turn(center, tmp_path / 'flag'), None)
+    wait_until_built(pool)
+    assert pool.scenes() == dict.fromkeys((at(10), at(50), at(90)), 'second time')
+
+
+def test_a_turn_whose_child_is_killed_from_outside_is_built_again(
+        pool, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_slowly)
+    flag = tmp_path / 'flag.10'
+    pool.submit(turn(10, tmp_path / 'flag'), None)
+    wait_for(lambda: flag.exists() and flag.read_text())
+    use(monkeypatch, child_tasks.build)
+    os.kill(int(flag.read_text()), signal.SIGKILL)
+    wait_until_built(pool)
+    assert pool.scenes() == {at(10): 'scene of 10'}
+
+
+def test_a_turn_that_kills_every_child_is_given_up_and_told(monkeypatch, tmp_path):
+    log, told = tmp_path / 'log', []
+    use(monkeypatch, child_tasks.build_dies)
+    pool = ScenePool(Config(), ChildWorker, on_lost=told.append)
+    pool.submit(turn(10, log), None)
+    wait_until_built(pool)
+    assert pool.scenes() == {at(10): None}
+    assert len(told) == 1 and 'turn at frame 10' in told[0]
+    assert log.read_text() == '10\n' * ATTEMPTS
+    # the others still are built
+    use(monkeypatch, child_tasks.build)
+    pool.submit(turn(50), None)
+    wait_until_built(pool)
+    assert pool.scenes() == {at(10): None, at(50): 'scene of 50'} and len(told) == 1
+    pool.close()
+
+
+def test_where_no_child_can_live_the_pictures_are_not_blamed(pool, monkeypatch):
+    """A broken installation, say, or a library of another processor."""
+    monkeypatch.setattr(pool_module, 'ATTEMPTS', 2)
+    monkeypatch.setattr(child_module, 'START', 'import sys; sys.exit(7)')
+    pool.submit(turn(10), None)
+    with pytest.raises(WorkerError, match=r'no reconstruction process .*exit code 7'):
+        wait_until_built(pool)
+    monkeypatch.undo()
+    use(monkeypatch, child_tasks.build)
+    wait_until_built(pool)
+    assert pool.scenes() == {at(10): 'scene of 10'}
+
+
+def test_an_error_is_told_once_and_the_turn_tried_again(pool, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_fails_at_first)
+    pool.submit(turn(10, tmp_path / 'flag'), None)
+    with pytest.raises(WorkerError, match='frame 10 failed: MemoryError: no room'):
+        wait_until_built(pool)
+    assert len(pool.unbuilt()) == 1
+    wait_until_built(pool)
+    assert pool.scenes() == {at(10): 'scene of 10'}
+
+
+def test_scenes_of_turns_that_left_are_dropped(pool, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build)
+    for center in (10, 50):
+        pool.submit(turn(center), None)
+    wait_until_built(pool)
+    pool.keep_only({at(50)})
+    assert pool.scenes() == {at(50): 'scene of 50'}
+    # also one that is not built yet
+    use(monkeypatch, child_tasks.build_slowly)
+    pool.submit(turn(90, tmp_path / 'flag'), None)
+    wait_for((tmp_path / 'flag.90').exists)
+    pool.keep_only({at(50)})
+    assert len(pool.unbuilt()) == 0
+    pool.reject(at(50))
+    assert pool.scenes() == {at(50): None}
+
+
+def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_slowly)
+    settled = threading.Semaphore(0)
+    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=2,
+                     on_built=settled.release)
+    try:
+        pool.submit(turn(10, tmp_path / 'flag'), None)
+        wait_for((tmp_path / 'flag.10').exists)
+        use(monkeypatch, child_tasks.build)
+        for center, prominence in ((20, 0.02), (30, 0.03), (40, 0.01), (50, 0.04)):
+            pool.submit(replace(turn(center), prominence=prominence), None)
+        # one is being built, two wait with their images
+        assert pool._jobs.turns() == {at(30), at(50)}
+        assert pool.unbuilt() == {at(10), at(30), at(50)}
+        assert pool.scenes() == {at(20): None, at(40): None}
+        pool.keep_only({at(20), at(30), at(40), at(50)})
+        os.kill(int((tmp_path / 'flag.10').read_text()), signal.SIGKILL)
+        wait_until_built(pool)
+        assert list(pool.scenes().items())[2:] == [
+            (at(50), 'scene of 50'), (at(30), 'scene of 30')]
+        for _ in (50, 30):
+            assert settled.acquire(timeout=LIMIT_S)
+        pool.submit(turn(60), None)
+        pool.keep_only(set())
+        assert not pool._jobs.turns() and len(pool.unbuilt()) == 0
+    finally:
+        pool.close()
+
+
+def filmed(center: int, images: int, log: Path) -> Turn:
+    picture = np.zeros((48, 64), np.uint8)
+    return replace(turn(center), frames=tuple(
+        Frame(center + n, n, picture, str(log)) for n in range(images)), prominence=center / 1e3)
+
+
+@pytest.mark.parametrize('live, done', [
+    (False, ['draft of 20', 'draft of 30', 'draft of 10', 'scene of 20', 'scene of 30',
+             'scene of 10']),
+    (True, ['draft of 30', 'scene of 30', 'draft of 20', 'scene of 20', 'draft of 10',
+            'scene of 10'])])
+def test_a_turn_is_built_in_two_halves(monkeypatch, tmp_path, live, done):
+    """Side by side offline, so that the children end together; one by one live."""
+    log, hold = tmp_path / 'log', tmp_path / 'hold'
+    use(monkeypatch, child_tasks.build_slowly)
+    monkeypatch.setattr(stages, 'finish', child_tasks.finish)
+    settled = []
+    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=9 if live else None,
+                     on_built=lambda: settled.append(1))
+    try:
+        pool.submit(turn(5, hold), None)
+        wait_for((tmp_path / 'hold.5').exists)
+        use(monkeypatch, child_tasks.draft)
+        for center, images in ((10, 3), (20, 9), (30, 5)):
+            pool.submit(filmed(center, images, log), None)
+        pool.keep_only({at(10), at(20), at(30)})
+        os.kill(int((tmp_path / 'hold.5').read_text()), signal.SIGKILL)
+        wait_until_built(pool)
+        # the second half gets the images of the keyframes only
+        assert pool.scenes() == {
+            at(10): [10, 12], at(20): [20, 22, 24, 26, 28], at(30): [30, 32, 34]}
+        assert log.read_text().split('\n')[-7:-1] == done
+        # for each scene; not for drafts, nor for the turn that left
+        wait_for(lambda: len(settled) == 3)
+    finally:
+        pool.close()
+
+
+def test_a_child_that_dies_in_the_second_half_loses_no_turn(pool, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.draft)
+    monkeypatch.setattr(stages, 'finish', child_tasks.finish_dies_at_first)
+    for center in (10, 50, 90):
+        pool.submit(filmed(center, 3, tmp_path / 'log'), None)
+    wait_until_built(pool)
+    assert pool.scenes() == {at(center): [center, center + 2] for center in (10, 50, 90)}
+    # and does not do the first half again
+    assert (tmp_path / 'log').read_text().count('draft') == 3
+
+
+def test_what_failed_is_not_kept_for_a_turn_that_left(pool, monkeypatch, tmp_path):
+    monkeypatch.setattr(jobs, 'BACK_OFF_S', 1000.0)
+    use(monkeypatch, child_tasks.build_fails_at_first)
+    pool.submit(turn(10, tmp_path / 'flag'), None)
+    wait_for(lambda: pool._jobs.turns() and pool._errors)
+    pool.keep_only(set())
+    assert not pool._jobs.turns() and not pool._errors and not pool.unbuilt()
+
+
+def test_a_lost_turn_is_tried_again_by_itself(pool, trouble, monkeypatch, tmp_path):
+    """Killed at each start for a while and then left alone; nobody waits for it."""
+    use(monkeypatch, child_tasks.build_dies)
+    monkeypatch.setattr(stages, 'load', child_tasks.die)
+    pool.submit(turn(10, tmp_path / 'log'), None)
+    wait_for(lambda: len(trouble) > ATTEMPTS)
+    assert all('exit code 1' in line and 'turn at frame 10 is tried again' in line
+               and '\n' not in line for line in trouble)
+    assert sum('no reconstruction process can start' in line for line in trouble) == 1
+    assert pool.unbuilt() == {at(10)}
+    use(monkeypatch, child_tasks.build)
+    wait_for(lambda: pool.scenes() == {at(10): 'scene of 10'})
+    # what is over is not told to who waits now
+    pool.wait(lambda: True)
+
+
+def test_a_turn_that_raised_is_tried_again_by_itself(pool, trouble, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_fails_at_first)
+    pool.submit(turn(10, tmp_path / 'flag'), None)
+    wait_for(lambda: pool.scenes() == {at(10): 'scene of 10'})
+    assert len(trouble) == 1 and 'MemoryError: no room' in trouble[0]
+
+
+def test_a_hung_child_is_told_of_and_its_turn_tried_again(pool, trouble, monkeypatch, tmp_path):
+    monkeypatch.setattr(child_module, 'LOOKS_TO_REPORT', 1)
+    monkeypatch.setattr(child_module, 'LOOKS_TO_KILL', 2)
+    use(monkeypatch, child_tasks.build_slowly)
+    flag = tmp_path / 'flag.10'
+    pool.submit(turn(10, tmp_path / 'flag'), None)
+    wait_for(lambda: flag.exists() and flag.read_text())
+    use(monkeypatch, child_tasks.build)
+    wait_for(lambda: pool.scenes() == {at(10): 'scene of 10'})
+    assert any('turn at frame 10 is tried again' in line for line in trouble)
+
+
+def test_the_pauses_grow_and_have_an_end(monkeypatch):
+    monkeypatch.setattr(jobs, 'BACK_OFF_S', 1.0)
+    assert [jobs.back_off_s(n) for n in (1, 2, 3, 4, 100, 2000)] == [1, 2, 4, 8, 60, 60]
+
+
+def test_a_job_that_failed_waits_while_others_do_not():
+    waiting = jobs.Jobs(None)
+    first, second = jobs.Job(turn(10), None), jobs.Job(turn(20), None)
+    waiting.put(replace(first, not_before=time.monotonic() + 1000.0))
+    waiting.put(second)
+    assert waiting.take() == second and waiting.take() is None
+    assert 900.0 < waiting.pause_s() <= 1000.0 and waiting.turns() == {at(10)}
+
+
+def test_who_runs_something_comes_before_the_turns(monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_slowly)
+    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker)
+    try:
+        pool.submit(turn(10, tmp_path / 'flag'), None)
+        wait_for(lambda: (tmp_path / 'flag.10').exists())
+        pool.submit(turn(20, tmp_path / 'flag'), None)
+        with background(lambda: pool.run(os.path.exists, tmp_path / 'flag.20')) as ran:
+            wait_for(lambda: pool._borrowers)
+            pool.keep_only({at(20)})
+            pool._workers[0].kill()
+        assert ran == [False]
+        wait_for((tmp_path / 'flag.20').exists)
+    finally:
+        pool.close()
+
+
+def test_inline_it_is_all_the_same(monkeypatch):
+    for name in THREAD_VARIABLES:
+        monkeypatch.setenv(name, '1')
+    use(monkeypatch, child_tasks.build)
+    pool = ScenePool(Config().replace({'threads': 2}), InlineWorker)
+    for center in (10, 50, 90):
+        pool.submit(turn(center), None)
+    wait_until_built(pool)
+    assert pool.scenes() == {at(center): f'scene of {center}' for center in (10, 50, 90)}
+    assert pool.run(child_tasks.pid) == os.getpid() and pool.pids() == []
+    pool.close()
+    with pytest.raises(WorkerDiedError, match='closed'):
+        pool.run(child_tasks.pid)
+
+
+def test_the_condition_may_take_a_lock_that_a_submitter_holds(pool, monkeypatch):
+    use(monkeypatch, child_tasks.build)
+    lock = threading.Lock()
+    asked = threading.Event()
+
+    def ready() -> bool:
+        asked.set()
+        time.sleep(0.05)
+        with lock:
+            return len(pool.unbuilt()) == 0 and at(10) in pool.scenes()
+
+    def submit() -> None:
+        assert asked.wait(LIMIT_S)
+        with lock:
+            time.sleep(0.1)
+            pool.submit(turn(10), None)
+
+    with background(lambda: pool.wait(ready)) as waited, background(submit) as submitted:
+        pass
+    assert waited == [None] and submitted == [None]
+
+
+def test_run_tries_a_child_that_dies_again(pool, tmp_path):
+    assert pool.run(child_tasks.die_at_first, str(tmp_path / 'flag')) == 'second time'
+    with pytest.raises(WorkerDiedError, match='exit code 7'):
+        pool.run(child_tasks.die, 7)
+    assert pool.run(child_tasks.add, 1, 2) == 3
+
+
+def test_close_while_others_wait(pool, monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build_slowly)
+    solving, flag = tmp_path / 'solving', tmp_path / 'flag.10'
+    with (background(lambda: pool.wait(lambda: False)) as waited,
+          background(lambda: pool.run(child_tasks.sleep, 60, solving)) as ran,
+          contextlib.ExitStack() as stack):
+        wait_for(lambda: solving.exists() and solving.read_text())
+        for center in (10, 50):
+            pool.submit(turn(center, tmp_path / 'flag'), None)
+        wait_for(lambda: flag.exists() and flag.read_text())
+        # all workers are busy
+        queued = stack.enter_context(background(lambda: pool.run(child_tasks.add, 1, 2)))
+        wait_for(lambda: pool._borrowers)
+        pids = pool.pids()
+        assert len(pids) == 2
+        pool.close()
+    assert waited == [None]
+    assert isinstance(ran[0], WorkerDiedError) and isinstance(queued[0], WorkerDiedError)
+    assert not any(is_running(pid) for pid in pids) and pool.pids() == []
+    # nothing starts again
+    pool.submit(turn(200), None)
+    with pytest.raises(WorkerDiedError, match='closed'):
+        pool.run(child_tasks.add, 1, 2)
+    assert pool.pids() == []
