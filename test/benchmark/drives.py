@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import os
 import shutil
 import zlib
@@ -164,6 +165,7 @@ def pictures_of(drive: Drive, cache: Path) -> Pictures:
 def _key(drive: Drive) -> str:
     """Return a name for what these pictures depend on: lens, spec and the code that renders."""
     digest = hashlib.sha256(repr((drive.lens, drive.spec)).encode())
-    for path in sorted(Path(dashcalib_ros.demo.__file__).parent.glob('*.py')):
+    demo = Path(dashcalib_ros.demo.__file__).parent.glob('*.py')
+    for path in sorted({*demo, Path(inspect.getfile(type(drive)))}):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
