@@ -62,7 +62,7 @@ class Camera(ABC):
     model: its name in result.json and --model. ros_model: CameraInfo's distortion_model.
     step1, step2: how COLMAP adjusts it with one focal length and the centre fixed, and with all
     parameters (paper, 3.2). spread: prior standard deviation of each distortion coefficient,
-    around 0.
+    around 0. focal_ratios: focal lengths over the image width that the search for a start tries.
     """
 
     image_size: tuple[int, int]
@@ -76,6 +76,7 @@ class Camera(ABC):
     step1: ClassVar[ColmapModel]
     step2: ClassVar[ColmapModel]
     spread: ClassVar[tuple[float, ...]]
+    focal_ratios: ClassVar[tuple[float, ...]]
 
     @classmethod
     def centred(cls, image_size: tuple[int, int], focal: float, *distortion: float) -> Self:
@@ -117,10 +118,10 @@ class Camera(ABC):
         """Return the camera with another focal length, fx = fy."""
         return replace(self, fx=focal, fy=focal)
 
-    def enlarged(self, factor: int, image_size: tuple[int, int]) -> Self:
-        """Return the camera of the full-size images, for one of images shrunk by a factor.
+    def resized(self, factor: float, image_size: tuple[int, int]) -> Self:
+        """Return the camera of images that are factor times as large as its own.
 
-        image_size: of the full-size images; see shrink_image() for how they were shrunk.
+        image_size: theirs. Pixel x of its own images is (x + 0.5) factor - 0.5 of theirs.
         """
         offset = (factor - 1) / 2
         return replace(self, image_size=image_size, fx=self.fx * factor, fy=self.fy * factor,
@@ -163,6 +164,10 @@ class Camera(ABC):
 
         First the derivatives by the parameters (m, 2, n), then those by the points (m, 2, 3).
         """
+
+    def depths(self, points: Floats) -> Floats:
+        """Return (...) by how much the pictures of small surfaces at points (..., 3) shrink."""
+        return np.asarray(points[..., 2])
 
     def covers_picture(self) -> bool:
         """Return whether every pixel has a viewing ray: the model does not fold over inside."""

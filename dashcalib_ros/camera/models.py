@@ -5,17 +5,34 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.camera.camera import Camera
+from dashcalib_ros.camera.equidistant import Fisheye
 from dashcalib_ros.camera.plumb_bob import Brown, Radial
 from dashcalib_ros.errors import ConfigError, InputError
 
-MODELS: dict[str, type[Camera]] = {model.model: model for model in (Radial, Brown)}
+# as a setting: the turns choose
+AUTO = 'auto'
+MODELS: dict[str, type[Camera]] = {model.model: model for model in (Radial, Brown, Fisheye)}
 
 
 def model_named(name: str) -> type[Camera]:
     """Return a model by its name; raises ConfigError for one that is not known."""
     if name not in MODELS:
-        raise ConfigError(f'there is no camera model {name!r}; there are {", ".join(MODELS)}')
+        raise ConfigError(f'there is no camera model {name!r}; there are '
+                          f'{", ".join([AUTO, *MODELS])}')
     return MODELS[name]
+
+
+def searched(name: str) -> tuple[type[Camera], ...]:
+    """Return the models that the search for a start tries; 'auto': one for each kind of lens.
+
+    Raises ConfigError for a name that is not known.
+    """
+    if name != AUTO:
+        return (model_named(name),)
+    kinds: dict[str, type[Camera]] = {}
+    for model in MODELS.values():
+        kinds.setdefault(model.ros_model, model)
+    return tuple(kinds.values())
 
 
 def camera_of(model: str, image_size: tuple[int, int], params: npt.ArrayLike) -> Camera:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel
 from dashcalib_ros.camera.prior import Prior
@@ -18,6 +18,8 @@ from dashcalib_ros.reconstruction.scene import Scene
 
 # no lens has a coefficient beyond this: the scene has diverged
 MAX_DISTORTION = 1.0
+# cosine (88 degrees): COLMAP's fisheye models project nothing from beside or behind the camera
+IN_FRONT = 0.035
 
 
 @dataclass(frozen=True)
@@ -35,15 +37,17 @@ def adjust_step1(scenes: Sequence[Scene], camera: Camera, solver: Solver,
     """Adjust with one focal length and the distortion, the centre fixed (paper, 3.2, step 1).
 
     focal_range: px, lowest and highest focal length; None holds the focal length, for one point of
-    its profile. Coefficients that the model's step 1 does not have stay 0.
+    its profile. Coefficients that the model's step 1 does not have stay as they are, which is
+    right only where they are 0; adjust_distortion() is for the others.
     """
     model = camera.step1
+    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
     reconstruction = _reconstruction(scenes, camera, model)
     adjuster = _adjuster(reconstruction, solver, refine_focal=focal_range is not None,
                          refine_centre=False)
     values = reconstruction.cameras[1].params
     if not adjuster.problem.has_parameter_block(values):
-        return list(scenes), camera  # there are no observations
+        return _with_used(scenes, all_used), camera  # there are no observations
     if focal_range is not None:
         _bound(adjuster.problem, values, model.places[0], *focal_range)
     for place in model.places[4:]:
@@ -52,7 +56,29 @@ def adjust_step1(scenes: Sequence[Scene], camera: Camera, solver: Solver,
     found = model.params(reconstruction.cameras[1].params)
     # the conversion from COLMAP's pixels rounds: keep the centre exact
     found[2:4] = camera.params[2:4]
-    return _updated(scenes, reconstruction), _completed(camera, found)
+    return _with_used(_updated(scenes, reconstruction), all_used), _completed(camera, found)
+
+
+def adjust_distortion(scenes: Sequence[Scene], camera: Camera, solver: Solver
+                      ) -> tuple[list[Scene], Camera]:
+    """Adjust the distortion, with all coefficients; the focal lengths and the centre are held."""
+    if len(camera.step1.places) == len(camera.names()):
+        return adjust_step1(scenes, camera, solver, None)
+    model = camera.step2
+    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
+    reconstruction = _reconstruction(scenes, camera, model)
+    adjuster = _adjuster(reconstruction, solver, refine_focal=False, refine_centre=False)
+    values, problem = reconstruction.cameras[1].params, adjuster.problem
+    if not problem.has_parameter_block(values):
+        return _with_used(scenes, all_used), camera
+    problem.set_manifold(values, pyceres.SubsetManifold(
+        model.size, sorted({*model.held, *model.places[:4]})))
+    for place in model.places[4:]:
+        _bound(problem, values, place, -MAX_DISTORTION, MAX_DISTORTION)
+    adjuster.solve()
+    found = model.params(reconstruction.cameras[1].params)
+    found[:4] = camera.params[:4]
+    return _with_used(_updated(scenes, reconstruction), all_used), camera.with_params(found)
 
 
 def adjust_step2(scenes: Sequence[Scene], camera: Camera, solver: Solver, prior: Prior,
@@ -63,12 +89,13 @@ def adjust_step2(scenes: Sequence[Scene], camera: Camera, solver: Solver, prior:
     """
     model = camera.step2
     places = list(model.places)
+    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
     reconstruction = _reconstruction(scenes, camera, model)
     adjuster = _adjuster(reconstruction, solver, refine_focal=True, refine_centre=True)
     values = reconstruction.cameras[1].params
     problem = adjuster.problem
     if not problem.has_parameter_block(values):
-        return list(scenes), camera
+        return _with_used(scenes, all_used), camera
     if model.held:
         problem.set_manifold(values, pyceres.SubsetManifold(model.size, model.held))
     low, high = (model.values(bound) for bound in bounds)
@@ -80,8 +107,31 @@ def adjust_step2(scenes: Sequence[Scene], camera: Camera, solver: Solver, prior:
         pyceres.factors.NormalPrior(model.values(prior.mean), covariance),
         pyceres.TrivialLoss(), [values])
     adjuster.solve()
-    return (_updated(scenes, reconstruction),
+    return (_with_used(_updated(scenes, reconstruction), all_used),
             camera.with_params(model.params(reconstruction.cameras[1].params)))
+
+
+def _in_front(scenes: Sequence[Scene]) -> list[Scene]:
+    """Return the scenes with those observations only that COLMAP can adjust.
+
+    Points that are left with fewer than two do not move; they are triangulated anew afterwards.
+    """
+    found = []
+    for scene in scenes:
+        structure = scene.structure
+        local = (structure.points @ structure.rotations.transpose(0, 2, 1)
+                 + structure.translations[:, None])
+        ahead = local[:, :, 2] > IN_FRONT * np.linalg.norm(local, axis=2)
+        used = structure.used & ahead
+        used &= used.sum(axis=0) >= 2
+        found.append(replace(scene, structure=replace(structure, used=used)))
+    return found
+
+
+def _with_used(scenes: Sequence[Scene], all_used: Sequence[Mask]) -> list[Scene]:
+    """Return the scenes with their observations as they were before _in_front()."""
+    return [replace(scene, structure=replace(scene.structure, used=used))
+            for scene, used in zip(scenes, all_used, strict=True)]
 
 
 def _completed(camera: Camera, found: Floats) -> Camera:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from dashcalib_ros.arrays import Mask
-from dashcalib_ros.camera import Camera, model_named
+from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1
 from dashcalib_ros.reconstruction.chain import chain
@@ -27,10 +27,8 @@ from dashcalib_ros.reconstruction.scene import (
 from dashcalib_ros.reconstruction.tracks import Tracks, thinned, track_turn
 from dashcalib_ros.turns.turn import Turn, TurnId
 
-# focal length / width: 0.256 is 126 degrees across, 1.91 is 29
-RATIOS = tuple(0.256 * 1.25**n for n in range(10))
-# which of them are tried first; the neighbours of the best follow
-COARSE = (1, 3, 5, 7, 9)
+# focal length / width; a lens that seems longer is no fisheye: 90 degrees across, or less
+WIDE = 0.5
 # how often a chain that does not reach all images is built anew, at the most
 COMPLETIONS = 2
 # relative change of the cost that ends an adjustment, where another follows
@@ -47,11 +45,25 @@ def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft 
     tracks, settings = track_turn(turn, config.tracks, valid), config.scene
     if tracks.xy.shape[1] < settings.min_tracks or len(tracks.frames) < settings.min_images:
         return None
-    trials = _trials(tracks, turn, config)
-    if not trials:
+    found: list[tuple[Profile, Camera]] = []
+    for model in searched(config.model):
+        if found and not _may_be_another(found[0][0], settings):
+            break
+        trials = _trials(tracks, turn, config, model)
+        if trials:
+            profile = _profile_of(trials)
+            found.append((profile, trials[profile.best].camera))
+    if not found:
         return None
-    profile = _profile_of(trials)
-    return Draft(thinned(tracks, settings.keyframes), profile, trials[profile.best].camera)
+    # min() returns the first one of equals: the simplest
+    best = min(found, key=lambda each: float(each[0].costs.min()))
+    return Draft(thinned(tracks, settings.keyframes), *best,
+                 {camera.ros_model: profile for profile, camera in found})
+
+
+def _may_be_another(profile: Profile, config: SceneConfig) -> bool:
+    """Return whether a pinhole's profile leaves it open that the lens is a fisheye."""
+    return profile.best < WIDE or float(profile.costs.min()) > config.good_cost
 
 
 def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
@@ -68,11 +80,12 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
     if scene is None:
         return None
     # the minimum of the profile lies between the grid's neighbours of the start
+    scene = replace(scene, rivals=draft.rivals)
     reach = (start.fx / 1.3, start.fx * 1.3)
     scene = _refined(scene, settings, reach, tolerance=ROUGH)
     by_index = {frame.index: frame.image for frame in turn.frames}
     images = [by_index[int(index)] for index in scene.tracks.frames]
-    registered = register_tracks(scene.tracks, scene.structure, images,
+    registered = register_tracks(scene.tracks, scene.structure, scene.camera, images,
                                  settings.patch_half_window, settings.max_shift_px)
     scene = retriangulated(replace(scene, tracks=registered), scene.camera,
                            settings.error_px, settings.min_angle_deg)
@@ -100,7 +113,8 @@ def _refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | Non
     return scene
 
 
-def _trials(tracks: Tracks, turn: Turn, config: Config) -> dict[float, Scene]:
+def _trials(tracks: Tracks, turn: Turn, config: Config, model: type[Camera]
+            ) -> dict[float, Scene]:
     """Return the best scene for each focal length held fixed; none for one without a scene.
 
     In most turns the longest tracks chain best. If no focal length explains much with them, tracks
@@ -108,9 +122,9 @@ def _trials(tracks: Tracks, turn: Turn, config: Config) -> dict[float, Scene]:
     """
     settings = config.scene
     few = thinned(tracks, settings.profile_keyframes)
-    trials = _profile_trials(_longest(few, settings.profile_tracks), turn, config)
+    trials = _profile_trials(_longest(few, settings.profile_tracks), turn, config, model)
     if not trials or min(map(_cost_of, trials.values())) > settings.good_cost:
-        others = _profile_trials(_spread(few, settings.profile_tracks), turn, config)
+        others = _profile_trials(_spread(few, settings.profile_tracks), turn, config, model)
         for ratio, scene in others.items():
             trials[ratio] = min(trials.get(ratio, scene), scene, key=_cost_of)
     return trials
@@ -120,28 +134,29 @@ def _cost_of(scene: Scene) -> float:
     return float(scene.profile.costs[0])
 
 
-def _profile_trials(tracks: Tracks, turn: Turn, config: Config) -> dict[float, Scene]:
-    """Return the scenes at focal lengths held fixed: the coarse grid, then around its best."""
-    model, settings, seed = model_named(config.model), config.scene, config.seed
+def _profile_trials(tracks: Tracks, turn: Turn, config: Config, model: type[Camera]
+                    ) -> dict[float, Scene]:
+    """Return the scenes at focal lengths held fixed: every second one, then around the best."""
+    settings, seed, ratios = config.scene, config.seed, model.focal_ratios
     trials: dict[float, Scene] = {}
     tried: set[int] = set()
 
     def attempt(n: int) -> None:
-        if n in tried or not 0 <= n < len(RATIOS):
+        if n in tried or not 0 <= n < len(ratios):
             return
         tried.add(n)
-        camera = model.centred(tracks.image_size, RATIOS[n] * tracks.image_size[0])
+        camera = model.centred(tracks.image_size, ratios[n] * tracks.image_size[0])
         scene = chain_scene(tracks, turn.id, camera, _NO_PROFILE, settings, seed)
         if scene is not None:
             scene = _completed(_refined(scene, settings, None, tolerance=ROUGH), settings, seed)
             cost = truncated_cost(scene, scene.camera, settings.error_px)
-            trials[RATIOS[n]] = replace(scene, profile=Profile(
-                np.array([RATIOS[n]]), np.array([cost]), int(tracks.seen.sum())))
+            trials[ratios[n]] = replace(scene, profile=Profile(
+                np.array([ratios[n]]), np.array([cost]), int(tracks.seen.sum())))
 
-    for n in COARSE:
+    for n in range(1, len(ratios), 2):
         attempt(n)
     if trials:
-        best = RATIOS.index(_profile_of(trials).best)
+        best = ratios.index(_profile_of(trials).best)
         attempt(best - 1)
         attempt(best + 1)
         # if one of them is the new best, its other neighbour is on the coarse grid

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
+from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruction.structure import Structure
 from dashcalib_ros.reconstruction.tracks import Tracks
 
@@ -27,15 +28,16 @@ MIN_CORRELATION = 0.85
 SETTLED_PX = 0.01
 
 
-def register_tracks(tracks: Tracks, structure: Structure, images: Sequence[GreyImage],
-                    half_window: int, max_shift_px: float) -> Tracks:
+def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
+                    images: Sequence[GreyImage], half_window: int, max_shift_px: float
+                    ) -> Tracks:
     """Return the tracks with every used observation registered against its track's reference.
 
     images: the keyframes' pictures. half_window: px; patches are (2 half_window + 1) wide.
     max_shift_px: an observation that moves farther than this, or whose patch does not look like
     the reference, is dropped.
     """
-    depth = _depths(structure)
+    depth = _depths(structure, camera)
     reference = _reference_rows(structure.used, depth)
     smooth = [cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32) for image in images]
     step = np.arange(-half_window, half_window + 1, dtype=np.float32)
@@ -57,10 +59,10 @@ def register_tracks(tracks: Tracks, structure: Structure, images: Sequence[GreyI
     return replace(tracks, xy=xy)
 
 
-def _depths(structure: Structure) -> Floats:
+def _depths(structure: Structure, camera: Camera) -> Floats:
     """Return (k, t) depths of the points in each image; 0 where not registered or behind."""
-    depth = (np.einsum('kj,tj->kt', structure.rotations[:, 2], structure.points)
-             + structure.translations[:, 2:])
+    depth = camera.depths(structure.points @ structure.rotations.transpose(0, 2, 1)
+                          + structure.translations[:, None])
     return np.asarray(np.where(structure.registered[:, None], np.maximum(depth, 0.0), 0.0))
 
 

@@ -1,7 +1,8 @@
 """A reconstructed turn: its tracks, structure, camera and focal profile."""
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -32,22 +33,35 @@ class Profile:
 
 @dataclass(frozen=True)
 class Draft:
-    """A turn half reconstructed: its tracks, its focal profile, and the camera to start from."""
+    """A turn half reconstructed: its tracks, its focal profile, and the camera to start from.
+
+    rivals: the profiles of other kinds of lenses that were tried, by their ros_model.
+    """
 
     tracks: Tracks
     profile: Profile
     start: Camera
+    rivals: Mapping[str, Profile] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One turn, reconstructed: its tracks, the structure that explains them, and its profile."""
+    """One turn, reconstructed: its tracks, the structure that explains them, and its profile.
+
+    profile: of the camera's kind of lens. rivals: those of other kinds, by their ros_model.
+    """
 
     turn: TurnId
     tracks: Tracks
     structure: Structure
     camera: Camera
     profile: Profile
+    rivals: Mapping[str, Profile] = field(default_factory=dict)
+
+    @property
+    def profiles(self) -> dict[str, Profile]:
+        """Return the profiles of all kinds of lenses that were tried, by their ros_model."""
+        return {**self.rivals, self.camera.ros_model: self.profile}
 
     @property
     def yaw_deg(self) -> float:

@@ -1,4 +1,5 @@
 """calibration.yaml, result.json, report.html; comparisons; what a terminal shows: tables.py."""
+from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.report.camera_file import load_camera
 from dashcalib_ros.report.camera_yaml import calibration_yaml, load_calibration_yaml
 from dashcalib_ros.report.compare import Comparison, Difference, compare
@@ -11,7 +12,6 @@ from dashcalib_ros.report.files import (
     write_results,
     write_text,
 )
-from dashcalib_ros.report.mapping import mapping_error
 from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.result import load_result, result_dict, result_json

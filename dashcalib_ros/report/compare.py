@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.report.mapping import mapping_error
 from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.result import plain_values
 

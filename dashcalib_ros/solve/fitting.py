@@ -8,7 +8,7 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1
+from dashcalib_ros.reconstruction.adjust import Solver, adjust_distortion
 from dashcalib_ros.reconstruction.build import chain_scene
 from dashcalib_ros.reconstruction.scene import Scene, retriangulated, truncated_cost
 from dashcalib_ros.solve.misfit import misfits
@@ -51,8 +51,9 @@ def with_poses_of(scene: Scene, part: Scene) -> Scene:
 
 
 def adapted_to(scene: Scene, camera: Camera, config: Config) -> Scene:
-    """Return the scene with this camera, chained anew if its focal length was far from it."""
-    if abs(np.log(scene.camera.fx / camera.fx)) > np.log(1.08):
+    """Return the scene with this camera, chained anew if its own camera was far from it."""
+    far = abs(np.log(scene.camera.fx / camera.fx)) > np.log(1.08)
+    if far or scene.camera.ros_model != camera.ros_model:
         anew = rechain(scene, camera, config)
         if anew is not None:
             return anew
@@ -105,5 +106,5 @@ def _readjusted(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
     """Return the scene adjusted to a camera that is nearly right."""
     # the focal length is held; the distortion that is found is not used
     solver = Solver(0.01 * camera.image_size[0], config.iterations)
-    [moved], _ = adjust_step1([retriangulate(scene, camera, config)], camera, solver, None)
+    [moved], _ = adjust_distortion([retriangulate(scene, camera, config)], camera, solver)
     return retriangulate(moved, camera, config)

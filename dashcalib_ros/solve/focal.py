@@ -7,7 +7,7 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1
+from dashcalib_ros.reconstruction.adjust import Solver, adjust_distortion
 from dashcalib_ros.reconstruction.scene import Profile, Scene, truncated_cost
 from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
 
@@ -29,6 +29,11 @@ def summed(profiles: Sequence[Profile]) -> Profile:
             np.log(ratios), np.log(profile.ratios), profile.costs)
     observations = sum(profile.observations for profile in profiles)
     return Profile(ratios, total / observations, observations)
+
+
+def kinds_of_lenses(scenes: Sequence[Scene]) -> list[str]:
+    """Return the ros_models of the cameras by which the scenes were reconstructed."""
+    return list(dict.fromkeys(scene.camera.ros_model for scene in scenes))
 
 
 def nearest_start(scenes: Sequence[Scene], profile: Profile) -> Camera:
@@ -75,7 +80,7 @@ def _held_cost(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> 
     costs = [cost(moved, camera)]
     # the first residuals are large: the loss must be as wide, or it ignores them
     for loss_px in (0.01 * camera.image_size[0], config.loss_px, config.loss_px):
-        moved, camera = adjust_step1(moved, camera, Solver(loss_px, config.iterations), None)
+        moved, camera = adjust_distortion(moved, camera, Solver(loss_px, config.iterations))
         moved = [retriangulate(scene, camera, config) for scene in moved]
         costs.append(cost(moved, camera))
     return min(costs)

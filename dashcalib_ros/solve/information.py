@@ -176,7 +176,7 @@ class Pooled:
     """All turns' information about the p parameters that are free, at unit noise.
 
     hessians: (n, p, p), scores: (n, p) of the n turns. inverse: (p, p) of the sum of the hessians
-    and the prior. clustered: (p,) variances that treat each track as one measurement.
+    and the prior. clustered: (p, p) covariance that treats each track as one measurement.
     """
 
     hessians: Floats
@@ -199,7 +199,7 @@ def pooled(parts: Sequence[Information], prior: Floats) -> Pooled:
     inverse = np.linalg.inv(total)
     by_track = np.sum([part.by_track[block] for part in parts], axis=0) / noise**2
     return Pooled(hessians, np.array([part.score[free] for part in parts]) / noise,
-                  np.asarray(inverse), np.diag(inverse @ by_track @ inverse))
+                  np.asarray(inverse), np.asarray(inverse @ by_track @ inverse))
 
 
 def covariance(parts: Sequence[Information], prior: Floats, extra_sigma: Floats) -> Floats:
@@ -211,7 +211,7 @@ def covariance(parts: Sequence[Information], prior: Floats, extra_sigma: Floats)
     """
     together = pooled(parts, prior)
     inverse = together.inverse
-    estimates = [np.diag(inverse), together.clustered]
+    estimates = [np.diag(inverse), np.diag(together.clustered)]
     if len(parts) > 1:
         estimates.append(between_turns(together.hessians, together.scores, inverse))
     # rounding can make a variance negative where there is no information

@@ -6,10 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera import AUTO, Camera, Fisheye, Radial
+from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1, adjust_step2
 from dashcalib_ros.reconstruction.scene import Profile, Scene
+from dashcalib_ros.solve.choice import (
+    Candidate,
+    gain_of_wider_model,
+    held_out_costs,
+    is_clear,
+    track_inflation,
+)
 from dashcalib_ros.solve.fitting import (
     adapted_to,
     explained_by,
@@ -18,12 +26,22 @@ from dashcalib_ros.solve.fitting import (
     with_better_poses,
     with_poses_of,
 )
-from dashcalib_ros.solve.focal import nearest_start, profile_around, summed
-from dashcalib_ros.solve.information import covariance, information, noise_in
+from dashcalib_ros.solve.focal import kinds_of_lenses, nearest_start, profile_around, summed
+from dashcalib_ros.solve.information import (
+    Information,
+    covariance,
+    information,
+    noise_in,
+    noise_of,
+    pooled,
+    step_to_wider_model,
+)
 from dashcalib_ros.solve.misfit import misfits
+from dashcalib_ros.solve.picture import PictureSigma, picture_sigma
 from dashcalib_ros.solve.prior import (
     bounds_of,
     extra_sigma_of,
+    floor_of,
     loss_px_of,
     prior_information,
     prior_of,
@@ -46,30 +64,166 @@ class _Fit:
     readout_s: float = 0.0
 
 
+@dataclass(frozen=True)
+class _Result:
+    """A fit at its end, what the priors come from, and what each turn says of the lens."""
+
+    fit: _Fit
+    step1: Camera
+    parts: tuple[Information, ...]
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A kind of lens after the first steps. full_scenes: the turns with all their tracks."""
+
+    result: _Result
+    full_scenes: ByTurn
+    profile: Profile
+
+
 def solve(separate: Sequence[Scene], config: Config,
           progress: Progress = lambda stage, done: None) -> Solution | None:
     """Adjust all scenes with one shared camera; None if the shared camera explains none of them.
 
     separate: at least one scene, each as its turn was reconstructed. The minimum of the summed
-    focal profile is the start; a scene with a focal length far from it is chained anew, and one
-    that the shared camera does not explain is dropped.
+    focal profile is the start; a scene with a camera far from it is chained anew, and one that the
+    shared camera does not explain is dropped. Where turns may be of two kinds of lenses, both are
+    tried with a part of the tracks. Where the better one leaves something, larger models are
+    tried, too.
     """
-    profile = summed([scene.profile for scene in separate])
-    start = nearest_start(separate, profile)
+    begun = [found for kind in kinds_of_lenses(separate)
+             if (found := _begun(kind, separate, config, progress)) is not None]
+    if not begun:
+        return None
+    roughly, tried = _chosen([each.result for each in begun], config)
+    start = next(each for each in begun if each.result is roughly)
+    complete = _with_all_tracks(roughly.fit, start.full_scenes, separate, config)
+    if not complete.scenes:
+        return None
+    final = _step2(complete, start.full_scenes, roughly.step1, config, progress)
+    result = _Result(final, roughly.step1, _parts(final))
+    if config.model == AUTO:
+        progress('model of the lens', 0.0)
+        result, others = _chosen(_tried(result, start.full_scenes, config), config)
+        tried = _merged(tried, others)
+    progress('focal profile', 0.0)
+    around = profile_around(result.fit.scenes, result.fit.camera, start.profile, config)
+    progress('sigma', 0.0)
+    return _solution(result, separate, (start.profile, around), tried, config)
+
+
+def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progress
+           ) -> _Begun | None:
+    """Return the first steps for one kind of lens, with a part of the tracks.
+
+    None where the shared camera explains none of the scenes.
+    """
+    profile = summed([scene.profiles[kind] for scene in separate if kind in scene.profiles])
+    start = nearest_start([scene for scene in separate if scene.camera.ros_model == kind], profile)
     full_scenes = {scene.turn: adapted_to(scene, start, config) for scene in separate}
     first = _step1(full_scenes, start, config, progress)
     if not first.scenes:
         return None
     progress('step 2: all parameters', 0.0)
     rough = _step2_roughly(first, config)
-    complete = _with_all_tracks(rough, full_scenes, separate, config)
-    if not complete.scenes:
+    return _Begun(_Result(rough, first.camera, _parts(rough)), full_scenes, profile)
+
+
+def _merged(first: Sequence[Candidate], later: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Return all candidates, the later figure of those that are in both."""
+    found = {each.model: each for each in (*first, *later)}
+    return tuple(found.values()) if len(found) > 1 else ()
+
+
+def _parts(fit: _Fit) -> tuple[Information, ...]:
+    return tuple(information(scene, fit.camera, fit.solver.loss_px,
+                             row_shift(scene, fit.camera) if fit.readout_s else None)
+                 for scene in fit.scenes)
+
+
+def _tried(first: _Result, full_scenes: ByTurn, config: Config) -> list[_Result]:
+    """Return the result, and those of other models that may explain what it leaves over."""
+    results = [first]
+    if len(first.parts) < 2:
+        return results
+
+    def attempt(model: type[Camera]) -> None:
+        if not any(type(result.fit.camera) is model for result in results):
+            result = _refitted(first, model, full_scenes, config)
+            results.extend([result] if result is not None else [])
+
+    camera = first.fit.camera
+    if isinstance(camera, Radial) and _leaves_something(first, config):
+        attempt(type(camera.widened()))
+        attempt(Fisheye)
+    return results
+
+
+def _leaves_something(result: _Result, config: Config) -> bool:
+    """Return whether the wider model would foretell the turns clearly better."""
+    prior = prior_information(result.step1, config.intrinsics)
+    gains = gain_of_wider_model(result.parts, prior, extra_sigma_of(result.fit.camera))
+    return is_clear(gains / track_inflation(pooled(result.parts, prior)),
+                    config.intrinsics.least_gain)
+
+
+def _refitted(first: _Result, model: type[Camera], full_scenes: ByTurn, config: Config
+              ) -> _Result | None:
+    """Return the result with another model, None where it does not explain all turns."""
+    camera = as_model(first.fit.camera, model)
+    step1 = camera
+    if model.ros_model == first.step1.ros_model:
+        step1 = model.centred(camera.image_size, first.step1.fx, *first.step1.params[4:])
+    scenes = retriangulate_all(first.fit.scenes, camera, config.scene)
+    if len(scenes) < len(first.fit.scenes):
         return None
-    final = _step2(complete, full_scenes, first.camera, config, progress)
-    progress('focal profile', 0.0)
-    around = profile_around(final.scenes, final.camera, profile, config)
-    progress('sigma', 0.0)
-    return _solution(final, first.camera, separate, (profile, around), config)
+    fit = _step2(replace(first.fit, scenes=scenes, camera=camera), full_scenes, step1, config)
+    return _Result(fit, step1, _parts(fit)) if len(fit.scenes) == len(first.fit.scenes) else None
+
+
+def _chosen(results: Sequence[_Result], config: Config) -> tuple[_Result, tuple[Candidate, ...]]:
+    """Return the result whose model foretells the turns best, and how the others compare.
+
+    The simplest comes first; one with more parameters must be clearly better, and map rays
+    differently by more than its sigma.
+    """
+    results = sorted(results, key=lambda result: len(result.fit.camera.names()))
+    loss_px = min(result.fit.solver.loss_px for result in results)
+    costs = [held_out_costs(
+        result.fit.scenes, result.fit.camera, result.parts,
+        prior_information(result.step1, config.intrinsics), loss_px, config.scene.error_px)
+        for result in results]
+    noise = min(noise_of(result.parts) for result in results)
+    inflation = min(track_inflation(pooled(result.parts, prior_information(
+        result.step1, config.intrinsics))) for result in results)
+    # a turn that a camera does not explain at all counts against it
+    worst = {turn: max(cost.get(turn, 0.0) for cost in costs) for cost in costs for turn in cost}
+    gains = [{turn: (worst[turn] - cost.get(turn, 2 * worst[turn])) / noise / inflation
+              for turn in worst} for cost in costs]
+    best = 0
+    for n in range(1, len(results)):
+        clear = is_clear(np.array([gains[n][turn] - gains[best][turn] for turn in worst]),
+                         config.intrinsics.least_gain)
+        if clear and not _alike(results[n], results[best], config):
+            best = n
+    chosen = results[best]
+    return chosen, tuple(Candidate(
+        result.fit.camera.model, sum(gains[best].values()) - sum(gains[n].values()),
+        mapping_error(result.fit.camera, chosen.fit.camera))
+        for n, result in enumerate(results))
+
+
+def _alike(larger: _Result, simpler: _Result, config: Config) -> bool:
+    """Return whether two models map rays alike, as far as the turns can tell."""
+    apart = mapping_error(larger.fit.camera, simpler.fit.camera)
+    return apart is not None and apart < _picture_sigma(larger, config).rms
+
+
+def _picture_sigma(result: _Result, config: Config) -> PictureSigma:
+    camera, prior = result.fit.camera, prior_information(result.step1, config.intrinsics)
+    return picture_sigma(camera, result.parts, prior, floor_of(camera, config.intrinsics),
+                         step_to_wider_model(result.parts, prior, extra_sigma_of(camera)))
 
 
 def _step1(full_scenes: ByTurn, start: Camera, config: Config, progress: Progress) -> _Fit:
@@ -132,8 +286,8 @@ def _with_all_tracks(rough: _Fit, full_scenes: ByTurn, separate: Sequence[Scene]
     return replace(rough, scenes=with_better_poses(scenes, separate, camera, config.scene))
 
 
-def _step2(complete: _Fit, full_scenes: ByTurn, step1: Camera, config: Config, progress: Progress
-           ) -> _Fit:
+def _step2(complete: _Fit, full_scenes: ByTurn, step1: Camera, config: Config,
+           progress: Progress = lambda stage, done: None) -> _Fit:
     """Return the scenes adjusted with all parameters, within bounds and priors from step 1."""
     settings = config.intrinsics
     fit, bounds = complete, bounds_of(step1, settings)
@@ -180,23 +334,20 @@ def _changed(before: _Fit, after: _Fit) -> float:
     return changed / sum(int(scene.structure.used.sum()) for scene in before.scenes)
 
 
-def _solution(final: _Fit, step1: Camera, separate: Sequence[Scene],
-           profiles: tuple[Profile, Profile], config: Config) -> Solution:
+def _solution(result: _Result, separate: Sequence[Scene], profiles: tuple[Profile, Profile],
+              tried: tuple[Candidate, ...], config: Config) -> Solution:
     """Return the solution with its covariance. profiles: the coarse one, and that around it."""
     settings = config.intrinsics
+    final, step1, parts = result.fit, result.step1, result.parts
     scenes, camera, readout_s = final.scenes, final.camera, final.readout_s
-    parts = tuple(information(scene, camera, final.solver.loss_px,
-                              row_shift(scene, camera) if readout_s else None)
-                  for scene in scenes)
     prior = prior_information(step1, settings)
     count = len(prior)
     spread = covariance(parts, prior, extra_sigma_of(camera))
-    floor = np.zeros(count)
-    floor[:2] = settings.focal_floor * camera.fx
-    floor[2:4] = settings.centre_floor * camera.image_size[0]
+    floor = floor_of(camera, settings)
     return Solution(
         camera=camera, covariance=spread[:count, :count] + np.diag(floor**2), step1=step1,
         scenes=tuple(scenes), parts=parts, coarse=profiles[0], around=profiles[1],
         bounds=np.array(bounds_of(step1, settings)), prior_information=prior, readout_s=readout_s,
         readout_sigma_s=float(np.sqrt(spread[count, count])) if readout_s else 0.0,
-        misfits=misfits(separate, scenes, camera, config.scene.error_px))
+        misfits=misfits(separate, scenes, camera, config.scene.error_px), tried=tried,
+        picture=_picture_sigma(result, config))

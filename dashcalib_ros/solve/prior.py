@@ -55,6 +55,14 @@ def extra_sigma_of(camera: Camera) -> Floats:
     return np.array(camera.widened().spread[len(camera.spread):])
 
 
+def floor_of(camera: Camera, config: IntrinsicsConfig) -> Floats:
+    """Return the sigmas (n,) of systematic errors, which no number of turns averages out."""
+    floor = np.zeros(len(camera.names()))
+    floor[:2] = config.focal_floor * camera.fx
+    floor[2:4] = config.centre_floor * camera.image_size[0]
+    return floor
+
+
 def loss_px_of(scenes: Sequence[Scene], camera: Camera, config: IntrinsicsConfig) -> float:
     """Return the scale of the Cauchy loss: config.loss times the median residual, px."""
     errors = np.concatenate([errors_px(scene, camera)[scene.structure.used] for scene in scenes])

@@ -66,7 +66,7 @@ def readout(scenes: Sequence[Scene], camera: Camera, loss_px: float, prior: Floa
     # the camera is at its optimum: only the readout has a gradient
     variance = together.inverse[-1, -1]
     seconds = variance * together.scores[:, -1].sum()
-    return float(seconds), float(np.sqrt(max(variance, together.clustered[-1])))
+    return float(seconds), float(np.sqrt(max(variance, together.clustered[-1, -1])))
 
 
 def remove_rolling_shutter(scene: Scene, measured: Scene, camera: Camera, readout_s: float

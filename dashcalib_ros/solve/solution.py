@@ -9,7 +9,9 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruction.scene import Profile, Scene, errors_px
+from dashcalib_ros.solve.choice import Candidate
 from dashcalib_ros.solve.information import Information, step_to_wider_model
+from dashcalib_ros.solve.picture import PictureSigma
 from dashcalib_ros.solve.prior import extra_sigma_of
 from dashcalib_ros.turns.turn import TurnId
 
@@ -26,7 +28,8 @@ class Solution:
     readout_s: from the first row to the last of a rolling shutter whose effect was removed from
     the scenes' tracks; 0 for a global one. readout_sigma_s: its standard deviation.
     misfits: of every turn that was given: the ratio of its cost with this camera to its cost
-    with its own camera.
+    with its own camera. tried: the models that were compared, the simplest first; empty where
+    the first one left nothing to explain. picture: the sigma over the picture.
     """
 
     camera: Camera
@@ -41,6 +44,8 @@ class Solution:
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     misfits: Mapping[TurnId, float] = field(default_factory=dict)
+    tried: tuple[Candidate, ...] = ()
+    picture: PictureSigma | None = None
 
     @property
     def sigma(self) -> Floats:

@@ -1,0 +1,95 @@
+"""Cameras compared by what they do: where in the picture they see the same viewing rays.
+
+Parameters of a camera, and all the more of two models, may differ much and map rays alike. What
+counts is the distance in the picture, after the best common rotation of the rays: a rotation of the
+camera cannot be told from one of its mounting (Hagemann et al.).
+"""
+from __future__ import annotations
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera.camera import Camera
+
+# columns, rows: enough for a smooth field, and as in the benchmarks
+GRID = (25, 15)
+# px; where a camera that is fitted does not see a ray, that counts as this
+UNSEEN_PX = 100.0
+
+
+def grid_of(camera: Camera) -> Floats:
+    """Return (n, 2) pixels spread over the picture."""
+    width, height = camera.image_size
+    u, v = np.meshgrid(np.linspace(0, width - 1, GRID[0]), np.linspace(0, height - 1, GRID[1]))
+    return np.stack([u.ravel(), v.ravel()], -1)
+
+
+def mapping_error(camera: Camera, reference: Camera) -> float | None:
+    """Return the RMS pixel distance between both cameras' images of the same rays.
+
+    The rays are those of a grid over the reference's image. None when the reference has no ray for
+    a pixel of the grid, or the camera cannot see one of the rays.
+    """
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    pixels = grid_of(reference)
+    rays = reference.rays(pixels)
+    if not np.isfinite(rays).all():
+        return None
+
+    def residual(rotation: Floats) -> Floats:
+        return (camera.project(Rotation.from_rotvec(rotation).apply(rays)) - pixels).ravel()
+
+    with np.errstate(all='ignore'):
+        if not np.isfinite(residual(np.zeros(3))).all():
+            return None
+        try:
+            rest = least_squares(residual, np.zeros(3)).fun
+        except ValueError:  # a ray left the camera's view on the way
+            return None
+    return float(np.sqrt(np.mean(np.sum(rest.reshape(-1, 2)**2, -1))))
+
+
+def sensitivity(camera: Camera) -> tuple[Floats, Floats]:
+    """Return by how much parameters move the picture, the best common rotation removed.
+
+    (m, 2, n) derivatives of the pixels of m viewing rays by the n parameters, and the rays'
+    pixels (m, 2): those of a grid over the picture for which the camera has a ray.
+    """
+    pixels = grid_of(camera)
+    rays = camera.rays(pixels)
+    known = np.isfinite(rays[:, 0])
+    pixels, rays = pixels[known], rays[known]
+    by_params, by_point, _ = camera.derivatives(rays)
+    x, y, z = rays.T
+    zero = np.zeros_like(x)
+    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+    by_rotation = (by_point @ turned).reshape(-1, 3)
+    flat = by_params.reshape(-1, by_params.shape[2])
+    rotation, *_ = np.linalg.lstsq(by_rotation, flat, rcond=None)
+    return (flat - by_rotation @ rotation).reshape(by_params.shape), pixels
+
+
+def as_model(camera: Camera, model: type[Camera]) -> Camera:
+    """Return the camera of another model that maps rays most alike; fitted, not exact."""
+    from scipy.optimize import least_squares
+    pixels = grid_of(camera)
+    rays = camera.rays(pixels)
+    known = np.isfinite(rays[:, 0])
+    pixels, rays = pixels[known], rays[known]
+    start = model.centred(camera.image_size, camera.fx).params
+    start[:4] = camera.params[:4]
+    if model.ros_model == camera.ros_model:
+        shared = min(len(start), len(camera.params))
+        start[4:shared] = camera.params[4:shared]
+    scale = np.ones(len(start))
+    scale[:4] = camera.fx
+
+    def residual(params: Floats) -> Floats:
+        off = model.of(camera.image_size, params * scale).project(rays) - pixels
+        return np.clip(np.nan_to_num(off, nan=UNSEEN_PX), -UNSEEN_PX, UNSEEN_PX).ravel()
+
+    with np.errstate(all='ignore'):
+        found = least_squares(residual, start / scale, loss='soft_l1').x
+    return model.of(camera.image_size, found * scale)
