@@ -6,9 +6,10 @@
 
 Runs every setting (or those named; part of a name will do) with every seed. Rows go to
 DIR/accuracy.json after each drive, and one that is there is not run again (--again: it is);
-DIR/accuracy.md has each drive, each setting, the bars and honesty. --data: a folder with kitti03/
-and carnd/ (bag or video beside a truth.json); kitti03 is seen through other lenses (views.py).
---cache: where rendered pictures are kept, about 100 MB a drive; a second run renders nothing.
+DIR/accuracy.md has each drive, each setting, the bars and honesty. --data: a folder with kitti03/,
+carnd/ and ntu_campus/ (bag, video or images beside a truth.json); kitti03 is seen through other
+lenses, too (views.py). --cache: where rendered pictures are kept, about 100 MB a drive; a second
+run renders nothing.
 """
 from __future__ import annotations
 
@@ -16,12 +17,13 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from drives import BY_NAME, SETTINGS, Pictures, drive_of, pictures_of
 from measure import (
+    ALL_KEYS,
     Outcome,
     calibrate,
     commit,
@@ -30,22 +32,27 @@ from measure import (
     error_cells,
     isolated,
     load,
+    mapping_cell,
     parser_with,
     save,
     summarised,
     table,
 )
 from summary import summary
-from views import BY_VIEW, INEXACT, Viewed, inexact_view, recorded_view
+from views import BY_VIEW, INEXACT, SMALL, Viewed, inexact_view, recorded_view, small_view
+from wide import WIDE, wide_drive_of
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.report import calibrated_camera, compare, load_camera
 
-RECORDED = {'kitti03': 'bag', 'carnd': 'drive.mp4'}
+RECORDED = {'kitti03': 'bag', 'carnd': 'drive.mp4', 'ntu_campus': 'images'}
+# images per second, of folders
+FPS = {'ntu_campus': 3.0}
+# what is known of a lens, where that is not all
+KNOWN = {'ntu_campus': ('fx', 'fy')}
 
 
-def rendered(pictures: Pictures, seed: int, truth: Mapping[str, float]) -> dict[str, Any]:
+def rendered(pictures: Pictures, seed: int, truth: Mapping[str, Any]) -> dict[str, Any]:
     """Calibrate a rendered drive (in a process of its own)."""
     return _row(pictures, Config(seed=seed), truth)
 
@@ -57,19 +64,16 @@ def viewed(drive: Viewed, seed: int) -> dict[str, Any]:
 
 def recorded(name: str, data: Path) -> dict[str, Any]:
     """Calibrate a real drive (in a process of its own)."""
-    truth_path = data / name / 'truth.json'
-    truth = {key: value for key, value in json.loads(truth_path.read_text()).items()
-             if not isinstance(value, list)}
-    return _row(open_frames(data / name / RECORDED[name]), Config(), truth, truth_path)
+    truth = {key: value for key, value in json.loads((data / name / 'truth.json').read_text()
+                                                     ).items() if not isinstance(value, list)}
+    return _row(open_frames(data / name / RECORDED[name], fps=FPS.get(name)), Config(), truth,
+                KNOWN.get(name, ALL_KEYS))
 
 
-def _row(frames: Iterable[Frame], config: Config, truth: Mapping[str, float],
-         truth_path: Path | None = None) -> dict[str, Any]:
+def _row(frames: Iterable[Frame], config: Config, truth: Mapping[str, Any],
+         known: Sequence[str] = ALL_KEYS) -> dict[str, Any]:
     result, seconds = calibrate(frames, config)
-    row = summarised(result, truth)
-    if truth_path is not None and result.intrinsics is not None:
-        row['mapping_px'] = compare(calibrated_camera(result), load_camera(truth_path)).mapping_px
-    return row | {'truth': dict(truth), 'seconds': seconds}
+    return summarised(result, truth, known) | {'truth': dict(truth), 'seconds': seconds}
 
 
 def _finished(outcome: Outcome, about: Mapping[str, Any]) -> dict[str, Any]:
@@ -102,21 +106,34 @@ def run_recorded(name: str, data: Path) -> dict[str, Any]:
     return _finished(isolated(viewed, drive, 0), about)
 
 
-def run_inexact(name: str, seed: int, cache: Path) -> dict[str, Any]:
-    """Calibrate a rendered drive whose lens has p1, p2 or k3."""
+def run_viewed(name: str, seed: int, cache: Path) -> dict[str, Any]:
+    """Calibrate a rendered drive whose lens has p1, p2 or k3, or whose pictures are small."""
     about = {'setting': name, 'seed': seed, 'must': 'judge', 'counts': False}
-    return _finished(isolated(viewed, inexact_view(name, seed, cache), seed), about)
+    view = (small_view if name in SMALL else inexact_view)(name, seed, cache)
+    return _finished(isolated(viewed, view, seed), about)
+
+
+def run_wide(name: str, seed: int, cache: Path) -> dict[str, Any]:
+    """Render a drive through a fisheye lens, or take it from the cache, and calibrate it."""
+    drive = wide_drive_of(name, seed)
+    started = time.monotonic()
+    pictures = pictures_of(drive, cache)
+    about = {'setting': name, 'seed': seed, 'must': 'accept', 'counts': False,
+             'true_turns': list(drive.turn_centers),
+             'render_s': round(time.monotonic() - started, 1)}
+    return _finished(isolated(rendered, pictures, seed, drive.truth), about)
 
 
 def drives_table(rows: Iterable[Mapping[str, Any]]) -> str:
     """Return a line for each drive."""
-    head = ['drive', 'seed', 'verdict', 'turns', 'fx %', 'fy %', 'cx %', 'cy %', 'k1 %', 'k2 %',
-            'z of fx', 'worst z', 's', 'MB']
+    head = ['drive', 'seed', 'verdict', 'turns', 'model', 'mapping px', 'fx %', 'fy %', 'cx %',
+            'cy %', 'k1 %', 'k2 %', 'z of fx', 'worst z', 's', 'MB']
     lines = []
     for row in rows:
         z = row.get('z')
         lines.append([
             row['setting'], str(row['seed']), row['verdict'], str(row.get('turns_used', '')),
+            row.get('model', ''), mapping_cell(row),
             *error_cells(row), f'{z["fx"]:+.1f}' if z else '',
             f'{max(map(abs, z.values())):.1f}' if z else '',
             f'{row["seconds"].get("total", 0.0):.0f}', str(row['peak_mb'])])
@@ -125,7 +142,7 @@ def drives_table(rows: Iterable[Mapping[str, Any]]) -> str:
 
 def _chosen(wanted: list[str], data: Path | None) -> list[str]:
     real = [name for name in RECORDED if data is not None and (data / name).is_dir()]
-    names = [*real, *BY_NAME, *INEXACT, *(BY_VIEW if 'kitti03' in real else ())]
+    names = [*real, *BY_NAME, *INEXACT, *WIDE, *SMALL, *(BY_VIEW if 'kitti03' in real else ())]
     for part in wanted:
         if not any(part in name for name in names):
             raise SystemExit(f'no setting has {part!r} in its name; --list shows them all')
@@ -148,7 +165,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.list:
         print('\n'.join([*(f'{setting.name} ({setting.must})' for setting in SETTINGS),
-                         *INEXACT, *BY_VIEW]))
+                         *INEXACT, *(f'{name} (accept)' for name in WIDE), *SMALL,
+                         *BY_VIEW]))
         return
     path = arguments.out / 'accuracy.json'
     rows = load(path)
@@ -165,7 +183,8 @@ def main() -> None:
                     continue
                 cache = arguments.cache or Path(passing) / str(number)
                 row = (run_recorded(name, arguments.data) if _real(name)
-                       else run_inexact(name, seed, cache) if name in INEXACT
+                       else run_wide(name, seed, cache) if name in WIDE
+                       else run_viewed(name, seed, cache) if name in INEXACT or name in SMALL
                        else run_rendered(name, seed, cache))
                 rows[key] = row
                 save(path, rows)
@@ -180,7 +199,7 @@ def main() -> None:
 
 
 def _ordered(rows: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    order = [*RECORDED, *BY_NAME, *INEXACT, *BY_VIEW]
+    order = [*RECORDED, *BY_NAME, *INEXACT, *WIDE, *SMALL, *BY_VIEW]
     known = [row for row in rows.values() if row['setting'] in order]
     return sorted(known, key=lambda row: (order.index(row['setting']), row['seed']))
 

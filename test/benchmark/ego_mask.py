@@ -60,12 +60,11 @@ def calibrated(drive: Drive, frames: Sequence[Frame], hidden: Mask, way: str) ->
             calibrator.push(frame)
         result = calibrator.calibrate()
     left_out = np.zeros(hidden.shape, bool) if result.mask is None else ~result.mask
-    truth = drive.truth
     return {'way': way, 'seconds': round(time.monotonic() - started, 1),
             'mask': {'hidden': hidden.mean(), 'left_out': left_out.mean(),
                      'covered': left_out[hidden].mean(),
                      'too_much': (left_out & ~grown(hidden, drive.lens.width // 50)).mean()},
-            **summarised(result, {key: getattr(truth, key) for key in KEYS})}
+            **summarised(result, drive.truth)}
 
 
 def report(rows: Mapping[str, Mapping[str, Any]]) -> str:

@@ -17,6 +17,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from mapping import is_fisheye, mapping_error, model_of
+
 from dashcalib_ros import Calibrator, Config, stages
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.frames import Frame
@@ -30,6 +32,8 @@ from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ScenePool
 
 KEYS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')
+# of all models; k1 and k2 of a fisheye are not those of the others
+ALL_KEYS = (*KEYS, 'p1', 'p2', 'k3', 'k4')
 FALSE_PERCENT = 3.0
 SAMPLE_S = 0.25
 
@@ -189,38 +193,66 @@ def solved(detection: Detection, scenes: Sequence[Scene], config: Config
     return stages.judge(solution, evidence, config), watch.seconds
 
 
-def errors(estimate: Mapping[str, float], truth: Mapping[str, float],
-           sigma: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """Return error (estimate - truth), percent (absolute, None where the truth is 0) and z."""
-    off = {key: estimate[key] - truth[key] for key in KEYS}
-    found: dict[str, Any] = {
-        'estimate': {key: estimate[key] for key in KEYS}, 'error': off,
-        'percent': {key: 100 * abs(off[key] / truth[key]) if abs(truth[key]) > 1e-9 else None
-                    for key in KEYS}}
+def errors(estimate: Mapping[str, Any], truth: Mapping[str, Any],
+           sigma: Mapping[str, float] | None = None,
+           known: Sequence[str] = ALL_KEYS) -> dict[str, Any]:
+    """Return error (estimate - truth), percent (absolute, None where the truth is 0) and z.
+
+    They are of the parameters that both have, and left out where one is a fisheye and the other
+    is not. known: which of the truth's parameters are good enough to compare with.
+    """
+    found: dict[str, Any] = {'estimate': {key: estimate[key] for key in ALL_KEYS
+                                          if key in estimate}}
     if sigma is not None:
-        found['sigma'] = {key: sigma[key] for key in KEYS}
-        found['z'] = {key: off[key] / sigma[key] for key in KEYS}
+        found['sigma'] = {key: sigma[key] for key in found['estimate'] if key in sigma}
+    if is_fisheye(estimate) != is_fisheye(truth):
+        return found
+    off = {key: value - truth[key] for key, value in found['estimate'].items()
+           if key in truth and key in known}
+    found |= {'error': off,
+              'percent': {key: 100 * abs(value / truth[key]) if abs(truth[key]) > 1e-9 else None
+                          for key, value in off.items()}}
+    if sigma is not None:
+        found['z'] = {key: value / sigma[key] for key, value in off.items() if sigma.get(key)}
     return found
 
 
-def summarised(result: Calibration, truth: Mapping[str, float]) -> dict[str, Any]:
-    """Return a calibration as a row of results."""
+def summarised(result: Calibration, truth: Mapping[str, Any],
+               known: Sequence[str] = ALL_KEYS) -> dict[str, Any]:
+    """Return a calibration as a row of results; known: see errors()."""
     row: dict[str, Any] = {
         'verdict': result.verdict.level, 'reasons': list(result.verdict.reasons),
         'frames': result.frames, 'turns_used': sum(turn.used for turn in result.turns),
         'turns': [[turn.center, turn.used, turn.yaw_deg] for turn in result.turns],
-        'misfits': [turn.misfit for turn in result.turns], 'timing': result.timing}
-    if result.intrinsics is not None and result.sigma is not None:
-        row |= errors(result.intrinsics, truth, result.sigma)
+        'misfits': [turn.misfit for turn in result.turns], 'timing': result.timing,
+        'truth_model': model_of(truth)}
+    if result.camera is not None and result.intrinsics is not None:
+        estimate = {**result.intrinsics, 'model': result.camera.model}
+        row |= errors(estimate, truth, result.sigma, known)
+        row['model'] = result.camera.model
+        row['mapping_px'] = mapping_error(estimate, truth, result.image_size)
+        # an older calibration has none
+        row['sigma_px'] = getattr(result, 'sigma_px', None)
     return dict(plain_values(row))
 
 
 def error_cells(row: Mapping[str, Any]) -> list[str]:
-    """Return the six errors as cells: percent of the truth, or 'abs' where that is 0."""
-    if 'error' not in row:
-        return [''] * len(KEYS)
-    return [f'{abs(row["error"][key]):.3f} abs' if row['percent'][key] is None
-            else f'{row["percent"][key]:.2f}' for key in KEYS]
+    """Return the errors of KEYS as cells: percent of the truth, or 'abs' where that is 0."""
+    cells = []
+    for key in KEYS:
+        if key not in row.get('error', {}):
+            cells.append('')
+        elif row['percent'][key] is None:
+            cells.append(f'{abs(row["error"][key]):.3f} abs')
+        else:
+            cells.append(f'{row["percent"][key]:.2f}')
+    return cells
+
+
+def mapping_cell(row: Mapping[str, Any]) -> str:
+    """Return the mapping error as a cell, px."""
+    error = row.get('mapping_px')
+    return '' if error is None else f'{error:.2f}'
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -55,11 +55,14 @@ def differences(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
     for key in COMPARED:
         if new.get(key) == old.get(key):
             continue
-        if key == 'intrinsics' and new.get(key) and old.get(key):
+        # of one camera model
+        alike = (key in ('intrinsics', 'sigma') and new.get(key) and old.get(key)
+                 and new[key].keys() == old[key].keys())
+        if key == 'intrinsics' and alike:
             lines += [f'{name}: {value!r}, was {old[key][name]!r} '
                       f'({(value - old[key][name]) / old["sigma"][name]:+.2g} sigma)'
                       for name, value in new[key].items() if value != old[key][name]]
-        elif key == 'sigma' and new.get(key) and old.get(key):
+        elif key == 'sigma' and alike:
             lines += [f'sigma of {name}: {100 * (value / old[key][name] - 1):+.2g} %'
                       for name, value in new[key].items()
                       if not math.isclose(value, old[key][name], rel_tol=0, abs_tol=0)]

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from measure import FALSE_PERCENT, KEYS, table
+from measure import ALL_KEYS, FALSE_PERCENT, KEYS, mapping_cell, table
 
 Row = Mapping[str, Any]
 
@@ -16,13 +16,15 @@ WORST_BARS = {'fx': 1.0}
 KITTI_BARS = {'fx': 0.75, 'fy': 0.75, 'cx': 0.5, 'cy': 1.0}
 ONE_TURN_FX = SHUTTER_FX = 1.5
 HONEST_SHARE = 0.9
+# of the picture's width, where the focal lengths cannot be compared: what 3 % of fx come to
+FALSE_MAPPING_PERCENT = 0.8
 
 
 def summary(rows: Iterable[Row]) -> str:
     """Return the whole summary in Markdown."""
     rows = list(rows)
-    parts = [_settings(rows), _accuracy(rows), _bars(rows), _honesty(rows), _mistakes(rows),
-             _cost(rows)]
+    parts = [_settings(rows), _accuracy(rows), _bars(rows), _mapping(rows), _honesty(rows),
+             _mistakes(rows), _cost(rows)]
     return '\n\n'.join(part for part in parts if part)
 
 
@@ -34,17 +36,21 @@ def _settings(rows: Sequence[Row]) -> str:
         found = [row for row in drives if 'error' in row]
         counts = Counter(row['verdict'] for row in drives)
         verdict = ', '.join(f'{count} {level}' for level, count in sorted(counts.items()))
-        worst = max((abs(z) for row in found for z in row['z'].values()), default=None)
+        worst = max((abs(z) for row in found for z in row.get('z', {}).values()), default=None)
+        models = dict.fromkeys(row['model'] for row in drives if row.get('model'))
+        mapping = [row['mapping_px'] for row in drives if row.get('mapping_px') is not None]
         lines.append([name, drives[0]['verdict'] if drives[0].get('recorded') else verdict,
+                      ', '.join(models), _median_px(mapping),
                       *(_median_cell(found, key) for key in KEYS),
                       '' if worst is None else f'{worst:.1f}'])
     return ('Each setting: median of its seeds, the worst in sigmas.\n\n'
-            + table(['drive', 'verdict', *(f'{key} %' for key in KEYS),
+            + table(['drive', 'verdict', 'model', 'mapping px', *(f'{key} %' for key in KEYS),
                      'worst error in sigmas'], lines))
 
 
 def _median_cell(rows: Sequence[Row], key: str) -> str:
     """Return the median error: percent of the truth, or 'abs' where that is 0."""
+    rows = [row for row in rows if key in row['error']]
     if not rows:
         return ''
     if any(row['percent'][key] is None for row in rows):
@@ -52,9 +58,14 @@ def _median_cell(rows: Sequence[Row], key: str) -> str:
     return f'{statistics.median(row["percent"][key] for row in rows):.2f}'
 
 
+def _median_px(errors: Sequence[float]) -> str:
+    return f'{statistics.median(errors):.2f}' if errors else ''
+
+
 def _accuracy(rows: Sequence[Row]) -> str:
     """Return the medians over settings of each setting's median over seeds, and the worst."""
-    counted = [row for row in rows if row['counts'] and row['verdict'] == 'accepted']
+    counted = [row for row in rows
+               if row['counts'] and row['verdict'] == 'accepted' and 'percent' in row]
     if not counted:
         return ''
     lines = []
@@ -97,6 +108,35 @@ def _bars(rows: Sequence[Row]) -> str:
     return table(['drive', 'measured', 'bar', ''], lines) if lines else ''
 
 
+def _mapping(rows: Sequence[Row]) -> str:
+    """Return for each kind of lens whether it was recognised, and the errors in pixels."""
+    rows = [row for row in rows if row.get('truth_model') and row['must'] != 'refuse']
+    lines = []
+    # what is known of a recorded drive's lens is not exact
+    kinds = {(bool(row.get('recorded')), row['truth_model']) for row in rows}
+    for recorded, truth in sorted(kinds):
+        of_truth = [row for row in rows
+                    if row['truth_model'] == truth and bool(row.get('recorded')) == recorded]
+        found = [row for row in of_truth if row.get('mapping_px') is not None]
+        chosen = Counter(row['model'] for row in found)
+        worst = max(found, key=lambda row: row['mapping_px'], default=None)
+        lines.append([
+            truth + ', recorded' * recorded, str(len(of_truth)),
+            f'{chosen[truth]} of {len(found)}',
+            ', '.join(f'{count} {name}' for name, count in sorted(chosen.items())
+                      if name != truth),
+            str(sum(row['verdict'] == 'accepted' for row in of_truth)),
+            _median_px([row['mapping_px'] for row in found]),
+            '' if worst is None else (f'{mapping_cell(worst)} ({worst["setting"]}, seed '
+                                      f'{worst["seed"]}, {worst["verdict"]})')])
+    if not lines:
+        return ''
+    return ('Mapping error: RMS over the picture, px, the best rotation removed; of all drives '
+            'that have a camera.\n\n'
+            + table(['true model', 'drives', 'that model chosen', 'other models', 'accepted',
+                     'median px', 'worst px'], lines))
+
+
 def _honesty(rows: Sequence[Row]) -> str:
     """Return how often the truth lies within 1 and 2 sigma."""
     lines = []
@@ -104,8 +144,10 @@ def _honesty(rows: Sequence[Row]) -> str:
             ('accepted', [row for row in rows if row['verdict'] == 'accepted']),
             ('weak', [row for row in rows if row['verdict'] == 'weak'])):
         found = [row['z'] for row in chosen if 'z' in row and not row.get('recorded')]
-        for key in KEYS if found else ():
-            z = [abs(values[key]) for values in found]
+        for key in ALL_KEYS:
+            z = [abs(values[key]) for values in found if key in values]
+            if not z:
+                continue
             within = [sum(value <= sigmas for value in z) / len(z) for sigmas in (1, 2)]
             bar = title == 'accepted' and key == 'fx'
             lines.append([title, key, str(len(z)), f'{within[0]:.0%}', f'{within[1]:.0%}',
@@ -123,20 +165,29 @@ def _honesty(rows: Sequence[Row]) -> str:
 def _mistakes(rows: Sequence[Row]) -> str:
     """Return verdicts that are wrong."""
     false = [row for row in rows if row['verdict'] == 'accepted'
-             and (row['must'] == 'refuse' or row['percent']['fx'] > FALSE_PERCENT)]
+             and (row['must'] == 'refuse' or _far_off(row))]
     clean = [row for row in rows if row['must'] == 'accept']
     withheld = [row for row in clean if row['verdict'] != 'accepted']
     hopeless = [row for row in rows if row['must'] == 'refuse']
     kept = [row for row in hopeless if row['verdict'] != 'refused']
     failed = [row for row in rows if row['verdict'] == 'failed']
     lines = [
-        [f'false accepts (fx off by more than {FALSE_PERCENT:g} %, or no turn at all)',
+        [f'false accepts (fx off by more than {FALSE_PERCENT:g} %, or no turn at all; another '
+         f'kind of lens, and off by more than {FALSE_MAPPING_PERCENT:g} % of the width)',
          *_count(false, rows), '0', _met(not false)],
         ['false refusals (clean drives of five turns or more, not accepted)',
          *_count(withheld, clean), '', ''],
         ['hopeless drives that were not refused', *_count(kept, hopeless), '', ''],
         ['crashes', *_count(failed, rows), '', '']]
     return table(['', 'drives', 'which', 'bar', ''], lines)
+
+
+def _far_off(row: Row) -> bool:
+    """Return whether a result would mislead."""
+    if 'percent' in row:
+        return bool(row['percent']['fx'] > FALSE_PERCENT)
+    limit = FALSE_MAPPING_PERCENT / 100 * row['truth']['width']
+    return bool(row['mapping_px'] is None or row['mapping_px'] > limit)
 
 
 def _cost(rows: Sequence[Row]) -> str:

@@ -1,6 +1,6 @@
 """A drive as another camera in its place would have seen it: its pictures, another known lens.
 
-The pictures are resampled for another lens, mirrored, cropped, halved, darkened or cut in time. A
+The pictures are resampled for another lens, mirrored, cropped, shrunk, darkened or cut in time. A
 recorded drive keeps its real pictures so. What its own calibration is off shows in every view
 alike: KITTI's nominal one has no distortion, its pictures have k1 = 0.017. A rendered drive gets
 what the renderer has not: p1, p2 and k3, which real lenses have and the calibration holds at zero.
@@ -30,7 +30,8 @@ class View:
     """What becomes of each picture.
 
     lens: of the camera that looks in the same direction from the same place; None: the drive's
-    own. extra: its p1, p2, k3. mirrored: left is right, before that. light: the grey values are
+    own. extra: its p1, p2, k3. mirrored: left is right, before that. shrink: so many pixels in a
+    row, and as many rows, become the mean of them, before that. light: the grey values are
     multiplied by it. noise: added, in grey values; blur: sigma, px; jpeg_quality: 0 for none.
     frames: the first one and the one after the last.
     """
@@ -39,6 +40,7 @@ class View:
     lens: Lens | None = None
     extra: tuple[float, float, float] = (0.0, 0.0, 0.0)
     mirrored: bool = False
+    shrink: int = 1
     light: float = 1.0
     noise: float = 0.0
     blur: float = 0.0
@@ -50,7 +52,6 @@ class View:
 BARREL = Lens(1000, 300, 700.0, 700.0, 497.0, 140.0, -0.25, 0.07)
 STRONG = Lens(940, 270, 690.0, 693.0, 468.0, 130.0, -0.35, 0.13)
 PINCUSHION = Lens(1150, 325, 640.0, 640.0, 564.0, 154.0, 0.10, 0.02)
-HALF = Lens(621, 187, 360.76885, 360.76885, 304.52965, 86.177)
 MIDDLE = Lens(800, 375, 721.5377, 721.5377, 389.5593, 172.854)
 RIGHT = Lens(1142, 375, 721.5377, 721.5377, 509.5593, 172.854)
 TALL = Lens(1242, 378, 721.5377, 728.753077, 609.5593, 174.58254)
@@ -61,7 +62,8 @@ VIEWS = tuple(View(f'kitti03, {name}', **options) for name, options in (
     ('strong barrel', {'lens': STRONG}),
     ('strong barrel, mirrored', {'lens': STRONG, 'mirrored': True}),
     ('pincushion', {'lens': PINCUSHION}),
-    ('half size', {'lens': HALF}),
+    ('half size', {'shrink': 2}),
+    ('a third', {'shrink': 3}),
     ('middle 800 px', {'lens': MIDDLE}),
     ('100 px cut at the left', {'lens': RIGHT}),
     ('fy/fx 1.01', {'lens': TALL}),
@@ -79,8 +81,15 @@ INEXACT = {
     'p1, p2 0.001': (-0.30, 0.10, (0.001, -0.001, 0.0)),
     'p1, p2 0.003': (-0.30, 0.10, (-0.003, 0.003, 0.0)),
     'k3 -0.03': (-0.30, 0.10, (0.0, 0.0, -0.03)),
+    'k3 0.1': (-0.30, 0.10, (0.0, 0.0, 0.1)),
     "KITTI's raw lens with p1, p2, k3": (-0.3729, 0.2037, (0.0022, 0.0014, -0.0723)),
 }
+
+# rendered drives and how many times smaller their pictures become
+SMALL = {f'{name}, 1/{shrink}': (name, shrink)
+         for name in ('KITTI raw lens, 1392x512', 'dashcam: bonnet, text',
+                      '640x480, fy/fx 1.01, noise 3')
+         for shrink in (2, 3)}
 
 
 @dataclass(frozen=True)
@@ -100,8 +109,9 @@ class Viewed:
             if frame.index < first or (end is not None and frame.index >= end):
                 continue
             image = np.ascontiguousarray(frame.image[:, ::-1]) if view.mirrored else frame.image
+            image = _shrunk(image, view.shrink)
             if maps is not None:
-                image = cv2.remap(image, *maps, cv2.INTER_LANCZOS4)
+                image = np.asarray(cv2.remap(image, *maps, cv2.INTER_LANCZOS4), np.uint8)
             image = _worse(image, view, rng)
             yield Frame(frame.index - first, frame.stamp_ns, image)
 
@@ -112,10 +122,13 @@ class Viewed:
         return {**asdict(lens), **dict(zip(('p1', 'p2', 'k3'), self.view.extra, strict=True))}
 
     def _turned(self) -> Lens:
-        """Return the drive's lens, mirrored where the pictures are."""
-        if not self.view.mirrored:
-            return self.own
-        return replace(self.own, cx=self.own.width - 1 - self.own.cx)
+        """Return the drive's lens, mirrored and shrunk as the pictures are."""
+        lens, by = self.own, self.view.shrink
+        if self.view.mirrored:
+            lens = replace(lens, cx=lens.width - 1 - lens.cx)
+        return replace(lens, width=lens.width // by, height=lens.height // by,
+                       fx=lens.fx / by, fy=lens.fy / by,
+                       cx=(lens.cx + 0.5) / by - 0.5, cy=(lens.cy + 0.5) / by - 0.5)
 
     def _maps(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]] | None:
         """Return where in the drive's pictures each pixel of the lens lies."""
@@ -154,6 +167,23 @@ def inexact_view(name: str, seed: int, cache: Path) -> Viewed:
     return Viewed(View(name, lens, extra), pictures_of(drive, cache), drive.lens)
 
 
+def small_view(name: str, seed: int, cache: Path) -> Viewed:
+    """Return one of the SMALL drives; it is rendered on the way."""
+    setting, shrink = SMALL[name]
+    drive = drive_of(BY_NAME[setting], seed)
+    return Viewed(View(name, shrink=shrink), pictures_of(drive, cache), drive.lens)
+
+
+def _shrunk(image: Grey, by: int) -> Grey:
+    """Return the means of squares of pixels; what is left over at the right and below is cut."""
+    if by == 1:
+        return image
+    height, width = image.shape[0] // by, image.shape[1] // by
+    small = cv2.resize(image[:height * by, :width * by], (width, height),
+                       interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
+
+
 def _worse(image: Grey, view: View, rng: np.random.Generator) -> Grey:
     """Return the picture as a worse camera gives it."""
     made: npt.NDArray[Any] = image
@@ -164,5 +194,5 @@ def _worse(image: Grey, view: View, rng: np.random.Generator) -> Grey:
         made = np.clip(np.rint(made), 0, 255).astype(np.uint8)
     if view.jpeg_quality:
         code = cv2.imencode('.jpg', made, [cv2.IMWRITE_JPEG_QUALITY, view.jpeg_quality])[1]
-        made = cv2.imdecode(code, cv2.IMREAD_GRAYSCALE)
+        made = np.asarray(cv2.imdecode(code, cv2.IMREAD_GRAYSCALE))
     return np.asarray(made, np.uint8)
