@@ -179,6 +179,9 @@ class IntrinsicsConfig:
         1.0, 'times the median reprojection error; scale of the Cauchy loss', 0.1, 100.0)
     profile_tracks: int = expert(
         120, 'of each turn, for the focal profile around the result', 20, 5000)
+    least_gain: float = expert(
+        10.0, 'noise variances of a track; a larger lens model must foretell turns so much better',
+        0.0, 1e6)
     aspect_sigma: float = expert(
         0.003, 'fy / fx is 1 to within this: planar turns know fx but hardly fy', 1e-5, 1.0)
     shutter_rounds: int = expert(
@@ -234,10 +237,14 @@ class Config:
     threads: int = setting(
         2, 'processes that reconstruct turns side by side; the result is the same with any', 1, 64)
     model: str = setting(
-        'radial', "of the lens; radial: the paper's fx fy cx cy k1 k2", pattern='[a-z_]+')
+        'auto', 'of the lens: radial, brown or fisheye; auto: the one that the turns prove',
+        pattern='[a-z_]+')
     max_width: int = setting(
         1440, 'px; wider images are halved until they fit: time and memory fall by four',
         320, 16384)
+    min_width: int = setting(
+        640, 'px; narrower images are enlarged 2, 3 or 4 times: limits in px fit them, too',
+        1, 4096)
     motion: MotionConfig = field(default_factory=MotionConfig)
     mask: MaskConfig = field(default_factory=MaskConfig)
     turns: TurnsConfig = field(default_factory=TurnsConfig)

@@ -67,7 +67,7 @@ class SceneSelection:
     def load(self, frame_id: str) -> None:
         """Load the turns of earlier drives, at the first frame: they must fit its size and id."""
         assert self._detection.size is not None
-        self._kept.load(Origin(self._detection.size, self._detection.shrink, frame_id),
+        self._kept.load(Origin(self._detection.size, self._detection.scale, frame_id),
                            self._use_stored)
 
     def submit(self, replace_failed: bool = False) -> None:

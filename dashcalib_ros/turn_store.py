@@ -27,6 +27,7 @@ from numpy.lib import format as npy
 
 from dashcalib_ros.camera import MODELS, camera_of
 from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.frames.scale import FULL_SIZE, Scale
 from dashcalib_ros.reconstruction.scene import Profile, Scene
 from dashcalib_ros.reconstruction.structure import Structure
 from dashcalib_ros.reconstruction.tracks import Tracks
@@ -48,24 +49,24 @@ ABANDONED_S = 3600.0
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a turn is from: image size (width, height) of the input, and its shrink factor.
+    """Where a turn is from: image size (width, height) of the input, and how it was resized.
 
     frame_id: of the image headers; an empty one, of inputs without, fits any.
     """
 
     image_size: tuple[int, int]
-    shrink: int
+    scale: Scale = FULL_SIZE
     frame_id: str = ''
 
     def fits(self, other: Origin) -> bool:
         """Return whether both may be of one camera."""
         frames = {self.frame_id, other.frame_id} - {''}
-        return (self.image_size, self.shrink) == (other.image_size, other.shrink) and (
+        return (self.image_size, self.scale) == (other.image_size, other.scale) and (
             len(frames) < 2)
 
     def __str__(self) -> str:
         frame = f' in frame {self.frame_id!r}' if self.frame_id else ''
-        return f'{self.image_size[0]}x{self.image_size[1]} shrunk by {self.shrink}{frame}'
+        return f'{self.image_size[0]}x{self.image_size[1]} {self.scale}{frame}'
 
 
 @dataclass(frozen=True)
@@ -305,8 +306,9 @@ def _count(files: list[Any]) -> str:
 def _arrays(turn: StoredTurn, origin: Origin) -> dict[str, Any]:
     scene = turn.scene
     values = {
-        'format': FORMAT, 'image_size': origin.image_size, 'shrink': origin.shrink,
-        'frame_id': origin.frame_id, 'stamp_s': turn.stamp_s, 'prominence': turn.prominence,
+        'format': FORMAT, 'image_size': origin.image_size, 'shrink': origin.scale.shrink,
+        'enlarge': origin.scale.enlarge, 'frame_id': origin.frame_id,
+        'stamp_s': turn.stamp_s, 'prominence': turn.prominence,
         'frames': scene.tracks.frames, 'xy': scene.tracks.xy, 'size': scene.tracks.image_size,
         'stamps_ns': scene.tracks.stamps_ns,
         'rotations': scene.structure.rotations, 'translations': scene.structure.translations,
@@ -335,8 +337,7 @@ def _read(path: Path) -> tuple[Origin, StoredTurn]:
     try:
         data = _loaded(path)
         origin, turn = _origin(data), _turn(data)
-        small = tuple(side // max(origin.shrink, 1) for side in origin.image_size)
-        if turn.scene.tracks.image_size != small:
+        if turn.scene.tracks.image_size != origin.scale.size(origin.image_size):
             raise ValueError('its numbers are no valid scene')
         return origin, turn
     except Exception as error:
@@ -386,8 +387,12 @@ def _origin(data: Mapping[str, npt.NDArray[Any]]) -> Origin:
     if (number := int(_array(data, 'format', int, ()))) != FORMAT:
         raise ValueError(f'it has format {number}, this version has {FORMAT}')
     width, height = (int(side) for side in _array(data, 'image_size', int, (2,)))
-    return Origin((width, height), int(_array(data, 'shrink', int, ())),
-                  str(_array(data, 'frame_id', str, ())))
+    # older files do not have it: nothing was enlarged
+    enlarge = int(_array(data, 'enlarge', int, ())) if 'enlarge' in data else 1
+    scale = Scale(int(_array(data, 'shrink', int, ())), enlarge)
+    if min(scale.shrink, scale.enlarge) < 1:
+        raise ValueError('its numbers are no valid scene')
+    return Origin((width, height), scale, str(_array(data, 'frame_id', str, ())))
 
 
 def _turn(data: Mapping[str, npt.NDArray[Any]]) -> StoredTurn:

@@ -250,7 +250,7 @@ def test_two_short_drives_add_up(drive, frames, tmp_path):
     folder = tmp_path / 'turns'
     config = QUICK.replace({'turns.store': str(folder)})
     store = TurnStore(str(folder), 10, 3.0, pytest.fail)
-    store.load(Origin((640, 360), 1))
+    store.load(Origin((640, 360)))
     store.mirror(lambda: {TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9)})
     assert len(list(folder.iterdir())) == 1
 
@@ -284,7 +284,7 @@ def test_a_stored_turn_of_another_camera_is_told_and_stays(frames, tmp_path):
     config = QUICK.replace({'turns.store': str(tmp_path)})
     lens = Radial((640, 360), 460.0, 460.0, 319.5, 179.5, -0.1)
     store = TurnStore(str(tmp_path), 10, 3.0, pytest.fail)
-    store.load(Origin((640, 360), 1))
+    store.load(Origin((640, 360)))
     stranger = StoredTurn(synthetic_turn(lens).scene(lens), 5.0, 0.001)
     store.mirror(lambda: {TurnId.at(0): stranger})
     result = calibrated(frames[:95], config)
@@ -299,7 +299,7 @@ def test_a_stored_turn_of_another_camera_is_told_and_stays(frames, tmp_path):
 def test_stored_turns_of_another_size_are_left_out_and_told(tmp_path):
     config = QUICK.replace({'turns.store': str(tmp_path)})
     store = TurnStore(str(tmp_path), 10, 3.0, pytest.fail)
-    store.load(Origin((640, 360), 1))
+    store.load(Origin((640, 360)))
     store.mirror(lambda: {TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9)})
     told: list[str] = []
     with Calibrator(config, warn=told.append) as calibrator:
@@ -319,7 +319,7 @@ def test_stored_turns_of_another_size_are_left_out_and_told(tmp_path):
 
 def test_turns_that_are_rejected_leave_the_store(tmp_path):
     store = TurnStore(str(tmp_path), 10, 3.0, pytest.fail)
-    store.load(Origin((640, 360), 1))
+    store.load(Origin((640, 360)))
     lens = Radial((640, 360), 390.0, 390.0, 325.0, 175.0, -0.2)
     other = synthetic_turn(lens, keyframes=12, tracks=120, world=1).scene(lens, 9)
     store.mirror(lambda: {TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9),
@@ -402,6 +402,34 @@ def test_large_pictures_are_shrunk_for_everything(monkeypatch):
     # 642 is halved twice: 321 does not fit
     assert set(sizes) == {(160, 90)}
     assert calibration.image_size == (642, 362)
+
+
+def test_small_pictures_are_enlarged_for_everything(monkeypatch):
+    sizes = []
+    with Calibrator(QUICK) as calibrator:
+        motion = calibrator._detection._motion
+        push = motion.push
+        monkeypatch.setattr(motion, 'push', lambda frame: sizes.append(frame.size) or push(frame))
+        for frame in pictures(5, 320, 180, 2):
+            calibrator.push(frame)
+        calibration = calibrator.calibrate()
+    assert set(sizes) == {(640, 360)}
+    assert calibration.image_size == (320, 180)
+
+
+def test_a_mask_fits_images_that_are_enlarged():
+    picture = np.random.default_rng(0).integers(0, 255, (120, 320), np.uint8)
+    mask = np.ones(picture.shape, bool)
+    mask[101:] = False
+    with Calibrator(mask=mask) as calibrator:
+        calibrator.push(Frame(0, 10**9, picture))
+        valid = calibrator.calibrate().mask
+    assert valid is not None and valid.shape == (240, 640)
+    assert valid[:202].all() and not valid[202:].any()
+    # as large as these pictures, once it is enlarged: but it is not theirs
+    large = picture.repeat(2, axis=0).repeat(2, axis=1)
+    with Calibrator(mask=mask) as calibrator, pytest.raises(InputError, match='320x120'):
+        calibrator.push(Frame(0, 10**9, large))
 
 
 def test_a_mask_fits_images_that_are_shrunk():

@@ -14,13 +14,14 @@ import pytest
 from synthetic import LENS, synthetic_turn
 
 from dashcalib_ros import turn_store as room
+from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.turns import TurnId
 
 HALF_WIDTH_S = 3.0
 DATE_S = 1_767_614_400.0
-CAMERA = Origin((800, 450), 1, 'camera')
+CAMERA = Origin((800, 450), Scale(), 'camera')
 
 
 @cache
@@ -149,8 +150,9 @@ def test_the_same_turn_counts_once(make):
 
 
 @pytest.mark.parametrize('other', [
-    Origin((640, 450), 1, 'camera'), Origin((800, 450), 2, 'camera'),
-    Origin((800, 450), 1, 'rear')], ids=['size', 'shrink', 'frame'])
+    Origin((640, 450), Scale(), 'camera'), Origin((800, 450), Scale(2), 'camera'),
+    Origin((800, 450), Scale(enlarge=2), 'camera'), Origin((800, 450), Scale(), 'rear')],
+    ids=['size', 'shrink', 'enlarge', 'frame'])
 def test_another_camera_is_left_out_with_one_warning(make, other):
     hold(make(), stored(0), stored(1))
     store = make(other)
@@ -165,9 +167,23 @@ def test_another_camera_is_left_out_with_one_warning(make, other):
     assert len(make().turns) == 2
 
 
+def test_turns_of_resized_images_come_back(make):
+    for scale, size in ((Scale(enlarge=2), (400, 225)), (Scale(shrink=2), (1601, 900))):
+        hold(make(Origin(size, scale)), stored())
+        assert len(make(Origin(size, scale)).turns) == 1
+
+
+def test_turns_from_before_small_images_were_enlarged_are_of_use(make):
+    store = make()
+    hold(store, stored())
+    [path] = store._folder.iterdir()
+    rewritten(path, enlarge=None)
+    assert len(make().turns) == 1 and make().said == []
+
+
 def test_a_camera_frame_that_is_not_known_fits_any(make):
-    hold(make(Origin((800, 450), 1)), stored())
-    assert len(make().turns) == len(make(Origin((800, 450), 1)).turns) == 1
+    hold(make(Origin((800, 450))), stored())
+    assert len(make().turns) == len(make(Origin((800, 450))).turns) == 1
 
 
 def bare(path, values) -> None:
@@ -226,6 +242,8 @@ SPOILED = {
     'other type': lambda path: rewritten(path, used=np.zeros((8, 60))),
     'not finite': lambda path: rewritten(path, camera=np.full(6, np.nan)),
     'no points': lambda path: rewritten(path, points=np.full((60, 3), np.nan)),
+    'no scale': lambda path: rewritten(path, shrink=0),
+    'other scale': lambda path: rewritten(path, enlarge=2),
     'other size': lambda path: rewritten(path, size=np.array([640, 450])),
     'no scene': lambda path: rewritten(path, used=np.zeros((8, 60), bool)),
     'too large': lambda path: path.write_bytes(path.read_bytes() + bytes(room.LARGEST)),
@@ -368,7 +386,7 @@ def test_clearing_ends_it(make):
 
 def test_clearing_before_the_camera_is_known_removes_all_turns_and_nothing_else(make, tmp_path):
     hold(make(), stored(0))
-    hold(make(Origin((640, 360), 1)), stored(1))
+    hold(make(Origin((640, 360))), stored(1))
     np.savez(tmp_path / 'turns' / 'mine.npz', weights=np.zeros(3))
     TurnStore(str(tmp_path / 'turns'), 10, HALF_WIDTH_S, pytest.fail).clear()
     assert [path.name for path in (tmp_path / 'turns').iterdir()] == ['mine.npz']

@@ -1,27 +1,10 @@
-"""Pictures are made smaller by an integer factor."""
+"""Pictures and masks are made smaller by a whole number."""
 from __future__ import annotations
-
-from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import GreyImage, Mask
-from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames.frame import Frame
-
-
-def shrink_factor(size: tuple[int, int], max_width: int) -> int:
-    """Return the power of two that an image of this (width, height) is divided by to fit.
-
-    Raises InputError for an image with too few rows to be shrunk.
-    """
-    factor = 1
-    while size[0] / factor > max_width:
-        factor *= 2
-    if size[1] < factor and factor > 1:
-        raise InputError(f'the images are {size[0]}x{size[1]}: a camera has more rows')
-    return factor
 
 
 def shrink_image(image: GreyImage, factor: int) -> GreyImage:
@@ -43,8 +26,3 @@ def shrink_mask(valid: Mask, factor: int) -> Mask:
     height, width = (side // factor for side in valid.shape)
     blocks = valid[:height * factor, :width * factor].reshape(height, factor, width, factor)
     return np.asarray(blocks.all(axis=(1, 3)), bool)
-
-
-def shrink(frame: Frame, factor: int) -> Frame:
-    """Return the frame with its image shrunk."""
-    return frame if factor == 1 else replace(frame, image=shrink_image(frame.image, factor))

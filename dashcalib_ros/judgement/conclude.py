@@ -10,6 +10,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.config import Config
+from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.judgement.agreement import focal_disagreement
 from dashcalib_ros.judgement.calibration import (
     Calibration,
@@ -33,8 +34,8 @@ PACKAGES = ('dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'pycolm
 class Evidence:
     """What a calibration needs beside the solution.
 
-    image_size: of the input; shrink: the factor by which the images of the scenes were made
-    smaller. built: scenes by their turn. stored: the turns of earlier drives that were available.
+    image_size: of the input; scale: how it was resized for the scenes. built: scenes by their
+    turn. stored: the turns of earlier drives that were available.
     """
 
     image_size: tuple[int, int]
@@ -43,7 +44,7 @@ class Evidence:
     built: dict[TurnId, Scene]
     magnitudes: Floats
     mask: Mask | None
-    shrink: int
+    scale: Scale
     timing: dict[str, float]
     warnings: tuple[str, ...] = ()
     stored: tuple[StoredTurn, ...] = ()
@@ -58,7 +59,7 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
     scenes: in any order; a turn without one is listed as not reconstructed.
     """
     return Evidence(
-        image_size=detection.size or (0, 0), shrink=detection.shrink, frames=detection.frames,
+        image_size=detection.size or (0, 0), scale=detection.scale, frames=detection.frames,
         turns=detection.turns(), magnitudes=detection.magnitudes(), mask=detection.valid(),
         built={scene.turn: scene for scene in scenes if scene is not None},
         timing=dict(timing or {}), warnings=(*detection.warnings(), *warnings), stored=stored)
@@ -73,12 +74,13 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     if solution is not None:
         details = _details(solution)
         if verdict.level != 'refused':
-            camera = solution.camera.enlarged(evidence.shrink, evidence.image_size)
+            px = evidence.scale.px
+            camera = solution.camera.resized(px, evidence.image_size)
             # fx, fy, cx and cy are pixels
-            scale = np.where(np.arange(len(solution.sigma)) < 4, evidence.shrink, 1)
-            sigma = dict(zip(camera.names(), (solution.sigma * scale).tolist(), strict=True))
-            error = solution.reprojection_error_px * evidence.shrink
-            warnings += _model_error_warnings(solution, evidence.shrink, config)
+            units = np.where(np.arange(len(solution.sigma)) < 4, px, 1)
+            sigma = dict(zip(camera.names(), (solution.sigma * units).tolist(), strict=True))
+            error = solution.reprojection_error_px * px
+            warnings += _model_error_warnings(solution, px, config)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
     return Calibration(
@@ -91,15 +93,18 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         stored_turns=tuple(_stored_summary(turn, solution) for turn in evidence.stored))
 
 
-def _model_error_warnings(solution: Solution, shrink: int, config: Config) -> tuple[str, ...]:
-    """Return a warning if a wider model would clearly change fx, fy, cx or cy."""
+def _model_error_warnings(solution: Solution, px: float, config: Config) -> tuple[str, ...]:
+    """Return a warning if a wider model would clearly change fx, fy, cx or cy.
+
+    px: of the input, in one pixel of the scenes.
+    """
     count, names = len(solution.prior_information), solution.camera.widened().names()
     step = solution.step_to_wider_model
     shifts, others = step[:4], step[count:]
     scale = np.repeat([solution.camera.fx, solution.camera.image_size[0]], 2)
     if not np.max(np.abs(shifts) / scale) > config.verdict.max_untold_model_error:
         return ()
-    changes = ', '.join(f'{name} by {shrink * shift:+.1f}'
+    changes = ', '.join(f'{name} by {px * shift:+.1f}'
                         for name, shift in zip(names, shifts, strict=False))
     found = [f'{name} {value:+.4f}' for name, value in zip(names[count:], others, strict=True)]
     return (f'the lens seems to have {", ".join(found)}, which are not calibrated: they would '
@@ -127,7 +132,7 @@ def _summary(turn: Turn, evidence: Evidence, solution: Solution | None) -> TurnS
     if scene is not None:
         camera = solution.camera if solution and turn.id in used else scene.camera
         squares = errors_px(scene, camera)[scene.structure.used] ** 2
-        error = float(np.sqrt(np.mean(squares))) * evidence.shrink
+        error = float(np.sqrt(np.mean(squares))) * evidence.scale.px
     return TurnSummary(
         center=turn.center, first=turn.first, last=turn.last, stamp_s=turn.stamp_s,
         prominence=turn.prominence, images=len(scene.tracks.frames) if scene else turn.images,

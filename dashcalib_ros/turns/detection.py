@@ -7,7 +7,8 @@ from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.shrink import shrink, shrink_factor, shrink_mask
+from dashcalib_ros.frames.mask_file import check_mask
+from dashcalib_ros.frames.scale import FULL_SIZE, Scale
 from dashcalib_ros.motion import MotionEstimator
 from dashcalib_ros.turns.detector import TurnDetector
 from dashcalib_ros.turns.turn import Turn
@@ -16,20 +17,20 @@ from dashcalib_ros.turns.turn import Turn
 class Detection:
     """Takes the images of one camera; keeps the best turns, with their images.
 
-    size: (width, height) of the images, None before the first. shrink: the factor by which they
-    are made smaller first. frames: how many there were. standing: the car stands now.
+    size: (width, height) of the images, None before the first. scale: how they are resized
+    first. frames: how many there were. standing: the car stands now.
     """
 
     def __init__(self, config: Config, mask: Mask | None = None) -> None:
         """mask: (h, w), False where the ego vehicle is."""
+        self._mask = mask
         if mask is not None:
-            size = mask.shape[1], mask.shape[0]
-            mask = shrink_mask(mask, shrink_factor(size, config.max_width))
+            mask = Scale.of((mask.shape[1], mask.shape[0]), config).mask(mask)
         self.size: tuple[int, int] | None = None
-        self.shrink = 1
+        self.scale = FULL_SIZE
         self.frames = 0
         self.standing = False
-        self._max_width = config.max_width
+        self._config = config
         self._motion = MotionEstimator(config.motion, config.mask, mask)
         # more turns than wanted replace those without a scene; --turns may be above the capacity
         self._turns = TurnDetector(replace(
@@ -43,16 +44,16 @@ class Detection:
     def push(self, frame: Frame) -> list[Turn]:
         """Take the next frame; return the turns that it completes or changes.
 
-        Raises InputError when its size differs from the first one's.
+        Raises InputError when its size differs from the first one's, or from the mask's.
         """
         self._check_size(frame)
         self.frames += 1
-        small = shrink(frame, self.shrink)
-        motion = self._motion.push(small)
+        frame = self.scale.frame(frame)
+        motion = self._motion.push(frame)
         if motion is None:
             return []
         self.standing = motion.standing
-        return self._fixed(self._turns.push(small, motion))
+        return self._fixed(self._turns.push(frame, motion))
 
     def finish(self) -> list[Turn]:
         """End the drive; return the turns that this completes or changes."""
@@ -71,7 +72,7 @@ class Detection:
         return self._turns.magnitudes()
 
     def valid(self) -> Mask | None:
-        """Return (h, w) of the shrunk images, False where the ego vehicle is; None: nowhere."""
+        """Return (h, w) of the resized images, False where the ego vehicle is; None: nowhere."""
         return self._motion.valid()
 
     def warnings(self) -> tuple[str, ...]:
@@ -91,8 +92,9 @@ class Detection:
 
     def _check_size(self, frame: Frame) -> None:
         if self.size is None:
+            check_mask(self._mask, frame.size)
+            self.scale = Scale.of(frame.size, self._config)
             self.size = frame.size
-            self.shrink = shrink_factor(frame.size, self._max_width)
         elif frame.size != self.size:
             raise InputError(
                 f'the image size changes from {self.size[0]}x{self.size[1]} to '

@@ -45,7 +45,7 @@ from measure import (
 
 from dashcalib_ros import Config, open_frames, stages
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.shrink import shrink, shrink_factor
+from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.turns import Turn
 from dashcalib_ros.turns.detection import Detection
 
@@ -145,7 +145,7 @@ def _thinned(task: Task) -> tuple[Frame, ...]:
     kept: list[Frame] = []
     for frame in task.frames:
         if not kept or frame.stamp_ns - kept[-1].stamp_ns > 0.9e9 / task.config.motion.rate:
-            kept.append(shrink(frame, shrink_factor(frame.size, task.config.max_width)))
+            kept.append(Scale.of(frame.size, task.config).frame(frame))
     return tuple(kept)
 
 
@@ -174,7 +174,7 @@ def _colmap(task: Task, windows: Sequence[Turn]) -> dict[str, Any]:
         root, database = Path(folder), Path(folder) / 'database.db'
         (root / 'images').mkdir()
         (root / 'sparse').mkdir()
-        # as they were recorded, not as dashcalib shrinks large ones
+        # as they were recorded, not as dashcalib resizes them
         for frame in task.frames:
             if frame.index in names:
                 cv2.imwrite(str(root / 'images' / f'{frame.index:06}.png'), frame.image)

@@ -43,7 +43,7 @@ from measure import (
 
 from dashcalib_ros import Config
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.shrink import shrink, shrink_factor
+from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.motion import MotionEstimator, estimator
 from dashcalib_ros.turns import TurnDetector
 from dashcalib_ros.turns.detection import Detection
@@ -97,10 +97,10 @@ def _detect_s(frames: Iterable[Frame]) -> float:
     spent = 0.0
     for frame in frames:
         started = time.perf_counter()
-        small = shrink(frame, shrink_factor(frame.size, config.max_width))
-        found = motion.push(small)
+        resized = Scale.of(frame.size, config).frame(frame)
+        found = motion.push(resized)
         if found is not None:
-            detector.push(small, found)
+            detector.push(resized, found)
         spent += time.perf_counter() - started
     return spent
 

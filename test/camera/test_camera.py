@@ -187,7 +187,8 @@ def test_what_no_model_describes_is_refused():
         camera_of('no such model', SIZE, BARREL.params)
 
 
-def test_the_camera_of_images_that_were_not_shrunk():
+def test_the_camera_of_images_of_another_size():
     small = Radial((640, 360), 400.0, 401.0, 319.5, 179.5, -0.2)
-    large = small.enlarged(2, (1281, 720))
-    assert large == Radial((1281, 720), 800.0, 802.0, 639.5, 359.5, -0.2)
+    large = Radial((1280, 720), 800.0, 802.0, 639.5, 359.5, -0.2)
+    assert small.resized(2, (1280, 720)) == large and large.resized(0.5, (640, 360)) == small
+    assert small.resized(2, (1281, 720)).image_size == (1281, 720)

@@ -23,6 +23,7 @@ from synthetic import synthetic_turn
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
+from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.report import load_calibration_yaml
 from dashcalib_ros.ros.learner import Result
@@ -332,8 +333,8 @@ def test_a_camera_that_changed_does_not_learn_from_the_turns_of_earlier_drives(
         make_desk, tmp_path):
     (tmp_path / 'camera.yaml').write_text(KEPT)
     store = TurnStore(str(tmp_path / 'turns'), 10, 3.0, pytest.fail)
-    store.load(Origin((320, 240), 1))
-    lens = Radial((320, 240), 200.0, 201.0, 160.0, 120.0)
+    store.load(Origin((320, 240), Scale(enlarge=2)))
+    lens = Radial((640, 480), 400.0, 402.0, 320.0, 240.0)
     scene = synthetic_turn(lens, keyframes=8, tracks=60).scene(lens)
     store.mirror(lambda: {TurnId.at(0): StoredTurn(scene, 5.0, 0.05)})
     desk = make_desk(contradictions=1, **{'turns.store': tmp_path / 'turns'})

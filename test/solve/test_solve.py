@@ -12,6 +12,7 @@ from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 from dashcalib_ros import stages
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
+from dashcalib_ros.frames.scale import FULL_SIZE, Scale
 from dashcalib_ros.judgement.agreement import (
     focal_disagreement,
     leverages,
@@ -587,13 +588,13 @@ def test_a_turn_without_a_step_aside_is_not_accepted():
 
 # what the user gets
 
-def evidence_for(solution: Solution | None, shrink: int = 1, turns: int = 3, frames: int = 500
-                 ) -> Evidence:
+def evidence_for(solution: Solution | None, scale: Scale = FULL_SIZE, turns: int = 3,
+                 frames: int = 500) -> Evidence:
     built = {scene.turn: scene for scene in solution.scenes} if solution else {}
     return Evidence(
-        (SIZE[0] * shrink, SIZE[1] * shrink), frames,
+        (round(SIZE[0] * scale.px), round(SIZE[1] * scale.px)), frames,
         tuple(Turn(n, n - 5, n + 5, n / 10, 0.05) for n in range(turns)), built,
-        np.zeros((0, 2)), None, shrink, {'detect': 1.0, 'calibrate': 2.0, 'total': 3.0})
+        np.zeros((0, 2)), None, scale, {'detect': 1.0, 'calibrate': 2.0, 'total': 3.0})
 
 
 def test_a_refused_solution_gives_no_numbers(good):
@@ -608,7 +609,7 @@ def test_a_lens_that_the_six_do_not_describe_is_told_of(good, monkeypatch):
     assert not conclude(good, evidence_for(good), CONFIG).warnings
     step = np.array([0.3, -2.0, 0.02 * SIZE[0], -4.0, 0.0, 0.0, 0.0012, -0.001, 0.02])
     monkeypatch.setattr(Solution, 'step_to_wider_model', step)
-    calibration = conclude(good, evidence_for(good, 2), CONFIG)
+    calibration = conclude(good, evidence_for(good, Scale(shrink=2)), CONFIG)
     [warning] = calibration.warnings
     assert 'p1 +0.0012, p2 -0.0010, k3 +0.0200' in warning
     # in px of the input
@@ -623,7 +624,7 @@ def test_a_lens_that_the_six_do_not_describe_is_told_of(good, monkeypatch):
     (0, 0, '0 image'), (0, 1, 'only 1 image'), (0, 500, 'no turn was found'),
     (3, 500, 'none of the 3 turns')])
 def test_no_solution_is_refused_with_the_reason(turns, frames, text):
-    calibration = conclude(None, evidence_for(None, 1, turns, frames), CONFIG)
+    calibration = conclude(None, evidence_for(None, FULL_SIZE, turns, frames), CONFIG)
     assert calibration.verdict.level == 'refused' and text in calibration.verdict.reasons[0]
     assert calibration.intrinsics is None and calibration.sigma is None
     assert len(calibration.turns) == turns and not any(t.used for t in calibration.turns)
@@ -639,20 +640,23 @@ def test_turns_are_summed_up_in_the_order_of_the_drive(good):
     assert calibration.turns[4].yaw_deg is None
 
 
-@pytest.mark.parametrize('factor', [1, 2, 4])
-def test_the_full_size_camera_sees_what_the_small_one_sees(good, factor):
-    calibration = conclude(good, evidence_for(good, factor), CONFIG)
-    camera = calibration.camera
+@pytest.mark.parametrize('scale', [
+    Scale(), Scale(shrink=2), Scale(shrink=4), Scale(enlarge=2), Scale(enlarge=3)], ids=str)
+def test_the_camera_sees_in_the_input_what_it_sees_in_resized_images(good, scale):
+    calibration = conclude(good, evidence_for(good, scale), CONFIG)
+    camera, px = calibration.camera, scale.px
     assert camera.image_size == calibration.image_size
     points = np.array([[0.3, -0.2, 1.0], [-2.0, 1.1, 4.0], [0.0, 0.0, 2.0]])
-    small = good.camera.project(points)
-    # frames/shrink.py: pixel x of the small image is (x + 0.5) factor - 0.5 of the large one
-    np.testing.assert_allclose(camera.project(points), (small + 0.5) * factor - 0.5, atol=1e-9)
+    resized = good.camera.project(points)
+    # frames/scale.py: pixel x of a resized image is (x + 0.5) px - 0.5 of the input
+    np.testing.assert_allclose(camera.project(points), (resized + 0.5) * px - 0.5, atol=1e-9)
     np.testing.assert_allclose(
         [calibration.sigma[name] for name in ('fx', 'cy', 'k1')],
-        good.sigma[[0, 3, 4]] * [factor, factor, 1])
+        good.sigma[[0, 3, 4]] * [px, px, 1])
     assert calibration.reprojection_error_px == pytest.approx(
-        good.reprojection_error_px * factor)
+        good.reprojection_error_px * px)
+    assert calibration.turns[0].reprojection_error_px == pytest.approx(
+        px * conclude(good, evidence_for(good), CONFIG).turns[0].reprojection_error_px)
 
 
 def test_residuals_are_projected_minus_seen(good):
