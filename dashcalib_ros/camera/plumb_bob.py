@@ -36,8 +36,6 @@ class Radial(Camera):
     step1: ClassVar[ColmapModel] = ColmapModel('RADIAL', 5, (0, 0, 1, 2, 3, 4))
     step2: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4, 5))
     spread: ClassVar[tuple[float, ...]] = (1.0, 1.0)
-    # 126 to 29 degrees across, without distortion
-    focal_ratios: ClassVar[tuple[float, ...]] = tuple(0.256 * 1.25**n for n in range(10))
 
     def widened(self) -> Camera:
         """Return the camera with p1, p2 and k3, which are 0."""

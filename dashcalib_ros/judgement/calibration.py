@@ -8,6 +8,7 @@ from typing import Any, Literal
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
+from dashcalib_ros.solve.picture import PictureSigma
 from dashcalib_ros.turns.turn import TurnId
 
 Level = Literal['accepted', 'weak', 'refused']
@@ -77,6 +78,7 @@ class Calibration:
     magnitudes: (n, 2) float64, columns stamp [s] and filtered turning magnitude [of the width].
     mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
     rolling_shutter: the one that was found, and whose effect was removed; None for a global one.
+    sigma_px: how far the whole camera may be off over the picture.
     """
 
     verdict: Verdict
@@ -96,6 +98,7 @@ class Calibration:
     details: dict[str, Any] = field(default_factory=dict)
     stored_turns: tuple[StoredTurnSummary, ...] = ()
     rolling_shutter: Shutter | None = None
+    sigma_px: PictureSigma | None = None
 
     @property
     def intrinsics(self) -> dict[str, float] | None:

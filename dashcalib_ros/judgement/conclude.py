@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import metadata
 
 import numpy as np
@@ -21,6 +21,7 @@ from dashcalib_ros.judgement.calibration import (
 )
 from dashcalib_ros.judgement.verdict import judge, profile_contrast
 from dashcalib_ros.reconstruction.scene import Scene, errors_px
+from dashcalib_ros.solve.picture import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turn_store import StoredTurn
 from dashcalib_ros.turns.detection import Detection
@@ -68,7 +69,7 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
     """Return the calibration; a refused one has no intrinsics, so that they cannot be used."""
     verdict = judge(solution, config.verdict) if solution else _verdict_without_solution(evidence)
-    camera = sigma = error = shutter = None
+    camera = sigma = error = shutter = sigma_px = None
     details: dict[str, object] = {}
     warnings = evidence.warnings
     if solution is not None:
@@ -80,6 +81,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
             units = np.where(np.arange(len(solution.sigma)) < 4, px, 1)
             sigma = dict(zip(camera.names(), (solution.sigma * units).tolist(), strict=True))
             error = solution.reprojection_error_px * px
+            sigma_px = PictureSigma(solution.picture.rms * px, solution.picture.worst * px)
             warnings += _model_error_warnings(solution, px, config)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
@@ -89,7 +91,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
         frames=evidence.frames, reprojection_error_px=error, timing=evidence.timing,
         versions=_versions(), config=config, magnitudes=evidence.magnitudes, mask=evidence.mask,
-        details=details, rolling_shutter=shutter, warnings=warnings,
+        details=details, rolling_shutter=shutter, sigma_px=sigma_px, warnings=warnings,
         stored_turns=tuple(_stored_summary(turn, solution) for turn in evidence.stored))
 
 
@@ -162,6 +164,7 @@ def _details(solution: Solution) -> dict[str, object]:
         'turns_disagree_fx': focal_disagreement(solution),
         'left_out': dict(zip(solution.camera.widened().names()[others:],
                              solution.step_to_wider_model[others:].tolist(), strict=True)),
+        'models': [asdict(candidate) for candidate in solution.tried],
         'correlation': (solution.covariance / np.outer(solution.sigma, solution.sigma)).tolist(),
     }
 

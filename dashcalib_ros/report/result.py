@@ -33,6 +33,7 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'seed': c.config.seed,
         'versions': c.versions,
         'config': c.config.flat(),
+        'sigma_px': c.sigma_px,
         'camera_model': None if c.camera is None else c.camera.model,
         'stored_turns': [_turn_dict(turn) for turn in c.stored_turns],
         'rolling_shutter': c.rolling_shutter,

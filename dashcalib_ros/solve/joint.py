@@ -105,7 +105,7 @@ def solve(separate: Sequence[Scene], config: Config,
     result = _Result(final, roughly.step1, _parts(final))
     if config.model == AUTO:
         progress('model of the lens', 0.0)
-        result, others = _chosen(_tried(result, start.full_scenes, config), config)
+        result, others = _with_model_chosen(result, start.full_scenes, config)
         tried = _merged(tried, others)
     progress('focal profile', 0.0)
     around = profile_around(result.fit.scenes, result.fit.camera, start.profile, config)
@@ -142,25 +142,29 @@ def _parts(fit: _Fit) -> tuple[Information, ...]:
                  for scene in fit.scenes)
 
 
-def _tried(first: _Result, full_scenes: ByTurn, config: Config) -> list[_Result]:
-    """Return the result, and those of other models that may explain what it leaves over."""
-    results = [first]
-    if len(first.parts) < 2:
-        return results
+def _with_model_chosen(first: _Result, full_scenes: ByTurn, config: Config
+                       ) -> tuple[_Result, tuple[Candidate, ...]]:
+    """Return the result with the model that the turns prove, and how the models compare.
 
-    def attempt(model: type[Camera]) -> None:
-        if not any(type(result.fit.camera) is model for result in results):
-            result = _refitted(first, model, full_scenes, config)
-            results.extend([result] if result is not None else [])
-
+    Others are tried only where the first one leaves something for them to explain, and with a part
+    of the tracks; the one that is chosen is adjusted with all.
+    """
     camera = first.fit.camera
-    if isinstance(camera, Radial) and _leaves_something(first, config):
-        attempt(type(camera.widened()))
-        attempt(Fisheye)
-    return results
+    if len(first.parts) < 2 or not isinstance(camera, Radial) or not _leaves_more(first, config):
+        return first, ()
+    wanted = config.intrinsics.first_tracks
+    few = replace(first, fit=replace(
+        first.fit, scenes=[subsample_tracks(scene, wanted) for scene in first.fit.scenes]))
+    few_measured = {turn: subsample_tracks(scene, wanted) for turn, scene in full_scenes.items()}
+    models: list[type[Camera]] = [type(camera), type(camera.widened()), Fisheye]
+    found = (_refitted(few, model, few_measured, config) for model in models)
+    chosen, tried = _chosen([result for result in found if result is not None], config)
+    if type(chosen.fit.camera) is type(camera):
+        return first, tried
+    return _refitted(first, type(chosen.fit.camera), full_scenes, config) or first, tried
 
 
-def _leaves_something(result: _Result, config: Config) -> bool:
+def _leaves_more(result: _Result, config: Config) -> bool:
     """Return whether the wider model would foretell the turns clearly better."""
     prior = prior_information(result.step1, config.intrinsics)
     gains = gain_of_wider_model(result.parts, prior, extra_sigma_of(result.fit.camera))
@@ -171,7 +175,9 @@ def _leaves_something(result: _Result, config: Config) -> bool:
 def _refitted(first: _Result, model: type[Camera], full_scenes: ByTurn, config: Config
               ) -> _Result | None:
     """Return the result with another model, None where it does not explain all turns."""
-    camera = as_model(first.fit.camera, model)
+    camera = first.fit.camera
+    if type(camera) is not model:
+        camera = as_model(camera, model)
     step1 = camera
     if model.ros_model == first.step1.ros_model:
         step1 = model.centred(camera.image_size, first.step1.fx, *first.step1.params[4:])

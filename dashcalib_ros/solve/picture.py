@@ -37,8 +37,8 @@ def picture_sigma(camera: Camera, parts: Sequence[Information], prior: Floats, f
                   step: Floats) -> PictureSigma:
     """Return the sigma over the picture.
 
-    parts, prior: (n, n) as for covariance(). floor: (n,) sigmas of systematic errors. step: (lens,)
-    to the wider model: what it would change counts as an error.
+    parts, prior: (n, n) as for covariance(). floor: (n,) sigmas of systematic errors. step:
+    (lens,) to the wider model; what it would change counts as an error.
     """
     moves, _ = sensitivity(camera)
     variances = _variances(moves, parts, prior) + _squares(moves * floor).sum(axis=1)

@@ -41,11 +41,11 @@ class Solution:
     around: Profile
     bounds: Floats
     prior_information: Floats
+    picture: PictureSigma
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     misfits: Mapping[TurnId, float] = field(default_factory=dict)
     tried: tuple[Candidate, ...] = ()
-    picture: PictureSigma | None = None
 
     @property
     def sigma(self) -> Floats:
