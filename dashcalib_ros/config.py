@@ -237,8 +237,10 @@ class Config:
     threads: int = setting(
         2, 'processes that reconstruct turns side by side; the result is the same with any', 1, 64)
     model: str = setting(
-        'auto', 'of the lens: radial, brown or fisheye; auto: the one that the turns prove',
-        pattern='[a-z_]+')
+        'auto', 'of the lens: radial, brown or fisheye; auto: the one that the turns prove')
+    rectified: str = setting(
+        'same', 'view of rectified pictures, P: as K, without black border, or all up to 75 deg',
+        choices=('same', 'crop', 'all'))
     max_width: int = setting(
         1440, 'px; wider images are halved until they fit: time and memory fall by four',
         320, 16384)

@@ -1,5 +1,6 @@
 """The camera models: projection, viewing rays, derivatives, limits; COLMAP's names and ROS's."""
-from dashcalib_ros.camera.camera import Camera, ros_camera
+from dashcalib_ros.camera.camera import Camera
+from dashcalib_ros.camera.camera_info import ros_camera
 from dashcalib_ros.camera.equidistant import Fisheye
 from dashcalib_ros.camera.models import (
     AUTO,
@@ -10,6 +11,7 @@ from dashcalib_ros.camera.models import (
     searched,
 )
 from dashcalib_ros.camera.plumb_bob import Brown, Radial
+from dashcalib_ros.camera.rectified import RECTIFIED
 
-__all__ = ['AUTO', 'MODELS', 'Brown', 'Camera', 'Fisheye', 'Radial', 'camera_from_ros', 'camera_of',
-           'model_named', 'ros_camera', 'searched']
+__all__ = ['AUTO', 'MODELS', 'RECTIFIED', 'Brown', 'Camera', 'Fisheye', 'Radial',
+           'camera_from_ros', 'camera_of', 'model_named', 'ros_camera', 'searched']

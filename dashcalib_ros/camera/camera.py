@@ -63,6 +63,7 @@ class Camera(ABC):
     step1, step2: how COLMAP adjusts it with one focal length and the centre fixed, and with all
     parameters (paper, 3.2). spread: prior standard deviation of each distortion coefficient,
     around 0. focal_ratios: focal lengths over the image width that the search for a start tries.
+    sees_behind: whether it projects rays beyond 90 degrees from its axis.
     """
 
     image_size: tuple[int, int]
@@ -77,6 +78,7 @@ class Camera(ABC):
     step2: ClassVar[ColmapModel]
     spread: ClassVar[tuple[float, ...]]
     focal_ratios: ClassVar[tuple[float, ...]]
+    sees_behind: ClassVar[bool] = False
 
     @classmethod
     def centred(cls, image_size: tuple[int, int], focal: float, *distortion: float) -> Self:
@@ -174,23 +176,3 @@ class Camera(ABC):
         width, height = self.image_size
         corners = np.array([[x, y] for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])
         return bool(np.isfinite(self.rays(corners)).all())
-
-
-@dataclass(frozen=True)
-class RosCamera:
-    """CameraInfo's fields, and those of a calibration file: row-major, no rectification."""
-
-    image_size: tuple[int, int]
-    distortion_model: str
-    d: list[float]
-    k: list[float]
-    r: list[float]
-    p: list[float]
-
-
-def ros_camera(camera: Camera) -> RosCamera:
-    """Return the camera as ROS has it: R is the identity, P has K's values."""
-    return RosCamera(
-        camera.image_size, camera.ros_model, [float(value) for value in camera.ros_distortion()],
-        camera.matrix.ravel().tolist(), np.eye(3).ravel().tolist(),
-        np.column_stack([camera.matrix, np.zeros(3)]).ravel().tolist())

@@ -40,6 +40,7 @@ class Fisheye(Camera):
     spread: ClassVar[tuple[float, ...]] = (0.2, 0.1, 0.05, 0.02)
     # 250 to 82 degrees across, without distortion
     focal_ratios: ClassVar[tuple[float, ...]] = tuple(0.23 * 1.2**n for n in range(7))
+    sees_behind: ClassVar[bool] = True
 
     def widened(self) -> Camera:
         """Return this camera: no model has more."""
@@ -106,7 +107,7 @@ class Fisheye(Camera):
         return by_params, by_point, focal * plain + [self.cx, self.cy]
 
     def depths(self, points: Floats) -> Floats:
-        """Return (...) the distances of points (..., 3): in all directions pictures shrink alike."""
+        """Return (...) the distances of points (..., 3): pictures shrink alike all around."""
         return np.asarray(np.linalg.norm(points, axis=-1))
 
     @cached_property

@@ -1,20 +1,22 @@
 """Cameras compared by what they do: where in the picture they see the same viewing rays.
 
 Parameters of a camera, and all the more of two models, may differ much and map rays alike. What
-counts is the distance in the picture, after the best common rotation of the rays: a rotation of the
-camera cannot be told from one of its mounting (Hagemann et al.).
+counts is the distance in the picture, after the best common rotation of the rays: a rotation of
+the camera cannot be told from one of its mounting (Hagemann et al.).
 """
 from __future__ import annotations
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera.camera import Camera
 
 # columns, rows: enough for a smooth field, and as in the benchmarks
 GRID = (25, 15)
 # px; where a camera that is fitted does not see a ray, that counts as this
 UNSEEN_PX = 100.0
+# degrees off the axis; cameras that do not see behind are compared up to here
+IN_FRONT_DEG = 88.0
 
 
 def grid_of(camera: Camera) -> Floats:
@@ -27,8 +29,9 @@ def grid_of(camera: Camera) -> Floats:
 def mapping_error(camera: Camera, reference: Camera) -> float | None:
     """Return the RMS pixel distance between both cameras' images of the same rays.
 
-    The rays are those of a grid over the reference's image. None when the reference has no ray for
-    a pixel of the grid, or the camera cannot see one of the rays.
+    The rays are those of a grid over the reference's image, without those that no camera of this
+    kind can see (unseen_share()). None when the reference has no ray for a pixel of the grid, or
+    the camera cannot see one of the others.
     """
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
@@ -37,6 +40,8 @@ def mapping_error(camera: Camera, reference: Camera) -> float | None:
     rays = reference.rays(pixels)
     if not np.isfinite(rays).all():
         return None
+    possible = _possible(camera, rays)
+    pixels, rays = pixels[possible], rays[possible]
 
     def residual(rotation: Floats) -> Floats:
         return (camera.project(Rotation.from_rotvec(rotation).apply(rays)) - pixels).ravel()
@@ -49,6 +54,18 @@ def mapping_error(camera: Camera, reference: Camera) -> float | None:
         except ValueError:  # a ray left the camera's view on the way
             return None
     return float(np.sqrt(np.mean(np.sum(rest.reshape(-1, 2)**2, -1))))
+
+
+def unseen_share(camera: Camera, reference: Camera) -> float:
+    """Return of how much of the reference's picture no camera of this kind can see the rays."""
+    rays = reference.rays(grid_of(reference))
+    return float(np.mean(~_possible(camera, rays[np.isfinite(rays[:, 0])])))
+
+
+def _possible(camera: Camera, rays: Floats) -> Mask:
+    """Return (n,) which rays are not too far from the axis for this kind of camera."""
+    return np.asarray(rays[:, 2] > (-2.0 if camera.sees_behind
+                                    else np.cos(np.radians(IN_FRONT_DEG))))
 
 
 def sensitivity(camera: Camera) -> tuple[Floats, Floats]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from dashcalib_ros.camera.camera import Camera
 from dashcalib_ros.camera.equidistant import Fisheye
 from dashcalib_ros.camera.plumb_bob import Brown, Radial
-from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.errors import ConfigError, InputError, shortened
 
 # as a setting: the turns choose
 AUTO = 'auto'
@@ -17,7 +17,7 @@ MODELS: dict[str, type[Camera]] = {model.model: model for model in (Radial, Brow
 def model_named(name: str) -> type[Camera]:
     """Return a model by its name; raises ConfigError for one that is not known."""
     if name not in MODELS:
-        raise ConfigError(f'there is no camera model {name!r}; there are '
+        raise ConfigError(f'there is no camera model {shortened(repr(name))}; there are '
                           f'{", ".join([AUTO, *MODELS])}')
     return MODELS[name]
 
@@ -65,4 +65,4 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
 
 
 # other names that ROS has for a model, or for one that contains it
-SAME = {'plumb_bob': ('rational_polynomial',)}
+SAME = {'plumb_bob': ('rational_polynomial',), 'equidistant': ('fisheye',)}

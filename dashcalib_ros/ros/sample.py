@@ -13,9 +13,9 @@ from dashcalib_ros.ros.parameters import CHANGEABLE, NodeConfig
 HEAD = """\
 # Every parameter of the node 'calibrator' with its default: first those that users set, then those
 # for experts. Made by dashcalib_ros.ros.sample from the code's own settings; keep only the lines
-# that you change. Names with a dot, seed, threads, model, max_width and min_width are settings of
-# the core, which dashcalib run --set NAME=VALUE takes, too; the others are the node's own.
-# Topics are remapped, not parameters: image_raw in, camera_info out.
+# that you change. Names with a dot, seed, threads, model, rectified, max_width and min_width are
+# settings of the core, which dashcalib run --set NAME=VALUE takes, too; the others are the node's
+# own. Topics are remapped, not parameters: image_raw in, camera_info out.
 /**:
   ros__parameters:
 """

@@ -11,12 +11,15 @@ from dashcalib_ros.camera import (
     MODELS,
     Brown,
     Camera,
+    Fisheye,
     Radial,
     camera_from_ros,
     camera_of,
+    model_named,
     ros_camera,
+    searched,
 )
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import ConfigError, InputError
 
 SIZE = (1280, 720)
 BARREL = Radial(SIZE, 700.0, 703.0, 652.0, 350.0, -0.30, 0.09)
@@ -25,8 +28,15 @@ PINHOLE = Radial(SIZE, 650.0, 650.0, 639.5, 359.5)
 # reaches a radius of 0.66 at k1 = -0.6 (fold at 0.745, distorted 0.497): the corners lie beyond
 FOLDED = Radial(SIZE, 700.0, 700.0, 639.5, 359.5, -0.6, 0.0)
 DECENTRED = Brown(SIZE, 700.0, 703.0, 652.0, 350.0, -0.30, 0.09, 0.002, -0.003, -0.01)
+FISHEYE = Fisheye(SIZE, 700.0, 703.0, 652.0, 350.0, -0.03, 0.01, -0.004, 0.001)
+# 190 degrees across; the corners see to 117
+ROUND = Fisheye(SIZE, 390.0, 391.0, 630.0, 365.0, -0.02, 0.004, -0.002, 0.0003)
+# theta (1 - 0.3 theta^2) has its maximum 0.7027 at theta = 1.0541: the sides lie beyond
+FOLDED_FISHEYE = Fisheye(SIZE, 600.0, 600.0, 639.5, 359.5, -0.3)
 CAMERAS: dict[str, Camera] = {
-    'barrel': BARREL, 'pincushion': PINCUSHION, 'pinhole': PINHOLE, 'decentred': DECENTRED}
+    'barrel': BARREL, 'pincushion': PINCUSHION, 'pinhole': PINHOLE, 'decentred': DECENTRED,
+    'fisheye': FISHEYE, 'round': ROUND}
+FISHEYES = [name for name, camera in CAMERAS.items() if isinstance(camera, Fisheye)]
 
 
 def pixels(camera: Camera) -> np.ndarray:
@@ -44,9 +54,16 @@ def test_projects_as_opencv_does(name):
                        depth], axis=1)
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     named = camera.named
-    expected, _ = cv2.projectPoints(
-        points, np.zeros(3), np.zeros(3), matrix,
-        np.array([named.get(name, 0.0) for name in ('k1', 'k2', 'p1', 'p2', 'k3')]))
+    fisheye = isinstance(camera, Fisheye)
+    names = ('k1', 'k2', 'k3', 'k4') if fisheye else ('k1', 'k2', 'p1', 'p2', 'k3')
+    distortion = np.array([named.get(name, 0.0) for name in names])
+    origin = np.zeros(3)
+    if fisheye:
+        expected, _ = cv2.fisheye.projectPoints(points[:, None], origin, origin, matrix,
+                                                distortion)
+        expected = expected.reshape(-1, 1, 2)
+    else:
+        expected, _ = cv2.projectPoints(points, origin, origin, matrix, distortion)
     np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-9)
     # any leading shape
     np.testing.assert_array_equal(camera.project(points.reshape(3, 100, 3)).reshape(-1, 2),
@@ -65,6 +82,56 @@ def test_rays_undo_project_all_over_the_picture(name):
     np.testing.assert_allclose(camera.rays(camera.project(rays * 7.0)), rays, atol=3e-6)
 
 
+def angles_off_axis(rays: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(rays[..., 2]))
+
+
+def all_around(angles: np.ndarray) -> np.ndarray:
+    """Return (n, 3) rays so many degrees off the axis, in all directions."""
+    theta, phi = np.meshgrid(np.radians(angles), np.radians(np.arange(0, 360, 15)))
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)],
+                    -1).reshape(-1, 3)
+
+
+def test_a_fisheye_sees_behind_itself():
+    rays = ROUND.rays(pixels(ROUND))
+    assert 110 < angles_off_axis(rays).max() < 120
+    wanted = all_around(np.linspace(0.0, 110.0, 45))
+    seen = ROUND.project(wanted)
+    assert np.isfinite(seen).all()
+    np.testing.assert_allclose(ROUND.rays(seen), wanted, atol=1e-8)
+    # the farther off the axis, the farther out in the picture
+    out = np.linalg.norm((seen - [ROUND.cx, ROUND.cy]) / [ROUND.fx, ROUND.fy], axis=1)
+    assert (np.diff(out.reshape(-1, 45), axis=1) > 0).all()
+    # other models do not
+    assert np.isnan(BARREL.project(wanted[wanted[:, 2] < 0])).all()
+    assert (ROUND.sees_behind, BARREL.sees_behind, DECENTRED.sees_behind) == (True, False, False)
+
+
+def test_a_fisheye_has_an_end_too():
+    assert np.isnan(ROUND.project(all_around(np.array([121.0, 150.0, 180.0])))).all()
+    assert np.isnan(ROUND.project(np.zeros(3))).all()
+    straight_back = ROUND.project(np.array([0.0, 0.0, -1.0]))
+    assert np.isnan(straight_back).all()
+    assert np.isnan(ROUND.rays(np.array([5000.0, 365.0]))).all()
+
+
+def test_a_fisheye_folds_over_where_its_slope_is_0():
+    assert FOLDED_FISHEYE.fold == pytest.approx(1.0541, abs=1e-4)
+    assert not FOLDED_FISHEYE.covers_picture()
+    xy = pixels(FOLDED_FISHEYE)
+    rays = FOLDED_FISHEYE.rays(xy)
+    reached = np.isfinite(rays[..., 0])
+    radius = np.linalg.norm((xy - [639.5, 359.5]) / 600.0, axis=-1)
+    assert not reached[radius > 0.7029].any() and reached[radius < 0.69].all()
+    assert angles_off_axis(rays[reached]).max() < 60.4  # 1.0541 rad
+    np.testing.assert_allclose(FOLDED_FISHEYE.project(rays[reached]), xy[reached], atol=1e-3)
+    # rays beyond would come to lie in the picture again
+    assert np.isnan(FOLDED_FISHEYE.project(all_around(np.array([60.5, 80.0, 100.0])))).all()
+    # k4 decides far out only
+    assert Fisheye(SIZE, 390.0, 390.0, 639.5, 359.5, 0.0, 0.0, 0.0, -0.002).fold < 1.9
+
+
 @given(fx=st.floats(300, 3000), aspect=st.floats(0.97, 1.03), k1=st.floats(-0.45, 0.4),
        k2=st.floats(-0.2, 0.3), x=st.floats(-0.5, 1279.5), y=st.floats(-0.5, 719.5))
 @settings(max_examples=300, deadline=None, derandomize=True)
@@ -78,10 +145,15 @@ def test_rays_are_right_or_missing(fx, aspect, k1, k2, x, y):
                                    atol=1e-5 * fx)
 
 
-def test_the_centre_is_straight_ahead_and_nan_stays_nan():
-    rays = BARREL.rays(np.array([[BARREL.cx, BARREL.cy], [np.nan, np.nan]]))
+@pytest.mark.parametrize('name', CAMERAS)
+def test_the_centre_is_straight_ahead_and_nan_stays_nan(name):
+    camera = CAMERAS[name]
+    rays = camera.rays(np.array([[camera.cx, camera.cy], [np.nan, np.nan], [np.nan, 100.0]]))
     np.testing.assert_allclose(rays[0], [0.0, 0.0, 1.0], atol=1e-12)
-    assert np.isnan(rays[1]).all()
+    assert np.isnan(rays[1:]).all()
+    seen = camera.project(np.array([[0.0, 0.0, 3.0], [np.nan, 0.0, 1.0], [0.1, 0.2, np.nan]]))
+    np.testing.assert_allclose(seen[0], [camera.cx, camera.cy], atol=1e-9)
+    assert np.isnan(seen[1:]).any(axis=1).all()
 
 
 def test_a_pixel_beyond_the_fold_has_no_ray():
@@ -139,6 +211,36 @@ def test_derivatives_are_those_of_the_projection(name):
         np.testing.assert_allclose(by_point[:, :, axis], numeric, atol=1e-4)
 
 
+@pytest.mark.parametrize('distance', [1.0, 0.2, 30.0])
+@pytest.mark.parametrize('name', FISHEYES)
+def test_derivatives_of_a_fisheye_are_right_all_around(name, distance):
+    camera = CAMERAS[name]
+    # on the axis, so near to it that limits are taken, a little farther, and behind
+    points = distance * all_around(np.array([0.0, 1e-7, 1e-5, 1e-3, 0.1, 30, 60, 89.9, 90, 100,
+                                             112]))
+    by_params, by_point, found = camera.derivatives(points)
+    np.testing.assert_allclose(found, camera.project(points), atol=1e-9)
+    for n, value in enumerate(camera.params):
+        step = 1e-6 * max(abs(value), 1.0) * np.eye(len(camera.params))[n]
+        ahead, behind = (camera.with_params(camera.params + sign * step).project(points)
+                         for sign in (1, -1))
+        numeric = (ahead - behind) / (2 * step[n])
+        np.testing.assert_allclose(by_params[:, :, n], numeric, atol=1e-4)
+    size = 1e-5 * distance
+    for axis in range(3):
+        step = size * np.eye(3)[axis]
+        numeric = (camera.project(points + step) - camera.project(points - step)) / (2 * size)
+        np.testing.assert_allclose(by_point[:, :, axis] * distance, numeric * distance,
+                                   atol=1e-4)
+
+
+def test_derivatives_of_no_points():
+    for camera in CAMERAS.values():
+        n = len(camera.names())
+        shapes = [each.shape for each in camera.derivatives(np.zeros((0, 3)))]
+        assert shapes == [(0, 2, n), (0, 2, 3), (0, 2)]
+
+
 def test_points_behind_the_camera_have_no_pixel():
     pixels = BARREL.project(np.array([[1.0, 1.0, -5.0], [0.0, 0.0, 0.0], [1.0, 1.0, 5.0]]))
     assert np.isnan(pixels[:2]).all() and np.isfinite(pixels[2]).all()
@@ -172,10 +274,32 @@ def test_colmap_projects_as_we_do(name):
 def test_ros_describes_the_same_camera(name):
     camera = CAMERAS[name]
     ros = ros_camera(camera)
-    assert ros.distortion_model == 'plumb_bob' and len(ros.d) == 5 and len(ros.p) == 12
+    assert (ros.distortion_model, len(ros.d)) == (
+        ('equidistant', 4) if name in FISHEYES else ('plumb_bob', 5))
+    assert len(ros.p) == 12 and ros.p[:3] == ros.k[:3]
     again = camera_from_ros(SIZE, ros.distortion_model, ros.k, ros.d)
     # the simplest that has these numbers
     assert again == camera
+
+
+def test_other_names_of_a_model_are_understood():
+    k = ros_camera(FISHEYE).k
+    for name in ('equidistant', 'fisheye'):
+        assert camera_from_ros(SIZE, name, k, FISHEYE.ros_distortion()) == FISHEYE
+    assert camera_from_ros(SIZE, 'equidistant', k, [0.0] * 4) == Fisheye(
+        SIZE, 700.0, 703.0, 652.0, 350.0)
+    # four are the same coefficients of other models, too, and never taken for them
+    assert camera_from_ros(SIZE, 'plumb_bob', k, [0.1, 0.2, 0.001, 0.0]).model == 'brown'
+
+
+def test_a_model_that_nobody_knows_is_told_in_one_line():
+    for name in ('fish-eye', 'Fisheye', '', 'x\ny' * 100):
+        with pytest.raises(ConfigError, match='there are auto, radial, brown, fisheye') as caught:
+            model_named(name)
+        assert '\n' not in str(caught.value) and len(str(caught.value)) < 300
+        with pytest.raises(ConfigError):
+            searched(name)
+    assert [model.model for model in searched('auto')] == ['radial', 'fisheye']
 
 
 def test_what_no_model_describes_is_refused():
