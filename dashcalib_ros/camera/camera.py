@@ -77,7 +77,8 @@ class Camera(ABC):
     step1: ClassVar[ColmapModel]
     step2: ClassVar[ColmapModel]
     spread: ClassVar[tuple[float, ...]]
-    focal_ratios: ClassVar[tuple[float, ...]]
+    # 126 to 29 degrees across, without distortion
+    focal_ratios: ClassVar[tuple[float, ...]] = tuple(0.256 * 1.25**n for n in range(10))
     sees_behind: ClassVar[bool] = False
 
     @classmethod
