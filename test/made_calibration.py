@@ -5,13 +5,25 @@ import dataclasses
 
 import numpy as np
 
-from dashcalib_ros.camera import Radial
+from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
 
 SIZE = (1242, 375)
 TRUTH = Radial(SIZE, 721.5377, 724.25, 609.5593, 172.854, -0.363, 0.151)
 SIGMA = dict(zip(TRUTH.names(), (3.5, 3.75, 2.0, 2.25, 0.004, 0.003), strict=True))
+# one camera of each model
+EACH_MODEL = {
+    'radial': TRUTH,
+    'brown': Brown.of(SIZE, [*TRUTH.params, 0.00034, -0.0012, -0.04]),
+    'fisheye': Fisheye(SIZE, 420.0, 421.5, 615.0, 180.0, -0.021, 0.0043, -0.0021, 0.00034)}
+
+
+def calibration_of(camera, level='accepted', **changes):
+    """Make a calibration of any camera, with sigmas for all its parameters."""
+    sigma = dict(zip(camera.names(), (3.5, 3.75, 2.0, 2.25, 0.004, 0.003, 0.0002, 0.00005, 0.001),
+                     strict=False))
+    return make_calibration(level, camera=camera, sigma=sigma, **changes)
 
 
 def make_calibration(level='accepted', **changes):

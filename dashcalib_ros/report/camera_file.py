@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dashcalib_ros.camera import MODELS, Brown, Camera, Radial
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.camera import MODELS, Brown, Camera, Fisheye, Radial
+from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.limits import JSON_BYTES, read_text
 from dashcalib_ros.report.camera_yaml import parse_calibration_yaml
 from dashcalib_ros.report.named_camera import (
@@ -46,10 +46,22 @@ def _read_camera(model: type[Camera], size: tuple[int, int], data: Any, path: Pa
 
 def _truth_camera(data: Mapping[str, Any], path: Path) -> NamedCamera:
     size = read_size(data.get('width'), data.get('height'), path)
-    extra = Brown.names()[len(Radial.names()):]
-    decentred = any(read_number(data, name, path, 0.0) for name in extra)
-    filled = {**dict.fromkeys(extra, 0.0), **data}
-    camera = _read_camera(Brown if decentred else Radial, size, filled, path)
+    name = data.get('model', Radial.model)
+    if name in (Fisheye.model, Fisheye.ros_model):
+        model: type[Camera] = Fisheye
+    elif name in (Radial.model, Brown.model, Radial.ros_model):
+        extra = Brown.names()[len(Radial.names()):]
+        model = Brown if any(read_number(data, each, path, 0.0) for each in extra) else Radial
+    else:
+        raise InputError(f'{path} has the camera model {shortened(repr(name))}; there are '
+                         f'{", ".join(MODELS)}')
+    # the terms after k2 may be left out: they are 0
+    further = dict.fromkeys(model.names()[len(Radial.names()):], 0.0)
+    camera = _read_camera(model, size, {**further, **data}, path)
+    odd = [each for each in ('p1', 'p2', 'k3', 'k4', 'k5', 'k6')
+           if each not in camera.names() and read_number(data, each, path, 0.0)]
+    if odd:
+        raise InputError(f'{path} has {odd[0]}, which the {camera.model} model has not')
     return NamedCamera(str(path), camera, read_sigma(data.get('sigma'), camera))
 
 
@@ -61,7 +73,8 @@ def _result_camera(data: Mapping[str, Any], path: Path) -> NamedCamera:
         raise InputError(f'{path}: image_size must be [width, height], not {size!r}')
     name = str(data.get('camera_model', Radial.model))
     if name not in MODELS:
-        raise InputError(f'{path} has the camera model {name}; there are {", ".join(MODELS)}')
+        raise InputError(f'{path} has the camera model {shortened(repr(name))}; there are '
+                         f'{", ".join(MODELS)}')
     camera = _read_camera(MODELS[name], read_size(size[0], size[1], path), data['intrinsics'],
                           path)
     return NamedCamera(str(path), camera, read_sigma(data.get('sigma'), camera),

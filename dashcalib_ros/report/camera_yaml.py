@@ -40,7 +40,7 @@ def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
     check_camera_name(camera_name)
     if calibration.camera is None or not np.isfinite(calibration.camera.params).all():
         raise ValueError('a calibration without finite intrinsics has no calibration.yaml')
-    c = ros_camera(calibration.camera)
+    c = ros_camera(calibration.camera, calibration.config.rectified)
     width, height = calibration.image_size
     document = {
         'image_width': int(width),

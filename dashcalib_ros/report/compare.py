@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.mapping import mapping_error
+from dashcalib_ros.camera.mapping import mapping_error, unseen_share
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.result import plain_values
@@ -32,12 +32,17 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What compare() found. mapping_px: RMS over the image; None where b's model folds over."""
+    """What compare() found.
+
+    mapping_px: RMS over the image; None where a model folds over inside. unseen: of the image,
+    where a's model can see no rays; it is left out.
+    """
 
     a: NamedCamera
     b: NamedCamera
     differences: tuple[Difference, ...]
     mapping_px: float | None
+    unseen: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Return the comparison as values of strict JSON."""
@@ -48,7 +53,7 @@ class Comparison:
             del row['name']
         plain: dict[str, Any] = plain_values({
             **sides, 'image_size': self.b.image_size, 'parameters': rows,
-            'mapping_px': self.mapping_px})
+            'mapping_px': self.mapping_px, 'unseen': self.unseen})
         return plain
 
 
@@ -60,7 +65,8 @@ def compare(a: NamedCamera, b: NamedCamera) -> Comparison:
             f'{b.image_size[0]} x {b.image_size[1]}; compare calibrations of the same image size')
     names = _common_names(a.camera, b.camera)
     rows = tuple(_difference(name, a, b) for name in names)
-    return Comparison(a, b, rows, mapping_error(a.camera, b.camera))
+    return Comparison(a, b, rows, mapping_error(a.camera, b.camera),
+                      unseen_share(a.camera, b.camera))
 
 
 def _common_names(a: Camera, b: Camera) -> tuple[str, ...]:

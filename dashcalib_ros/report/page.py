@@ -15,6 +15,7 @@ from dashcalib_ros.report.wording import (
     ADVICE,
     TURN_COLUMNS,
     parameter_rows,
+    picture_text,
     shutter_text,
     stored_text,
     turn_row,
@@ -78,7 +79,7 @@ def _parameters(c: Calibration) -> str:
     size = f'{c.image_size[0]} × {c.image_size[1]} px'
     return (f'<h2>Parameters</h2>{_table(("parameter", "value", "sigma", "relative"), rows)}'
             f'<p class="note">For images of {size}, full size; {c.camera.model} model, '
-            f'{c.camera.ros_model} in ROS; '
+            f'{c.camera.ros_model} in ROS, P: {c.config.rectified}; '
             "the first pixel's centre is (0, 0), as in ROS and OpenCV.</p>")
 
 
@@ -111,6 +112,8 @@ def _drive(c: Calibration) -> str:
         rows.append(('earlier drives', stored_text(c.stored_turns)))
     if c.reprojection_error_px is not None:
         rows.append(('reprojection error', f'{c.reprojection_error_px:.3f} px'))
+    if c.sigma_px is not None:
+        rows.append(('sigma', picture_text(c.sigma_px)))
     if c.rolling_shutter is not None:
         rows.append(('shutter', shutter_text(c.rolling_shutter)))
     rows += [(f'time: {name}', f'{seconds:.1f} s') for name, seconds in c.timing.items()]

@@ -14,9 +14,11 @@ from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.report.compare import Comparison, Difference
 from dashcalib_ros.report.wording import (
     TURN_COLUMNS,
+    digits_of,
     number,
     optional,
     parameter_rows,
+    picture_text,
     shutter_text,
     stored_text,
     turn_row,
@@ -69,7 +71,11 @@ def mapping_text(found: Comparison) -> Text:
     """Return the line with the mapping error."""
     if found.mapping_px is None or not math.isfinite(found.mapping_px):
         return Text('mapping error: unknown, a lens model folds over inside the image')
-    return Text(f'mapping error: {found.mapping_px:.2f} px')
+    text = f'mapping error: {found.mapping_px:.2f} px'
+    if found.unseen:
+        text += (f', without the {100 * found.unseen:.0f} % of the picture that the '
+                 f'{found.a.camera.model} model cannot see')
+    return Text(text)
 
 
 def text_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
@@ -83,17 +89,22 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 
 
 def _difference_row(d: Difference) -> tuple[str, ...]:
-    return (d.name, number(d.name, d.a), number(d.name, d.b), f'{d.difference:+.4f}',
+    digits = max(4, digits_of(d.name))
+    return (d.name, number(d.name, d.a), number(d.name, d.b), f'{d.difference:+.{digits}f}',
             '-' if d.percent is None else f'{d.percent:+.3f} %', optional(d.z, 1))
 
 
 def _facts(c: Calibration) -> str:
     used = sum(turn.used for turn in c.turns)
     facts = [f'{c.frames} frames', f'{used} of {len(c.turns)} turns used']
+    if c.camera is not None:
+        facts.append(f'{c.camera.model} model')
     if c.stored_turns:
         facts.append(stored_text(c.stored_turns))
     if c.reprojection_error_px is not None:
         facts.append('reprojection error ' + optional(c.reprojection_error_px, 3, ' px'))
+    if c.sigma_px is not None:
+        facts.append('sigma ' + picture_text(c.sigma_px))
     if c.rolling_shutter is not None:
         facts.append(shutter_text(c.rolling_shutter))
     if c.mask is not None:

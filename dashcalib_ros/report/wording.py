@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from dashcalib_ros.judgement import Calibration, TurnSummary
 from dashcalib_ros.judgement.calibration import Shutter, StoredTurnSummary
+from dashcalib_ros.solve.picture import PictureSigma
 
 ADVICE = {
     'accepted': 'Good to use: calibration.yaml was written.',
@@ -37,7 +38,15 @@ def _parameter_row(name: str, value: float, sigma: float | None) -> tuple[str, s
 
 def number(name: str, value: float) -> str:
     """Return a parameter's value with its significant digits and its unit."""
-    return f'{value:.2f} px' if name in PIXELS else f'{value:.4f}'
+    return f'{value:.{digits_of(name)}f}' + (' px' if name in PIXELS else '')
+
+
+def digits_of(name: str) -> int:
+    """Return how many digits after the point a parameter and its sigma need."""
+    if name in PIXELS:
+        return 2
+    # the coefficients of higher terms, and of a lens that is decentred, are small
+    return 4 if name in ('k1', 'k2') else 6
 
 
 def turn_row(turn: TurnSummary) -> tuple[str, ...]:
@@ -58,6 +67,11 @@ def shutter_text(shutter: Shutter) -> str:
     """Return a line about the rolling shutter that was found."""
     return (f'rolling shutter of {shutter.readout_ms:.1f} ± {shutter.sigma_ms:.1f} ms found and '
             'removed')
+
+
+def picture_text(sigma: PictureSigma) -> str:
+    """Return a line about how far the whole camera may be off."""
+    return f'{sigma.rms:.2f} px over the picture, {sigma.worst:.2f} px at the worst'
 
 
 def optional(value: float | None, digits: int, unit: str = '') -> str:

@@ -7,11 +7,11 @@ import math
 
 import numpy as np
 import pytest
-from made_calibration import SIGMA, TRUTH, make_calibration
+from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from dashcalib_ros.camera import Brown, Radial
+from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.report import (
     NamedCamera,
@@ -79,6 +79,59 @@ def test_a_common_rotation_hides_most_of_a_shifted_centre():
     assert 0 < mapping_error(shifted(cx=2.0).camera, TRUTH) < 1.0
 
 
+WIDE = Fisheye((1280, 720), 390.0, 391.0, 630.0, 365.0, -0.02, 0.004, -0.002, 0.0003)
+
+
+@pytest.mark.parametrize('estimate', [
+    dataclasses.replace(WIDE, fx=392.0, cy=366.0, k1=-0.022, k4=0.0004),
+    Radial(WIDE.image_size, 380.0, 385.0, 635.0, 360.0, 0.002, 0.0),
+    Brown(WIDE.image_size, 380.0, 385.0, 635.0, 360.0, -0.01, 0.001, 1e-4, 1e-4, 0.0),
+], ids=['fisheye', 'radial', 'brown'])
+def test_mapping_error_against_a_fisheye_agrees_with_the_scoring_tool(estimate):
+    """Its rule: rays beyond 88 degrees are left out where the estimate is no fisheye."""
+    width, height = WIDE.image_size
+    uv = np.array([(u, v) for v in np.linspace(0, height - 1, 15)
+                   for u in np.linspace(0, width - 1, 25)])
+    xy = (uv - [WIDE.cx, WIDE.cy]) / [WIDE.fx, WIDE.fy]
+    radius = np.hypot(*xy.T)
+    theta = radius.copy()
+    for _ in range(100):
+        s = theta**2
+        value = theta * (1 + s * (WIDE.k1 + s * (WIDE.k2 + s * (WIDE.k3 + s * WIDE.k4))))
+        slope = 1 + s * (3 * WIDE.k1 + s * (5 * WIDE.k2 + s * (7 * WIDE.k3 + 9 * s * WIDE.k4)))
+        theta = theta - (value - radius) / slope
+    rays = np.column_stack([xy / radius[:, None] * np.sin(theta)[:, None], np.cos(theta)])
+    fisheye = isinstance(estimate, Fisheye)
+    kept = fisheye | (theta < np.radians(88.0))
+
+    def residual(rotation):
+        x, y, z = Rotation.from_rotvec(rotation).apply(rays[kept]).T
+        c = {**dict.fromkeys(('p1', 'p2', 'k3', 'k4'), 0.0), **estimate.named}
+        if fisheye:
+            r = np.hypot(x, y)
+            t = np.arctan2(r, z)
+            s = t * t
+            factor = t / r * (1 + s * (c['k1'] + s * (c['k2'] + s * (c['k3'] + s * c['k4']))))
+            x, y = x * factor, y * factor
+        else:
+            x, y = x / z, y / z
+            s = x * x + y * y
+            factor = 1 + s * (c['k1'] + s * (c['k2'] + s * c['k3']))
+            x, y = (x * factor + 2 * c['p1'] * x * y + c['p2'] * (s + 2 * x * x),
+                    y * factor + c['p1'] * (s + 2 * y * y) + 2 * c['p2'] * x * y)
+        return (np.stack([c['fx'] * x + c['cx'], c['fy'] * y + c['cy']], -1) - uv[kept]).ravel()
+
+    fit = least_squares(residual, np.zeros(3))
+    expected = math.sqrt(np.mean(fit.fun.reshape(-1, 2) ** 2) * 2)
+    assert mapping_error(estimate, WIDE) == pytest.approx(expected, rel=1e-6)
+    found = compare(NamedCamera('estimate', estimate), NamedCamera('truth', WIDE))
+    assert found.unseen == pytest.approx(1 - np.mean(kept))
+    assert found.as_dict()['unseen'] == found.unseen and (found.unseen == 0) == fisheye
+    # a coefficient of the same name has another meaning in another family
+    assert [row.name for row in found.differences] == list(
+        WIDE.names() if fisheye else ('fx', 'fy', 'cx', 'cy'))
+
+
 @pytest.mark.parametrize('k2', [0.0, 0.1])
 def test_pixels_beyond_a_fold_have_no_ray_and_no_number_is_made_up(k2):
     # with k2 = 0.1 there is a second, false root far out: the search must not take it
@@ -129,6 +182,52 @@ def test_all_three_formats_say_the_same(tmp_path):
         assert camera.camera == TRUTH
         assert compare(result, camera).mapping_px == pytest.approx(0, abs=1e-9)
     assert load_camera(tmp_path / 'calibration.yaml').sigma == result.sigma == SIGMA
+
+
+@pytest.mark.parametrize('model', EACH_MODEL)
+def test_all_formats_know_all_models(tmp_path, model):
+    lens = EACH_MODEL[model]
+    calibration = calibration_of(lens)
+    (tmp_path / 'result.json').write_text(result_json(calibration))
+    (tmp_path / 'calibration.yaml').write_text(calibration_yaml(calibration))
+    (tmp_path / 'truth.json').write_text(json.dumps(
+        {**lens.named, 'width': 1242, 'height': 375,
+         **({'model': 'fisheye'} if model == 'fisheye' else {})}))
+    for name in ('result.json', 'calibration.yaml', 'truth.json'):
+        read = load_camera(tmp_path / name)
+        assert read.camera == lens
+        assert read.sigma == (None if name == 'truth.json' else calibration.sigma)
+
+
+@pytest.mark.parametrize(('model', 'expected'), [
+    ('fisheye', 'fisheye'), ('equidistant', 'fisheye'), ('radial', 'radial'), ('brown', 'radial'),
+    ('plumb_bob', 'radial')])
+def test_a_truth_may_name_its_model(tmp_path, model, expected):
+    data = {**TRUTH.named, 'width': 1242, 'height': 375, 'model': model}
+    (tmp_path / 'truth.json').write_text(json.dumps(data))
+    camera = load_camera(tmp_path / 'truth.json').camera
+    assert camera.model == expected and camera.named == {
+        **TRUTH.named, **({'k3': 0.0, 'k4': 0.0} if expected == 'fisheye' else {})}
+
+
+@pytest.mark.parametrize(('change', 'complaint'), [
+    ({'model': 'mirror'}, "the camera model 'mirror'; there are radial, brown, fisheye"),
+    ({'model': ['fisheye']}, 'there are radial'),
+    ({'k4': 0.01}, 'has k4, which the radial model has not'),
+    ({'model': 'fisheye', 'p1': 0.01}, 'has p1, which the fisheye model has not')])
+def test_a_truth_of_no_model_here_is_refused(tmp_path, change, complaint):
+    data = {**TRUTH.named, 'width': 1242, 'height': 375, **change}
+    (tmp_path / 'truth.json').write_text(json.dumps(data))
+    with pytest.raises(InputError, match=complaint):
+        load_camera(tmp_path / 'truth.json')
+
+
+def test_a_result_of_no_model_here_is_refused(tmp_path):
+    data = json.loads(result_json(make_calibration())) | {'camera_model': 'x' * 1000}
+    (tmp_path / 'result.json').write_text(json.dumps(data))
+    with pytest.raises(InputError, match='there are radial, brown, fisheye') as caught:
+        load_camera(tmp_path)
+    assert len(str(caught.value)) < 400
 
 
 def test_different_image_sizes_are_an_error():

@@ -10,12 +10,14 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
-from made_calibration import SIGMA, TRUTH, make_calibration
+from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
 from rich.console import Console
 
+from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.report import NamedCamera, compare, report_html
 from dashcalib_ros.report.figures import magnitude_svg, mask_data_uri, ticks
 from dashcalib_ros.report.tables import against_truth, comparison, summary
+from dashcalib_ros.solve.picture import PictureSigma
 
 VOID = {'meta', 'img', 'br'}
 
@@ -63,6 +65,22 @@ def test_the_page_shows_the_verdict_and_needs_nothing_else(level):
     assert page.links and all(link.startswith('data:') for link in page.links)
     assert 'http' not in text and 'script' not in page.tags and 'url(' not in text
     assert 'svg' in page.tags and 'turns.half_width' in page.text and '4.2.1' in page.text
+
+
+@pytest.mark.parametrize('model', EACH_MODEL)
+def test_every_model_s_parameters_are_shown_with_their_sigmas(model):
+    lens = EACH_MODEL[model]
+    calibration = calibration_of(lens, sigma_px=PictureSigma(0.412, 1.37))
+    page = Page(report_html(calibration))
+    assert f'{model} model, {lens.ros_model} in ROS' in page.text
+    for text in (page.text, terminal(summary(calibration))):
+        assert f'{model} model' in text
+        assert '0.41 px over the picture, 1.37 px at the worst' in ' '.join(text.split())
+        for name in lens.names():
+            # a sigma of 0.0000 would be a lie
+            shown = re.search(rf'\b{name}\s+(-?[\d.]+)( px)?\s+± ([\d.]+)', text)
+            assert shown, name
+            assert float(shown[1]) != 0 and float(shown[3]) > 0
 
 
 def test_text_from_outside_is_escaped():
@@ -181,6 +199,22 @@ def test_against_truth_has_error_in_percent_and_in_sigmas():
     text = terminal(against_truth(compare(NamedCamera('a', moved, SIGMA),
                                           NamedCamera('truth', TRUTH))))
     assert re.search(r'fx\s+728\.54 px\s+± 3\.50 px\s+721\.54 px\s+\+0\.970 %\s+2\.0', text)
+
+
+def test_what_one_of_two_models_cannot_see_is_told():
+    wide = Fisheye((1280, 720), 390.0, 391.0, 630.0, 365.0)
+    pinhole = NamedCamera('pinhole', Radial((1280, 720), 390.0, 391.0, 630.0, 365.0))
+    text = terminal(comparison(compare(pinhole, NamedCamera('truth', wide))))
+    assert re.search(r'px, without the \d+ % of the picture that the radial model cannot', text)
+    assert 'k1' not in text and 'cy' in text
+    assert 'without' not in terminal(comparison(compare(NamedCamera('truth', wide), pinhole)))
+
+
+def test_small_coefficients_differ_visibly():
+    lens = EACH_MODEL['brown']
+    moved = dataclasses.replace(lens, p1=lens.p1 + 0.00002)
+    text = terminal(comparison(compare(NamedCamera('a', moved), NamedCamera('b', lens))))
+    assert re.search(r'p1\s+0\.000360\s+0\.000340\s+\+0\.000020', text)
 
 
 def test_an_unknown_mapping_error_is_said_to_be_unknown():

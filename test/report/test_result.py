@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from made_calibration import SIGMA, TRUTH, make_calibration
+from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
@@ -50,6 +50,15 @@ def test_result_has_the_contract_s_keys_and_values():
         'images': 31, 'registered': 30, 'used': True, 'yaw_deg': 91.5,
         'reprojection_error_px': 0.46, 'misfit': 1.1}
     assert result['masked_fraction'] == pytest.approx(75 / 375)
+
+
+@pytest.mark.parametrize('model', EACH_MODEL)
+def test_intrinsics_have_the_keys_of_the_model(model):
+    lens = EACH_MODEL[model]
+    result = strict(result_json(calibration_of(lens)))
+    assert result['camera_model'] == model
+    assert result['intrinsics'] == lens.named
+    assert list(result['sigma']) == list(lens.names())
 
 
 def test_a_refused_result_has_null_intrinsics():

@@ -5,9 +5,10 @@ import dataclasses
 
 import pytest
 import yaml
-from made_calibration import SIGMA, TRUTH, make_calibration
+from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
 
-from dashcalib_ros.camera import Brown
+from dashcalib_ros.camera import Brown, Fisheye
+from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.report import calibration_yaml, load_calibration_yaml
 
@@ -58,6 +59,34 @@ def test_keys_order_and_values_are_the_parsers_own():
     for key in ('camera_matrix', 'distortion_coefficients', 'projection_matrix'):
         assert list(document[key]) == ['rows', 'cols', 'data']
         assert all(type(value) is float for value in document[key]['data'])
+
+
+def test_a_fisheye_has_four_coefficients():
+    lens = EACH_MODEL['fisheye']
+    document = yaml.safe_load(calibration_yaml(calibration_of(lens)))
+    assert list(document) == [*PARSERS_KEYS, 'dashcalib']
+    assert document['distortion_model'] == 'equidistant'
+    assert document['distortion_coefficients'] == {
+        'rows': 1, 'cols': 4, 'data': [lens.k1, lens.k2, lens.k3, lens.k4]}
+    assert document['dashcalib']['camera_model'] == 'fisheye'
+    assert list(document['dashcalib']['sigma']) == list(lens.names())
+
+
+@pytest.mark.parametrize('model', EACH_MODEL)
+def test_p_is_what_the_setting_wants(tmp_path, model):
+    lens = EACH_MODEL[model]
+    shown = {}
+    for rectified in ('same', 'crop', 'all'):
+        config = Config().replace({'rectified': rectified})
+        text = calibration_yaml(calibration_of(lens, config=config))
+        document = yaml.safe_load(text)
+        shown[rectified] = document['projection_matrix']['data']
+        assert document['camera_matrix']['data'][0] == lens.fx
+        # what is read is the camera, whatever P is
+        (tmp_path / 'calibration.yaml').write_text(text)
+        assert load_calibration_yaml(tmp_path / 'calibration.yaml').camera == lens
+    assert shown['same'][0] == lens.fx
+    assert shown['all'][0] < shown['crop'][0] and shown['all'][0] == shown['all'][5]
 
 
 def test_layout_is_one_flow_list_a_matrix():
@@ -125,6 +154,15 @@ def test_another_tool_s_file_loads(tmp_path):
     assert camera.camera == Brown((640, 480), 500, 501.5, 320, 240, -0.1, 1e-5, 0.001, -0.002,
                                   0.003)
     assert camera.sigma is None and camera.verdict is None
+
+
+@pytest.mark.parametrize('name', ['equidistant', 'fisheye'])
+def test_another_tool_s_fisheye_loads(tmp_path, name):
+    path = tmp_path / 'ost.yaml'
+    path.write_text(FOREIGN.replace('plumb_bob', name).replace('cols: 5', 'cols: 4').replace(
+        '-0.1, 1e-05, 0.001, -0.002, 0.003', '-0.1, 1e-05, 0.001, -0.002'))
+    assert load_calibration_yaml(path).camera == Fisheye(
+        (640, 480), 500, 501.5, 320, 240, -0.1, 1e-5, 0.001, -0.002)
 
 
 @pytest.mark.parametrize(('old', 'new', 'complaint'), [
