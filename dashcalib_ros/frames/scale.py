@@ -87,4 +87,4 @@ def enlarge_image(image: GreyImage, factor: int) -> GreyImage:
     large = cv2.resize(image.astype(np.float32), None, fx=factor, fy=factor,
                        interpolation=cv2.INTER_LANCZOS4)
     # rounds, and cuts what goes beyond black and white
-    return np.asarray(cv2.add(large, 0.0, dtype=cv2.CV_8U), np.uint8)
+    return np.asarray(cv2.add(large, np.zeros(4), dtype=cv2.CV_8U), np.uint8)
