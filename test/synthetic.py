@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dashcalib_ros.camera import Camera, Radial
+from dashcalib_ros.camera import Camera, Fisheye, Radial
 from dashcalib_ros.reconstruction.scene import Profile, Scene, retriangulated
 from dashcalib_ros.reconstruction.structure import Structure
 from dashcalib_ros.reconstruction.tracks import Tracks
@@ -16,6 +16,8 @@ LENS = Radial(SIZE, 520.0, 521.0, 407.0, 219.0, -0.28, 0.09)
 # between two keyframes
 KEYFRAME_S = 0.3
 NEAR_M, FAR_M = 2.0, 45.0
+# rad (100 degrees) off the axis, to which tests of a fisheye look
+WIDEST = 1.75
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,9 @@ def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int 
     points = np.einsum('nji,nj->ni', rotations[origin], local) + centres[origin]
     seen_from = points @ rotations.transpose(0, 2, 1) + translations[:, None]
     width, height = camera.image_size
-    behind = seen_from[:, :, 2] < NEAR_M
+    wide = isinstance(camera, Fisheye)
+    distance = np.linalg.norm(seen_from, axis=2) if wide else seen_from[:, :, 2]
+    behind = distance < NEAR_M
     global_shutter = seen_from.copy()
     seen_from[behind] = [0, 0, 1]
     xy = project(seen_from, camera, extra)
@@ -95,9 +99,10 @@ def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int 
         seen_from = between(global_shutter, np.clip(late, -1.0, 1.0))
         seen_from[behind] = [0, 0, 1]
         xy = project(seen_from, camera, extra)
-    radius = np.linalg.norm(seen_from[:, :, :2] / seen_from[:, :, 2:], axis=2)
-    limit = 0.98 * fold_radius(camera)
-    visible = (~behind & (seen_from[:, :, 2] < FAR_M) & (radius < limit)
+    off_axis = np.linalg.norm(seen_from[:, :, :2], axis=2)
+    in_view = (np.arctan2(off_axis, seen_from[:, :, 2]) < WIDEST if wide else
+               off_axis / seen_from[:, :, 2] < 0.98 * fold_radius(camera))
+    visible = (~behind & (distance < FAR_M) & in_view
                & (xy[:, :, 0] > 8) & (xy[:, :, 0] < width - 9)
                & (xy[:, :, 1] > 8) & (xy[:, :, 1] < height - 9))
     visible = longest_runs(visible)
@@ -126,6 +131,8 @@ def between(local: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 def project(points: np.ndarray, camera: Camera, extra: tuple[float, float, float]) -> np.ndarray:
     """Return pixels of points in the camera's frame, with OpenCV's p1, p2, k3 besides."""
+    if isinstance(camera, Fisheye):
+        return project_wide(points, camera)
     p1, p2, k3 = extra
     x, y = np.moveaxis(points[..., :2] / points[..., 2:], -1, 0)
     square = x * x + y * y
@@ -133,6 +140,16 @@ def project(points: np.ndarray, camera: Camera, extra: tuple[float, float, float
     return np.stack([
         camera.fx * (x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)) + camera.cx,
         camera.fy * (y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y) + camera.cy], -1)
+
+
+def project_wide(points: np.ndarray, camera: Fisheye) -> np.ndarray:
+    """Return pixels of points anywhere: equidistant, with four coefficients."""
+    radius = np.maximum(np.hypot(points[..., 0], points[..., 1]), 1e-12)
+    theta = np.arctan2(radius, points[..., 2])
+    bent = theta + sum(k * theta ** (2 * n + 3)
+                       for n, k in enumerate((camera.k1, camera.k2, camera.k3, camera.k4)))
+    return np.stack([camera.fx * bent * points[..., 0] / radius + camera.cx,
+                     camera.fy * bent * points[..., 1] / radius + camera.cy], -1)
 
 
 def fold_radius(camera: Camera) -> float:

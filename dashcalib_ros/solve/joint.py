@@ -8,7 +8,7 @@ import numpy as np
 
 from dashcalib_ros.camera import AUTO, Camera, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model, mapping_error
-from dashcalib_ros.config import Config
+from dashcalib_ros.config import Config, IntrinsicsConfig
 from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1, adjust_step2
 from dashcalib_ros.reconstruction.scene import Profile, Scene
 from dashcalib_ros.solve.choice import (
@@ -49,6 +49,9 @@ from dashcalib_ros.solve.prior import (
 from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shift
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turns.turn import TurnId
+
+# a lens with p1, p2 of 0.003 looks like a shutter of 3 ms
+SHORT_READOUT_S = 0.008
 
 ByTurn = Mapping[TurnId, Scene]
 Progress = Callable[[str, float], None]
@@ -152,20 +155,53 @@ def _with_model_chosen(first: _Result, full_scenes: ByTurn, config: Config
     camera = first.fit.camera
     if len(first.parts) < 2 or not isinstance(camera, Radial) or not _leaves_more(first, config):
         return first, ()
-    wanted = config.intrinsics.first_tracks
-    few = replace(first, fit=replace(
-        first.fit, scenes=[subsample_tracks(scene, wanted) for scene in first.fit.scenes]))
-    few_measured = {turn: subsample_tracks(scene, wanted) for turn, scene in full_scenes.items()}
-    models: list[type[Camera]] = [type(camera), type(camera.widened()), Fisheye]
-    found = (_refitted(few, model, few_measured, config) for model in models)
+    models: list[type[Camera]] = [type(camera.widened()), Fisheye]
+    few, measured = _few(first, full_scenes, config)
+    found = [_refitted(few, type(camera), measured, config),
+             *(_without_shutter(few, model, measured, config) for model in models)]
     chosen, tried = _chosen([result for result in found if result is not None], config)
-    if type(chosen.fit.camera) is type(camera):
+    model = type(chosen.fit.camera)
+    if model is type(camera):
         return first, tried
-    return _refitted(first, type(chosen.fit.camera), full_scenes, config) or first, tried
+    return _without_shutter(first, model, full_scenes, config) or first, tried
+
+
+def _few(first: _Result, full_scenes: ByTurn, config: Config) -> tuple[_Result, ByTurn]:
+    """Return the result, and the scenes as they were measured, with a part of the tracks."""
+    wanted = config.intrinsics.first_tracks
+    scenes = [subsample_tracks(scene, wanted) for scene in first.fit.scenes]
+    return (replace(first, fit=replace(first.fit, scenes=scenes)),
+            {turn: subsample_tracks(scene, wanted) for turn, scene in full_scenes.items()})
+
+
+def _without_shutter(first: _Result, model: type[Camera], measured: ByTurn, config: Config
+                     ) -> _Result | None:
+    """Return the result with another model and a global shutter; None where that is not enough.
+
+    A decentred lens looks like a short rolling shutter, and what the removal of a true one leaves
+    over looks like a decentred lens: the larger model must do without.
+    """
+    if not first.fit.readout_s:
+        return _refitted(first, model, measured, config)
+    scenes = [replace(scene, tracks=measured[scene.turn].tracks) for scene in first.fit.scenes]
+    found = _refitted(replace(first, fit=replace(first.fit, scenes=scenes, readout_s=0.0)),
+                      model, measured, config)
+    if found is None:
+        return None
+    prior = prior_information(found.step1, config.intrinsics)
+    left_s, sigma_s = readout(found.fit.scenes, found.fit.camera, found.fit.solver.loss_px, prior)
+    return None if _is_rolling(left_s, sigma_s, config.intrinsics) else found
+
+
+def _is_rolling(readout_s: float, sigma_s: float, config: IntrinsicsConfig) -> bool:
+    """Return whether a readout is clear evidence of a rolling shutter."""
+    return abs(readout_s) >= max(config.shutter_sigmas * sigma_s, config.least_readout_ms / 1e3)
 
 
 def _leaves_more(result: _Result, config: Config) -> bool:
-    """Return whether the wider model would foretell the turns clearly better."""
+    """Return whether a wider model may foretell the turns clearly better."""
+    if result.fit.readout_s:
+        return abs(result.fit.readout_s) < SHORT_READOUT_S
     prior = prior_information(result.step1, config.intrinsics)
     gains = gain_of_wider_model(result.parts, prior, extra_sigma_of(result.fit.camera))
     return is_clear(gains / track_inflation(pooled(result.parts, prior)),
@@ -264,8 +300,7 @@ def _step2_roughly(first: _Fit, config: Config) -> _Fit:
     total = 0.0
     for _ in range(settings.shutter_rounds):
         found, sigma = readout(scenes, camera, solver.loss_px, prior_information(camera, settings))
-        if abs(found) < (sigma if total else max(settings.shutter_sigmas * sigma,
-                                                 settings.least_readout_ms / 1e3)):
+        if (abs(found) < sigma) if total else not _is_rolling(found, sigma, settings):
             break
         total += found
         scenes = _without_rolling_shutter(scenes, measured, camera, total, config)

@@ -241,7 +241,7 @@ def test_the_profile_finds_a_barrel_lens(turn):
     # length too; the profile's minimum then was at 1.9 times the truth
     config = Config().replace({'scene.profile_tracks': 200})
     sample = build._spread(thinned(turn.tracks, 16), config.scene.profile_tracks)
-    trials = build._profile_trials(sample, Turn(0, 0, 60, 3.0, 0.05), config)
+    trials = build._profile_trials(sample, Turn(0, 0, 60, 3.0, 0.05), config, Radial)
     profile = build._profile_of(trials)
     truth = LENS.fx / SIZE[0]
     assert truth / 1.25 < profile.best < truth * 1.25
@@ -471,7 +471,7 @@ def test_registration_finds_the_exact_positions_and_repairs_drift(case):
         reference = 1  # the nearer one: of two depths the lower is the median
     drift[reference] = 0.0
     drifted = replace(tracks, xy=tracks.xy + drift)
-    found = register_tracks(drifted, structure, images, 7, 3.0)
+    found = register_tracks(drifted, structure, LENS, images, 7, 3.0)
     assert np.isfinite(found.xy).all()
     off = np.linalg.norm(found.xy - tracks.xy, axis=2)
     assert off[reference].max() < 1e-3
@@ -483,7 +483,7 @@ def test_registration_drops_what_does_not_look_like_the_reference():
     tracks, structure, images = registered_case(*CASES['translation'])
     xy = tracks.xy.copy()
     xy[1, :10] += [31.0, 23.0]
-    found = register_tracks(replace(tracks, xy=xy), structure, images, 7, 3.0)
+    found = register_tracks(replace(tracks, xy=xy), structure, LENS, images, 7, 3.0)
     assert np.isnan(found.xy[1, :10]).all()
     assert np.isfinite(found.xy[1, 10:]).all() and np.isfinite(found.xy[0]).all()
 
@@ -493,8 +493,8 @@ def test_registration_drops_what_moves_too_far():
     xy = tracks.xy.copy()
     xy[1] += [1.2, 0.9]
     moved = replace(tracks, xy=xy)
-    assert np.isfinite(register_tracks(moved, structure, images, 7, 3.0).xy[1]).all()
-    assert np.isnan(register_tracks(moved, structure, images, 7, 1.0).xy[1]).all()
+    assert np.isfinite(register_tracks(moved, structure, LENS, images, 7, 3.0).xy[1]).all()
+    assert np.isnan(register_tracks(moved, structure, LENS, images, 7, 1.0).xy[1]).all()
 
 
 def test_registration_touches_only_what_the_structure_uses():
@@ -502,7 +502,7 @@ def test_registration_touches_only_what_the_structure_uses():
     used = structure.used.copy()
     used[1, ::2] = False
     used[:, 1] = False
-    found = register_tracks(tracks, replace(structure, used=used), images, 7, 3.0)
+    found = register_tracks(tracks, replace(structure, used=used), LENS, images, 7, 3.0)
     np.testing.assert_array_equal(np.isfinite(found.xy[:, :, 0]), used)
 
 
@@ -512,14 +512,14 @@ def test_registration_passes_over_an_image_that_only_unused_tracks_refer_to():
     used[:, :5] = False
     # the first image is nobody's reference but, for want of another, theirs
     xy[0, :5] = np.nan
-    found = register_tracks(replace(tracks, xy=xy), replace(structure, used=used), images, 7, 3.0)
+    found = register_tracks(replace(tracks, xy=xy), replace(structure, used=used), LENS, images, 7, 3.0)
     assert np.isnan(found.xy[:, :5]).all() and np.isfinite(found.xy[:, 5:]).all()
 
 
 def test_registration_on_pictures_without_texture_keeps_nothing_wrong():
     tracks, structure, images = registered_case(*CASES['translation'])
     flat = [np.full_like(image, 90) for image in images]
-    found = register_tracks(tracks, structure, flat, 7, 3.0)
+    found = register_tracks(tracks, structure, LENS, flat, 7, 3.0)
     off = np.linalg.norm(found.xy - tracks.xy, axis=2)
     assert not (off > 1e-6).any()
 

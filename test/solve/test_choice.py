@@ -1,0 +1,120 @@
+"""Which model the turns prove, and how far the camera may be off over the picture."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from solving import CONFIG, EXTRA, NOTHING, scenes_of, solved
+from synthetic import LENS, SIZE, synthetic_turn
+
+from dashcalib_ros.camera import Brown, Fisheye, Radial
+from dashcalib_ros.camera.mapping import as_model, mapping_error
+from dashcalib_ros.reconstruction.scene import Profile
+from dashcalib_ros.solve.choice import gain_of_wider_model, is_clear
+from dashcalib_ros.solve.information import information
+from dashcalib_ros.solve.picture import scatter_between_turns
+
+WIDE = Fisheye(SIZE, 300.0, 300.6, 404.0, 221.0, 0.02, -0.008, 0.003, -0.0005)
+DECENTRED = Brown(SIZE, *LENS.params, 0.003, -0.003, 0.0)
+
+
+def wide_scenes(count: int, tracks: int = 220):
+    start = Fisheye.centred(SIZE, 1.02 * WIDE.fx, 0.0)
+    return [synthetic_turn(WIDE, yaw, world=world, tracks=tracks, keyframes=16).scene(start, world)
+            for world, yaw in enumerate((80.0, -70.0, 85.0, -90.0)[:count])]
+
+
+def test_a_radial_lens_stays_one_and_nothing_else_is_tried():
+    found = solved(scenes_of(4))
+    assert type(found.camera) is Radial and not found.tried
+
+
+@pytest.mark.parametrize('count', [3, 5])
+def test_a_decentred_lens_is_found(count):
+    found = solved(scenes_of(count, extra=(0.003, -0.003, 0.0)))
+    assert type(found.camera) is Brown
+    assert mapping_error(found.camera, DECENTRED) < 1.0
+    assert mapping_error(found.camera, DECENTRED) < 2.5 * found.picture.rms
+    error = np.abs(found.camera.params - DECENTRED.params) / found.sigma
+    assert (error[2:4] < 3).all()
+    models = [each.model for each in found.tried]
+    assert models == ['radial', 'fisheye', 'brown']
+    assert found.tried[-1].loses_by == 0 and found.tried[0].loses_by > 30
+
+
+def test_a_model_that_is_asked_for_is_kept():
+    scenes = scenes_of(3, extra=(0.003, -0.003, 0.0))
+    assert type(solved(scenes, CONFIG.replace({'model': 'radial'})).camera) is Radial
+    brown = solved(scenes_of(3), CONFIG.replace({'model': 'brown'}))
+    # all scenes came with a radial camera: the first step is the same
+    assert mapping_error(brown.camera, LENS) < 1.0
+
+
+def test_one_turn_chooses_no_larger_model():
+    found = solved(scenes_of(1, extra=(0.003, -0.003, 0.0)))
+    assert type(found.camera) is Radial and not found.tried
+
+
+def test_a_fisheye_is_recovered_beyond_90_degrees():
+    scenes = wide_scenes(4)
+    assert np.arccos(np.nanmin(WIDE.rays(scenes[0].tracks.xy)[..., 2])) > np.radians(80)
+    found = solved(scenes)
+    assert type(found.camera) is Fisheye
+    assert mapping_error(found.camera, WIDE) < max(2.5 * found.picture.rms, 0.3)
+    # points beside the camera are used, too
+    used = found.scenes[0].structure
+    local = used.points @ used.rotations.transpose(0, 2, 1) + used.translations[:, None]
+    assert used.used[local[:, :, 2] < 0.2 * np.linalg.norm(local, axis=2)].any()
+
+
+def test_turns_that_may_be_of_two_kinds_are_tried_with_both():
+    scenes = wide_scenes(3)
+    narrow = as_model(WIDE, Radial)
+    unsure = Profile(np.array([0.2, 0.3, 0.4]), np.array([2.0, 1.5, 1.8]), 100)
+    scenes = [replace(scene, rivals={'plumb_bob': unsure}) for scene in scenes]
+    # one turn was taken for that of a pinhole
+    first = synthetic_turn(WIDE, 80.0, world=0, tracks=220, keyframes=16).scene(narrow, 0)
+    scenes[0] = replace(first, rivals={'equidistant': scenes[0].profile})
+    found = solved(scenes)
+    assert type(found.camera) is Fisheye
+    radial = next(each for each in found.tried if each.model == 'radial')
+    assert radial.loses_by > 30
+
+
+def test_the_wider_model_gains_only_where_the_lens_needs_it():
+    def gains(extra):
+        scenes = [scene for scene in solved(
+            scenes_of(4, extra=extra), CONFIG.replace({'model': 'radial'})).scenes]
+        camera = solved(scenes_of(4, extra=extra), CONFIG.replace({'model': 'radial'})).camera
+        return gain_of_wider_model([information(scene, camera, 1.0) for scene in scenes],
+                                   NOTHING + 1e-9 * np.eye(6), EXTRA)
+    assert gains((0.0, 0.0, 0.0)).sum() < 10
+    assert is_clear(gains((0.002, -0.002, 0.0)), 30)
+
+
+def test_what_one_turn_alone_says_is_not_clear():
+    assert is_clear(np.array([20.0, 15.0, 18.0]), 30)
+    assert not is_clear(np.array([90.0, -3.0, -2.0]), 30)
+    assert not is_clear(np.array([90.0, 2.0, -1.0, -2.0]), 30)
+    assert not is_clear(np.array([5.0, 4.0, 6.0]), 30)
+
+
+def test_turns_that_agree_scatter_as_their_noise():
+    rng = np.random.default_rng(0)
+    count, size = 200, 6
+    roots = rng.normal(size=(count, size, size))
+    hessians = roots @ roots.transpose(0, 2, 1)
+    whole = np.linalg.cholesky(np.linalg.inv(hessians.sum(axis=0)))
+    hessians = whole.T @ hessians @ whole
+    scores = np.array([rng.multivariate_normal(np.zeros(size), h - h @ h) for h in hessians])
+    assert scatter_between_turns(hessians, scores) == pytest.approx(1.0, abs=0.15)
+    assert scatter_between_turns(hessians, 3 * scores) == pytest.approx(9.0, rel=0.15)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_the_sigma_over_the_picture_is_neither_blind_nor_timid(seed):
+    found = solved(scenes_of(4, seed=seed))
+    off = mapping_error(found.camera, LENS)
+    assert 0.15 * found.picture.rms < off < 2 * found.picture.rms
+    assert found.picture.rms <= found.picture.worst < 2.0
