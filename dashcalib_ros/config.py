@@ -180,7 +180,7 @@ class IntrinsicsConfig:
     profile_tracks: int = expert(
         120, 'of each turn, for the focal profile around the result', 20, 5000)
     least_gain: float = expert(
-        10.0, 'noise variances of a track; a larger lens model must foretell turns so much better',
+        30.0, 'noise variances of a track; a larger lens model must foretell turns so much better',
         0.0, 1e6)
     aspect_sigma: float = expert(
         0.003, 'fy / fx is 1 to within this: planar turns know fx but hardly fy', 1e-5, 1.0)
