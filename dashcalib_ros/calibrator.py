@@ -12,6 +12,7 @@ from types import TracebackType
 
 from dashcalib_ros import stages
 from dashcalib_ros.arrays import Mask
+from dashcalib_ros.camera import searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.judgement import Calibration
@@ -65,6 +66,7 @@ class Calibrator:
         died or hangs, and for each turn that is tried again after that, from any thread.
         """
         self._config = config or Config()
+        searched(self._config.model)  # raises ConfigError for one that there is not
         # guards what push() and calibrate() share: the detection and the selection of turns
         self._lock = threading.Lock()
         self._detection = Detection(self._config, mask)

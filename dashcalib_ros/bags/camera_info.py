@@ -16,6 +16,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.bags.storage import check_unpacked
 from dashcalib_ros.camera import Camera, ros_camera
+from dashcalib_ros.camera.camera_info import RosCamera
+from dashcalib_ros.camera.rectified import SAME
 from dashcalib_ros.errors import InputError, OutputError
 
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
@@ -41,12 +43,13 @@ def check_bag(source: str | os.PathLike[str], image_topic: str | None,
 
 
 def write_bag(source: str | os.PathLike[str], image_topic: str, camera: Camera,
-              out: str | os.PathLike[str]) -> int:
+              out: str | os.PathLike[str], rectified: str = SAME) -> int:
     """Copy the bag and add a camera_info for each image of the topic; return how many.
 
     The copy is an MCAP bag with every message of the source as it was, except an older camera_info
     of that camera, which is left out. Each new one has its image's header and time of reception.
-    out: the new bag's folder; it appears only when all went well. Raises InputError, OutputError.
+    out: the new bag's folder; it appears only when all went well. rectified: as ros_camera()'s.
+    Raises InputError, OutputError.
     """
     path = Path(out).absolute()
     if path.exists():
@@ -58,7 +61,8 @@ def write_bag(source: str | os.PathLike[str], image_topic: str, camera: Camera,
             draft = Path(tempfile.mkdtemp(prefix='.writing-', dir=path.parent))
             # rosbags names the file inside after the folder: it has its last name already
             with Writer(draft / path.name, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-                count = _copy(reader, writer, image_topic, camera, source)
+                count = _copy(reader, writer, image_topic, ros_camera(camera, rectified),
+                              source)
             (draft / path.name).rename(path)
             return count
         except (OSError, WriterError) as error:
@@ -69,7 +73,7 @@ def write_bag(source: str | os.PathLike[str], image_topic: str, camera: Camera,
                 shutil.rmtree(draft, ignore_errors=True)
 
 
-def _copy(reader: Reader, writer: Writer, image_topic: str, camera: Camera,
+def _copy(reader: Reader, writer: Writer, image_topic: str, camera: RosCamera,
           source: str | os.PathLike[str]) -> int:
     topic = camera_info_topic(image_topic)
     kept = [each for each in reader.connections if each.topic != topic]
@@ -143,8 +147,7 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
         reader.close()
 
 
-def _camera_info(types: Any, camera: Camera, header: Any) -> Any:
-    c = ros_camera(camera)
+def _camera_info(types: Any, c: RosCamera, header: Any) -> Any:
     width, height = c.image_size
     return types[CAMERA_INFO](
         header=header, height=height, width=width, distortion_model=c.distortion_model,

@@ -21,6 +21,8 @@ WIDEST = 1.309
 SIDE_POINTS = 512
 # halvings on the way from the principal point to the border
 HALVINGS = 30
+# in the search for the largest view; 30 to 60 are needed
+SEARCH_STEPS = 300
 # of a shift; a view that is no larger elsewhere stays in the middle
 STAYS = 0.001
 
@@ -35,12 +37,21 @@ def rectified_matrix(camera: Camera, rectified: str = SAME) -> Floats:
         raise ConfigError(f'rectified must be one of {", ".join(RECTIFIED)}, not {rectified!r}')
     if rectified == SAME:
         return camera.matrix
+    with np.errstate(all='ignore'):
+        matrix = (_all if rectified == ALL else _crop)(camera)
+    # a file may hold a camera that sees nothing
+    return matrix if np.isfinite(matrix).all() else camera.matrix
+
+
+def _all(camera: Camera) -> Floats:
     outline = _outline(camera)
-    if rectified == ALL:
-        low, high = outline.min(axis=0), outline.max(axis=0)
-        focal = float((_middle(camera) / ((high - low) / 2)).min())
-        return _matrix(camera, (low + high) / 2, focal)
-    centre, focal = _largest_inside(camera, outline)
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    focal = float((_middle(camera) / ((high - low) / 2)).min())
+    return _matrix(camera, (low + high) / 2, focal)
+
+
+def _crop(camera: Camera) -> Floats:
+    centre, focal = _largest_inside(camera, _outline(camera))
     # the outline is known at points only: a little less may be seen between them
     for _ in range(100):
         if _has_source_everywhere(camera, _matrix(camera, centre, focal)):
@@ -98,9 +109,12 @@ def _largest_inside(camera: Camera, outline: Floats) -> tuple[Floats, float]:
         return np.asarray(width(centres) - STAYS * np.linalg.norm(centres, axis=-1))
 
     around = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), -1).reshape(-1, 2)
-    centre, step = np.zeros(2), np.ptp(outline, axis=0) / 8
-    while step.max() > 1e-6:
-        near = centre + around * step
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    centre, step = np.zeros(2), (high - low) / 8
+    for _ in range(SEARCH_STEPS):
+        if step.max() < 1e-6:
+            break
+        near = np.clip(centre + around * step, low, high)
         best = near[worth(near).argmax()]
         if worth(best) > worth(centre):
             centre = best

@@ -72,6 +72,7 @@ def _add_run(commands: Any) -> None:
     parser = _command(commands, 'run', 'calibrate a recorded drive',
                       'Writes calibration.yaml (accepted), result.json and report.html to DIR.')
     _add_drive_arguments(parser)
+    _add_model(parser)
     parser.add_argument('--threads', type=int, metavar='N',
                         help='processes that reconstruct turns side by side; the result is the '
                              'same with any')
@@ -91,6 +92,7 @@ def _add_turns(commands: Any) -> None:
 def _add_demo(commands: Any) -> None:
     parser = _command(commands, 'demo', 'render a drive, calibrate it, compare with the truth',
                       'Renders a drive with a known lens into a ROS 2 bag and calibrates that.')
+    _add_model(parser)
     _add_seed(parser)
     _add_verbose(parser)
     _add_out(parser, 'demo')
@@ -137,6 +139,13 @@ def _add_drive_arguments(parser: argparse.ArgumentParser) -> None:
                         help='one setting, over those of --config; may be repeated')
     _add_seed(parser)
     _add_verbose(parser)
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    # the names are not taken from the table of models: that would load numpy and OpenCV
+    parser.add_argument('--model', metavar='NAME',
+                        help='of the lens: radial, brown, fisheye, or auto: the one that the '
+                             'turns prove (default)')
 
 
 def _add_seed(parser: argparse.ArgumentParser) -> None:

@@ -43,7 +43,8 @@ def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration) -
         warn([f'no bag was written: the calibration is {calibration.verdict.level}, not accepted'])
         return
     assert calibration.camera is not None
-    count = write_bag(args.input, topic, calibration.camera, args.write_bag)
+    count = write_bag(args.input, topic, calibration.camera, args.write_bag,
+                      calibration.config.rectified)
     with summary_of_files():
         show_text(f'written: {args.write_bag} with {count} messages on '
                   f'{camera_info_topic(topic)}')

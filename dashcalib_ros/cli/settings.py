@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from dashcalib_ros.camera import searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError, shortened
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 
 # --turns sets both, so that exactly this number of turns is used
 FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads': ('threads',),
-         'segmentation': ('mask.segmentation',)}
+         'segmentation': ('mask.segmentation',), 'model': ('model',)}
 EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+')  # 1e-3, a word to YAML 1.1
 
 
@@ -24,7 +25,9 @@ def read_config(args: argparse.Namespace) -> Config:
     changes = parse_settings(getattr(args, 'set', []))
     changes.update({name: getattr(args, flag) for flag, names in FLAGS.items() for name in names
                     if getattr(args, flag, None) is not None})
-    return config.replace(changes)
+    config = config.replace(changes)
+    searched(config.model)  # raises for a model that there is not, before anything is begun
+    return config
 
 
 def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:

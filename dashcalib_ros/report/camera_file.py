@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dashcalib_ros.camera import MODELS, Brown, Camera, Fisheye, Radial
+from dashcalib_ros.camera import MODELS, Camera, Radial
 from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.limits import JSON_BYTES, read_text
 from dashcalib_ros.report.camera_yaml import parse_calibration_yaml
@@ -18,6 +18,9 @@ from dashcalib_ros.report.named_camera import (
     read_size,
 )
 from dashcalib_ros.report.result import parse_json, parse_result
+
+# of distortion, in any model's truth
+TERMS = ('k1', 'k2', 'k3', 'k4', 'k5', 'k6', 'p1', 'p2')
 
 
 def load_camera(path: str | Path) -> NamedCamera:
@@ -46,23 +49,32 @@ def _read_camera(model: type[Camera], size: tuple[int, int], data: Any, path: Pa
 
 def _truth_camera(data: Mapping[str, Any], path: Path) -> NamedCamera:
     size = read_size(data.get('width'), data.get('height'), path)
-    name = data.get('model', Radial.model)
-    if name in (Fisheye.model, Fisheye.ros_model):
-        model: type[Camera] = Fisheye
-    elif name in (Radial.model, Brown.model, Radial.ros_model):
-        extra = Brown.names()[len(Radial.names()):]
-        model = Brown if any(read_number(data, each, path, 0.0) for each in extra) else Radial
-    else:
-        raise InputError(f'{path} has the camera model {shortened(repr(name))}; there are '
-                         f'{", ".join(MODELS)}')
+    model = _truth_model(data, path)
     # the terms after k2 may be left out: they are 0
-    further = dict.fromkeys(model.names()[len(Radial.names()):], 0.0)
-    camera = _read_camera(model, size, {**further, **data}, path)
-    odd = [each for each in ('p1', 'p2', 'k3', 'k4', 'k5', 'k6')
-           if each not in camera.names() and read_number(data, each, path, 0.0)]
-    if odd:
-        raise InputError(f'{path} has {odd[0]}, which the {camera.model} model has not')
+    filled = {**dict.fromkeys(model.names()[len(Radial.names()):], 0.0), **data}
+    camera = _read_camera(model, size, filled, path)
     return NamedCamera(str(path), camera, read_sigma(data.get('sigma'), camera))
+
+
+def _truth_model(data: Mapping[str, Any], path: Path) -> type[Camera]:
+    """Return the simplest model of the kind that is named which has all terms that are not 0."""
+    name = data.get('model', Radial.model)
+    kinds = [model.ros_model for model in MODELS.values() if name in (model.model,
+                                                                      model.ros_model)]
+    if not kinds:
+        raise InputError(_no_model(name, path))
+    terms = [each for each in TERMS if read_number(data, each, path, 0.0)]
+    found = [model for model in MODELS.values()
+             if model.ros_model in kinds and set(terms) <= set(model.names())]
+    if not found:
+        raise InputError(f'{path} has {", ".join(terms)}, and no {kinds[0]} model here has all of '
+                         f'these')
+    return found[0]
+
+
+def _no_model(name: Any, path: Path) -> str:
+    return (f'{path} has the camera model {shortened(repr(name))}; there are '
+            f'{", ".join(MODELS)}')
 
 
 def _result_camera(data: Mapping[str, Any], path: Path) -> NamedCamera:
@@ -73,8 +85,7 @@ def _result_camera(data: Mapping[str, Any], path: Path) -> NamedCamera:
         raise InputError(f'{path}: image_size must be [width, height], not {size!r}')
     name = str(data.get('camera_model', Radial.model))
     if name not in MODELS:
-        raise InputError(f'{path} has the camera model {shortened(repr(name))}; there are '
-                         f'{", ".join(MODELS)}')
+        raise InputError(_no_model(name, path))
     camera = _read_camera(MODELS[name], read_size(size[0], size[1], path), data['intrinsics'],
                           path)
     return NamedCamera(str(path), camera, read_sigma(data.get('sigma'), camera),

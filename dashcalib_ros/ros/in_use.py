@@ -22,8 +22,8 @@ class CalibrationInUse:
     """
 
     def __init__(self, node: Node, name: str, store: Store, rules: Rules,
-                 complaints: Complaints) -> None:
-        self.publication = Publication(node)
+                 complaints: Complaints, rectified: str) -> None:
+        self.publication = Publication(node, rectified)
         self.verdict: Verdict | None = None
         self.contradictions = 0
         self.stale = False
@@ -33,6 +33,7 @@ class CalibrationInUse:
         self._store = store
         self._rules = rules
         self._complaints = complaints
+        self._rectified = rectified
 
     @property
     def camera(self) -> NamedCamera | None:
@@ -56,9 +57,14 @@ class CalibrationInUse:
         except InputError as error:
             self._log.warning(str(error))
             return
-        if kept is not None:
-            self._use(kept)
-            self._log.info(f'loaded {self.file}: {sigma_text(kept.camera)}')
+        if kept is None:
+            return
+        wanted = kept.rectified(self._rectified)
+        if wanted is not kept:
+            self._log.warning(f'the projection_matrix in {self.file} is not that of rectified: '
+                              f'{self._rectified}, which is published; ~/save writes it there')
+        self._use(wanted)
+        self._log.info(f'loaded {self.file}: {sigma_text(kept.camera)}')
 
     def check(self, source: Source) -> None:
         """Stop using it if it is for other images than these; the file stays where it is."""

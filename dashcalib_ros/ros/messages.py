@@ -18,9 +18,9 @@ OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, Diagnostic
                           DiagnosticStatus.STALE)
 
 
-def camera_info(camera: Camera, header: Header) -> CameraInfo:
-    """Return the camera as a message."""
-    c = ros_camera(camera)
+def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:
+    """Return the camera as a message; rectified: as ros_camera()'s."""
+    c = ros_camera(camera, rectified)
     width, height = c.image_size
     return CameraInfo(header=header, width=width, height=height,
                       distortion_model=c.distortion_model, d=c.d, k=c.k, r=c.r, p=c.p)
@@ -77,6 +77,7 @@ def diagnostic_status(health: Health, name: str, hardware_id: str) -> Diagnostic
         'verdict': health.verdict,
         'reasons': '; '.join(health.reasons),
         'published': sigma_text(health.published) if health.published else 'nothing',
+        'camera model': health.published.camera.model if health.published else '',
         'sigma fx (px)': _sigma(health.published),
         'file': health.file,
         'topic': health.topic,

@@ -77,7 +77,8 @@ class CalibratorNode(Node):
         self._complaints = Complaints(self.get_logger().warning)
         self._in_use = CalibrationInUse(
             self, self._name, Store(self._own.camera_info_file, self._name),
-            Rules(self._own.better, self._own.contradictions), self._complaints)
+            Rules(self._own.better, self._own.contradictions), self._complaints,
+            self._core.rectified)
         self._publication = self._in_use.publication
         self._magnitude = self.create_publisher(Float64, '~/turn_magnitude', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)

@@ -21,9 +21,11 @@ class Publication:
     info: what is published now. sent: how many were published beside images.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, rectified: str) -> None:
+        """rectified: what P shows, the setting of this name."""
         self.info: CameraInfo | None = None
         self.sent = 0
+        self._rectified = rectified
         self._clock = node.get_clock()
         self._beside = node.create_publisher(CameraInfo, 'camera_info', BESIDE_IMAGES)
         self._latched = node.create_publisher(CameraInfo, '~/calibration', LATCHED)
@@ -32,7 +34,7 @@ class Publication:
 
     def set(self, camera: NamedCamera, frame_id: str) -> None:
         """Publish this one from now on."""
-        self.info = camera_info(camera.camera, self._now(frame_id))
+        self.info = camera_info(camera.camera, self._now(frame_id), self._rectified)
         self._latched.publish(self.info)
 
     def retract(self) -> None:

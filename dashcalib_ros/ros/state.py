@@ -15,6 +15,7 @@ from typing import Literal
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report.wording import digits_of
 
 State = Literal['collecting', 'calibrating', 'calibrated', 'refused_so_far']
 Action = Literal['wait', 'adopt', 'keep', 'replace', 'give_up']
@@ -23,7 +24,8 @@ Action = Literal['wait', 'adopt', 'keep', 'replace', 'give_up']
 CONTRADICTION = 3.0
 # of fx; least sigma: good calibrations of one lens differ by this much, also with smaller sigmas
 LEAST_SIGMA = 0.0025
-# k1 and k2 are not compared: they are correlated with the focal length
+# in every model fx and fy are the scale on the axis, so that two models of one lens agree in them;
+# the coefficients of distortion are not compared: they are correlated with the focal length
 COMPARED = ('fx', 'fy', 'cx', 'cy')
 
 
@@ -97,7 +99,7 @@ def sigma_text(camera: NamedCamera) -> str:
     """Return 'fx 412.31 ± 0.92, ...' of a published camera."""
     parts = []
     for name, number in camera.camera.named.items():
-        digits = 2 if name in COMPARED else 4
+        digits = digits_of(name)
         value = f'{name} {number:.{digits}f}'
         if camera.sigma is not None:
             value += f' ± {camera.sigma[name]:.{digits}f}'

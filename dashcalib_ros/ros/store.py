@@ -3,12 +3,15 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import yaml
 
+from dashcalib_ros.camera import ros_camera
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
@@ -37,9 +40,33 @@ class Kept:
         now = datetime.now(timezone.utc).isoformat(timespec='seconds')
         document = yaml.safe_load(calibration_yaml(calibration, name, now))
         document['dashcalib']['frame_id'] = frame_id
-        text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=2**20,
-                              allow_unicode=True)
-        return cls(calibrated_camera(calibration, name), frame_id, text)
+        return cls(calibrated_camera(calibration, name), frame_id, _dumped(document))
+
+    def rectified(self, rectified: str) -> Kept:
+        """Return it with the P of a setting, itself where the file has that already.
+
+        P is no measurement but the user's choice: the present one counts, not the file's.
+        """
+        document = parse_yaml(self.text, self.camera.name)
+        p = ros_camera(self.camera.camera, rectified).p
+        before = document.get('projection_matrix')
+        if isinstance(before, dict) and _equal(before.get('data'), p):
+            return self
+        document['projection_matrix'] = {'rows': 3, 'cols': 4, 'data': p}
+        return replace(self, text=_dumped(document))
+
+
+def _dumped(document: dict[str, Any]) -> str:
+    text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=2**20,
+                               allow_unicode=True)
+    return text
+
+
+def _equal(data: Any, p: list[float]) -> bool:
+    try:
+        return bool(np.allclose(np.asarray(data, np.float64), p, rtol=1e-9, atol=0))
+    except (TypeError, ValueError):
+        return False
 
 
 class Store:

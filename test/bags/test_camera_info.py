@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.bags.camera_info import camera_info_topic, check_bag, write_bag
 from dashcalib_ros.bags.write import BagWriter
-from dashcalib_ros.camera import Radial
+from dashcalib_ros.camera import Brown, Fisheye, Radial, ros_camera
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.inputs import open_frames
@@ -72,6 +72,22 @@ def test_each_image_gets_its_camera_info_and_all_else_stays(bag, tmp_path):
         assert info.p.tolist() == [400, 0, 31, 0, 0, 401, 23, 0, 0, 0, 1, 0]
         assert info.d.tolist() == [-0.3, 0.1, 0, 0, 0]
     assert [path.name for path in out.parent.iterdir()] == ['with_info']
+
+
+@pytest.mark.parametrize('lens', [
+    Brown((64, 48), 40.0, 40.1, 31.0, 23.0, -0.3, 0.1, 0.001, -0.002, -0.01),
+    Fisheye((64, 48), 30.0, 30.1, 31.0, 23.0, -0.02, 0.003, -0.001, 0.0002)],
+    ids=['brown', 'fisheye'])
+@pytest.mark.parametrize('rectified', ['same', 'crop', 'all'])
+def test_other_models_and_their_rectified_view(bag, tmp_path, lens, rectified):
+    out = tmp_path / 'with_info'
+    assert write_bag(bag, '/cam/image_raw', lens, out, rectified) == 5
+    ros = ros_camera(lens, rectified)
+    for _, raw in messages(out, '/cam/camera_info'):
+        info = TYPES.deserialize_cdr(raw, 'sensor_msgs/msg/CameraInfo')
+        assert info.distortion_model == lens.ros_model and info.d.tolist() == ros.d
+        assert info.k.tolist() == ros.k and info.p.tolist() == ros.p
+        assert (info.p[0] == lens.fx) == (rectified == 'same')
 
 
 def test_compressed_images_and_the_other_reader(tmp_path):

@@ -140,6 +140,16 @@ def test_the_widest_lens_is_cut_at_75_degrees():
     assert rectified_matrix(camera, 'crop')[0, 0] < camera.fx
 
 
+@pytest.mark.parametrize('camera', [
+    Radial(SIZE, 1e-300, 1e-300, 640.0, 360.0), Radial(SIZE, 1e300, 1e300, 640.0, 360.0, 1e300),
+    Brown(SIZE, 5.0, 5.0, 640.0, 360.0, 1e9, -1e9, 1e9, 1e9, 1e9),
+    Fisheye(SIZE, 1e-9, 1e-9, 640.0, 360.0, -1e9), Radial((1, 1), 5.0, 5.0, 0.0, 0.0),
+    Radial(SIZE, 700.0, 700.0, -5000.0, 9000.0), Fisheye(SIZE, 300.0, 300.0, 9000.0, 360.0)])
+def test_a_camera_that_is_none_gives_numbers_all_the_same(camera):
+    for each in RECTIFIED:
+        assert np.isfinite(rectified_matrix(camera, each)).all()
+
+
 def test_a_lens_that_folds_over_is_used_as_far_as_it_sees():
     camera = Radial(SIZE, 700.0, 700.0, 639.5, 359.5, -0.6)
     crop, everything = (rectified_matrix(camera, each) for each in ('crop', 'all'))

@@ -15,15 +15,21 @@ from unittest.mock import create_autospec
 import cv2
 import numpy as np
 import pytest
+import yaml
 from fakes import called_like, stands_in_for
 from made_calibration import TRUTH, make_calibration
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
 
+from dashcalib_ros.bags.write import BagWriter
 from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.camera import AUTO, MODELS, ros_camera
 from dashcalib_ros.cli import main
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.demo.drive import Drive
-from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.errors import ConfigError, WorkerError
+from dashcalib_ros.frames import Frame
 from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.turns.turn import Turn
 
@@ -165,6 +171,50 @@ def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
     assert fake.made[0].config == wanted and fake.made[0].verbose
 
 
+@pytest.mark.parametrize('model', [AUTO, *MODELS])
+def test_model_is_a_setting(fake, drive, model):
+    assert main(['run', drive, '--set', 'model=brown', '--model', model]) == 0
+    assert main(['run', drive, '--set', f'model={model}']) == 0
+    assert [made.config for made in fake.made] == [Config().replace({'model': model})] * 2
+
+
+def test_help_names_every_model(capsys):
+    for command in ('run', 'demo'):
+        assert main([command, '--help']) == 0
+        text = capsys.readouterr().out.rpartition('--model NAME')[2].partition('\n  --')[0]
+        assert all(name in text for name in (AUTO, *MODELS)), text
+
+
+def test_a_model_that_there_is_not_is_told_before_a_drive_is_rendered(
+        fake, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(['demo', '--model', 'mirror']) == 2
+    assert capsys.readouterr().err == ("dashcalib: error: there is no camera model 'mirror'; "
+                                       'there are auto, radial, brown, fisheye\n')
+    assert names(tmp_path) == []
+    with pytest.raises(ConfigError, match='there are auto, radial'):
+        Calibrator(Config(model='mirror'))
+
+
+def test_the_bag_has_the_view_that_the_setting_wants(fake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with BagWriter(tmp_path / 'drive', '/image_raw') as writer:
+        for n in range(3):
+            writer.write(Frame(n, 10**18 + n * 10**8, np.full((48, 64), n, np.uint8)))
+    assert main(['run', 'drive', '--set', 'rectified=all', '--write-bag', 'with_info']) == 0
+    p = load_projection(tmp_path / 'calibration' / 'calibration.yaml')
+    assert p == ros_camera(TRUTH, 'all').p != ros_camera(TRUTH).p
+    types = get_typestore(Stores.ROS2_JAZZY)
+    with Reader(tmp_path / 'with_info') as reader:
+        infos = [types.deserialize_cdr(raw, connection.msgtype) for connection, _, raw
+                 in reader.messages() if connection.topic == '/camera_info']
+    assert len(infos) == 3 and all(info.p.tolist() == p for info in infos)
+
+
+def load_projection(path):
+    return yaml.safe_load(path.read_text())['projection_matrix']['data']
+
+
 @pytest.mark.parametrize(('args', 'complaint'), [
     (['--set', 'turns.wantd=3'], 'did you mean turns.wanted?'),
     (['--set', 'turns.half_width=.nan'], 'finite'),
@@ -176,6 +226,9 @@ def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
     (['--set', 'turns.wanted=!!int ""'], 'not valid YAML'),
     (['--turns', '0'], 'turns.wanted must be between'),
     (['--seed', '-1'], 'seed must be between'),
+    (['--model', 'fish-eye'], 'there are auto, radial, brown, fisheye'),
+    (['--set', 'model=Radial'], 'there are auto, radial, brown, fisheye'),
+    (['--set', 'rectified=whole'], 'rectified must be one of same, crop, all'),
     (['--config', 'missing.yaml'], 'missing.yaml'),
     (['--config', '.'], 'cannot read the configuration'),
     (['--config', 'broken.yaml'], 'not valid YAML at line 3'),

@@ -213,8 +213,8 @@ def test_a_truth_may_name_its_model(tmp_path, model, expected):
 @pytest.mark.parametrize(('change', 'complaint'), [
     ({'model': 'mirror'}, "the camera model 'mirror'; there are radial, brown, fisheye"),
     ({'model': ['fisheye']}, 'there are radial'),
-    ({'k4': 0.01}, 'has k4, which the radial model has not'),
-    ({'model': 'fisheye', 'p1': 0.01}, 'has p1, which the fisheye model has not')])
+    ({'k4': 0.01}, 'has k1, k2, k4, and no plumb_bob model here has all'),
+    ({'model': 'fisheye', 'p1': 0.01}, 'has k1, k2, p1, and no equidistant model here')])
 def test_a_truth_of_no_model_here_is_refused(tmp_path, change, complaint):
     data = {**TRUTH.named, 'width': 1242, 'height': 375, **change}
     (tmp_path / 'truth.json').write_text(json.dumps(data))

@@ -95,6 +95,8 @@ def test_every_parameter_is_declared_with_its_reason_and_range(node_and_bench):
     assert (wanted.from_value, wanted.to_value) == (1, 20)
     assert not about['commit'].read_only
     assert 'best_effort' in about['reliability'].additional_constraints
+    assert 'crop' in about['rectified'].additional_constraints
+    assert 'fisheye' in about['model'].description
 
 
 def test_parameters_that_may_not_change_say_so(node_and_bench):
@@ -110,6 +112,11 @@ def test_parameters_that_may_not_change_say_so(node_and_bench):
     whole = ParameterType.PARAMETER_INTEGER
     refused = set_to('turns.wanted', type=whole, integer_value=3)
     assert not refused.successful and 'read-only' in refused.reason
+    text = ParameterType.PARAMETER_STRING
+    for name, value in (('model', 'fisheye'), ('model', 'mirror'), ('rectified', 'crop')):
+        refused = set_to(name, type=text, string_value=value)
+        assert not refused.successful and 'read-only' in refused.reason
+        assert '\n' not in refused.reason
     refused = set_to('commit', type=whole, integer_value=3)
     assert not refused.successful and 'commit must be bool' in refused.reason
     assert set_to('commit', type=ParameterType.PARAMETER_BOOL, bool_value=True).successful

@@ -10,6 +10,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
@@ -27,6 +28,9 @@ from ros_bench import (
     ros_environment,
 )
 from sensor_msgs.msg import CameraInfo, CompressedImage
+
+from dashcalib_ros.camera import Fisheye, ros_camera
+from dashcalib_ros.report import load_calibration_yaml
 
 
 def noise(index, size=(320, 240)):
@@ -102,6 +106,38 @@ def test_a_kept_calibration_is_published_from_the_first_image_on(start_node, mak
     assert [info.header for info in camera.infos] == [image.header for image in sent]
     assert camera.infos[0].k[0] == 200.0 and list(camera.infos[0].d) == [-0.1, 0.01, 0, 0, 0]
     assert camera.latched[0].header.frame_id == 'camera'
+
+
+FISHEYE_FILE = CAMERA_FILE.format(width=320).replace('plumb_bob', 'equidistant').replace(
+    'cols: 5, data: [-0.1, 0.01, 0.0, 0.0, 0.0]', 'cols: 4, data: [-0.02, 0.003, -0.001, 0.0002]')
+OUR_FISHEYE = OURS.replace('k2: 0.01', 'k2: 0.01, k3: 0.001, k4: 0.001')
+
+
+def test_a_kept_fisheye_is_published_with_the_view_that_is_wanted_now(start_node, make_bench,
+                                                                      tmp_path):
+    path = keep_file(tmp_path, FISHEYE_FILE + OUR_FISHEYE)
+    node, camera = start_node(rectified='all', model='fisheye'), make_bench()
+    camera.connect(node)
+    camera.until(lambda: camera.latched, node=node)
+    lens = Fisheye((320, 240), 200.0, 201.0, 160.0, 120.0, -0.02, 0.003, -0.001, 0.0002)
+    for info in camera.latched:
+        assert (info.distortion_model, list(info.d)) == ('equidistant', lens.ros_distortion())
+        assert list(info.k) == ros_camera(lens).k and list(info.p) == ros_camera(lens, 'all').p
+    camera.until(lambda: camera.values.get('camera model') == 'fisheye', node=node)
+    assert 'k4 0.000200 ± 0.001000' in camera.values['published']
+    # the file keeps its own until it is asked for
+    node.wait_for('is not that of rectified: all')
+    assert path.read_text() == FISHEYE_FILE + OUR_FISHEYE
+    assert camera.call('save', node).success
+    saved = yaml.safe_load(path.read_text())
+    assert saved['projection_matrix']['data'] == ros_camera(lens, 'all').p
+    assert load_calibration_yaml(path).camera == lens
+    assert saved['dashcalib']['sigma'] == yaml.safe_load(OUR_FISHEYE)['dashcalib']['sigma']
+    assert node.stop() == 0
+    # it fits now: there is nothing to tell
+    node, camera = start_node(rectified='all'), make_bench()
+    node.wait_for('loaded ')
+    assert 'projection_matrix' not in node.text
 
 
 @pytest.mark.parametrize(('text', 'words'), [
@@ -317,6 +353,9 @@ def test_services_say_why_not(plain):
 @pytest.mark.parametrize(('parameters', 'words'), [
     ({'turns__half_width': 99.0}, 'out of range'),
     ({'turns__wanted': 2.5}, 'must be int'),
+    ({'model': 'mirror'}, 'there are auto, radial, brown, fisheye'),
+    ({'model': 3.5}, 'model must be str'),
+    ({'rectified': 'whole'}, 'must be one of same, crop, all'),
     ({'reliability': 'perfect'}, 'must be one of'),
     ({'camera_name': 'narrow_stereo'}, 'belongs to image_pipeline'),
     ({'mask_file': 'missing.png'}, 'cannot read the mask'),

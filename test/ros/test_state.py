@@ -5,11 +5,12 @@ import dataclasses
 
 import pytest
 
-from dashcalib_ros.camera import Radial
+from dashcalib_ros.camera import Brown, Fisheye, Radial
+from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.config import Config
 from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.ros.state import Rules, contradicted, judge, state_of
+from dashcalib_ros.ros.state import Rules, contradicted, judge, sigma_text, state_of
 
 RULES = Rules(replace_ratio=0.7, contradictions=3)
 TRUTH = Radial((640, 360), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
@@ -68,6 +69,28 @@ def test_the_last_contradiction_replaces_it_when_its_turns_suffice():
 ])
 def test_a_contradiction_is_three_combined_sigmas(change, found):
     assert bool(contradicted(OLD, dataclasses.replace(TRUTH, **change), SIGMA)) == found
+
+
+@pytest.mark.parametrize('model', [Brown, Fisheye])
+def test_the_same_lens_in_another_model_confirms(model):
+    narrow = Radial((640, 360), 550.0, 551.0, 320.0, 180.0, -0.1, 0.02)
+    other = as_model(narrow, model)
+    old = NamedCamera('old', narrow, SIGMA, 'accepted')
+    tiny = dict.fromkeys(other.names(), 1e-6)
+    assert not contradicted(old, other, tiny)
+    assert contradicted(old, dataclasses.replace(other, fx=other.fx + 10), tiny)
+    new = dataclasses.replace(calibration(), camera=other, sigma=tiny)
+    assert judge(new, True, old, 0, RULES).action == 'replace'
+    assert judge(calibration(), True, NamedCamera('old', as_model(TRUTH, model), dict.fromkeys(
+        other.names(), 2.0), 'accepted'), 0, RULES).action == 'keep'
+
+
+def test_every_parameter_is_told_with_digits_enough():
+    lens = Brown((640, 360), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1, 0.00034, -0.00052, 0.01)
+    sigma = dict.fromkeys(lens.names(), 0.00006) | {'fx': 2.0}
+    text = sigma_text(NamedCamera('new', lens, sigma))
+    assert text.startswith('fx 400.00 ± 2.00, ') and 'k1 -0.3000 ± ' in text
+    assert 'p1 0.000340 ± 0.000060' in text and text.endswith('k3 0.010000 ± 0.000060')
 
 
 def test_sigmas_too_good_to_be_true_do_not_contradict():
