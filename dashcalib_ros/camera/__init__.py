@@ -7,6 +7,7 @@ from dashcalib_ros.camera.models import (
     MODELS,
     camera_from_ros,
     camera_of,
+    larger_models,
     model_named,
     searched,
 )
@@ -14,4 +15,5 @@ from dashcalib_ros.camera.plumb_bob import Brown, Radial
 from dashcalib_ros.camera.rectified import RECTIFIED
 
 __all__ = ['AUTO', 'MODELS', 'RECTIFIED', 'Brown', 'Camera', 'Fisheye', 'Radial',
-           'camera_from_ros', 'camera_of', 'model_named', 'ros_camera', 'searched']
+           'camera_from_ros', 'camera_of', 'larger_models', 'model_named', 'ros_camera',
+           'searched']

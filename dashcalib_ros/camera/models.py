@@ -35,6 +35,11 @@ def searched(name: str) -> tuple[type[Camera], ...]:
     return tuple(kinds.values())
 
 
+def larger_models(camera: Camera) -> list[type[Camera]]:
+    """Return the models with more parameters than the camera's."""
+    return [model for model in MODELS.values() if len(model.names()) > len(camera.names())]
+
+
 def camera_of(model: str, image_size: tuple[int, int], params: npt.ArrayLike) -> Camera:
     """Return the camera of a model's name; raises InputError for a model that is not known."""
     if model not in MODELS:

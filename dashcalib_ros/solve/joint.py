@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dashcalib_ros.camera import AUTO, Camera, Fisheye, Radial
+from dashcalib_ros.camera import AUTO, Camera, larger_models
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.config import Config, IntrinsicsConfig
 from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1, adjust_step2
@@ -153,9 +153,9 @@ def _with_model_chosen(first: _Result, full_scenes: ByTurn, config: Config
     of the tracks; the one that is chosen is adjusted with all.
     """
     camera = first.fit.camera
-    if len(first.parts) < 2 or not isinstance(camera, Radial) or not _leaves_more(first, config):
+    if len(first.parts) < 2 or not _leaves_more(first, config):
         return first, ()
-    models: list[type[Camera]] = [type(camera.widened()), Fisheye]
+    models = larger_models(camera)
     few, measured = _few(first, full_scenes, config)
     found = [_refitted(few, type(camera), measured, config),
              *(_without_shutter(few, model, measured, config) for model in models)]
@@ -200,10 +200,13 @@ def _is_rolling(readout_s: float, sigma_s: float, config: IntrinsicsConfig) -> b
 
 def _leaves_more(result: _Result, config: Config) -> bool:
     """Return whether a wider model may foretell the turns clearly better."""
+    camera = result.fit.camera
+    if type(camera.widened()) is type(camera):
+        return False
     if result.fit.readout_s:
         return abs(result.fit.readout_s) < SHORT_READOUT_S
     prior = prior_information(result.step1, config.intrinsics)
-    gains = gain_of_wider_model(result.parts, prior, extra_sigma_of(result.fit.camera))
+    gains = gain_of_wider_model(result.parts, prior, extra_sigma_of(camera))
     return is_clear(gains / track_inflation(pooled(result.parts, prior)),
                     config.intrinsics.least_gain)
 

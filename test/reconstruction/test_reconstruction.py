@@ -512,7 +512,8 @@ def test_registration_passes_over_an_image_that_only_unused_tracks_refer_to():
     used[:, :5] = False
     # the first image is nobody's reference but, for want of another, theirs
     xy[0, :5] = np.nan
-    found = register_tracks(replace(tracks, xy=xy), replace(structure, used=used), LENS, images, 7, 3.0)
+    found = register_tracks(
+        replace(tracks, xy=xy), replace(structure, used=used), LENS, images, 7, 3.0)
     assert np.isnan(found.xy[:, :5]).all() and np.isfinite(found.xy[:, 5:]).all()
 
 
