@@ -21,7 +21,7 @@ WIDEST = 1.309
 SIDE_POINTS = 512
 # halvings on the way from the principal point to the border
 HALVINGS = 30
-# in the search for the largest view; 30 to 60 are needed
+# in the search for the largest view; about 30 are needed
 SEARCH_STEPS = 300
 # of a shift; a view that is no larger elsewhere stays in the middle
 STAYS = 0.001
