@@ -14,6 +14,7 @@ import pytest
 from synthetic import LENS, synthetic_turn
 
 from dashcalib_ros import turn_store as room
+from dashcalib_ros.camera import Fisheye
 from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
@@ -66,6 +67,14 @@ def same(a: Scene, b: Scene) -> bool:
     return all(x.dtype == y.dtype and np.array_equal(x, y, equal_nan=True) for x, y in pairs) and (
         (a.camera, a.tracks.image_size, a.profile.observations)
         == (b.camera, b.tracks.image_size, b.profile.observations))
+
+
+def test_a_turn_through_a_fisheye_comes_back(make):
+    size = scene(0).tracks.image_size
+    wide = replace(scene(0), camera=Fisheye(size, 300.0, 301.0, 400.0, 220.0, 0.02, -0.01, 0.002))
+    hold(make(), StoredTurn(wide, DATE_S, 0.05))
+    [found] = make().turns.values()
+    assert same(found.scene, wide)
 
 
 def test_what_is_stored_comes_back_with_keys_of_its_own(make):

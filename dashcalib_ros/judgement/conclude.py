@@ -9,6 +9,7 @@ from importlib import metadata
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera import AUTO
 from dashcalib_ros.config import Config
 from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.judgement.agreement import focal_disagreement
@@ -72,6 +73,9 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     camera = sigma = error = shutter = sigma_px = None
     details: dict[str, object] = {}
     warnings = evidence.warnings
+    if solution is not None and verdict.level != 'accepted' and config.model != AUTO:
+        warnings += (f'the model {config.model} was asked for; {AUTO} takes the one that the turns '
+                     f'prove',)
     if solution is not None:
         details = _details(solution)
         if verdict.level != 'refused':

@@ -620,6 +620,14 @@ def test_a_lens_that_the_six_do_not_describe_is_told_of(good, monkeypatch):
     assert not conclude(refused, evidence_for(refused), CONFIG).warnings
 
 
+def test_a_model_that_was_asked_for_and_does_not_do_is_told_of(good):
+    asked = CONFIG.replace({'model': 'radial'})
+    assert not conclude(good, evidence_for(good), asked).warnings
+    refused = replace(good, around=replace(good.around, costs=np.ones_like(good.around.costs)))
+    [warning] = conclude(refused, evidence_for(refused), asked).warnings
+    assert 'model radial was asked for; auto' in warning
+
+
 @pytest.mark.parametrize(('turns', 'frames', 'text'), [
     (0, 0, '0 image'), (0, 1, 'only 1 image'), (0, 500, 'no turn was found'),
     (3, 500, 'none of the 3 turns')])
