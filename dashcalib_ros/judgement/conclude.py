@@ -74,8 +74,8 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     details: dict[str, object] = {}
     warnings = evidence.warnings
     if solution is not None and verdict.level != 'accepted' and config.model != AUTO:
-        warnings += (f'the model {config.model} was asked for; {AUTO} takes the one that the turns '
-                     f'prove',)
+        warnings += (f'the model {config.model} was asked for; {AUTO} takes the one that the '
+                     f'turns prove',)
     if solution is not None:
         details = _details(solution)
         if verdict.level != 'refused':
