@@ -94,9 +94,19 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         turns=tuple(_summary(turn, evidence, solution)
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
         frames=evidence.frames, reprojection_error_px=error, timing=evidence.timing,
-        versions=_versions(), config=config, magnitudes=evidence.magnitudes, mask=evidence.mask,
+        versions=_versions(), config=config, magnitudes=evidence.magnitudes,
+        mask=_of_size(evidence.mask, evidence.image_size),
         details=details, rolling_shutter=shutter, sigma_px=sigma_px, warnings=warnings,
         stored_turns=tuple(_stored_summary(turn, solution) for turn in evidence.stored))
+
+
+def _of_size(mask: Mask | None, size: tuple[int, int]) -> Mask | None:
+    """Return the mask of resized images for images of this (width, height)."""
+    if mask is None:
+        return None
+    row, column = (np.arange(length) * count // length
+                   for length, count in zip(size[::-1], mask.shape, strict=True))
+    return np.asarray(mask[np.ix_(row, column)], bool)
 
 
 def _model_error_warnings(solution: Solution, px: float, config: Config) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ pytest.importorskip('dashcalib_ros.calibrator')
 from processes import processes_of
 
 from dashcalib_ros.camera import Radial, camera_of
-from dashcalib_ros.demo import demo_drive, render_to_bag
+from dashcalib_ros.demo import demo_drive
 from dashcalib_ros.report import NamedCamera, compare, load_camera, load_result
 
 COMMAND = (sys.executable, '-m', 'dashcalib_ros.cli')
@@ -29,12 +29,16 @@ def dashcalib(*args):
 
 
 @pytest.fixture(scope='module')
-def rendered(tmp_path_factory):
-    """Render the demo's drive once; return it and its bag."""
-    drive = demo_drive(0)
-    bag = tmp_path_factory.mktemp('demo') / 'bag'
-    render_to_bag(drive, bag)
-    return drive, bag
+def demo(tmp_path_factory):
+    """Run the demo once; return the finished process and its folder, which has the bag, too."""
+    out = tmp_path_factory.mktemp('demo') / 'demo'
+    return dashcalib('demo', '--out', out, '--keep-bag'), out
+
+
+@pytest.fixture(scope='module')
+def rendered(demo):
+    """Return the demo's drive and its bag."""
+    return demo_drive(0), demo[1] / 'bag'
 
 
 @pytest.fixture(scope='module')
@@ -73,11 +77,9 @@ def test_the_result_is_complete(rendered, calibrated):
     assert str(rendered[1]) in result['input'] or rendered[1].name in result['input']
 
 
-def test_the_same_input_and_seed_give_the_same_result(rendered, calibrated, tmp_path):
-    done = dashcalib('run', rendered[1], '--out', tmp_path)
-    assert done.returncode == calibrated[0].returncode
-    first, second = load_result(calibrated[1] / 'result.json'), load_result(
-        tmp_path / 'result.json')
+def test_the_same_input_and_seed_give_the_same_result(demo, calibrated):
+    """The demo calibrates the same bag, in a process of its own."""
+    first, second = (load_result(out / 'result.json') for out in (demo[1], calibrated[1]))
     for key in ('intrinsics', 'sigma', 'turns', 'verdict', 'reasons', 'reprojection_error_px'):
         assert first[key] == second[key], key
 
@@ -145,13 +147,13 @@ def test_a_signal_ends_it_whole(rendered, tmp_path, name, seconds):
             os.killpg(process.pid, signal.SIGKILL)
 
 
-def test_demo_prints_estimate_sigma_and_truth(tmp_path):
-    done = dashcalib('demo', '--out', tmp_path / 'demo', '--keep-bag')
+def test_demo_prints_estimate_sigma_and_truth(demo):
+    done, out = demo
     assert done.returncode == 0, done.stdout + done.stderr
     assert 'estimate' in done.stdout and 'truth' in done.stdout
     assert 'mapping error: ' in done.stdout
-    assert (tmp_path / 'demo' / 'bag' / 'metadata.yaml').exists()
-    again = dashcalib('compare', tmp_path / 'demo', tmp_path / 'demo' / 'truth.json', '--json')
+    assert (out / 'bag' / 'metadata.yaml').exists()
+    again = dashcalib('compare', out, out / 'truth.json', '--json')
     assert json.loads(again.stdout)['mapping_px'] is not None
-    refused = dashcalib('demo', '--out', tmp_path / 'demo', '--keep-bag')
+    refused = dashcalib('demo', '--out', out, '--keep-bag')
     assert refused.returncode == 2 and 'exists' in refused.stderr
