@@ -21,6 +21,9 @@ GRID = (25, 15)
 # from the axis; a camera that is no fisheye sees nothing beyond
 WIDEST_DEG = 88.0
 UNSEEN_PX = 1e3
+# in focal lengths: of a numerical derivative, and the longest step of an iteration
+STEP = 1e-6
+LEAP = 0.1
 
 
 def is_fisheye(camera: Mapping[str, Any]) -> bool:
@@ -84,9 +87,16 @@ def rays(camera: Mapping[str, Any], pixels: Floats) -> Floats:
         scale = np.sin(angle) / np.maximum(radius, 1e-12)
         return np.column_stack([x_d * scale, y_d * scale, np.cos(angle)])
     x, y = x_d, y_d
-    for _ in range(500):
+    # Newton's method: the simple iteration runs away where a lens is near its fold
+    for _ in range(50):
         x_now, y_now = _distorted(camera, x, y)
-        x, y = x + x_d - x_now, y + y_d - y_now
+        right, down = (_distorted(camera, x + STEP, y), _distorted(camera, x, y + STEP))
+        a, c = (right[0] - x_now) / STEP, (right[1] - y_now) / STEP
+        b, d = (down[0] - x_now) / STEP, (down[1] - y_now) / STEP
+        off_x, off_y = x_d - x_now, y_d - y_now
+        area = np.maximum(a * d - b * c, 0.05)
+        x = x + np.clip((d * off_x - b * off_y) / area, -LEAP, LEAP)
+        y = y + np.clip((a * off_y - c * off_x) / area, -LEAP, LEAP)
     found = np.column_stack([x, y, np.ones_like(x)])
     return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
