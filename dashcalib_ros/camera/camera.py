@@ -130,6 +130,10 @@ class Camera(ABC):
         return replace(self, image_size=image_size, fx=self.fx * factor, fy=self.fy * factor,
                        cx=self.cx * factor + offset, cy=self.cy * factor + offset)
 
+    def without_distortion(self) -> Self:
+        """Return the camera with all distortion coefficients 0."""
+        return self.of(self.image_size, [*self.params[:4], *np.zeros(len(self.names()) - 4)])
+
     @property
     def matrix(self) -> Floats:
         """Return K (3, 3)."""

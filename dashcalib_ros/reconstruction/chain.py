@@ -51,8 +51,8 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
         # only points that the newest image sees can have changed
         touched = seen[newest]
         points[touched], used[:, touched] = triangulate(
-            camera, tracks.xy[:, touched], rays[:, touched], rotations, translations, registered,
-            error_px, min_angle_deg)
+            camera, rays[:, touched], rotations, translations, registered, error_px,
+            min_angle_deg)
         known: Mask = np.asarray(used.any(axis=0), bool)
         support = np.where(registered | failed, -1, (seen & known).sum(axis=1))
         nearest = int(np.argmax(support))

@@ -110,6 +110,6 @@ def retriangulated(scene: Scene, camera: Camera, limit_px: float, min_angle_deg:
     """Return the scene with every track triangulated anew, also those that were not used."""
     structure = scene.structure
     points, used = triangulate(
-        camera, scene.tracks.xy, camera.rays(scene.tracks.xy), structure.rotations,
-        structure.translations, structure.registered, limit_px, min_angle_deg)
+        camera, camera.rays(scene.tracks.xy), structure.rotations, structure.translations,
+        structure.registered, limit_px, min_angle_deg)
     return replace(scene, structure=replace(structure, points=points, used=used), camera=camera)

@@ -28,20 +28,19 @@ class Structure:
     used: Mask
 
 
-def triangulate(camera: Camera, xy: Floats, rays: Floats, rotations: Floats,
-                translations: Floats, registered: Mask, error_px: float, min_angle_deg: float
+def triangulate(camera: Camera, rays: Floats, rotations: Floats, translations: Floats,
+                registered: Mask, error_px: float, min_angle_deg: float
                 ) -> tuple[Floats, Mask]:
     """Triangulate every track from all registered images that see it, linearly.
 
-    xy: (k, t, 2) pixels; rays: (k, t, 3) their unit viewing rays. error_px: largest error.
+    rays: (k, t, 3) unit viewing rays. error_px: largest error, see ray_errors_px().
     Returns points (t, 3) and used (k, t): the good observations of the points that are kept. Those
     have at least 2 good observations and a triangulation angle of at least min_angle_deg.
     """
     seen = np.isfinite(rays[:, :, 0]) & registered[:, None]
 
     def good_of(points: Floats, tracks: Mask | slice) -> Mask:
-        error = ray_errors_px(
-            camera, xy[:, tracks], rays[:, tracks], rotations, translations, points)
+        error = ray_errors_px(camera, rays[:, tracks], rotations, translations, points)
         return np.asarray(seen[:, tracks] & (error < error_px), bool)
 
     points = _linear_points(rays, rotations, translations, seen)
@@ -57,15 +56,18 @@ def triangulate(camera: Camera, xy: Floats, rays: Floats, rotations: Floats,
     return points, good & enough
 
 
-def ray_errors_px(camera: Camera, xy: Floats, rays: Floats, rotations: Floats,
-                  translations: Floats, points: Floats) -> Floats:
+def ray_errors_px(camera: Camera, rays: Floats, rotations: Floats, translations: Floats,
+                  points: Floats) -> Floats:
     """Return (k, t) reprojection errors, px; inf where a point does not lie along its ray.
 
-    A model that folds over projects other directions to the same pixel, too: those do not count.
+    They are those of a picture without distortion: barrel distortion makes the rim of the picture
+    small, and errors there, too. A model that folds over projects other directions to the same
+    pixel, too: those do not count.
     """
+    flat = camera.without_distortion()
     local = points @ rotations.transpose(0, 2, 1) + translations[:, None]
     along = np.einsum('ktc,ktc->kt', local, rays) > ALONG * np.linalg.norm(local, axis=2)
-    error = np.linalg.norm(camera.project(local) - xy, axis=2)
+    error = np.linalg.norm(flat.project(local) - flat.project(rays), axis=2)
     return np.asarray(np.where(along & np.isfinite(error), error, np.inf))
 
 

@@ -119,14 +119,14 @@ def test_chain_with_a_lens_that_folds_over_is_no_crash(turn):
 def test_triangulates_exactly_what_is_exact():
     exact = synthetic_turn(noise_px=0.0)
     structure = exact.structure
-    points, used = triangulate(LENS, exact.tracks.xy, LENS.rays(exact.tracks.xy),
+    points, used = triangulate(LENS, LENS.rays(exact.tracks.xy),
                                structure.rotations, structure.translations,
                                structure.registered, 1.0, 1.0)
     kept = used.any(axis=0)
     assert kept.sum() > 250
     np.testing.assert_allclose(points[kept], structure.points[kept], rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(used[:, kept], exact.tracks.seen[:, kept])
-    error = ray_errors_px(LENS, exact.tracks.xy, LENS.rays(exact.tracks.xy),
+    error = ray_errors_px(LENS, LENS.rays(exact.tracks.xy),
                           structure.rotations, structure.translations, points)
     assert error[used].max() < 5e-3 and np.isinf(error[~exact.tracks.seen]).all()
 
@@ -138,7 +138,7 @@ def test_triangulates_around_one_bad_observation():
     xy = exact.tracks.xy.copy()
     first = int(exact.tracks.seen[:, long].argmax())
     xy[first + 1, long] += [6.0, -8.0]
-    points, used = triangulate(LENS, xy, LENS.rays(xy), structure.rotations,
+    points, used = triangulate(LENS, LENS.rays(xy), structure.rotations,
                                structure.translations, structure.registered, 5.0, 0.1)
     assert not used[first + 1, long]
     np.testing.assert_array_equal(np.delete(used[:, long], first + 1),
@@ -151,10 +151,10 @@ def test_triangulates_only_from_registered_images_and_wide_angles():
     structure = exact.structure
     registered = np.arange(20) % 2 == 0
     rays = LENS.rays(exact.tracks.xy)
-    _, used = triangulate(LENS, exact.tracks.xy, rays, structure.rotations,
+    _, used = triangulate(LENS, rays, structure.rotations,
                           structure.translations, registered, 1.0, 0.5)
     assert used[registered].any() and not used[~registered].any()
-    counts = [triangulate(LENS, exact.tracks.xy, rays, structure.rotations,
+    counts = [triangulate(LENS, rays, structure.rotations,
                           structure.translations, structure.registered, 1.0, angle
                           )[1].any(axis=0).sum()
               for angle in (0.5, 5.0, 20.0, 179.0)]
@@ -168,7 +168,7 @@ def test_a_point_against_its_rays_is_no_point():
         local = np.array([0.5, 0.2, depth]) + translations
         seen = local if good else -local
         rays = (seen / np.linalg.norm(seen, axis=1, keepdims=True))[:, None]
-        _, used = triangulate(LENS, LENS.project(seen)[:, None], rays, poses, translations,
+        _, used = triangulate(LENS, rays, poses, translations,
                               np.ones(3, bool), 1.0, 1.0)
         assert used.all() == good and used.any() == good
 
@@ -182,7 +182,7 @@ def test_a_pixel_beyond_the_fold_is_no_match():
     pixel = folded.project(point + translations)[:, None]
     rays = folded.rays(pixel)
     assert np.abs(rays[0, 0, 0] / rays[0, 0, 2] - 0.548) < 0.001
-    errors = ray_errors_px(folded, pixel, rays, poses, translations, point)
+    errors = ray_errors_px(folded, rays, poses, translations, point)
     assert np.isinf(errors[0, 0])
 
 
