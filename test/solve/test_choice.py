@@ -39,7 +39,8 @@ def test_a_decentred_lens_is_found(count):
     error = np.abs(found.camera.params - DECENTRED.params) / found.sigma
     assert (error[2:4] < 3).all()
     models = [each.model for each in found.tried]
-    assert models == ['radial', 'fisheye', 'brown']
+    # a fisheye that still shows a shutter is no candidate
+    assert models[0] == 'radial' and models[-1] == 'brown'
     assert found.tried[-1].loses_by == 0 and found.tried[0].loses_by > 30
 
 
