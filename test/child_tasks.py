@@ -12,7 +12,7 @@ import numpy as np
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.reconstruction.scene import Draft, Profile
+from dashcalib_ros.reconstruction.scene import Draft, Profile, Start
 from dashcalib_ros.reconstruction.tracks import Tracks
 
 
@@ -135,7 +135,7 @@ def draft(turn, config, valid):
     noted(turn, f'draft of {turn.center}')
     frames = np.array([frame.index for frame in turn.frames[::2]])
     tracks = Tracks(frames, np.zeros((len(frames), 0, 2)), (64, 48), frames)
-    return Draft(tracks, Profile(np.ones(1), np.ones(1), 1), Radial.centred((64, 48), 50.0))
+    return Draft(tracks, Start(Profile(np.ones(1), np.ones(1), 1), Radial.centred((64, 48), 50.0)))
 
 
 # stand-ins for stages.finish(turn, config, begun)

@@ -21,6 +21,7 @@ from dashcalib_ros.reconstruction.scene import (
     Draft,
     Profile,
     Scene,
+    Start,
     retriangulated,
     truncated_cost,
 )
@@ -45,20 +46,28 @@ def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft 
     tracks, settings = track_turn(turn, config.tracks, valid), config.scene
     if tracks.xy.shape[1] < settings.min_tracks or len(tracks.frames) < settings.min_images:
         return None
-    found: list[tuple[Profile, Camera]] = []
+    found: list[Scene] = []
     for model in searched(config.model):
-        if found and not _may_be_another(found[0][0], settings):
+        if found and not _may_be_another(found[0].profile, settings):
             break
         trials = _trials(tracks, turn, config, model)
         if trials:
             profile = _profile_of(trials)
-            found.append((profile, trials[profile.best].camera))
+            found.append(replace(trials[profile.best], profile=profile))
     if not found:
         return None
+    if len(found) > 1:
+        # at the focal lengths of the grid, the right kind may look worse
+        found = [_refined(scene, settings, _around(scene.camera)) for scene in found]
     # min() returns the first one of equals: the simplest
-    best = min(found, key=lambda each: float(each[0].costs.min()))
-    return Draft(thinned(tracks, settings.keyframes), *best,
-                 {camera.ros_model: profile for profile, camera in found})
+    best = min(found, key=lambda scene: truncated_cost(scene, scene.camera, settings.error_px))
+    return Draft(thinned(tracks, settings.keyframes), Start(best.profile, best.camera),
+                 tuple(Start(scene.profile, scene.camera) for scene in found if scene is not best))
+
+
+def _around(camera: Camera) -> tuple[float, float]:
+    """Return the focal lengths between which the minimum may lie: the profile's grid is coarse."""
+    return camera.fx / 1.3, camera.fx * 1.3
 
 
 def _may_be_another(profile: Profile, config: SceneConfig) -> bool:
@@ -71,17 +80,15 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
 
     turn: needs the images of the draft's keyframes only.
     """
-    start, settings = draft.start, config.scene
+    start, settings = draft.start.camera, config.scene
     # with spread tracks there may be no pair of images that shares enough of them
     scene = None
     for choose in (_spread, _longest):
         scene = scene or chain_scene(choose(draft.tracks, settings.tracks), turn.id, start,
-                                     draft.profile, settings, config.seed)
+                                     draft.start.profile, settings, config.seed)
     if scene is None:
         return None
-    # the minimum of the profile lies between the grid's neighbours of the start
-    scene = replace(scene, rivals=draft.rivals)
-    reach = (start.fx / 1.3, start.fx * 1.3)
+    scene, reach = replace(scene, rivals=draft.rivals), _around(start)
     scene = _refined(scene, settings, reach, tolerance=ROUGH)
     by_index = {frame.index: frame.image for frame in turn.frames}
     images = [by_index[int(index)] for index in scene.tracks.frames]

@@ -1,8 +1,7 @@
 """A reconstructed turn: its tracks, structure, camera and focal profile."""
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,23 +31,30 @@ class Profile:
 
 
 @dataclass(frozen=True)
-class Draft:
-    """A turn half reconstructed: its tracks, its focal profile, and the camera to start from.
+class Start:
+    """Where a kind of lens may start from: its focal profile, and the camera of its minimum."""
 
-    rivals: the profiles of other kinds of lenses that were tried, by their ros_model.
+    profile: Profile
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A turn half reconstructed: its tracks, and where to start from.
+
+    rivals: the starts of other kinds of lenses that were tried.
     """
 
     tracks: Tracks
-    profile: Profile
-    start: Camera
-    rivals: Mapping[str, Profile] = field(default_factory=dict)
+    start: Start
+    rivals: tuple[Start, ...] = ()
 
 
 @dataclass(frozen=True)
 class Scene:
     """One turn, reconstructed: its tracks, the structure that explains them, and its profile.
 
-    profile: of the camera's kind of lens. rivals: those of other kinds, by their ros_model.
+    profile: of the camera's kind of lens. rivals: the starts of other kinds that were tried.
     """
 
     turn: TurnId
@@ -56,12 +62,13 @@ class Scene:
     structure: Structure
     camera: Camera
     profile: Profile
-    rivals: Mapping[str, Profile] = field(default_factory=dict)
+    rivals: tuple[Start, ...] = ()
 
     @property
-    def profiles(self) -> dict[str, Profile]:
-        """Return the profiles of all kinds of lenses that were tried, by their ros_model."""
-        return {**self.rivals, self.camera.ros_model: self.profile}
+    def starts(self) -> dict[str, Start]:
+        """Return a start for each kind of lens that was tried, by its ros_model."""
+        starts = (*self.rivals, Start(self.profile, self.camera))
+        return {start.camera.ros_model: start for start in starts}
 
     @property
     def yaw_deg(self) -> float:

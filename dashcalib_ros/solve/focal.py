@@ -1,6 +1,7 @@
 """The focal profile of all turns: where to start, and how the cost rises around the result."""
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -32,15 +33,19 @@ def summed(profiles: Sequence[Profile]) -> Profile:
 
 
 def kinds_of_lenses(scenes: Sequence[Scene]) -> list[str]:
-    """Return the ros_models of the cameras by which the scenes were reconstructed."""
-    return list(dict.fromkeys(scene.camera.ros_model for scene in scenes))
+    """Return the ros_models of the cameras that were tried for at least half of the scenes.
+
+    The profiles do not decide between them: with two coefficients of distortion, wide lenses of
+    one kind may look more like the other.
+    """
+    counts = Counter(kind for scene in scenes for kind in scene.starts)
+    return [kind for kind, count in counts.items() if 2 * count >= len(scenes)]
 
 
-def nearest_start(scenes: Sequence[Scene], profile: Profile) -> Camera:
-    """Return, of the scenes' own cameras, the one nearest to the summed profile's minimum."""
-    wanted = np.log(profile.best * scenes[0].camera.image_size[0])
-    return min((scene.camera for scene in scenes),
-               key=lambda camera: abs(float(np.log(camera.fx)) - wanted))
+def nearest_start(cameras: Sequence[Camera], profile: Profile) -> Camera:
+    """Return the camera that is nearest to the summed profile's minimum."""
+    wanted = np.log(profile.best * cameras[0].image_size[0])
+    return min(cameras, key=lambda camera: abs(float(np.log(camera.fx)) - wanted))
 
 
 def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,

@@ -122,8 +122,9 @@ def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progr
 
     None where the shared camera explains none of the scenes.
     """
-    profile = summed([scene.profiles[kind] for scene in separate if kind in scene.profiles])
-    start = nearest_start([scene for scene in separate if scene.camera.ros_model == kind], profile)
+    starts = [scene.starts[kind] for scene in separate if kind in scene.starts]
+    profile = summed([start.profile for start in starts])
+    start = nearest_start([start.camera for start in starts], profile)
     full_scenes = {scene.turn: adapted_to(scene, start, config) for scene in separate}
     first = _step1(full_scenes, start, config, progress)
     if not first.scenes:

@@ -10,7 +10,7 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model, mapping_error
-from dashcalib_ros.reconstruction.scene import Profile
+from dashcalib_ros.reconstruction.scene import Profile, Start
 from dashcalib_ros.solve.choice import gain_of_wider_model, is_clear
 from dashcalib_ros.solve.information import information
 from dashcalib_ros.solve.picture import scatter_between_turns
@@ -73,14 +73,23 @@ def test_turns_that_may_be_of_two_kinds_are_tried_with_both():
     scenes = wide_scenes(3)
     narrow = as_model(WIDE, Radial)
     unsure = Profile(np.array([0.2, 0.3, 0.4]), np.array([2.0, 1.5, 1.8]), 100)
-    scenes = [replace(scene, rivals={'plumb_bob': unsure}) for scene in scenes]
+    scenes = [replace(scene, rivals=(Start(unsure, narrow),)) for scene in scenes]
     # one turn was taken for that of a pinhole
     first = synthetic_turn(WIDE, 80.0, world=0, tracks=220, keyframes=16).scene(narrow, 0)
-    scenes[0] = replace(first, rivals={'equidistant': scenes[0].profile})
+    scenes[0] = replace(first, rivals=(Start(scenes[0].profile, scenes[0].camera),))
     found = solved(scenes)
     assert type(found.camera) is Fisheye
     radial = next(each for each in found.tried if each.model == 'radial')
     assert radial.loses_by > 30
+
+
+def test_a_pinhole_that_all_turns_were_taken_for_a_fisheye_is_one():
+    taken = as_model(LENS, Fisheye)
+    sure = Profile(np.array([0.5, 0.65, 0.8]), np.array([1.2, 1.0, 1.3]), 100)
+    scenes = [replace(synthetic_turn(LENS, yaw, world=world, tracks=200).scene(taken, world),
+                      rivals=(Start(sure, LENS),)) for world, yaw in enumerate((80, -70, 85))]
+    found = solved(scenes)
+    assert type(found.camera) is Radial and mapping_error(found.camera, LENS) < 1.0
 
 
 def test_the_wider_model_gains_only_where_the_lens_needs_it():
