@@ -142,7 +142,7 @@ def draft(turn, config, valid):
 
 def finish(turn, config, begun):
     noted(turn, f'scene of {turn.center}')
-    assert begun.start.fx == 50.0
+    assert begun.start.camera.fx == 50.0
     return [frame.index for frame in turn.frames]
 
 
