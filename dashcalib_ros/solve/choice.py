@@ -24,7 +24,8 @@ class Candidate:
     """A model that was tried.
 
     loses_by: how much worse than the chosen model it foretells the turns left out: the sum of the
-    robust squared errors, in units of the noise of a track; 0 for the chosen one. apart_px: how
+    robust squared errors, in units of the noise of a track; 0 for the chosen one, negative for one
+    that does better, but not clearly. apart_px: how
     far its camera is from the chosen one over the picture; None where they cannot be compared.
     """
 

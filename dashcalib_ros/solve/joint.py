@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -69,11 +70,18 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Result:
-    """A fit at its end, what the priors come from, and what each turn says of the lens."""
+    """A fit at its end, and what the priors come from."""
 
     fit: _Fit
     step1: Camera
-    parts: tuple[Information, ...]
+
+    @cached_property
+    def parts(self) -> tuple[Information, ...]:
+        """Return what each turn says of the lens."""
+        fit = self.fit
+        return tuple(information(scene, fit.camera, fit.solver.loss_px,
+                                 row_shift(scene, fit.camera) if fit.readout_s else None)
+                     for scene in fit.scenes)
 
 
 @dataclass(frozen=True)
@@ -105,7 +113,7 @@ def solve(separate: Sequence[Scene], config: Config,
     if not complete.scenes:
         return None
     final = _step2(complete, start.full_scenes, roughly.step1, config, progress)
-    result = _Result(final, roughly.step1, _parts(final))
+    result = _Result(final, roughly.step1)
     if config.model == AUTO:
         progress('model of the lens', 0.0)
         result, others = _with_model_chosen(result, start.full_scenes, config)
@@ -131,19 +139,13 @@ def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progr
         return None
     progress('step 2: all parameters', 0.0)
     rough = _step2_roughly(first, config)
-    return _Begun(_Result(rough, first.camera, _parts(rough)), full_scenes, profile)
+    return _Begun(_Result(rough, first.camera), full_scenes, profile)
 
 
 def _merged(first: Sequence[Candidate], later: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """Return all candidates, the later figure of those that are in both."""
     found = {each.model: each for each in (*first, *later)}
     return tuple(found.values()) if len(found) > 1 else ()
-
-
-def _parts(fit: _Fit) -> tuple[Information, ...]:
-    return tuple(information(scene, fit.camera, fit.solver.loss_px,
-                             row_shift(scene, fit.camera) if fit.readout_s else None)
-                 for scene in fit.scenes)
 
 
 def _with_model_chosen(first: _Result, full_scenes: ByTurn, config: Config
@@ -225,7 +227,7 @@ def _refitted(first: _Result, model: type[Camera], full_scenes: ByTurn, config: 
     if len(scenes) < len(first.fit.scenes):
         return None
     fit = _step2(replace(first.fit, scenes=scenes, camera=camera), full_scenes, step1, config)
-    return _Result(fit, step1, _parts(fit)) if len(fit.scenes) == len(first.fit.scenes) else None
+    return _Result(fit, step1) if len(fit.scenes) == len(first.fit.scenes) else None
 
 
 def _chosen(results: Sequence[_Result], config: Config) -> tuple[_Result, tuple[Candidate, ...]]:
@@ -234,6 +236,8 @@ def _chosen(results: Sequence[_Result], config: Config) -> tuple[_Result, tuple[
     The simplest comes first; one with more parameters must be clearly better, and map rays
     differently by more than its sigma.
     """
+    if len(results) == 1:
+        return results[0], ()
     results = sorted(results, key=lambda result: len(result.fit.camera.names()))
     loss_px = min(result.fit.solver.loss_px for result in results)
     costs = [held_out_costs(
