@@ -424,8 +424,8 @@ def test_a_mask_fits_images_that_are_enlarged():
     with Calibrator(mask=mask) as calibrator:
         calibrator.push(Frame(0, 10**9, picture))
         valid = calibrator.calibrate().mask
-    assert valid is not None and valid.shape == (240, 640)
-    assert valid[:202].all() and not valid[202:].any()
+    assert valid is not None and valid.shape == (120, 320)
+    assert valid[:101].all() and not valid[101:].any()
     # as large as these pictures, once it is enlarged: but it is not theirs
     large = picture.repeat(2, axis=0).repeat(2, axis=1)
     with Calibrator(mask=mask) as calibrator, pytest.raises(InputError, match='320x120'):
@@ -439,8 +439,8 @@ def test_a_mask_fits_images_that_are_shrunk():
     with Calibrator(mask=mask) as calibrator:
         calibrator.push(Frame(0, 10**9, picture))
         valid = calibrator.calibrate().mask
-    # row 400 of the small picture holds rows 800 and 801: one of them is masked
-    assert valid is not None and valid.shape == (450, 800)
-    assert valid[:400].all() and not valid[400:].any()
+    # a row of the small picture holds rows 800 and 801, of which one is masked: both are then
+    assert valid is not None and valid.shape == (900, 1600)
+    assert valid[:800].all() and not valid[800:].any()
     with Calibrator(mask=mask[:, :-4]) as calibrator, pytest.raises(InputError):
         calibrator.push(Frame(0, 10**9, picture))
