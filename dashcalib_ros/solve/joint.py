@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import AUTO, Camera, larger_models
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.config import Config, IntrinsicsConfig
@@ -191,7 +192,7 @@ def _without_shutter(first: _Result, model: type[Camera], measured: ByTurn, conf
                       model, measured, config)
     if found is None:
         return None
-    prior = prior_information(found.step1, config.intrinsics)
+    prior = _prior(found, config)
     left_s, sigma_s = readout(found.fit.scenes, found.fit.camera, found.fit.solver.loss_px, prior)
     return None if _is_rolling(left_s, sigma_s, config.intrinsics) else found
 
@@ -208,7 +209,7 @@ def _leaves_more(result: _Result, config: Config) -> bool:
         return False
     if result.fit.readout_s:
         return abs(result.fit.readout_s) < SHORT_READOUT_S
-    prior = prior_information(result.step1, config.intrinsics)
+    prior = _prior(result, config)
     gains = gain_of_wider_model(result.parts, prior, extra_sigma_of(camera))
     return is_clear(gains / track_inflation(pooled(result.parts, prior)),
                     config.intrinsics.least_gain)
@@ -240,13 +241,13 @@ def _chosen(results: Sequence[_Result], config: Config) -> tuple[_Result, tuple[
         return results[0], ()
     results = sorted(results, key=lambda result: len(result.fit.camera.names()))
     loss_px = min(result.fit.solver.loss_px for result in results)
-    costs = [held_out_costs(
-        result.fit.scenes, result.fit.camera, result.parts,
-        prior_information(result.step1, config.intrinsics), loss_px, config.scene.error_px)
-        for result in results]
+    priors = [_prior(result, config) for result in results]
+    costs = [held_out_costs(result.fit.scenes, result.fit.camera, result.parts, prior, loss_px,
+                            config.scene.error_px)
+             for result, prior in zip(results, priors, strict=True)]
     noise = min(noise_of(result.parts) for result in results)
-    inflation = min(track_inflation(pooled(result.parts, prior_information(
-        result.step1, config.intrinsics))) for result in results)
+    inflation = min(track_inflation(pooled(result.parts, prior))
+                    for result, prior in zip(results, priors, strict=True))
     # a turn that a camera does not explain at all counts against it
     worst = {turn: max(cost.get(turn, 0.0) for cost in costs) for cost in costs for turn in cost}
     gains = [{turn: (worst[turn] - cost.get(turn, 2 * worst[turn])) / noise / inflation
@@ -264,6 +265,11 @@ def _chosen(results: Sequence[_Result], config: Config) -> tuple[_Result, tuple[
         for n, result in enumerate(results))
 
 
+def _prior(result: _Result, config: Config) -> Floats:
+    """Return the prior's information (n, n) about the result's camera."""
+    return prior_information(result.step1, config.intrinsics)
+
+
 def _alike(larger: _Result, simpler: _Result, config: Config) -> bool:
     """Return whether two models map rays alike, as far as the turns can tell."""
     apart = mapping_error(larger.fit.camera, simpler.fit.camera)
@@ -271,7 +277,7 @@ def _alike(larger: _Result, simpler: _Result, config: Config) -> bool:
 
 
 def _picture_sigma(result: _Result, config: Config) -> PictureSigma:
-    camera, prior = result.fit.camera, prior_information(result.step1, config.intrinsics)
+    camera, prior = result.fit.camera, _prior(result, config)
     return picture_sigma(camera, result.parts, prior, floor_of(camera, config.intrinsics),
                          step_to_wider_model(result.parts, prior, extra_sigma_of(camera)))
 

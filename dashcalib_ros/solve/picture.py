@@ -40,9 +40,10 @@ def picture_sigma(camera: Camera, parts: Sequence[Information], prior: Floats, f
     parts, prior: (n, n) as for covariance(). floor: (n,) sigmas of systematic errors. step:
     (lens,) to the wider model; what it would change counts as an error.
     """
-    moves, _ = sensitivity(camera)
-    variances = _variances(moves, parts, prior) + _squares(moves * floor).sum(axis=1)
     wide, _ = sensitivity(camera.widened())
+    # the wider model's first parameters are the camera's own
+    moves = wide[:, :, :len(floor)]
+    variances = _variances(moves, parts, prior) + _squares(moves * floor).sum(axis=1)
     variances += _squares(wide @ step[:, None])[:, 0]
     return PictureSigma(float(np.sqrt(np.mean(variances))), float(np.sqrt(np.max(variances))))
 
