@@ -191,6 +191,22 @@ class IntrinsicsConfig:
         5.0, 'of its readout; a shorter readout counts as a global shutter', 1.0, 100.0)
     least_readout_ms: float = expert(
         1.0, 'ms; six global shutters came out at 0.0 to 0.5', 0.0, 100.0)
+    clear_shift: float = expert(
+        2.0, 'times what chance gains; more is a picture that moves: 0.9 to 1.3 are fixed ones',
+        1.0, 1e6)
+    left_shift: float = expert(
+        4.0, "the same, after a stabiliser's movement was taken out", 1.0, 1e6)
+    clear_zoom: float = expert(
+        3.0, 'the same, of a picture that zooms: 0.9 to 1.5 are fixed ones', 1.0, 1e6)
+    clear_bend: float = expert(
+        8.0, 'the same, of a picture that is bent: kitti03 has 4, by its own rectification',
+        1.0, 1e6)
+    crop_sigma: float = expert(
+        0.03, 'of the width; how far a stabiliser moves its crop', 1e-4, 1.0)
+    crop_time_s: float = expert(
+        1.0, 's; a stabiliser holds its crop about so long', 0.01, 100.0)
+    crop_rounds: int = expert(
+        10, 'corrections of a stabilised picture at the most; with 0 none is taken out', 0, 100)
     focal_floor: float = expert(
         0.0005, 'of fx, added to the sigma of fx and fy: systematic errors of the tracking',
         0.0, 0.1)

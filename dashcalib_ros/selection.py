@@ -7,6 +7,7 @@ from typing import Any
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.reconstruction.repeated import without_repeated
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.turns import TurnId
@@ -159,9 +160,20 @@ class SceneSelection:
                 own = [scene for scene in self._pool.scenes().values() if scene is not None]
                 self._kept.drop_repeated((), own)
                 self.submit(replace_failed=True)
-                if not self._undecided() and not (everything and len(self._pool.unbuilt())):
+                ready_now = (not self._undecided()
+                             and not (everything and len(self._pool.unbuilt())))
+                chosen = self.chosen() if ready_now else []
+            if ready_now:
+                kept, repeated = without_repeated(chosen, self._config.scene.min_images)
+                if repeated:
+                    # the next best turns take their places
+                    self.warnings += [_repeated_text(turn, other)
+                                      for turn, other in sorted(repeated.items())]
+                    self.reject(repeated)
+                    continue
+                with self._lock:
                     self._stored_before = self.stored()
-                    return self.chosen()
+                return kept
 
     def widen(self) -> bool:
         """Use more turns, up to turns.at_most; return False if there are no more to use."""
@@ -223,3 +235,8 @@ class SceneSelection:
     def _lost(self, text: str) -> None:
         self.warnings.append(text)
         self._on_trouble(text)
+
+
+def _repeated_text(turn: TurnId, other: TurnId) -> str:
+    return (f'{turn} repeats {other}: it shows the same place in the same pictures, and counts '
+            f'once; is the recording played in a loop?')

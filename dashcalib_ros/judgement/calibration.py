@@ -69,6 +69,13 @@ class Shutter:
 
 
 @dataclass(frozen=True)
+class Stabiliser:
+    """A stabilised video, its movement taken out. largest_px: how far its crop moved."""
+
+    largest_px: float
+
+
+@dataclass(frozen=True)
 class Calibration:
     """The complete result. camera and sigma are None when the verdict is refused.
 
@@ -78,6 +85,7 @@ class Calibration:
     magnitudes: (n, 2) float64, columns stamp [s] and filtered turning magnitude [of the width].
     mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
     rolling_shutter: the one that was found, and whose effect was removed; None for a global one.
+    stabiliser: the one that was found, and whose effect was removed; None for a fixed picture.
     sigma_px: how far the whole camera may be off over the picture.
     """
 
@@ -99,6 +107,7 @@ class Calibration:
     stored_turns: tuple[StoredTurnSummary, ...] = ()
     rolling_shutter: Shutter | None = None
     sigma_px: PictureSigma | None = None
+    stabiliser: Stabiliser | None = None
 
     @property
     def intrinsics(self) -> dict[str, float] | None:

@@ -16,12 +16,14 @@ from dashcalib_ros.judgement.agreement import focal_disagreement
 from dashcalib_ros.judgement.calibration import (
     Calibration,
     Shutter,
+    Stabiliser,
     StoredTurnSummary,
     TurnSummary,
     Verdict,
 )
 from dashcalib_ros.judgement.verdict import judge, profile_contrast
 from dashcalib_ros.reconstruction.scene import Scene, errors_px
+from dashcalib_ros.solve.departures import largest_crop
 from dashcalib_ros.solve.picture import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turn_store import StoredTurn
@@ -70,7 +72,7 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
     """Return the calibration; a refused one has no intrinsics, so that they cannot be used."""
     verdict = judge(solution, config.verdict) if solution else _verdict_without_solution(evidence)
-    camera = sigma = error = shutter = sigma_px = None
+    camera = sigma = error = shutter = sigma_px = stabiliser = None
     details: dict[str, object] = {}
     warnings = evidence.warnings
     if solution is not None and verdict.level != 'accepted' and config.model != AUTO:
@@ -89,6 +91,12 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
             warnings += _model_error_warnings(solution, px, config)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
+            if solution.crops:
+                stabiliser = Stabiliser(px * largest_crop(solution.crops))
+                warnings += (f'the video is stabilised: its picture moves by up to '
+                             f'{stabiliser.largest_px:.0f} px against the lens; that was taken '
+                             f'out, and the result is for the picture in its middle: switch the '
+                             f'stabiliser off',)
     return Calibration(
         verdict=verdict, image_size=evidence.image_size, camera=camera, sigma=sigma,
         turns=tuple(_summary(turn, evidence, solution)
@@ -96,7 +104,8 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         frames=evidence.frames, reprojection_error_px=error, timing=evidence.timing,
         versions=_versions(), config=config, magnitudes=evidence.magnitudes,
         mask=_of_size(evidence.mask, evidence.image_size),
-        details=details, rolling_shutter=shutter, sigma_px=sigma_px, warnings=warnings,
+        details=details, rolling_shutter=shutter, stabiliser=stabiliser, sigma_px=sigma_px,
+        warnings=warnings,
         stored_turns=tuple(_stored_summary(turn, solution) for turn in evidence.stored))
 
 
@@ -178,6 +187,8 @@ def _details(solution: Solution) -> dict[str, object]:
         'turns_disagree_fx': focal_disagreement(solution),
         'left_out': dict(zip(solution.camera.widened().names()[others:],
                              solution.step_to_wider_model[others:].tolist(), strict=True)),
+        'fixed_camera': {each.kind: {'strength': each.strength, 'size': each.size}
+                         for each in solution.departures},
         'models': [asdict(candidate) for candidate in solution.tried],
         'correlation': (solution.covariance / np.outer(solution.sigma, solution.sigma)).tolist(),
     }

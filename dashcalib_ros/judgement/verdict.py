@@ -19,6 +19,7 @@ from dashcalib_ros.judgement.agreement import (
     turns_of_another_camera,
 )
 from dashcalib_ros.judgement.calibration import Verdict
+from dashcalib_ros.solve.departures import Departure
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turns.turn import TurnId
 
@@ -139,6 +140,33 @@ def _turns(turns: list[TurnId]) -> str:
     return ' and '.join(names)
 
 
+def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Name what no fixed camera does; a stabilised video's movement may have been taken out."""
+    clear = [each for each in solution.departures if each.clear]
+    if not clear:
+        return None
+    return Finding('weak', _departure_text(clear[0], solution))
+
+
+def _departure_text(departure: Departure, solution: Solution) -> str:
+    if departure.kind == 'shift':
+        share = 100 * departure.size / solution.camera.image_size[0]
+        return (f'the picture moves against the lens by about {share:.1f} % of its width, as that '
+                f'of a stabilised video does: switch the stabiliser off')
+    if departure.kind == 'bend':
+        return (f'the picture is bent locally, as no lens of the model {solution.camera.model} '
+                f'bends it: is there a windscreen or a cover that does so, or another kind of '
+                f'lens?')
+    zooms = departure.by_turn
+    larger = sorted(turn for turn, zoom in zooms.items() if zoom > np.mean(list(zooms.values())))
+    apart = max(zooms.values()) - min(zooms.values())
+    if apart < departure.size:
+        return (f'the zoom changes from image to image, by about {100 * departure.size:.1f} %: '
+                f'fix the zoom and the focus')
+    return (f'the zoom changes by about {100 * apart:.1f} %: it is larger in {_turns(larger)} '
+            f'than in the others; fix the zoom and the focus')
+
+
 def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None:
     """A rolling shutter that was not removed changes fy first."""
     aspect = solution.camera.fy / solution.camera.fx
@@ -183,5 +211,5 @@ def _graded(refused: bool, weak: bool, text: str) -> Finding | None:
 
 RULES: tuple[Callable[[Solution, VerdictConfig], Finding | None], ...] = (
     _too_few_turns, _too_little_yaw, _flat_profile, _far_from_profile, _sigma_too_large,
-    _one_turn_dominates, _turns_disagree, _other_camera, _strange_aspect, _strange_shutter,
-    _on_bound, _folds_over)
+    _one_turn_dominates, _turns_disagree, _other_camera, _not_fixed, _strange_aspect,
+    _strange_shutter, _on_bound, _folds_over)

@@ -37,6 +37,7 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'camera_model': None if c.camera is None else c.camera.model,
         'stored_turns': [_turn_dict(turn) for turn in c.stored_turns],
         'rolling_shutter': c.rolling_shutter,
+        'stabiliser': c.stabiliser,
         'input': c.input_name,
         'warnings': c.warnings,
         'masked_fraction': None if c.mask is None else 1.0 - float(np.mean(c.mask)),

@@ -20,11 +20,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruction.scene import Scene, residuals_px
+from dashcalib_ros.solve.normal import (
+    ImagePrior,
+    normal_equations,
+    squares_and_freedom,
+    weights,
+)
 
 # least value of 1 - leverage: a turn that alone determines a parameter has leverage 1
 LEAST_RESIDUAL = 0.01
@@ -51,94 +56,21 @@ class Information:
     lens: int
 
 
-def information(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats | None = None
-                ) -> Information:
+def information(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats | None = None,
+                images: ImagePrior | None = None) -> Information:
     """Return the information that a scene gives about the camera, at the solution.
 
     loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply.
-    by_extra: (k, t, 2) derivatives of the observations by one more parameter.
+    by_extra: (k, t, 2) derivatives of the observations by one more parameter. images: what may
+    differ between the images; None: nothing.
     """
-    used = scene.structure.used
-    wide, by_point, residual, weight = _linearised(scene, camera, loss_px, by_extra)
-    # the poses of the turn come first, six parameters each, then the lens
-    rows, columns = np.nonzero(used)
-    _, pose = np.unique(rows, return_inverse=True)
-    _, point = np.unique(columns, return_inverse=True)
-    nuisance, lens = 6 * (int(pose.max()) + 1), wide.shape[2] - 6
-    last = np.broadcast_to(np.arange(nuisance, nuisance + lens), (len(rows), lens))
-    where = np.concatenate([6 * pose[:, None] + np.arange(6), last], axis=1)
-
-    reduced, inverse, mixed = _eliminate_points(wide, by_point, where, point)
-    response = _pose_response(reduced, nuisance)
-    hessian = reduced[nuisance:, nuisance:] - reduced[:nuisance, nuisance:].T @ response
-
-    # each track's score, with poses and points at their optimum for a given lens
-    combine = np.concatenate([-response, np.eye(lens)])
-    point_response = inverse @ (mixed.transpose(0, 2, 1) @ combine)
-    effective = (np.einsum('nij,njc->nic', wide, combine[where])
-                 - by_point @ point_response[point])
-    scores = np.zeros((len(mixed), lens))
-    np.add.at(scores, point, np.einsum('nic,ni->nc', effective, residual))
-    return Information(hessian, scores.sum(axis=0), scores.T @ scores,
-                       *_squares_and_freedom(used, residual, weight, len(camera.names())),
-                       lens=lens - (by_extra is not None))
-
-
-def _linearised(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats | None
-                ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the weighted derivatives, the residuals and the weights of all used observations.
-
-    Derivatives by the pose and the lens (n, 2, 6 + lens), and by the point (n, 2, 3); residuals
-    (n, 2), px; weights (n,).
-    """
-    structure = scene.structure
-    rows, columns = np.nonzero(structure.used)
-    rotation = structure.rotations[rows]
-    rotated = np.einsum('nij,nj->ni', rotation, structure.points[columns])
-    by_camera, by_local, projected = camera.widened().derivatives(
-        rotated + structure.translations[rows])
-    if by_extra is not None:
-        by_camera = np.concatenate([by_camera, by_extra[rows, columns, :, None]], axis=2)
-    residual = scene.tracks.xy[rows, columns] - projected
-    # the loss has the gradient w e, and the curvature w^2 on average over the directions of e
-    weight = _weights(residual, loss_px)
-    by_camera, by_local = by_camera * weight[:, None, None], by_local * weight[:, None, None]
-    # a small rotation w of the camera moves the local point by w x (R X)
-    wide = np.concatenate([by_local @ -_cross(rotated), by_local, by_camera], axis=2)
-    return wide, by_local @ rotation, residual, weight
-
-
-def _eliminate_points(wide: Floats, by_point: Floats, where: npt.NDArray[np.intp],
-                    point: npt.NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
-    """Return the normal matrix of poses and lens after the points are eliminated (Schur).
-
-    where: (n, 6 + lens) rows of that matrix for an observation's pose and the lens; point: (n,)
-    the observation's point. Also returned, for back-substitution: (t, 3, 3) the inverses of the
-    points' blocks, (t, size, 3) the mixed blocks.
-    """
-    size, points = int(where.max()) + 1, int(point.max()) + 1
-    normal = np.zeros((size, size))
-    mixed = np.zeros((points, size, 3))
-    own = np.zeros((points, 3, 3))
-    np.add.at(own, point, by_point.transpose(0, 2, 1) @ by_point)
-    np.add.at(normal, (where[:, :, None], where[:, None, :]), wide.transpose(0, 2, 1) @ wide)
-    np.add.at(mixed, (point[:, None], where), wide.transpose(0, 2, 1) @ by_point)
-    # a little damping, so that badly determined points have a finite inverse
-    damping = 1e-9 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    inverse = np.linalg.inv(own + damping + 1e-12 * np.eye(3))
-    return normal - np.tensordot(mixed @ inverse, mixed, axes=([0, 2], [0, 2])), inverse, mixed
-
-
-def _pose_response(reduced: Floats, nuisance: int) -> Floats:
-    """Return (nuisance, lens) the negative derivatives of the poses by the lens parameters.
-
-    The gauge (position, rotation and scale of the scene: seven directions) is free: the
-    pseudo-inverse leaves it out.
-    """
-    poses = reduced[:nuisance, :nuisance]
-    scale = 1 / np.sqrt(np.maximum(np.diag(poses), 1e-12))
-    inner = np.linalg.pinv(poses * scale[:, None] * scale, rcond=1e-10, hermitian=True)
-    return np.asarray((inner * scale[:, None] * scale) @ reduced[:nuisance, nuisance:])
+    normal = normal_equations(scene, camera, loss_px,
+                              None if by_extra is None else by_extra[..., None],
+                              by_image=images is not None)
+    hessian, score, by_track = normal.hessian, normal.score, normal.by_track
+    if images is not None:
+        hessian, score, by_track = images.eliminated(normal)
+    return Information(hessian, score, by_track, normal.squares, normal.freedom, normal.lens)
 
 
 def noise_of(parts: Sequence[Information]) -> float:
@@ -152,23 +84,10 @@ def noise_in(scenes: Sequence[Scene], camera: Camera, loss_px: float) -> float:
     for scene in scenes:
         used = scene.structure.used
         residual = residuals_px(scene, camera)[used]
-        more = _squares_and_freedom(used, residual, _weights(residual, loss_px),
-                                    len(camera.names()))
+        more = squares_and_freedom(used, residual, weights(residual, loss_px),
+                                   len(camera.names()))
         squares, freedom = squares + more[0], freedom + more[1]
     return squares / freedom
-
-
-def _weights(residual: Floats, loss_px: float) -> Floats:
-    """Return (n,) weights of residuals (n, 2) under the Cauchy loss."""
-    return np.asarray(1 / (1 + np.sum(residual**2, axis=1) / loss_px**2))
-
-
-def _squares_and_freedom(used: Mask, residual: Floats, weight: Floats, parameters: int
-                         ) -> tuple[float, float]:
-    observations, points, poses = used.sum(), used.any(axis=0).sum(), used.any(axis=1).sum()
-    # the gauge (position, rotation and scale of the scene) is free: seven
-    freedom = max(2 * observations - 3 * points - 6 * poses + 7 - parameters, 1)
-    return float(np.sum((residual * weight[:, None])**2) / np.mean(weight**2)), float(freedom)
 
 
 @dataclass(frozen=True)
@@ -202,16 +121,18 @@ def pooled(parts: Sequence[Information], prior: Floats) -> Pooled:
                   np.asarray(inverse), np.asarray(inverse @ by_track @ inverse))
 
 
-def covariance(parts: Sequence[Information], prior: Floats, extra_sigma: Floats) -> Floats:
+def covariance(parts: Sequence[Information], prior: Floats, extra_sigma: Floats,
+               systematic: float = 1.0) -> Floats:
     """Return the (n, n) covariance: the largest of the three estimates in each parameter.
 
     prior: (n, n) information of the prior, at unit noise. extra_sigma: as for
-    step_to_wider_model(). The correlations are those of the first estimate. If the parts have a
-    readout, it is one more parameter: (n + 1, n + 1).
+    step_to_wider_model(). systematic: by how much the errors that tracks share inflate the
+    variance of the second estimate. The correlations are those of the first estimate. If the parts
+    have a readout, it is one more parameter: (n + 1, n + 1).
     """
     together = pooled(parts, prior)
     inverse = together.inverse
-    estimates = [np.diag(inverse), np.diag(together.clustered)]
+    estimates = [np.diag(inverse), systematic * np.diag(together.clustered)]
     if len(parts) > 1:
         estimates.append(between_turns(together.hessians, together.scores, inverse))
     # rounding can make a variance negative where there is no information
@@ -277,10 +198,3 @@ def step_to_wider_model(parts: Sequence[Information], prior: Floats, extra_sigma
     score = sum((part.score[:lens] for part in parts), np.zeros(lens)) / noise
     score[:count] = 0.0
     return np.asarray(np.linalg.solve(total, score))
-
-
-def _cross(vectors: Floats) -> Floats:
-    """Return (n, 3, 3) matrices that take the cross product with each vector (n, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,7 @@ from dashcalib_ros.solve.choice import (
     is_clear,
     track_inflation,
 )
+from dashcalib_ros.solve.departures import Crops, Departure, departures, shift_prior
 from dashcalib_ros.solve.fitting import (
     adapted_to,
     explained_by,
@@ -50,10 +51,18 @@ from dashcalib_ros.solve.prior import (
 )
 from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shift
 from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.stabiliser import (
+    Steadied,
+    fixed_crops,
+    without_crops,
+    without_stabiliser,
+)
 from dashcalib_ros.turns.turn import TurnId
 
 # a lens with p1, p2 of 0.003 looks like a shutter of 3 ms
 SHORT_READOUT_S = 0.008
+# of a stabilised video's crop, with all tracks
+FINAL_ROUNDS = 4
 
 ByTurn = Mapping[TurnId, Scene]
 Progress = Callable[[str, float], None]
@@ -61,12 +70,16 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class _Fit:
-    """The state of the adjustment. readout_s: of the rolling shutter that was removed."""
+    """The state of the adjustment. readout_s: of the rolling shutter that was removed.
+
+    crops: of the stabilised video, as removed; empty for a fixed picture.
+    """
 
     scenes: list[Scene]
     camera: Camera
     solver: Solver
     readout_s: float = 0.0
+    crops: Crops = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -75,14 +88,24 @@ class _Result:
 
     fit: _Fit
     step1: Camera
+    settings: IntrinsicsConfig
 
     @cached_property
     def parts(self) -> tuple[Information, ...]:
         """Return what each turn says of the lens."""
         fit = self.fit
-        return tuple(information(scene, fit.camera, fit.solver.loss_px,
-                                 row_shift(scene, fit.camera) if fit.readout_s else None)
-                     for scene in fit.scenes)
+        loss_px = fit.solver.loss_px
+        noise = noise_in(fit.scenes, fit.camera, loss_px)
+        return tuple(information(
+            scene, fit.camera, loss_px, row_shift(scene, fit.camera) if fit.readout_s else None,
+            shift_prior(scene, noise, self.settings, fit.crops[scene.turn]) if fit.crops else None)
+            for scene in fit.scenes)
+
+    def departures(self, bent: bool = True) -> tuple[Departure, ...]:
+        """Return how the drive departs from a fixed camera, the strongest first."""
+        scenes = [subsample_tracks(scene, self.settings.first_tracks) for scene in self.fit.scenes]
+        return departures(scenes, self.fit.camera, self.step1, self.fit.solver.loss_px,
+                          self.settings, self.fit.crops, bent)
 
 
 @dataclass(frozen=True)
@@ -110,19 +133,51 @@ def solve(separate: Sequence[Scene], config: Config,
         return None
     roughly, tried = _chosen([each.result for each in begun], config)
     start = next(each for each in begun if each.result is roughly)
-    complete = _with_all_tracks(roughly.fit, start.full_scenes, separate, config)
+    roughly = _steadied(roughly, config)
+    crops, full_scenes = roughly.fit.crops, start.full_scenes
+    if crops:
+        full_scenes = {turn: without_crops(full_scenes[turn], crops) for turn in crops}
+    complete = _with_all_tracks(roughly.fit, full_scenes, separate, config)
     if not complete.scenes:
         return None
-    final = _step2(complete, start.full_scenes, roughly.step1, config, progress)
-    result = _Result(final, roughly.step1)
-    if config.model == AUTO:
+    final = _step2(complete, full_scenes, roughly.step1, config, progress)
+    result = _Result(final, roughly.step1, config.intrinsics)
+    if crops:
+        # a part of the tracks leaves the crops uncertain
+        result = _without_stabiliser(result, config, FINAL_ROUNDS)
+    elif config.model == AUTO:
         progress('model of the lens', 0.0)
-        result, others = _with_model_chosen(result, start.full_scenes, config)
+        result, others = _with_model_chosen(result, full_scenes, config)
         tried = _merged(tried, others)
     progress('focal profile', 0.0)
     around = profile_around(result.fit.scenes, result.fit.camera, start.profile, config)
     progress('sigma', 0.0)
     return _solution(result, separate, (start.profile, around), tried, config)
+
+
+def _steadied(first: _Result, config: Config) -> _Result:
+    """Return the result with a stabilised video's crop held, if that is what the video shows."""
+    def moves(found: Sequence[Departure]) -> bool:
+        return found[0].kind == 'shift' and found[0].clear
+
+    rounds = config.intrinsics.crop_rounds
+    # the bend takes longer, and is asked for only where the picture moves
+    if not rounds or not moves(first.departures(bent=False)) or not moves(first.departures()):
+        return first
+    return _without_stabiliser(first, config, rounds)
+
+
+def _without_stabiliser(first: _Result, config: Config, rounds: int) -> _Result:
+    """Return the result with the movement of the crop taken out; the same if a turn is lost."""
+    fit = first.fit
+    found = without_stabiliser(
+        Steadied(fit.scenes, fit.camera, first.step1, fit.readout_s,
+                 fit.crops or fixed_crops(fit.scenes)), config, rounds)
+    if len(found.scenes) < len(fit.scenes):
+        return first
+    solver = replace(fit.solver, loss_px=loss_px_of(found.scenes, found.camera, config.intrinsics))
+    return _Result(_Fit(found.scenes, found.camera, solver, found.readout_s, found.crops),
+                   found.step1, config.intrinsics)
 
 
 def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progress
@@ -140,7 +195,7 @@ def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progr
         return None
     progress('step 2: all parameters', 0.0)
     rough = _step2_roughly(first, config)
-    return _Begun(_Result(rough, first.camera), full_scenes, profile)
+    return _Begun(_Result(rough, first.camera, config.intrinsics), full_scenes, profile)
 
 
 def _merged(first: Sequence[Candidate], later: Sequence[Candidate]) -> tuple[Candidate, ...]:
@@ -228,7 +283,9 @@ def _refitted(first: _Result, model: type[Camera], full_scenes: ByTurn, config: 
     if len(scenes) < len(first.fit.scenes):
         return None
     fit = _step2(replace(first.fit, scenes=scenes, camera=camera), full_scenes, step1, config)
-    return _Result(fit, step1) if len(fit.scenes) == len(first.fit.scenes) else None
+    if len(fit.scenes) < len(first.fit.scenes):
+        return None
+    return _Result(fit, step1, config.intrinsics)
 
 
 def _chosen(results: Sequence[_Result], config: Config) -> tuple[_Result, tuple[Candidate, ...]]:
@@ -276,10 +333,11 @@ def _alike(larger: _Result, simpler: _Result, config: Config) -> bool:
     return apart is not None and apart < _picture_sigma(larger, config).rms
 
 
-def _picture_sigma(result: _Result, config: Config) -> PictureSigma:
+def _picture_sigma(result: _Result, config: Config, systematic: float = 1.0) -> PictureSigma:
     camera, prior = result.fit.camera, _prior(result, config)
     return picture_sigma(camera, result.parts, prior, floor_of(camera, config.intrinsics),
-                         step_to_wider_model(result.parts, prior, extra_sigma_of(camera)))
+                         step_to_wider_model(result.parts, prior, extra_sigma_of(camera)),
+                         systematic)
 
 
 def _step1(full_scenes: ByTurn, start: Camera, config: Config, progress: Progress) -> _Fit:
@@ -397,7 +455,9 @@ def _solution(result: _Result, separate: Sequence[Scene], profiles: tuple[Profil
     scenes, camera, readout_s = final.scenes, final.camera, final.readout_s
     prior = prior_information(step1, settings)
     count = len(prior)
-    spread = covariance(parts, prior, extra_sigma_of(camera))
+    departed = result.departures()
+    systematic = max(1.0, *(each.strength for each in departed))
+    spread = covariance(parts, prior, extra_sigma_of(camera), systematic)
     floor = floor_of(camera, settings)
     return Solution(
         camera=camera, covariance=spread[:count, :count] + np.diag(floor**2), step1=step1,
@@ -405,4 +465,5 @@ def _solution(result: _Result, separate: Sequence[Scene], profiles: tuple[Profil
         bounds=np.array(bounds_of(step1, settings)), prior_information=prior, readout_s=readout_s,
         readout_sigma_s=float(np.sqrt(spread[count, count])) if readout_s else 0.0,
         misfits=misfits(separate, scenes, camera, config.scene.error_px), tried=tried,
-        picture=_picture_sigma(result, config))
+        picture=_picture_sigma(result, config, systematic), departures=departed,
+        crops=final.crops)

@@ -34,16 +34,16 @@ class PictureSigma:
 
 
 def picture_sigma(camera: Camera, parts: Sequence[Information], prior: Floats, floor: Floats,
-                  step: Floats) -> PictureSigma:
+                  step: Floats, systematic: float = 1.0) -> PictureSigma:
     """Return the sigma over the picture.
 
-    parts, prior: (n, n) as for covariance(). floor: (n,) sigmas of systematic errors. step:
-    (lens,) to the wider model; what it would change counts as an error.
+    parts, prior: (n, n) and systematic as for covariance(). floor: (n,) sigmas of systematic
+    errors. step: (lens,) to the wider model; what it would change counts as an error.
     """
     wide, _ = sensitivity(camera.widened())
     # the wider model's first parameters are the camera's own
     moves = wide[:, :, :len(floor)]
-    variances = _variances(moves, parts, prior) + _squares(moves * floor).sum(axis=1)
+    variances = _variances(moves, parts, prior, systematic) + _squares(moves * floor).sum(axis=1)
     variances += _squares(wide @ step[:, None])[:, 0]
     return PictureSigma(float(np.sqrt(np.mean(variances))), float(np.sqrt(np.max(variances))))
 
@@ -53,7 +53,8 @@ def _squares(moves: Floats) -> Floats:
     return np.asarray(np.sum(moves**2, axis=1))
 
 
-def _variances(moves: Floats, parts: Sequence[Information], prior: Floats) -> Floats:
+def _variances(moves: Floats, parts: Sequence[Information], prior: Floats, systematic: float
+               ) -> Floats:
     """Return (m,) the variances of pixels, px^2. moves: (m, 2, n) by the parameters."""
     together, count = pooled(parts, prior), len(prior)
     inverse = together.inverse
@@ -63,7 +64,7 @@ def _variances(moves: Floats, parts: Sequence[Information], prior: Floats) -> Fl
     _, _, modes = np.linalg.svd(flat, full_matrices=False)
     basis = root @ modes.T
     back = modes @ np.linalg.inv(root)
-    estimates = [np.ones(len(modes)), np.diag(back @ together.clustered @ back.T)]
+    estimates = [np.ones(len(modes)), systematic * np.diag(back @ together.clustered @ back.T)]
     if len(parts) > 1:
         # in these directions the covariance of the first estimate is the unit matrix
         scatter = scatter_between_turns(basis.T @ together.hessians @ basis,

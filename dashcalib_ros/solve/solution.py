@@ -10,6 +10,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruction.scene import Profile, Scene, errors_px
 from dashcalib_ros.solve.choice import Candidate
+from dashcalib_ros.solve.departures import Crops, Departure
 from dashcalib_ros.solve.information import Information, step_to_wider_model
 from dashcalib_ros.solve.picture import PictureSigma
 from dashcalib_ros.solve.prior import extra_sigma_of
@@ -29,7 +30,8 @@ class Solution:
     the scenes' tracks; 0 for a global one. readout_sigma_s: its standard deviation.
     misfits: of every turn that was given: the ratio of its cost with this camera to its cost
     with its own camera. tried: the models that were compared, the simplest first; empty where
-    the first one left nothing to explain. picture: the sigma over the picture.
+    the first one left nothing to explain. picture: the sigma over the picture. departures: from a
+    fixed camera, the strongest first. crops: of a stabilised video, taken out of the tracks.
     """
 
     camera: Camera
@@ -46,6 +48,8 @@ class Solution:
     readout_sigma_s: float = 0.0
     misfits: Mapping[TurnId, float] = field(default_factory=dict)
     tried: tuple[Candidate, ...] = ()
+    departures: tuple[Departure, ...] = ()
+    crops: Crops = field(default_factory=dict)
 
     @property
     def sigma(self) -> Floats:

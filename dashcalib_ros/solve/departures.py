@@ -1,0 +1,267 @@
+"""What a fixed camera cannot do is estimated: its picture shifts, zooms, or is bent locally.
+
+Each is a few more parameters of the linearised problem: a shift and a zoom of each image, a smooth
+field of displacements over the picture that all images share. What they gain is compared with what
+chance would gain, each track counted as one measurement: the ratio is about 1 for a fixed camera,
+and the largest one names what is wrong. A stabilised video's shift can be taken out
+(stabiliser.py).
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Ints
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.config import IntrinsicsConfig
+from dashcalib_ros.reconstruction.scene import Scene, residuals_px
+from dashcalib_ros.solve.normal import (
+    IMAGE,
+    ImagePrior,
+    Normal,
+    normal_equations,
+    used_keyframes,
+)
+from dashcalib_ros.solve.prior import extra_sigma_of, prior_of
+from dashcalib_ros.turns.turn import TurnId
+
+Kind = Literal['shift', 'zoom', 'bend']
+
+# columns and rows of the smooth field's supports over the picture
+FIELD = (5, 4)
+# prior sigma of the field at each of them, px
+FIELD_PX = 3.0
+# prior sigmas of the zoom: of one image, of a stretch, of a turn
+ZOOM_IMAGE, ZOOM_STRETCH, ZOOM_TURN = 0.01, 0.02, 0.03
+
+# by turn: (k, 2) shifts of the keyframes' pictures that were taken out of the tracks, px
+Crops = Mapping[TurnId, Floats]
+
+
+@dataclass(frozen=True)
+class Departure:
+    """How a drive departs from a fixed camera.
+
+    strength: what its parameters gain, over what chance would gain; more than limit is clear.
+    size: the root mean square of the shift or the field, px, or of the zoom. by_turn: the mean
+    zoom of each turn; empty for other kinds.
+    """
+
+    kind: Kind
+    strength: float
+    limit: float
+    size: float
+    by_turn: Mapping[TurnId, float]
+
+    @property
+    def clear(self) -> bool:
+        """Return whether chance does not explain it; so for a strength of NaN."""
+        return not self.strength <= self.limit
+
+
+@dataclass(frozen=True)
+class Step:
+    """A Gauss-Newton step with more parameters than the camera's.
+
+    gain: by how much it lowers the cost, at unit noise; chance: how much noise alone would, each
+    track counted as one measurement. shared: (s,) of the camera, of the wider model and of what
+    follows it; images: (p,) of each scene's free image parameters. variance: (s, s).
+    """
+
+    gain: float
+    chance: float
+    shared: Floats
+    images: tuple[Floats, ...]
+    covariance: Floats
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The linearised problem of all scenes, about the camera and all that it may depart in.
+
+    prior_pull: (n,) the negative gradient of the camera's prior; prior: (n, n) its information.
+    extra: variances of the shared parameters that follow the camera's own.
+    """
+
+    scenes: tuple[Scene, ...]
+    normals: tuple[Normal, ...]
+    prior: Floats
+    prior_pull: Floats
+    extra: Floats
+    noise: float
+
+    def solved(self, images: Sequence[ImagePrior] | None, shared: Sequence[int],
+               inflation: float = 1.0) -> Step:
+        """Return the step with these parameters free; images: a prior for each scene.
+
+        shared: indices behind the camera's own. inflation: of the noise: smaller steps where the
+        present solution is far from the right one.
+        """
+        count, noise = len(self.prior), self.noise * inflation
+        free = np.array([*range(count), *shared])
+        total = np.diag(np.concatenate([np.zeros(count), 1 / self.extra[free[count:] - count]]))
+        total[:count, :count] = self.prior
+        pull = np.concatenate([self.prior_pull, np.zeros(len(shared))])
+        gain = chance = 0.0
+        maps = []
+        for n, normal in enumerate(self.normals):
+            own = IMAGE * normal.images + free
+            combine = np.zeros((len(free), len(normal.score)))
+            combine[np.arange(len(free)), own] = 1.0
+            hessian = normal.hessian[np.ix_(own, own)]
+            if images is not None:
+                inverse, mixed = images[n].inverse(normal), normal.hessian[np.ix_(
+                    images[n].free, own)]
+                combine[:, images[n].free] = -mixed.T @ inverse
+                hessian = hessian - mixed.T @ inverse @ mixed
+                own_pull = images[n].pull(normal)
+                pull -= mixed.T @ inverse @ own_pull / noise
+                gain += float(own_pull @ inverse @ own_pull) / noise
+                scatter = normal.by_track[np.ix_(images[n].free, images[n].free)]
+                chance += float(np.sum(inverse * scatter)) / noise
+            pull += normal.score[own] / noise
+            total += hessian / noise
+            maps.append(combine)
+        covariance = np.linalg.inv(total)
+        step = covariance @ pull
+        for combine, normal in zip(maps, self.normals, strict=True):
+            scatter = combine @ normal.by_track @ combine.T
+            chance += float(np.sum(covariance * scatter)) / noise**2
+        steps = () if images is None else tuple(
+            each.inverse(normal) @ (each.pull(normal) - normal.hessian[np.ix_(
+                each.free, IMAGE * normal.images + free)] @ step)
+            for each, normal in zip(images, self.normals, strict=True))
+        return Step(gain + float(pull @ step), chance, step, steps, covariance)
+
+
+def problem_of(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: float,
+               config: IntrinsicsConfig, by_extra: Sequence[Floats] = ()) -> Problem:
+    """Return the linearised problem of scenes at their solution.
+
+    by_extra: for each scene (k, t, 2, e) derivatives by parameters that follow the wider model's.
+    """
+    normals = tuple(
+        normal_equations(scene, camera, loss_px, by_extra[n] if by_extra else None, by_image=True)
+        for n, scene in enumerate(scenes))
+    noise = (sum(normal.squares for normal in normals)
+             / sum(normal.freedom for normal in normals))
+    prior = prior_of(step1, config, 1.0)
+    information = np.asarray(np.linalg.inv(prior.covariance), np.float64)
+    extra = np.square(extra_sigma_of(camera))
+    count = by_extra[0].shape[-1] if by_extra else 0
+    return Problem(tuple(scenes), normals, information,
+                   information @ (prior.mean - camera.params),
+                   np.concatenate([extra, np.full(count, FIELD_PX**2)]), noise)
+
+
+def image_priors(problem: Problem, kind: Kind, config: IntrinsicsConfig, crops: Crops | None = None
+                 ) -> list[ImagePrior]:
+    """Return for each scene the prior of its images' shifts, or of their zooms.
+
+    crops: shifts that were taken out of the tracks already.
+    """
+    crops = crops or {}
+    prior = shift_prior if kind == 'shift' else _zoom_prior
+    return [prior(scene, problem.noise, config, crops.get(scene.turn)) for scene in problem.scenes]
+
+
+def shift_prior(scene: Scene, noise: float, config: IntrinsicsConfig, crop: Floats | None = None
+                ) -> ImagePrior:
+    """Return the prior of the shifts of a scene's images: smooth in time.
+
+    noise: variance of a residual, px^2. crop: (k, 2) what was taken out of the tracks already, px.
+    """
+    keyframes = used_keyframes(scene)
+    spread = (config.crop_sigma * scene.tracks.image_size[0])**2 * (
+        np.exp(-_apart(scene, config)) + 1e-6 * np.eye(len(keyframes)))
+    inner = np.asarray(np.linalg.inv(spread) * noise, np.float64)
+    zero = np.zeros_like(inner)
+    values = np.zeros(2 * len(keyframes)) if crop is None else crop[keyframes].T.ravel()
+    return ImagePrior(_indices(keyframes, 0, 1), np.block([[inner, zero], [zero, inner]]), values)
+
+
+def _zoom_prior(scene: Scene, noise: float, config: IntrinsicsConfig, crop: Floats | None = None
+                ) -> ImagePrior:
+    """Return the prior of the zooms of a scene's images."""
+    keyframes = used_keyframes(scene)
+    spread = (ZOOM_STRETCH**2 * np.exp(-_apart(scene, config))
+              + ZOOM_IMAGE**2 * np.eye(len(keyframes)) + ZOOM_TURN**2)
+    precision = np.asarray(np.linalg.inv(spread) * noise, np.float64)
+    return ImagePrior(_indices(keyframes, 2), precision, np.zeros(len(keyframes)))
+
+
+def _apart(scene: Scene, config: IntrinsicsConfig) -> Floats:
+    """Return (k, k) how far the used keyframes are apart, in units of a stabiliser's time."""
+    seconds = scene.tracks.stamps_ns[used_keyframes(scene)] / 1e9
+    return np.asarray(np.abs(seconds[:, None] - seconds) / config.crop_time_s)
+
+
+def _indices(keyframes: Ints, *components: int) -> Ints:
+    """Return the indices of these components among the images' parameters."""
+    return np.concatenate([IMAGE * np.arange(len(keyframes)) + component
+                           for component in components])
+
+
+def departures(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: float,
+               config: IntrinsicsConfig, crops: Crops | None = None, bent: bool = True
+               ) -> tuple[Departure, ...]:
+    """Return how the scenes depart from a fixed camera, the strongest first.
+
+    crops: of a stabilised video, as taken out already. bent: False leaves out the field.
+    """
+    fields = [_field(scene, camera) for scene in scenes] if bent else []
+    problem = problem_of(scenes, camera, step1, loss_px, config, fields)
+    count, lens = len(camera.names()), len(camera.widened().names())
+    wide = range(count, lens)
+    shifts = image_priors(problem, 'shift', config, crops)
+    zooms = image_priors(problem, 'zoom', config)
+    fixed = problem.solved(None, wide)
+    # what a stabiliser's removal leaves over makes sigma larger, and may be larger itself
+    left = config.left_shift if crops else config.clear_shift
+    found = [_departure('shift', problem.solved(shifts, wide), fixed, scenes, left),
+             _departure('zoom', problem.solved(zooms, wide), fixed, scenes, config.clear_zoom)]
+    if bent:
+        # a stabilised picture goes on moving
+        moving = shifts if crops else None
+        found.append(_departure(
+            'bend', problem.solved(moving, range(count, lens + fields[0].shape[-1])),
+            problem.solved(moving, wide), scenes, config.clear_bend))
+    return tuple(sorted(found, key=lambda each: -each.strength / each.limit))
+
+
+def _departure(kind: Kind, step: Step, base: Step, scenes: Sequence[Scene], limit: float
+               ) -> Departure:
+    """Return the departure that a step finds. base: the step without its parameters."""
+    strength = (step.gain - base.gain) / max(step.chance - base.chance, 1e-9)
+    parts = step.images if kind != 'bend' else (step.shared[len(base.shared):],)
+    turns = {scene.turn: float(part.mean()) for scene, part in zip(scenes, parts, strict=False)}
+    return Departure(kind, strength, limit,
+                     float(np.sqrt(np.mean(np.square(np.concatenate(parts))))),
+                     turns if kind == 'zoom' else {})
+
+
+def largest_crop(crops: Crops) -> float:
+    """Return how far the crop moved at the most, from its middle, px."""
+    paths = np.concatenate(list(crops.values()))
+    return float(np.abs(paths - np.median(paths, axis=0)).max())
+
+
+def _field(scene: Scene, camera: Camera) -> Floats:
+    """Return (k, t, 2, 2 f) derivatives by a smooth field's displacements at its f supports.
+
+    The weights of the supports at an observation sum to 1.
+    """
+    size = np.array(scene.tracks.image_size)
+    # not as observed: errors would correlate with the weights
+    places = np.nan_to_num((scene.tracks.xy + residuals_px(scene, camera)) / size)
+    columns, rows = ((np.arange(count) + 0.5) / count for count in FIELD)
+    across = np.exp(-0.5 * ((places[..., :1] - columns) * FIELD[0])**2)
+    down = np.exp(-0.5 * ((places[..., 1:] - rows) * FIELD[1])**2)
+    weight = (across[..., :, None] * down[..., None, :]).reshape(*places.shape[:2], 1, -1)
+    weight /= np.maximum(weight.sum(axis=-1, keepdims=True), 1e-9)
+    zero = np.zeros_like(weight)
+    return np.concatenate([np.concatenate([weight, zero], axis=-1),
+                           np.concatenate([zero, weight], axis=-1)], axis=2)

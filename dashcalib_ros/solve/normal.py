@@ -1,0 +1,261 @@
+"""The normal equations of one scene, with its points and poses eliminated (Schur complement).
+
+At the adjusted solution the residuals are linearised by the scene's points and poses, and by what
+is asked for: the lens, further parameters that all turns share, and, where wanted, three of each
+image: a shift of its picture in x and y, and its zoom.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.arrays import Floats, Ints, Mask
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.reconstruction.structure import Structure
+
+# parameters of a pose, and of an image: its shift in x and y (px), its zoom (1 = 100 %)
+POSE = 6
+IMAGE = 3
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """What finds the points and poses again. keyframes: (k,), tracks: (t,) those that are used.
+
+    pose_inverse: (6k, 6k); pose_score: (6k,); pose_mixed: (6k, m) with the parameters that are
+    left. point_inverse: (t, 3, 3); point_score: (t, 3); point_mixed: (t, 6k + m, 3).
+    """
+
+    keyframes: Ints
+    tracks: Ints
+    pose_inverse: Floats
+    pose_score: Floats
+    pose_mixed: Floats
+    point_inverse: Floats
+    point_score: Floats
+    point_mixed: Floats
+
+    def moved(self, structure: Structure, step: Floats) -> Structure:
+        """Return the structure at its optimum after a step (m,) of the parameters that are left.
+
+        Of the linearised problem.
+        """
+        pose = self.pose_inverse @ (self.pose_score - self.pose_mixed @ step)
+        both = np.concatenate([pose, step])
+        shift = np.einsum('tij,tj->ti', self.point_inverse,
+                          self.point_score - both @ self.point_mixed)
+        turn, move = np.split(pose.reshape(-1, POSE), 2, axis=1)
+        rotations, translations = structure.rotations.copy(), structure.translations.copy()
+        rotations[self.keyframes] = _rotation(turn) @ rotations[self.keyframes]
+        translations[self.keyframes] += move
+        points = structure.points.copy()
+        points[self.tracks] += shift
+        return replace(structure, rotations=rotations, translations=translations, points=points)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """The normal equations of one scene, in px^-2, about m parameters.
+
+    First come IMAGE parameters of each of its k used keyframes, if they were asked for; then lens
+    parameters of the wider model; then further ones. hessian: (m, m); score: (m,) the negative
+    gradient; by_track: (m, m) sum over tracks of the outer products of their scores. squares and
+    freedom: see Information.
+    """
+
+    hessian: Floats
+    score: Floats
+    by_track: Floats
+    squares: float
+    freedom: float
+    lens: int
+    images: int
+    eliminated: Eliminated
+
+
+def used_keyframes(scene: Scene) -> Ints:
+    """Return the rows (k,) of the keyframes of which observations are used."""
+    return np.flatnonzero(scene.structure.used.any(axis=1))
+
+
+@dataclass(frozen=True)
+class ImagePrior:
+    """What may differ between the images of a scene, and how much: a normal distribution.
+
+    free: (p,) the indices of these parameters among the images'; the others are held. precision:
+    (p, p) the inverse of their covariance around 0, times the noise in px^2. values: (p,) how
+    large they are already, in the scene's tracks.
+    """
+
+    free: Ints
+    precision: Floats
+    values: Floats
+
+    def inverse(self, normal: Normal) -> Floats:
+        """Return (p, p) the inverse of their block, with the prior."""
+        return np.asarray(np.linalg.inv(
+            normal.hessian[np.ix_(self.free, self.free)] + self.precision), np.float64)
+
+    def pull(self, normal: Normal) -> Floats:
+        """Return (p,) their negative gradient, with the prior's."""
+        return np.asarray(normal.score[self.free] - self.precision @ self.values)
+
+    def eliminated(self, normal: Normal) -> tuple[Floats, Floats, Floats]:
+        """Return hessian, score and by_track of the other parameters, these at their optimum."""
+        shared = slice(IMAGE * normal.images, None)
+        inverse, mixed = self.inverse(normal), normal.hessian[self.free, shared]
+        combine = np.zeros((len(normal.score) - IMAGE * normal.images, len(normal.score)))
+        combine[:, shared] = np.eye(len(combine))
+        combine[:, self.free] = -mixed.T @ inverse
+        hessian = normal.hessian[shared, shared] - mixed.T @ inverse @ mixed
+        score = normal.score[shared] - mixed.T @ inverse @ self.pull(normal)
+        return hessian, score, combine @ normal.by_track @ combine.T
+
+
+def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats | None = None,
+                     by_image: bool = False) -> Normal:
+    """Return the normal equations of a scene at the solution.
+
+    loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply.
+    by_extra: (k, t, 2, e) derivatives of the observations by e more parameters that all turns
+    share. by_image: with the parameters of each image.
+    """
+    used = scene.structure.used
+    linear = _linearised(scene, camera, loss_px, by_extra, by_image)
+    rows, columns = np.nonzero(used)
+    keyframes, image = np.unique(rows, return_inverse=True)
+    tracks, point = np.unique(columns, return_inverse=True)
+    own = IMAGE if by_image else 0
+    poses, images = POSE * len(keyframes), own * len(keyframes)
+    shared = linear.wide.shape[2] - POSE - own
+    where = np.concatenate([
+        POSE * image[:, None] + np.arange(POSE), poses + own * image[:, None] + np.arange(own),
+        np.broadcast_to(poses + images + np.arange(shared), (len(rows), shared))], axis=1)
+
+    reduced, inverse, mixed = _eliminate_points(linear, where, point)
+    pose_inverse = _pose_inverse(reduced[:poses, :poses])
+    response = pose_inverse @ reduced[:poses, poses:]
+    hessian = reduced[poses:, poses:] - reduced[:poses, poses:].T @ response
+
+    # each track's score, with poses and points at their optimum for given other parameters
+    combine = np.concatenate([-response, np.eye(images + shared)])
+    point_response = inverse @ (mixed.transpose(0, 2, 1) @ combine)
+    effective = (np.einsum('nij,njc->nic', linear.wide, combine[where])
+                 - linear.by_point @ point_response[point])
+    scores = np.zeros((len(tracks), images + shared))
+    np.add.at(scores, point, np.einsum('nic,ni->nc', effective, linear.residual))
+
+    point_score = np.zeros((len(tracks), 3))
+    np.add.at(point_score, point, np.einsum('nij,ni->nj', linear.by_point, linear.residual))
+    pose_score = np.zeros(poses + images + shared)
+    np.add.at(pose_score, where, np.einsum('nij,ni->nj', linear.wide, linear.residual))
+    pose_score -= np.einsum('tsi,tij,tj->s', mixed, inverse, point_score, optimize=True)
+    return Normal(
+        hessian, scores.sum(axis=0), scores.T @ scores,
+        *squares_and_freedom(used, linear.residual, linear.weight, len(camera.names())),
+        lens=len(camera.widened().names()), images=images // IMAGE,
+        eliminated=Eliminated(keyframes, tracks, pose_inverse, pose_score[:poses],
+                              reduced[:poses, poses:], inverse, point_score, mixed))
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """All used observations, linearised.
+
+    wide: (n, 2, c) weighted derivatives by the pose, the image, the lens and the rest. by_point:
+    (n, 2, 3). residual: (n, 2) px. weight: (n,).
+    """
+
+    wide: Floats
+    by_point: Floats
+    residual: Floats
+    weight: Floats
+
+
+def _linearised(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats | None,
+                by_image: bool) -> _Linear:
+    structure = scene.structure
+    rows, columns = np.nonzero(structure.used)
+    rotation = structure.rotations[rows]
+    rotated = np.einsum('nij,nj->ni', rotation, structure.points[columns])
+    by_camera, by_local, projected = camera.widened().derivatives(
+        rotated + structure.translations[rows])
+    residual = scene.tracks.xy[rows, columns] - projected
+    # the loss has the gradient w e, and the curvature w^2 on average over the directions of e
+    weight = weights(residual, loss_px)
+    # a small rotation w of the camera moves the local point by w x (R X)
+    parts = [by_local @ -_cross(rotated), by_local]
+    if by_image:
+        middle = (np.array(camera.image_size) - 1) / 2
+        shift = np.broadcast_to(np.eye(2), (len(rows), 2, 2))
+        parts += [shift, (projected - middle)[:, :, None]]
+    parts.append(by_camera)
+    if by_extra is not None:
+        parts.append(by_extra[rows, columns])
+    wide = np.concatenate(parts, axis=2)
+    return _Linear(wide * weight[:, None, None], by_local @ rotation * weight[:, None, None],
+                   residual, weight)
+
+
+def _eliminate_points(linear: _Linear, where: npt.NDArray[np.intp], point: npt.NDArray[np.intp]
+                      ) -> tuple[Floats, Floats, Floats]:
+    """Return the normal matrix after the points are eliminated (Schur).
+
+    where: (n, c) rows of that matrix for an observation's derivatives; point: (n,) its point.
+    Also returned, for back-substitution: (t, 3, 3) the inverses of the points' blocks, (t, size,
+    3) the mixed blocks.
+    """
+    wide, by_point = linear.wide, linear.by_point
+    size, points = int(where.max()) + 1, int(point.max()) + 1
+    normal = np.zeros((size, size))
+    mixed = np.zeros((points, size, 3))
+    own = np.zeros((points, 3, 3))
+    np.add.at(own, point, by_point.transpose(0, 2, 1) @ by_point)
+    np.add.at(normal, (where[:, :, None], where[:, None, :]), wide.transpose(0, 2, 1) @ wide)
+    np.add.at(mixed, (point[:, None], where), wide.transpose(0, 2, 1) @ by_point)
+    # a little damping, so that badly determined points have a finite inverse
+    damping = 1e-9 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    inverse = np.linalg.inv(own + damping + 1e-12 * np.eye(3))
+    return normal - np.tensordot(mixed @ inverse, mixed, axes=([0, 2], [0, 2])), inverse, mixed
+
+
+def _pose_inverse(poses: Floats) -> Floats:
+    """Return the inverse of the poses' block.
+
+    The gauge (position, rotation and scale of the scene: seven directions) is free: the
+    pseudo-inverse leaves it out.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.diag(poses), 1e-12))
+    inner = np.linalg.pinv(poses * scale[:, None] * scale, rcond=1e-10, hermitian=True)
+    return np.asarray(inner * scale[:, None] * scale)
+
+
+def weights(residual: Floats, loss_px: float) -> Floats:
+    """Return (n,) weights of residuals (n, 2) under the Cauchy loss."""
+    return np.asarray(1 / (1 + np.sum(residual**2, axis=1) / loss_px**2))
+
+
+def squares_and_freedom(used: Mask, residual: Floats, weight: Floats, parameters: int
+                        ) -> tuple[float, float]:
+    """Return the sum of the weighted squared residuals, px^2, and their degrees of freedom."""
+    observations, points, poses = used.sum(), used.any(axis=0).sum(), used.any(axis=1).sum()
+    # the gauge (position, rotation and scale of the scene) is free: seven
+    freedom = max(2 * observations - 3 * points - 6 * poses + 7 - parameters, 1)
+    return float(np.sum((residual * weight[:, None])**2) / np.mean(weight**2)), float(freedom)
+
+
+def _rotation(turns: Floats) -> Floats:
+    """Return the (n, 3, 3) rotation matrices of rotation vectors (n, 3), rad (Rodrigues)."""
+    angle = np.maximum(np.linalg.norm(turns, axis=1), 1e-12)[:, None, None]
+    axis = _cross(turns) / angle
+    return np.asarray(np.eye(3) + np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis)
+
+
+def _cross(vectors: Floats) -> Floats:
+    """Return (n, 3, 3) matrices that take the cross product with each vector (n, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

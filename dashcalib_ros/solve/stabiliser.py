@@ -1,0 +1,112 @@
+"""A stabilised video: how far its crop moved in each image is found and taken out of the tracks.
+
+A stabiliser moves the crop against the car's turning, so that the principal point moves through
+the picture. That looks much like a rotation, and makes focal lengths wrong by up to 20 %. What
+tells them apart is the lens: its distortion moves with the crop, and a rotation moves the rim of
+the picture farther than its middle. So the shift of each image is a parameter of the solution; the
+tracks are moved to where a fixed crop would have seen them, and all is adjusted again.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.config import Config
+from dashcalib_ros.reconstruction.adjust import Solver, adjust_step2
+from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.solve.departures import Crops, Problem, image_priors, problem_of
+from dashcalib_ros.solve.fitting import retriangulate_all
+from dashcalib_ros.solve.normal import IMAGE
+from dashcalib_ros.solve.prior import bounds_of, loss_px_of, prior_of
+from dashcalib_ros.solve.shutter import row_shift
+
+# of the width; the longest step of a shift in one round
+LONGEST_STEP = 0.04
+# times what chance gains; a step that gains less is the last one
+SETTLED = 2.0
+
+
+@dataclass(frozen=True)
+class Steadied:
+    """Scenes with the tracks of a fixed crop. crops: what was taken out of them.
+
+    step1: the camera that the prior is centred at. readout_s: of the rolling shutter.
+    """
+
+    scenes: list[Scene]
+    camera: Camera
+    step1: Camera
+    readout_s: float
+    crops: Crops
+
+
+def fixed_crops(scenes: Sequence[Scene]) -> Crops:
+    """Return the crops of a camera that has no stabiliser."""
+    return {scene.turn: np.zeros((len(scene.tracks.frames), 2)) for scene in scenes}
+
+
+def without_crops(scene: Scene, crops: Crops) -> Scene:
+    """Return the scene with the tracks that a fixed crop would have given."""
+    moved = scene.tracks.xy - crops[scene.turn][:, None]
+    return replace(scene, tracks=replace(scene.tracks, xy=moved))
+
+
+def without_stabiliser(given: Steadied, config: Config, rounds: int) -> Steadied:
+    """Return the scenes with the movement of their crop taken out, in so many rounds at the most.
+
+    given: at its solution. A rolling shutter that was taken out before is estimated anew together
+    with the crop.
+    """
+    settings, now = config.intrinsics, given
+    for _ in range(rounds):
+        loss_px = loss_px_of(now.scenes, now.camera, settings)
+        shutter = [row_shift(scene, now.camera) for scene in now.scenes] if now.readout_s else []
+        problem = problem_of(now.scenes, now.camera, now.step1, loss_px, settings,
+                             [shift[..., None] for shift in shutter])
+        now, strength = _step(now, problem, shutter, config)
+        found, camera = adjust_step2(
+            now.scenes, now.camera, Solver(loss_px, config.scene.iterations),
+            prior_of(now.step1, settings, problem.noise), bounds_of(now.step1, settings))
+        now = replace(now, scenes=retriangulate_all(found, camera, config.scene), camera=camera)
+        if strength < SETTLED or len(now.scenes) < len(given.scenes):
+            break
+    return now
+
+
+def _step(now: Steadied, problem: Problem, shutter: Sequence[Floats], config: Config
+          ) -> tuple[Steadied, float]:
+    """Return what one Gauss-Newton step makes of it, and how clear the step is."""
+    camera = now.camera
+    count, lens = len(camera.names()), len(camera.widened().names())
+    shared = range(count, lens + bool(shutter))
+    priors = image_priors(problem, 'shift', config.intrinsics, now.crops)
+    fixed, moving = problem.solved(None, shared), problem.solved(priors, shared)
+    strength = (moving.gain - fixed.gain) / max(moving.chance - fixed.chance, 1e-9)
+    # as long as much is unexplained, small steps
+    moving = problem.solved(priors, shared, max(strength, 1.0))
+    longest = float(np.abs(np.concatenate(moving.images)).max())
+    part = min(1.0, LONGEST_STEP * camera.image_size[0] / max(longest, 1e-9))
+    step_s = part * float(moving.shared[-1]) if shutter else 0.0
+    scenes, crops = [], dict(now.crops)
+    for n, (scene, normal) in enumerate(zip(now.scenes, problem.normals, strict=True)):
+        step = np.zeros(len(normal.score))
+        step[priors[n].free] = part * moving.images[n]
+        step[IMAGE * normal.images:IMAGE * normal.images + count] = part * moving.shared[:count]
+        crop = np.zeros_like(crops[scene.turn])
+        crop[normal.eliminated.keyframes] = step[priors[n].free].reshape(2, -1).T
+        crops[scene.turn] = crops[scene.turn] + crop
+        moved = without_crops(scene, {scene.turn: crop})
+        if shutter:
+            moved = replace(moved, tracks=replace(
+                moved.tracks, xy=moved.tracks.xy - step_s * shutter[n]))
+        scenes.append(replace(moved, structure=normal.eliminated.moved(scene.structure, step)))
+    nearer = camera.with_params(camera.params + part * moving.shared[:count])
+    if nearer.covers_picture():
+        camera = nearer
+    step1 = type(camera).centred(camera.image_size, camera.fx, *now.step1.params[4:])
+    return Steadied(scenes, camera, step1, now.readout_s + step_s, crops), strength
+
