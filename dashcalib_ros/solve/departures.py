@@ -26,6 +26,7 @@ from dashcalib_ros.solve.normal import (
     used_keyframes,
 )
 from dashcalib_ros.solve.prior import extra_sigma_of, prior_of
+from dashcalib_ros.solve.shutter import row_shift
 from dashcalib_ros.turns.turn import TurnId
 
 Kind = Literal['shift', 'zoom', 'bend']
@@ -206,30 +207,35 @@ def _indices(keyframes: Ints, *components: int) -> Ints:
 
 
 def departures(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: float,
-               config: IntrinsicsConfig, crops: Crops | None = None, bent: bool = True
-               ) -> tuple[Departure, ...]:
+               config: IntrinsicsConfig, crops: Crops | None = None, bent: bool = True,
+               rolling: bool = False) -> tuple[Departure, ...]:
     """Return how the scenes depart from a fixed camera, the strongest first.
 
-    crops: of a stabilised video, as taken out already. bent: False leaves out the field.
+    crops: of a stabilised video, as taken out already. bent: False leaves out the field. rolling:
+    a rolling shutter was taken out: what is left of it is no departure.
     """
-    fields = [_field(scene, camera) for scene in scenes] if bent else []
-    problem = problem_of(scenes, camera, step1, loss_px, config, fields)
+    by_extra: list[list[Floats]] = [[] for _ in scenes]
+    for scene, found in zip(scenes, by_extra, strict=True):
+        found += [row_shift(scene, camera)[..., None]] * rolling
+        found += [_field(scene, camera)] * bent
+    problem = problem_of(scenes, camera, step1, loss_px, config,
+                         [np.concatenate(found, axis=-1) for found in by_extra if found])
     count, lens = len(camera.names()), len(camera.widened().names())
-    wide = range(count, lens)
+    wide = range(count, lens + rolling)
     shifts = image_priors(problem, 'shift', config, crops)
     zooms = image_priors(problem, 'zoom', config)
     fixed = problem.solved(None, wide)
     # what a stabiliser's removal leaves over makes sigma larger, and may be larger itself
     left = config.left_shift if crops else config.clear_shift
-    found = [_departure('shift', problem.solved(shifts, wide), fixed, scenes, left),
+    tests = [_departure('shift', problem.solved(shifts, wide), fixed, scenes, left),
              _departure('zoom', problem.solved(zooms, wide), fixed, scenes, config.clear_zoom)]
     if bent:
         # a stabilised picture goes on moving
         moving = shifts if crops else None
-        found.append(_departure(
-            'bend', problem.solved(moving, range(count, lens + fields[0].shape[-1])),
+        tests.append(_departure(
+            'bend', problem.solved(moving, range(count, count + len(problem.extra))),
             problem.solved(moving, wide), scenes, config.clear_bend))
-    return tuple(sorted(found, key=lambda each: -each.strength / each.limit))
+    return tuple(sorted(tests, key=lambda each: -each.strength / each.limit))
 
 
 def _departure(kind: Kind, step: Step, base: Step, scenes: Sequence[Scene], limit: float

@@ -105,7 +105,7 @@ class _Result:
         """Return how the drive departs from a fixed camera, the strongest first."""
         scenes = [subsample_tracks(scene, self.settings.first_tracks) for scene in self.fit.scenes]
         return departures(scenes, self.fit.camera, self.step1, self.fit.solver.loss_px,
-                          self.settings, self.fit.crops, bent)
+                          self.settings, self.fit.crops, bent, bool(self.fit.readout_s))
 
 
 @dataclass(frozen=True)

@@ -225,7 +225,10 @@ def summarised(result: Calibration, truth: Mapping[str, Any],
         'frames': result.frames, 'turns_used': sum(turn.used for turn in result.turns),
         'turns': [[turn.center, turn.used, turn.yaw_deg] for turn in result.turns],
         'misfits': [turn.misfit for turn in result.turns], 'timing': result.timing,
-        'truth_model': model_of(truth)}
+        'truth_model': model_of(truth), 'warnings': list(result.warnings),
+        # of an older calibration there is none
+        'fixed_camera': {kind: found['strength'] for kind, found in
+                         result.details.get('fixed_camera', {}).items()}}
     if result.camera is not None and result.intrinsics is not None:
         estimate = {**result.intrinsics, 'model': result.camera.model}
         row |= errors(estimate, truth, result.sigma, known)
