@@ -188,12 +188,14 @@ class IntrinsicsConfig:
         5, 'corrections of a rolling shutter at the most; with 0 every shutter counts as global',
         0, 20)
     shutter_sigmas: float = expert(
-        5.0, 'of its readout; a shorter readout counts as a global shutter', 1.0, 100.0)
+        4.0, 'of its readout; a shorter readout counts as a global shutter', 1.0, 100.0)
     least_readout_ms: float = expert(
         1.0, 'ms; six global shutters came out at 0.0 to 0.5', 0.0, 100.0)
     clear_shift: float = expert(
         2.0, 'times what chance gains; more is a picture that moves: 0.9 to 1.3 are fixed ones',
         1.0, 1e6)
+    clear_rolling_shift: float = expert(
+        2.7, 'the same, of a rolling shutter: what is left of it comes to 1.3 to 2.4', 1.0, 1e6)
     left_shift: float = expert(
         4.0, "the same, after a stabiliser's movement was taken out", 1.0, 1e6)
     clear_zoom: float = expert(

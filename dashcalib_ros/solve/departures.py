@@ -226,8 +226,9 @@ def departures(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: 
     zooms = image_priors(problem, 'zoom', config)
     fixed = problem.solved(None, wide)
     # what a stabiliser's removal leaves over makes sigma larger, and may be larger itself
-    left = config.left_shift if crops else config.clear_shift
-    tests = [_departure('shift', problem.solved(shifts, wide), fixed, scenes, left),
+    limit = (config.left_shift if crops else
+             config.clear_rolling_shift if rolling else config.clear_shift)
+    tests = [_departure('shift', problem.solved(shifts, wide), fixed, scenes, limit),
              _departure('zoom', problem.solved(zooms, wide), fixed, scenes, config.clear_zoom)]
     if bent:
         # a stabilised picture goes on moving
