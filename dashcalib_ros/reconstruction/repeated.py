@@ -32,8 +32,8 @@ LEAST_SHARE, TIMES_CHANCE = 0.01, 2.5
 DISPLACED_PX = (11.0, 7.0)
 # tracks of a keyframe that are compared, at the most and at least
 MOST_PLACES, FEWEST_PLACES = 100, 20
-# keyframes that tell the offset in time, and how far it may be from what yaw tells, s
-PROBES, REACH_S = 5, 0.1
+# keyframes that tell the offset in time, and how many offsets are tried
+PROBES, MOST_OFFSETS = 5, 60
 # of a turn's keyframes; with fewer new ones it is left out
 LEAST_NEW = 0.5
 
@@ -70,12 +70,12 @@ def repeats(scene: Scene, other: Scene) -> Mask:
         return again
     rows = np.flatnonzero(scene.structure.registered)
     for direction in (1.0, -1.0):
-        rough = _offset(scene, other, direction)
-        if rough is None:
+        offsets = _offsets(scene, other, direction)
+        if not len(offsets):
             continue
         some = rows[np.linspace(0, len(rows) - 1, PROBES).astype(int)]
-        # tracks tell the time better than yaw does
-        offset = max(rough + np.arange(-REACH_S, REACH_S, OFFSET_S), key=lambda each: float(
+        # a steady turn fits in many places: tracks tell which one is right
+        offset = max(offsets, key=lambda each: float(
             np.sum(_shares(scene, other, some, direction, each))))
         shares = _shares(scene, other, rows, direction, offset)
         by_chance = _shares(scene, other, rows, direction, offset, DISPLACED_PX)
@@ -112,15 +112,15 @@ def _yaw_deg(scene: Scene) -> tuple[Floats, Floats]:
             np.degrees(np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))))
 
 
-def _offset(scene: Scene, other: Scene, direction: float) -> float | None:
-    """Return by how much the scene's time must be moved to fit the other's yaw, s.
+def _offsets(scene: Scene, other: Scene, direction: float) -> Floats:
+    """Return (n,) by how much the scene's time may be moved so that it fits the other's yaw, s.
 
-    None where no offset fits. direction: -1 turns its time round.
+    direction: -1 turns its time round.
     """
     times, yaw = _yaw_deg(scene)
     other_times, other_yaw = _yaw_deg(other)
     if len(times) < 2 or len(other_times) < 2:
-        return None
+        return np.zeros(0)
     times = direction * times
     reach = LEAST_OVERLAP * min(np.ptp(times), np.ptp(other_times))
     offsets = np.arange(other_times[0] - times.max() + reach,
@@ -140,11 +140,11 @@ def _offset(scene: Scene, other: Scene, direction: float) -> float | None:
                     1 / YAW_RATIO, YAW_RATIO)
     scatter = np.sqrt(np.sum((own - slope[:, None] * there)**2, axis=1) / count)
     # a stretch without yaw fits everywhere: the longer one of two is the better
-    scatter = scatter * len(times) / count
+    scatter = scatter * np.sqrt(len(times) / count)
     scatter[(count < 3) | (np.ptp(own, axis=1) < 2 * SAME_YAW_DEG)] = np.inf
-    if not len(offsets) or scatter.min() > SAME_YAW_DEG:
-        return None
-    return float(offsets[np.argmin(scatter)])
+    fitting = np.flatnonzero(scatter < SAME_YAW_DEG)
+    best = fitting[np.argsort(scatter[fitting], kind='stable')[:MOST_OFFSETS]]
+    return np.asarray(offsets[best])
 
 
 def _places_at(scene: Scene, time: float) -> Floats:

@@ -1,0 +1,160 @@
+"""A fixed camera's picture stands; one that moves, zooms or is bent is found and named."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from solving import CONFIG, START, scenes_of, solved, z_of
+from synthetic import LENS, SIZE
+
+from dashcalib_ros.camera.mapping import mapping_error
+from dashcalib_ros.judgement.verdict import judge
+from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.solve import focal
+from dashcalib_ros.solve.departures import departures
+from dashcalib_ros.solve.normal import normal_equations
+from dashcalib_ros.solve.stabiliser import fixed_crops, without_crops
+
+SETTINGS = CONFIG.intrinsics
+# what the others are measured against: nothing is taken out
+KEPT = CONFIG.replace({'intrinsics.crop_rounds': 0})
+
+
+@pytest.fixture(autouse=True)
+def no_profile(monkeypatch):
+    """Leave out the focal profile around the result, which takes most of the time."""
+    monkeypatch.setattr(focal, 'PROBES', (1.0,))
+
+
+def moved(scenes: list[Scene], displacement) -> list[Scene]:
+    """Return the scenes with their tracks displaced: of a scene (k, 1 or t, 2) px."""
+    return [replace(scene, tracks=replace(
+        scene.tracks, xy=scene.tracks.xy + displacement(scene))) for scene in scenes]
+
+
+def stabilised(scene: Scene, limit_px: float = 30.0) -> np.ndarray:
+    """Return (k, 1, 2) how a stabiliser moves the picture: against the turn, up to a limit."""
+    ahead = scene.structure.rotations[:, 2]
+    yaw = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))
+    smooth = yaw.copy()
+    for k in range(1, len(yaw)):
+        smooth[k] = 0.5 * smooth[k - 1] + 0.5 * yaw[k]
+    shift = np.clip(LENS.fx * (yaw - smooth), -limit_px, limit_px)
+    return np.stack([shift, np.zeros_like(shift)], axis=1)[:, None]
+
+
+def zoomed(scene: Scene, factor: float) -> np.ndarray:
+    middle = (np.array(SIZE) - 1) / 2
+    return (factor - 1) * (scene.tracks.xy - middle)
+
+
+def bent(scene: Scene, most_px: float) -> np.ndarray:
+    places = (scene.tracks.xy - (250.0, 150.0)) / 120.0
+    bump = np.exp(-0.5 * np.sum(places**2, axis=2, keepdims=True))
+    return most_px * bump * (0.8, -0.6)
+
+
+def test_a_fixed_camera_departs_in_nothing():
+    solution = solved(scenes_of(4))
+    assert {each.kind for each in solution.departures} == {'shift', 'zoom', 'bend'}
+    assert all(0.3 < each.strength < 1.7 and not each.clear for each in solution.departures)
+    assert not solution.crops
+
+
+def test_a_stabilised_video_is_found_and_taken_out():
+    scenes = moved(scenes_of(4, tracks=200, keyframes=16, noise_px=0.15), stabilised)
+    kept, found = solved(scenes, KEPT), solved(scenes)
+    strongest = kept.departures[0]
+    assert strongest.kind == 'shift' and strongest.clear
+    [reason] = [text for text in judge(kept, CONFIG.verdict).reasons if 'stabil' in text]
+    assert 'switch the stabiliser off' in reason
+    wrong, left = (mapping_error(each.camera, LENS) for each in (kept, found))
+    assert wrong > 1.0 and left < 0.4
+    assert not found.departures[0].clear
+    # sigma knows that the crop is uncertain
+    assert np.abs(z_of(found)).max() < 3.5
+    assert found.sigma[2] > 2.0
+    # what was taken out is what was there, up to a shift of all pictures
+    taken = np.concatenate([found.crops[scene.turn][:, 0] for scene in scenes])
+    there = np.concatenate([stabilised(scene)[:, 0, 0] for scene in scenes])
+    assert np.corrcoef(taken, there)[0, 1] > 0.95
+
+
+def test_a_crop_is_taken_out_of_the_tracks():
+    [scene] = scenes_of(1)
+    crops = fixed_crops([scene])
+    np.testing.assert_array_equal(without_crops(scene, crops).tracks.xy, scene.tracks.xy)
+    crops = {scene.turn: crops[scene.turn] + (3.0, -1.0)}
+    np.testing.assert_allclose(without_crops(scene, crops).tracks.xy,
+                               scene.tracks.xy - (3.0, -1.0))
+
+
+@pytest.mark.parametrize('turns', [(0,), (2, 3), (0, 1, 2)])
+def test_a_zoom_between_turns_is_named(turns):
+    scenes = scenes_of(5)
+    scenes = [moved([scene], lambda each: zoomed(each, 1.03))[0] if n in turns else scene
+              for n, scene in enumerate(scenes)]
+    solution = solved(scenes)
+    assert solution.departures[0].kind == 'zoom' and solution.departures[0].clear
+    verdict = judge(solution, CONFIG.verdict)
+    assert verdict.level == 'weak'
+    assert any('zoom changes by about' in reason for reason in verdict.reasons)
+    zooms = solution.departures[0].by_turn
+    larger = {scene.turn for n, scene in enumerate(scenes) if n in turns}
+    assert min(zooms[turn] for turn in larger) > max(
+        zoom for turn, zoom in zooms.items() if turn not in larger)
+
+
+def test_every_other_picture_zoomed_is_named():
+    def breathing(scene: Scene) -> np.ndarray:
+        odd = np.arange(len(scene.tracks.frames)) % 2
+        return odd[:, None, None] * zoomed(scene, 1.02)
+
+    solution = solved(moved(scenes_of(4), breathing))
+    assert solution.departures[0].kind == 'zoom'
+    assert any('from image to image' in reason
+               for reason in judge(solution, CONFIG.verdict).reasons)
+
+
+def test_a_windscreen_that_bends_the_picture_is_named():
+    solution = solved(moved(scenes_of(4, tracks=260), lambda scene: bent(scene, 4.0)))
+    assert solution.departures[0].kind == 'bend' and solution.departures[0].clear
+    verdict = judge(solution, CONFIG.verdict)
+    assert verdict.level != 'accepted' and any('bent' in text for text in verdict.reasons)
+
+
+def test_what_tracks_share_makes_sigma_larger():
+    fixed = solved(scenes_of(4, tracks=260))
+    slightly = solved(moved(scenes_of(4, tracks=260), lambda scene: bent(scene, 0.8)))
+    strength = max(each.strength for each in slightly.departures)
+    assert strength > 1.5
+    assert slightly.picture.rms > 1.1 * fixed.picture.rms
+
+
+def test_points_and_poses_follow_the_camera():
+    solution = solved(scenes_of(2))
+    [scene, _], camera = solution.scenes, solution.camera
+    normal = normal_equations(scene, camera, 0.5)
+    step = np.zeros(normal.lens)
+    step[0] = 1e-3 * camera.fx
+    after = normal.eliminated.moved(scene.structure, step)
+    other = camera.with_params(camera.params + step[:6])
+
+    def rms(structure, lens) -> float:
+        local = (structure.points @ structure.rotations.transpose(0, 2, 1)
+                 + structure.translations[:, None])
+        error = np.linalg.norm(lens.project(local) - scene.tracks.xy, axis=2)
+        return float(np.sqrt(np.mean(error[structure.used]**2)))
+
+    best = rms(scene.structure, camera)
+    # they make up for nearly all that another focal length spoils
+    assert rms(after, other) - best < 0.2 * (rms(scene.structure, other) - best)
+    for rotation in after.rotations[after.registered]:
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+
+
+def test_departures_of_one_scene_are_finite():
+    solution = solved(scenes_of(1))
+    found = departures(solution.scenes, solution.camera, START, 0.3, SETTINGS)
+    assert all(np.isfinite(each.strength) for each in found)
