@@ -280,6 +280,18 @@ def test_two_short_drives_add_up(drive, frames, tmp_path):
     assert len(list(folder.iterdir())) == 2
 
 
+def test_a_turn_that_is_played_in_a_loop_counts_once(drive, frames):
+    around = [frame.image for frame in frames[max(drive.turn_centers[0] - 35, 0):
+                                              drive.turn_centers[0] + 35]]
+    with limited(Calibrator(QUICK.replace({'turns.wanted': 3}))) as calibrator:
+        for n, image in enumerate(3 * around):
+            calibrator.push(Frame(n, frames[0].stamp_ns + n * 100_000_000, image))
+        looped = calibrator.calibrate()
+    assert looped.verdict.level != 'accepted' and looped.turns_used == 1
+    assert any('only 1 of at least 2 turns' in text for text in looped.verdict.reasons)
+    assert sum('played in a loop' in text for text in looped.warnings) >= 1
+
+
 def test_a_stored_turn_of_another_camera_is_told_and_stays(frames, tmp_path):
     config = QUICK.replace({'turns.store': str(tmp_path)})
     lens = Radial((640, 360), 460.0, 460.0, 319.5, 179.5, -0.1)
