@@ -135,30 +135,26 @@ def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_extra: Flo
         POSE * image[:, None] + np.arange(POSE), poses + own * image[:, None] + np.arange(own),
         np.broadcast_to(poses + images + np.arange(shared), (len(rows), shared))], axis=1)
 
-    reduced, inverse, mixed = _eliminate_points(linear, where, point)
+    reduced, inverse, mixed = _eliminate_points(linear, where, point, POSE + own)
     pose_inverse = _pose_inverse(reduced[:poses, :poses])
     response = pose_inverse @ reduced[:poses, poses:]
     hessian = reduced[poses:, poses:] - reduced[:poses, poses:].T @ response
 
-    # each track's score, with poses and points at their optimum for given other parameters
-    combine = np.concatenate([-response, np.eye(images + shared)])
-    point_response = inverse @ (mixed.transpose(0, 2, 1) @ combine)
-    effective = (np.einsum('nij,njc->nic', linear.wide, combine[where])
-                 - linear.by_point @ point_response[point])
-    scores = np.zeros((len(tracks), images + shared))
-    np.add.at(scores, point, np.einsum('nic,ni->nc', effective, linear.residual))
-
-    point_score = np.zeros((len(tracks), 3))
-    np.add.at(point_score, point, np.einsum('nij,ni->nj', linear.by_point, linear.residual))
-    pose_score = np.zeros(poses + images + shared)
-    np.add.at(pose_score, where, np.einsum('nij,ni->nj', linear.wide, linear.residual))
-    pose_score -= np.einsum('tsi,tij,tj->s', mixed, inverse, point_score, optimize=True)
+    # each track's score with its point at its optimum, then with the poses at theirs, too
+    pulls = (linear.residual[:, None] @ linear.wide)[:, 0]
+    point_score = _summed(linear.residual[:, None] @ linear.by_point, point)[:, 0]
+    track_score = np.zeros(mixed.shape[:2])
+    track_score[point[:, None], where[:, :POSE + own]] = pulls[:, :POSE + own]
+    track_score[:, where[0, POSE + own:]] = _summed(pulls[:, POSE + own:], point)
+    track_score -= (mixed @ (inverse @ point_score[:, :, None]))[:, :, 0]
+    scores = track_score[:, poses:] - track_score[:, :poses] @ response
     return Normal(
         hessian, scores.sum(axis=0), scores.T @ scores,
         *squares_and_freedom(used, linear.residual, linear.weight, len(camera.names())),
         lens=len(camera.widened().names()), images=images // IMAGE,
-        eliminated=Eliminated(keyframes, tracks, pose_inverse, pose_score[:poses],
-                              reduced[:poses, poses:], inverse, point_score, mixed))
+        eliminated=Eliminated(keyframes, tracks, pose_inverse,
+                              track_score[:, :poses].sum(axis=0), reduced[:poses, poses:],
+                              inverse, point_score, mixed))
 
 
 @dataclass(frozen=True)
@@ -200,26 +196,47 @@ def _linearised(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats |
                    residual, weight)
 
 
-def _eliminate_points(linear: _Linear, where: npt.NDArray[np.intp], point: npt.NDArray[np.intp]
-                      ) -> tuple[Floats, Floats, Floats]:
+def _eliminate_points(linear: _Linear, where: npt.NDArray[np.intp], point: npt.NDArray[np.intp],
+                      local: int) -> tuple[Floats, Floats, Floats]:
     """Return the normal matrix after the points are eliminated (Schur).
 
-    where: (n, c) rows of that matrix for an observation's derivatives; point: (n,) its point.
-    Also returned, for back-substitution: (t, 3, 3) the inverses of the points' blocks, (t, size,
-    3) the mixed blocks.
+    where: (n, c) rows of that matrix for an observation's derivatives, ascending in the first
+    column; those behind the first `local` are the same for all. point: (n,) its point. Also
+    returned, for back-substitution: (t, 3, 3) the inverses of the points' blocks, (t, size, 3) the
+    mixed blocks.
     """
     wide, by_point = linear.wide, linear.by_point
     size, points = int(where.max()) + 1, int(point.max()) + 1
+    own, shared = wide[:, :, :local], wide[:, :, local:]
     normal = np.zeros((size, size))
+    starts = np.flatnonzero(np.diff(where[:, 0], prepend=-1))
+    ends = np.append(starts, len(where))[1:]
+    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+        # of one image
+        rows = where[start, :local]
+        flat = wide[start:end].reshape(-1, wide.shape[2])
+        block = flat[:, :local].T @ flat
+        normal[np.ix_(rows, where[start])] = block
+        normal[np.ix_(where[start, local:], rows)] = block[:, local:].T
+    flat = shared.reshape(-1, shared.shape[2])
+    normal[np.ix_(where[0, local:], where[0, local:])] = flat.T @ flat
+
     mixed = np.zeros((points, size, 3))
-    own = np.zeros((points, 3, 3))
-    np.add.at(own, point, by_point.transpose(0, 2, 1) @ by_point)
-    np.add.at(normal, (where[:, :, None], where[:, None, :]), wide.transpose(0, 2, 1) @ wide)
-    np.add.at(mixed, (point[:, None], where), wide.transpose(0, 2, 1) @ by_point)
+    # a point is seen once in an image
+    mixed[point[:, None], where[:, :local]] = own.transpose(0, 2, 1) @ by_point
+    mixed[:, where[0, local:]] = _summed(shared.transpose(0, 2, 1) @ by_point, point)
+    blocks = _summed(by_point.transpose(0, 2, 1) @ by_point, point)
     # a little damping, so that badly determined points have a finite inverse
-    damping = 1e-9 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    inverse = np.linalg.inv(own + damping + 1e-12 * np.eye(3))
+    damping = 1e-9 * np.trace(blocks, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    inverse = np.linalg.inv(blocks + damping + 1e-12 * np.eye(3))
     return normal - np.tensordot(mixed @ inverse, mixed, axes=([0, 2], [0, 2])), inverse, mixed
+
+
+def _summed(values: Floats, point: npt.NDArray[np.intp]) -> Floats:
+    """Return (t, ...) the sums of values (n, ...) over the observations of each point."""
+    order = np.argsort(point, kind='stable')
+    starts = np.flatnonzero(np.diff(point[order], prepend=-1))
+    return np.asarray(np.add.reduceat(values[order], starts))
 
 
 def _pose_inverse(poses: Floats) -> Floats:
