@@ -91,12 +91,12 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
             warnings += _model_error_warnings(solution, px, config)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
-            if solution.crops:
-                stabiliser = Stabiliser(px * largest_crop(solution.crops))
-                warnings += (f'the video is stabilised: its picture moves by up to '
-                             f'{stabiliser.largest_px:.0f} px against the lens; that was taken '
-                             f'out, and the result is for the picture in its middle: switch the '
-                             f'stabiliser off',)
+        if solution.crops:
+            stabiliser = Stabiliser(largest_crop(solution.crops) * evidence.scale.px)
+            warnings += (f'the video is stabilised: its picture moves by up to '
+                         f'{stabiliser.largest_px:.0f} px against the lens; that was taken out, '
+                         f'and the result is for the picture in its middle: switch the '
+                         f'stabiliser off',)
     return Calibration(
         verdict=verdict, image_size=evidence.image_size, camera=camera, sigma=sigma,
         turns=tuple(_summary(turn, evidence, solution)

@@ -17,6 +17,7 @@ from dashcalib_ros.report.wording import (
     parameter_rows,
     picture_text,
     shutter_text,
+    stabiliser_text,
     stored_text,
     turn_row,
 )
@@ -116,6 +117,8 @@ def _drive(c: Calibration) -> str:
         rows.append(('sigma', picture_text(c.sigma_px)))
     if c.rolling_shutter is not None:
         rows.append(('shutter', shutter_text(c.rolling_shutter)))
+    if c.stabiliser is not None:
+        rows.append(('stabiliser', stabiliser_text(c.stabiliser)))
     rows += [(f'time: {name}', f'{seconds:.1f} s') for name, seconds in c.timing.items()]
     return f'<h2>Run</h2>{_table(("", ""), rows)}'
 

@@ -20,6 +20,7 @@ from dashcalib_ros.report.wording import (
     parameter_rows,
     picture_text,
     shutter_text,
+    stabiliser_text,
     stored_text,
     turn_row,
 )
@@ -107,6 +108,8 @@ def _facts(c: Calibration) -> str:
         facts.append('sigma ' + picture_text(c.sigma_px))
     if c.rolling_shutter is not None:
         facts.append(shutter_text(c.rolling_shutter))
+    if c.stabiliser is not None:
+        facts.append(stabiliser_text(c.stabiliser))
     if c.mask is not None:
         facts.append(f'{100 * (1 - float(np.mean(c.mask))):.0f} % masked as ego vehicle')
     if 'total' in c.timing:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 
 from dashcalib_ros.judgement import Calibration, TurnSummary
-from dashcalib_ros.judgement.calibration import Shutter, StoredTurnSummary
+from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.solve.picture import PictureSigma
 
 ADVICE = {
@@ -61,6 +61,11 @@ def stored_text(turns: Sequence[StoredTurnSummary]) -> str:
     """Return how many turns of earlier drives were used."""
     used = sum(turn.used for turn in turns)
     return f'{used} of {len(turns)} stored turn{"" if len(turns) == 1 else "s"} used'
+
+
+def stabiliser_text(stabiliser: Stabiliser) -> str:
+    """Return what became of a stabilised video."""
+    return f'picture stabilised by up to {stabiliser.largest_px:.0f} px, found and removed'
 
 
 def shutter_text(shutter: Shutter) -> str:
