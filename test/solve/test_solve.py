@@ -30,7 +30,7 @@ from dashcalib_ros.reconstruction.scene import (
     retriangulated,
     truncated_cost,
 )
-from dashcalib_ros.solve import fitting, focal, joint
+from dashcalib_ros.solve import fitting, focal, steps
 from dashcalib_ros.solve.focal import summed
 from dashcalib_ros.solve.information import (
     Information,
@@ -70,7 +70,7 @@ def test_step_2_ends_where_a_round_would_change_little(monkeypatch, no_profile, 
         calls.append(arguments)
         return adjust_step2(*arguments)
 
-    monkeypatch.setattr(joint, 'adjust_step2', counted)
+    monkeypatch.setattr(steps, 'adjust_step2', counted)
     solution = solved(scenes_of(2, outliers=0.03, tracks=100), CONFIG.replace(
         {'intrinsics.rounds': 3, 'intrinsics.settled': settled}))
     # one more with a part of the tracks, where a rolling shutter is looked for
