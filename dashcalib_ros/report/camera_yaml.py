@@ -1,7 +1,8 @@
 """calibration.yaml: the file that camera_info_manager, usb_cam, v4l2_camera and others load.
 
 Keys, order and layout are those that camera_calibration_parsers writes. Its parser looks keys up
-by name, so it ignores our one extra block, dashcalib, which has sigma and provenance.
+by name, so it ignores our one extra block, dashcalib, which has sigma and provenance. Texts in
+it are quoted: OpenCV's FileStorage, which reads the file, too, takes 4.2.1 for a broken number.
 """
 from __future__ import annotations
 
@@ -51,10 +52,10 @@ def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
         'distortion_coefficients': _matrix(1, len(c.d), c.d),
         'rectification_matrix': _matrix(3, 3, c.r),
         'projection_matrix': _matrix(3, 4, c.p),
-        'dashcalib': _provenance(calibration, created),
+        'dashcalib': _quoted(_provenance(calibration, created)),
     }
-    text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=None,
-                               width=2**20, allow_unicode=True)
+    text: str = yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None,
+                          width=2**20, allow_unicode=True)
     return text
 
 
@@ -96,8 +97,30 @@ def check_camera_name(name: str) -> None:
                           'files; choose another')
 
 
+class _Text(str):
+    """A text that is written with quotes."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes plain values, and texts with quotes."""
+
+
+_Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(
+    'tag:yaml.org,2002:str', str(text), style='"'))
+
+
+def _quoted(value: Any) -> Any:
+    """Return a value with every text in it, other than keys, as one that is written in quotes."""
+    if isinstance(value, str):
+        return _Text(value)
+    if isinstance(value, Mapping):
+        return {key: _quoted(each) for key, each in value.items()}
+    return [_quoted(each) for each in value] if isinstance(value, (list, tuple)) else value
+
+
 def _matrix(rows: int, cols: int, data: Sequence[float]) -> dict[str, Any]:
-    return {'rows': rows, 'cols': cols, 'data': [float(value) for value in data]}
+    # dt: OpenCV reads the matrix by it, as doubles; the other readers look up what they know
+    return {'rows': rows, 'cols': cols, 'dt': 'd', 'data': [float(value) for value in data]}
 
 
 def _provenance(calibration: Calibration, created: str | None) -> dict[str, Any]:

@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
+import numpy as np
 import pytest
 import yaml
 from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
@@ -49,15 +51,16 @@ def test_keys_order_and_values_are_the_parsers_own():
     assert document['camera_name'] == 'dashcam'
     assert document['distortion_model'] == 'plumb_bob'
     assert document['camera_matrix'] == {
-        'rows': 3, 'cols': 3, 'data': [c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1]}
+        'rows': 3, 'cols': 3, 'dt': 'd', 'data': [c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1]}
     assert document['distortion_coefficients'] == {
-        'rows': 1, 'cols': 5, 'data': [c.k1, c.k2, 0, 0, 0]}
+        'rows': 1, 'cols': 5, 'dt': 'd', 'data': [c.k1, c.k2, 0, 0, 0]}
     assert document['rectification_matrix'] == {
-        'rows': 3, 'cols': 3, 'data': [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+        'rows': 3, 'cols': 3, 'dt': 'd', 'data': [1, 0, 0, 0, 1, 0, 0, 0, 1]}
     assert document['projection_matrix'] == {
-        'rows': 3, 'cols': 4, 'data': [c.fx, 0, c.cx, 0, 0, c.fy, c.cy, 0, 0, 0, 1, 0]}
+        'rows': 3, 'cols': 4, 'dt': 'd',
+        'data': [c.fx, 0, c.cx, 0, 0, c.fy, c.cy, 0, 0, 0, 1, 0]}
     for key in ('camera_matrix', 'distortion_coefficients', 'projection_matrix'):
-        assert list(document[key]) == ['rows', 'cols', 'data']
+        assert list(document[key]) == ['rows', 'cols', 'dt', 'data']
         assert all(type(value) is float for value in document[key]['data'])
 
 
@@ -67,7 +70,7 @@ def test_a_fisheye_has_four_coefficients():
     assert list(document) == [*PARSERS_KEYS, 'dashcalib']
     assert document['distortion_model'] == 'equidistant'
     assert document['distortion_coefficients'] == {
-        'rows': 1, 'cols': 4, 'data': [lens.k1, lens.k2, lens.k3, lens.k4]}
+        'rows': 1, 'cols': 4, 'dt': 'd', 'data': [lens.k1, lens.k2, lens.k3, lens.k4]}
     assert document['dashcalib']['camera_model'] == 'fisheye'
     assert list(document['dashcalib']['sigma']) == list(lens.names())
 
@@ -93,7 +96,8 @@ def test_layout_is_one_flow_list_a_matrix():
     text = calibration_yaml(make_calibration())
     assert text.startswith(
         'image_width: 1242\nimage_height: 375\ncamera_name: dashcam\ncamera_matrix:\n  rows: 3\n'
-        '  cols: 3\n  data: [721.5377, 0.0, 609.5593, 0.0, 724.25, 172.854, 0.0, 0.0, 1.0]\n'
+        '  cols: 3\n  dt: d\n'
+        '  data: [721.5377, 0.0, 609.5593, 0.0, 724.25, 172.854, 0.0, 0.0, 1.0]\n'
         'distortion_model: plumb_bob\n')
 
 
@@ -122,6 +126,21 @@ def test_full_precision_survives_the_round_trip(tmp_path):
 
 def test_the_same_calibration_gives_the_same_text():
     assert calibration_yaml(make_calibration()) == calibration_yaml(make_calibration())
+
+
+@pytest.mark.parametrize('name', EACH_MODEL)
+def test_opencv_opens_it(tmp_path, name):
+    lens, odd = EACH_MODEL[name], 'a: "b" \\ #c ü %, {[ 4.2.1'
+    path = tmp_path / 'calibration.yaml'
+    path.write_text(calibration_yaml(calibration_of(lens, input_name=odd), created='2026-11-22'),
+                    encoding='utf-8')
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    assert file.isOpened() and file.getNode('image_width').real() == lens.image_size[0]
+    np.testing.assert_array_equal(file.getNode('camera_matrix').mat(), lens.matrix)
+    np.testing.assert_array_equal(file.getNode('distortion_coefficients').mat(),
+                                  [lens.ros_distortion()])
+    assert file.getNode('dashcalib').getNode('input').string() == odd
+    file.release()
 
 
 def test_names_from_outside_cannot_break_the_file():
