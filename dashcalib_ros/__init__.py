@@ -6,18 +6,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dashcalib_ros.calibrator import Calibrator
+    from dashcalib_ros.calibrator import Calibrator, calibrate
+    from dashcalib_ros.camera import Camera
     from dashcalib_ros.config import Config
+    from dashcalib_ros.frames import Frame
     from dashcalib_ros.inputs import open_frames
+    from dashcalib_ros.judgement import Calibration
 
 from dashcalib_ros.limits import PIXELS
 
 # OpenCV reads it when it is loaded; image headers are checked before decoding, too
 os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(PIXELS))
 
-__all__ = ['Calibrator', 'Config', 'open_frames']
+__all__ = ['Calibration', 'Calibrator', 'Camera', 'Config', 'Frame', 'calibrate', 'open_frames']
 
-_HOMES = {'Calibrator': 'calibrator', 'Config': 'config', 'open_frames': 'inputs'}
+_HOMES = {'Calibration': 'judgement', 'Calibrator': 'calibrator', 'Camera': 'camera',
+          'Config': 'config', 'Frame': 'frames', 'calibrate': 'calibrator',
+          'open_frames': 'inputs'}
 
 
 def __getattr__(name: str) -> Any:

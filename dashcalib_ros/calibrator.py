@@ -4,6 +4,7 @@ The stages are in stages.py; the Calibrator decides only what runs when.
 """
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -166,3 +167,18 @@ class Calibrator:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self.close()
+
+
+def calibrate(path: str | os.PathLike[str], fps: float | None = None,
+              config: Config | None = None, topic: str | None = None) -> Calibration:
+    """Calibrate a recorded drive.
+
+    path, topic, fps: as for open_frames(). Raises InputError for what cannot be read; a drive that
+    teaches too little gives a calibration that is weak or refused.
+    """
+    # the node has no use for the readers of files
+    from dashcalib_ros.inputs import open_frames
+    with Calibrator(config) as calibrator:
+        for frame in open_frames(path, topic, fps):
+            calibrator.push(frame)
+        return calibrator.calibrate()

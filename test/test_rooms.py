@@ -21,7 +21,7 @@ ALLOWED: dict[str, set[str]] = {
     'errors': set(),
     'limits': {'errors'},
     'arrays': set(),
-    '__init__': {'calibrator', 'inputs'},
+    '__init__': {'calibrator', 'camera', 'frames', 'inputs', 'judgement'},
     'demo': {'camera', 'frames', 'bags', 'judgement'},
 }
 # rooms that nobody but these may import

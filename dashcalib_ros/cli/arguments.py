@@ -65,6 +65,7 @@ def make_parser() -> Parser:
     _add_turns(commands)
     _add_demo(commands)
     _add_compare(commands)
+    _add_export(commands)
     return parser
 
 
@@ -107,6 +108,40 @@ def _add_compare(commands: Any) -> None:
     parser.add_argument('a', metavar='A', type=Path, help=what)
     parser.add_argument('b', metavar='B', type=Path, help=f'the reference: {what}')
     parser.add_argument('--json', action='store_true', help='print JSON')
+
+
+def _add_export(commands: Any) -> None:
+    parser = _command(commands, 'export', "write a calibration as another program's camera file",
+                      'Prints the camera in the format of another program, or writes it to FILE.')
+    parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
+                        help='a result.json (or its folder), a camera_info YAML or a truth JSON')
+    # the names are not taken from the table of exports: that would load numpy and OpenCV
+    parser.add_argument('--to', required=True, metavar='KIND',
+                        help='opencv, colmap, kalibr, opensfm, nerfstudio or ros')
+    view = parser.add_mutually_exclusive_group()
+    view.add_argument('--size', type=_size, metavar='WxH',
+                      help='for pictures that were resized to this')
+    view.add_argument('--crop', type=_crop, metavar='X,Y,W,H',
+                      help='for this part of the pictures')
+    parser.add_argument('--out', type=Path, metavar='FILE', help='default: standard output')
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Return a size that is given as WxH."""
+    width, height = _whole_numbers(text, 'x', 2, '1280x720')
+    return width, height
+
+
+def _crop(text: str) -> list[int]:
+    """Return a part of the picture that is given as X,Y,W,H."""
+    return _whole_numbers(text, ',', 4, '0,100,1280,520')
+
+
+def _whole_numbers(text: str, between: str, count: int, like: str) -> list[int]:
+    parts = text.lower().split(between)
+    if len(parts) != count or not all(part.strip().isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f'{text!r} is not like {like}')
+    return [int(part) for part in parts]
 
 
 def _command(commands: Any, name: str, summary: str, description: str) -> argparse.ArgumentParser:

@@ -1,13 +1,18 @@
 """The result of a calibration: a camera, a sigma for each parameter, a verdict with reasons."""
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+import numpy.typing as npt
+
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.solve.picture import PictureSigma
 from dashcalib_ros.turns.turn import TurnId
 
@@ -75,7 +80,7 @@ class Stabiliser:
     largest_px: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Calibration:
     """The complete result. camera and sigma are None when the verdict is refused.
 
@@ -108,6 +113,48 @@ class Calibration:
     rolling_shutter: Shutter | None = None
     sigma_px: PictureSigma | None = None
     stabiliser: Stabiliser | None = None
+
+    def __repr__(self) -> str:
+        """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
+        if self.camera is None:
+            return f'Calibration({self.verdict.level}: {"; ".join(self.verdict.reasons[:1])})'
+        sigma = self.sigma or {}
+        found = [f'{name} {value:.6g} ± {sigma.get(name, math.nan):.1g}'
+                 for name, value in self.camera.named.items()]
+        return f'Calibration({self.verdict.level}, {self.camera.model}, {", ".join(found)})'
+
+    @property
+    def K(self) -> Floats:  # noqa: N802, the field's name for it
+        """Return the camera matrix (3, 3). Raises InputError where there is no camera."""
+        return self._camera.matrix
+
+    @property
+    def D(self) -> Floats:  # noqa: N802
+        """Return OpenCV's distortion coefficients, (5,), of a fisheye (4,). Raises InputError.
+
+        Those of a fisheye are for cv2.fisheye.
+        """
+        return np.array(self._camera.ros_distortion())
+
+    def undistort(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return an image without distortion, as a camera with the matrix K sees it.
+
+        Raises InputError for an image of another size, and where there is no camera.
+        """
+        import cv2
+        camera = self._camera
+        if image.shape[1::-1] != camera.image_size:
+            raise InputError(f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
+                             f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}')
+        if camera.sees_behind:
+            return np.asarray(cv2.fisheye.undistortImage(image, self.K, self.D, Knew=self.K))
+        return np.asarray(cv2.undistort(image, self.K, self.D))
+
+    @property
+    def _camera(self) -> Camera:
+        if self.camera is None:
+            raise InputError(f'the calibration was refused: {"; ".join(self.verdict.reasons)}')
+        return self.camera
 
     @property
     def intrinsics(self) -> dict[str, float] | None:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from dashcalib_ros.camera import Radial, camera_from_ros, ros_camera
+from dashcalib_ros.camera import Camera, Radial, camera_from_ros, ros_camera
+from dashcalib_ros.camera.rectified import SAME
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
@@ -41,9 +42,19 @@ def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
     check_camera_name(camera_name)
     if calibration.camera is None or not np.isfinite(calibration.camera.params).all():
         raise ValueError('a calibration without finite intrinsics has no calibration.yaml')
-    c = ros_camera(calibration.camera, calibration.config.rectified)
-    width, height = calibration.image_size
-    document = {
+    document = _document(calibration.camera, camera_name, calibration.config.rectified)
+    return _text({**document, 'dashcalib': _quoted(_provenance(calibration, created))})
+
+
+def camera_info_yaml(camera: Camera) -> str:
+    """Return the YAML text of a camera alone, without a calibration's sigma and provenance."""
+    return _text(_document(camera, CAMERA_NAME, SAME))
+
+
+def _document(camera: Camera, camera_name: str, rectified: str) -> dict[str, Any]:
+    c = ros_camera(camera, rectified)
+    width, height = camera.image_size
+    return {
         'image_width': int(width),
         'image_height': int(height),
         'camera_name': camera_name,
@@ -52,11 +63,12 @@ def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
         'distortion_coefficients': _matrix(1, len(c.d), c.d),
         'rectification_matrix': _matrix(3, 3, c.r),
         'projection_matrix': _matrix(3, 4, c.p),
-        'dashcalib': _quoted(_provenance(calibration, created)),
     }
-    text: str = yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None,
-                          width=2**20, allow_unicode=True)
-    return text
+
+
+def _text(document: Mapping[str, Any]) -> str:
+    return str(yaml.dump(dict(document), Dumper=_Dumper, sort_keys=False, default_flow_style=None,
+                         width=2**20, allow_unicode=True))
 
 
 def load_calibration_yaml(path: str | Path) -> NamedCamera:

@@ -39,7 +39,8 @@ def results(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize('command', [[], ['run'], ['turns'], ['demo'], ['compare']])
+@pytest.mark.parametrize('command', [[], ['run'], ['turns'], ['demo'], ['compare'],
+                                     ['export']])
 def test_help_names_the_exit_codes(command):
     done = dashcalib(*command, '--help')
     assert (done.returncode, done.stderr) == (0, '')
@@ -68,6 +69,10 @@ def test_version():
     (['run', 'x', '--turns', 'many'], '--turns'),
     (['run', 'x', '--thread', '2'], 'unrecognized'),
     (['compare', 'a'], 'B'),
+    (['export', 'a'], '--to'),
+    (['export', 'a', '--to', 'ros', '--size', '640'], '1280x720'),
+    (['export', 'a', '--to', 'ros', '--crop', '0,0,x,9'], '0,100,1280,520'),
+    (['export', 'a', '--to', 'ros', '--crop', '0,0,9,9', '--size', '9x9'], 'not allowed'),
 ])
 def test_bad_usage_is_one_line(args, complaint):
     done = dashcalib(*args)
@@ -91,6 +96,25 @@ def test_compare_as_json(results):
     assert data['parameters']['fx']['z'] == pytest.approx(2)
     assert 0 < data['mapping_px'] < 7
     assert data['a']['verdict'] == 'accepted'
+
+
+def test_export_prints_or_writes_a_camera_file(results):
+    printed = dashcalib('export', results / 'a', '--to', 'colmap')
+    assert (printed.returncode, printed.stderr) == (0, '')
+    assert re.search(r'^1 OPENCV 1242 375 721\.', printed.stdout, re.MULTILINE)
+    out = results / 'cameras.txt'
+    written = dashcalib('export', results / 'a', '--to', 'colmap', '--out', out)
+    assert (written.returncode, written.stdout, written.stderr) == (0, '', '')
+    assert out.read_text() == printed.stdout
+    half = dashcalib('export', results / 'a', '--to', 'ros', '--size', '621x188')
+    assert half.returncode == 0 and 'image_width: 621' in half.stdout
+
+
+def test_export_to_what_there_is_not(results):
+    done = dashcalib('export', results / 'a', '--to', 'matlab')
+    assert_one_line_error(done)
+    assert 'opencv, colmap, kalibr' in done.stderr
+    assert_one_line_error(dashcalib('export', results / 'missing', '--to', 'ros'))
 
 
 @pytest.mark.parametrize('content', [None, b'', b'\x89junk\x00\xff', b'{}', b'fx: 3', b'[[['])
