@@ -12,11 +12,12 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from synthetic import synthetic_turn
 
-from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.calibrator import Calibrator, calibrate
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
@@ -158,7 +159,7 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way(frames, resul
 
 INLINE = """
 import pickle, sys
-from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.calibrator import Calibrator, calibrate
 frames, config = pickle.load(sys.stdin.buffer)
 with Calibrator(config, inline=True) as calibrator:
     for frame in frames:
@@ -359,6 +360,29 @@ def refused(frames: Iterable[Frame]) -> str:
     assert calibration.intrinsics is None and calibration.sigma is None
     assert calibration.verdict.reasons and '\n' not in ''.join(calibration.verdict.reasons)
     return ' | '.join(calibration.verdict.reasons)
+
+
+@pytest.mark.parametrize('image', [np.zeros((64, 96, 3), np.uint8), np.zeros((64, 96), float)])
+def test_a_picture_that_is_not_grey_is_named(image):
+    with limited(Calibrator(QUICK)) as calibrator, pytest.raises(InputError, match='cvtColor'):
+        calibrator.push(Frame(0, 0, image))
+
+
+@pytest.mark.parametrize('step', [0, 1, 100, 100_000 // 2])
+def test_stamps_in_the_wrong_unit_are_named(step):
+    image = np.zeros((64, 96), np.uint8)
+    with limited(Calibrator(QUICK)) as calibrator, pytest.raises(InputError, match='nanoseconds'):
+        for n in range(20):
+            calibrator.push(Frame(n, 1_700_000_000 + n * step, image))
+
+
+def test_a_folder_is_calibrated_in_one_call(tmp_path):
+    with pytest.raises(InputError):
+        calibrate(tmp_path / 'nothing')
+    for n in range(3):
+        cv2.imwrite(str(tmp_path / f'{n}.png'), np.full((64, 96, 3), 50 * n, np.uint8))
+    found = calibrate(tmp_path, fps=10.0, config=QUICK)
+    assert found.verdict.level == 'refused' and found.frames == 3 and 'refused' in repr(found)
 
 
 def test_no_image_and_one_image():

@@ -3,6 +3,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
@@ -13,6 +15,9 @@ from dashcalib_ros.motion import MotionEstimator
 from dashcalib_ros.turns.detector import TurnDetector
 from dashcalib_ros.turns.turn import Turn
 
+# images after which the stamps' unit is checked; ns between images of the fastest camera, 10 kHz
+FIRST_FRAMES = 10
+SHORTEST_NS = 100_000
 
 class Detection:
     """Takes the images of one camera; keeps the best turns, with their images.
@@ -29,6 +34,7 @@ class Detection:
         self.size: tuple[int, int] | None = None
         self.scale = FULL_SIZE
         self.frames = 0
+        self._first_ns = 0
         self.standing = False
         self._config = config
         self._motion = MotionEstimator(config.motion, config.mask, mask)
@@ -44,9 +50,12 @@ class Detection:
     def push(self, frame: Frame) -> list[Turn]:
         """Take the next frame; return the turns that it completes or changes.
 
-        Raises InputError when its size differs from the first one's, or from the mask's.
+        Raises InputError when its size differs from the first one's, or from the mask's, when it
+        is no grey picture of bytes, and when the stamps cannot be nanoseconds.
         """
+        _check_image(frame)
         self._check_size(frame)
+        self._check_stamps(frame)
         self.frames += 1
         frame = self.scale.frame(frame)
         motion = self._motion.push(frame)
@@ -100,3 +109,22 @@ class Detection:
                 f'the image size changes from {self.size[0]}x{self.size[1]} to '
                 f'{frame.size[0]}x{frame.size[1]} at frame {frame.index}: calibrate each size '
                 f'on its own')
+
+    def _check_stamps(self, frame: Frame) -> None:
+        """Check once that time passes between the first images, in the right unit."""
+        if self.frames == 0:
+            self._first_ns = frame.stamp_ns
+        passed = frame.stamp_ns - self._first_ns
+        if self.frames == FIRST_FRAMES and 0 <= passed < FIRST_FRAMES * SHORTEST_NS:
+            raise InputError(
+                f'{FIRST_FRAMES} images pass in {passed} ns: Frame.stamp_ns must rise, and count '
+                f'nanoseconds, not seconds, milliseconds or images')
+
+
+def _check_image(frame: Frame) -> None:
+    if frame.image.ndim != 2 or frame.image.dtype != np.uint8:
+        shape = 'x'.join(map(str, frame.image.shape))
+        raise InputError(
+            f'Frame.image must be grey, (height, width) of uint8, and frame {frame.index} has '
+            f'{shape} of {frame.image.dtype}: convert it, with '
+            f'cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if it is in colour')
