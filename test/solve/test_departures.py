@@ -125,8 +125,8 @@ def test_a_windscreen_that_bends_the_picture_is_named():
 
 
 def test_what_tracks_share_makes_sigma_larger():
-    fixed = solved(scenes_of(4, tracks=260))
-    slightly = solved(moved(scenes_of(4, tracks=260), lambda scene: bent(scene, 0.8)))
+    fixed = solved(scenes_of(3))
+    slightly = solved(moved(scenes_of(3), lambda scene: bent(scene, 1.0)))
     strength = max(each.strength for each in slightly.departures)
     assert strength > 1.5
     assert slightly.picture.rms > 1.1 * fixed.picture.rms
