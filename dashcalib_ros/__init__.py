@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dashcalib_ros.calibrator import Calibrator, calibrate
+    from dashcalib_ros.calibrator import Calibrator, calibrate, check
     from dashcalib_ros.camera import Camera
     from dashcalib_ros.config import Config
     from dashcalib_ros.frames import Frame
@@ -18,11 +18,12 @@ from dashcalib_ros.limits import PIXELS
 # OpenCV reads it when it is loaded; image headers are checked before decoding, too
 os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(PIXELS))
 
-__all__ = ['Calibration', 'Calibrator', 'Camera', 'Config', 'Frame', 'calibrate', 'open_frames']
+__all__ = ['Calibration', 'Calibrator', 'Camera', 'Config', 'Frame', 'calibrate', 'check',
+           'open_frames']
 
 _HOMES = {'Calibration': 'judgement', 'Calibrator': 'calibrator', 'Camera': 'camera',
           'Config': 'config', 'Frame': 'frames', 'calibrate': 'calibrator',
-          'open_frames': 'inputs'}
+          'check': 'calibrator', 'open_frames': 'inputs'}
 
 
 def __getattr__(name: str) -> Any:

@@ -4,25 +4,31 @@ The stages are in stages.py; the Calibrator decides only what runs when.
 """
 from __future__ import annotations
 
-import os
 import threading
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from dashcalib_ros import stages
 from dashcalib_ros.arrays import Mask
-from dashcalib_ros.camera import searched
+from dashcalib_ros.camera import Camera, searched
+from dashcalib_ros.checking import Check, Monitor, Odometry, Poses, Reading, watch, with_lines
 from dashcalib_ros.config import Config
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.frames import Frame, FrameSource
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.judgement.agreement import evidence_of
-from dashcalib_ros.judgement.conclude import Evidence, evidence_of_detection
+from dashcalib_ros.judgement.conclude import CONTRADICTS, Evidence, evidence_of_detection
+from dashcalib_ros.motion.motion import TrackedPoints
 from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turns import Turn, TurnId
 from dashcalib_ros.turns.detection import Detection
+
+if TYPE_CHECKING:
+    from dashcalib_ros.inputs import Paths
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,8 @@ class Status:
     frames: pushed so far. turns: in the bank and stored. built: how many scenes a calibration
     would use now; ready: their turns; yaw_deg: the sum of their yaw. stored: how many turns are of
     earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
+    yaws_deg: of the turns in ready, in their order. reconstructed: the turns of this drive that
+    watch() has scenes of, chosen or not.
     """
 
     frames: int
@@ -42,6 +50,27 @@ class Status:
     standing: bool
     ready: tuple[TurnId, ...] = ()
     stored: int = 0
+    yaws_deg: tuple[float, ...] = ()
+    reconstructed: tuple[TurnId, ...] = ()
+
+
+@dataclass(frozen=True)
+class View:
+    """What is seen in the newest frame: for pictures that people look at.
+
+    valid: (h, w) of the frame, or of the frame resized; None: no ego vehicle is known.
+    """
+
+    points: TrackedPoints
+    valid: Mask | None
+
+
+@dataclass(frozen=True)
+class _Read:
+    """What turns say of a camera in use, which is of the resized pictures; added to."""
+
+    camera: Camera
+    turns: dict[TurnId, Reading]
 
 
 class Calibrator:
@@ -73,6 +102,9 @@ class Calibrator:
         self._detection = Detection(self._config, mask)
         self._scenes = SceneSelection(self._config, self._detection, self._lock, live, verbose,
                                       use_stored, warn, inline, on_trouble)
+        self._live = live
+        self._solution: Solution | None = None
+        self._read: _Read | None = None
         self._detect_s = 0.0
         self._started = time.monotonic()
 
@@ -114,8 +146,10 @@ class Calibrator:
         solution: Solution | None = None
         if scenes:
             solution = self._scenes.run(stages.solve, scenes, self._config, progress=tell)
-            self._scenes.reject({scene.turn for scene in scenes}
-                                - evidence_of(solution, self._config.verdict))
+            self._scenes.reject(dict.fromkeys(
+                {scene.turn for scene in scenes} - evidence_of(solution, self._config.verdict),
+                CONTRADICTS))
+        self._solution = solution
         return stages.judge(solution, self._evidence(started), self._config)
 
     def _evidence(self, started: float) -> Evidence:
@@ -125,7 +159,71 @@ class Calibrator:
         with self._lock:
             return evidence_of_detection(
                 self._detection, self._scenes.built(), timing, tuple(self._scenes.warnings),
-                self._scenes.stored_before())
+                self._scenes.stored_before(), self._scenes.left_out(),
+                None if self._live else self._scenes.pictures())
+
+    def check(self, given: Camera, calibration: Calibration, progress: Progress | None = None
+              ) -> Check:
+        """Say whether a given camera explains the drive.
+
+        given: of the full-size pictures. calibration: what the last calibrate() returned.
+        progress: as for calibrate().
+        """
+        found: Check = self._scenes.run(
+            stages.check, given, calibration.image_size, self._solution, calibration.verdict,
+            self._config, progress=progress or (lambda stage, done: None))
+        with self._lock:
+            lines = self._detection.lines()
+        return with_lines(found, given, lines, calibration.image_size, self._config)
+
+    def odometry(self, given: Camera, calibration: Calibration, poses: Poses,
+                 progress: Progress | None = None) -> Odometry | None:
+        """Compare the motion that cameras find in the turns with true poses.
+
+        The cameras: given, the drive's own, and a trivial guess. given, calibration: as for
+        check(). Returns None where the drive has no camera of its own. Raises InputError where
+        given is for pictures of another size, or no turn has poses.
+        """
+        if self._solution is None:
+            return None
+        found: Odometry = self._scenes.run(
+            stages.odometry, given, calibration.image_size, self._solution, poses, self._config,
+            progress=progress or (lambda stage, done: None))
+        return found
+
+    def watch(self, camera: Camera, sigma: Mapping[str, float] | None = None,
+              progress: Progress | None = None) -> Monitor:
+        """Return whether the turns so far show that a camera in use has changed.
+
+        camera: of the full-size pictures; sigma: of its parameters, None where not known. Turns
+        that were read with the same camera before are not read again. progress: as for
+        calibrate(). Raises InputError where the camera is for pictures of another size.
+        """
+        with self._lock:
+            size, scale = self._detection.size, self._detection.scale
+            scenes = {scene.turn: scene for scene in self._scenes.built() if scene is not None}
+        if camera.image_size != size:
+            raise InputError(f'the camera in use is for pictures of another size: '
+                             f'{camera.image_size[0]}x{camera.image_size[1]}')
+        small = camera.resized(1 / scale.px, scale.size(size))
+        if self._read is None or self._read.camera != small:
+            self._read = _Read(small, {})
+        turns = self._read.turns
+        new = [scene for turn, scene in scenes.items() if turn not in turns]
+        if new:
+            readings: tuple[Reading, ...] = self._scenes.run(
+                stages.read, new, small, self._config,
+                progress=progress or (lambda stage, done: None))
+            turns |= {reading.turn: reading for reading in readings}
+        # fx, fy, cx and cy are pixels
+        scaled = {name: value / scale.px if name in small.names()[:4] else value
+                  for name, value in (sigma or {}).items()}
+        return watch((turns[turn] for turn in sorted(turns)), small, scaled, self._config.monitor)
+
+    @property
+    def solution(self) -> Solution | None:
+        """Return what the last calibrate() judged, in the resized pictures' pixels."""
+        return self._solution
 
     def turns(self) -> tuple[Turn, ...]:
         """Return the bank's turns, the most prominent first."""
@@ -139,11 +237,26 @@ class Calibrator:
             found = self._detection
             return Status(found.frames, len(found.turns()) + stored, len(chosen),
                           sum(scene.yaw_deg for scene in chosen), found.magnitude,
-                          found.standing, tuple(scene.turn for scene in chosen), stored)
+                          found.standing, tuple(scene.turn for scene in chosen), stored,
+                          tuple(scene.yaw_deg for scene in chosen),
+                          tuple(scene.turn for scene in self._scenes.built()
+                                if scene is not None))
+
+    def view(self) -> View:
+        """Return what is tracked and masked in the newest frame."""
+        with self._lock:
+            return View(self._detection.points(), self._detection.valid())
+
+    def want(self, turns: int) -> None:
+        """Use so many turns from the next calibration on, turns.capacity at the most."""
+        with self._lock:
+            if turns != self._config.turns.wanted:
+                self._config = self._config.replace({'turns.wanted': turns})
+                self._scenes.want(turns)
 
     def reject(self, turns: Iterable[TurnId]) -> None:
         """Take turns out that are not of the present camera."""
-        self._scenes.reject(turns)
+        self._scenes.reject(dict.fromkeys(turns, CONTRADICTS))
 
     def forget_stored(self) -> None:
         """Drop the turns of earlier drives, also on disk: for a camera that has changed since."""
@@ -169,16 +282,40 @@ class Calibrator:
         self.close()
 
 
-def calibrate(path: str | os.PathLike[str], fps: float | None = None,
-              config: Config | None = None, topic: str | None = None) -> Calibration:
+def calibrate(path: Paths, fps: float | None = None,
+              config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
+              duration_s: float | None = None) -> Calibration:
     """Calibrate a recorded drive.
 
-    path, topic, fps: as for open_frames(). Raises InputError for what cannot be read; a drive that
-    teaches too little gives a calibration that is weak or refused.
+    path, topic, fps, start_s, duration_s: as for open_frames(). Raises InputError for what cannot
+    be read; a drive that teaches too little gives a calibration that is weak or refused.
     """
     # the node has no use for the readers of files
     from dashcalib_ros.inputs import open_frames
+    source = open_frames(path, topic, fps, start_s, duration_s)
     with Calibrator(config) as calibrator:
-        for frame in open_frames(path, topic, fps):
+        for frame in source:
             calibrator.push(frame)
-        return calibrator.calibrate()
+        return with_source(calibrator.calibrate(), source)
+
+
+def check(given: Camera, path: Paths, fps: float | None = None,
+          config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
+          duration_s: float | None = None) -> Check:
+    """Say whether a camera explains a recorded drive.
+
+    given: of the drive's pictures. All others are those of open_frames(). Raises InputError for
+    what cannot be read.
+    """
+    from dashcalib_ros.inputs import open_frames
+    with Calibrator(config) as calibrator:
+        for frame in open_frames(path, topic, fps, start_s, duration_s):
+            calibrator.push(frame)
+        return calibrator.check(given, calibrator.calibrate())
+
+
+def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
+    """Return the calibration with its input's name and warnings."""
+    new = tuple(line for line in source.warnings if line not in calibration.warnings)
+    return replace(calibration, input_name=calibration.input_name or source.name,
+                   warnings=(*new, *calibration.warnings))

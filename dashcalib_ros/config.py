@@ -219,6 +219,24 @@ class IntrinsicsConfig:
 
 
 @dataclass(frozen=True)
+class LinesConfig:
+    """Upright lines of the world: poles and the edges of houses, a second witness."""
+
+    period_s: float = expert(
+        0.5, 's between the images that are searched; more often costs time and adds little',
+        0.0, 600.0)
+    images: int = expert(
+        300, 'searched at the most; when there are more, every second one is dropped', 10, 10000)
+    min_length_px: int = expert(
+        40, 'px; a shorter line shows too little of its bend', 32, 10000)
+    contrast: float = expert(
+        4.0, 'grey levels per px across a line; noise of 6 levels comes to 0.7', 0.1, 255.0)
+    group_s: float = expert(
+        5.0, 's; images of so long a time may show the same line, and count as one witness',
+        0.1, 600.0)
+
+
+@dataclass(frozen=True)
 class VerdictConfig:
     """When a result is weak or refused."""
 
@@ -243,8 +261,70 @@ class VerdictConfig:
         0.0, 1.0)
     max_untold_model_error: float = expert(
         0.005, 'of fx or the width; a warning comes if p1, p2 and k3 would change more', 0.0, 1.0)
+    max_line_sigmas: float = expert(
+        4.0, 'of both; where straight lines ask for another k1 by more, the result is weak',
+        1.0, 1e6)
+    max_line_move: float = expert(
+        0.001, 'of the width; only if that k1 moves the picture by more: less does no harm',
+        0.0, 1.0)
     max_misfit: float = expert(
         2.0, "times a turn's cost with a camera of its own; more is weak: another lens", 1.0, 1e4)
+
+
+@dataclass(frozen=True)
+class FleetConfig:
+    """Many cameras: dashcalib batch."""
+
+    turns: int = expert(
+        20, 'of one camera at the most; a clip with one bend knows a little, twenty much', 1, 200)
+    attempts: int = expert(
+        3, 'of a clip that kills its worker; then it is set aside, and others go on', 1, 100)
+    memory_mb: int = expert(
+        1200, 'MB declared for a task; measured: 250 MB, and up to 8 turns of 1440 px', 1, 2**20)
+    least_units: int = expert(
+        8, 'cameras of one make, beside the one it is for; fewer give it no prior', 3, 10**6)
+    focal_spread: float = expert(
+        0.0125, 'of fx between units of a model; 14 models in public profiles: 1 to 1.5 %',
+        1e-4, 1.0)
+    distortion_spread: float = expert(
+        0.01, 'of k1 and the like between units of a model: much less than of fx', 1e-5, 1.0)
+    spread_units: float = expert(
+        20.0, 'units that the two spreads count as, beside those of the fleet', 0.0, 1e6)
+    other_mode: float = expert(
+        3.0, 'sigmas off the fx of its make; a unit farther off is in another sensor mode',
+        1.0, 1e3)
+
+
+@dataclass(frozen=True)
+class MonitorConfig:
+    """Whether a camera in use has changed since, turn by turn."""
+
+    turns: int = expert(
+        8, 'newest turns that are looked at: a change shows within three of them', 3, 100)
+    limit: float = expert(
+        25.0, 'of the evidence for another lens, a chi-squared of 3; chance: once in 60000',
+        0.0, 1e6)
+    turn_limit: float = expert(
+        4.0, 'of one turn, the same: two sigma', 0.0, 1e6)
+    scatter: float = expert(
+        3.0, 'by which the turns of one camera vary more than their noise; KITTI 03: up to 5',
+        1.0, 100.0)
+    max_misfit: float = expert(
+        1.3, "times a turn's cost with its own camera; in 88 turns of one camera: 1.21 at most",
+        1.0, 1e4)
+    least_change: float = expert(
+        0.008, 'of fx, or of the width: smaller changes are not told', 0.0, 1.0)
+    heading_limit: float = expert(
+        4.0, 'sigmas between the directions of travel before and after the camera was moved',
+        0.0, 100.0)
+    least_turned_deg: float = expert(
+        0.6, 'degrees; a camera that was moved by less is not told', 0.0, 90.0)
+    heading_sigma_deg: float = expert(
+        0.15, 'degrees; the direction of travel varies so much between turns, sideways', 0.0, 10.0)
+    pitch_sigma_deg: float = expert(
+        0.2, 'degrees; the same up and down: roads, brakes and load', 0.0, 10.0)
+    max_heading_sigma_deg: float = expert(
+        1.0, 'degrees; a turn that shows the direction of travel worse is not used', 0.0, 90.0)
 
 
 @dataclass(frozen=True)
@@ -271,7 +351,10 @@ class Config:
     tracks: TracksConfig = field(default_factory=TracksConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
+    lines: LinesConfig = field(default_factory=LinesConfig)
     verdict: VerdictConfig = field(default_factory=VerdictConfig)
+    monitor: MonitorConfig = field(default_factory=MonitorConfig)
+    fleet: FleetConfig = field(default_factory=FleetConfig)
 
     def __post_init__(self) -> None:
         for name, spec, value in _settings(self):
@@ -314,14 +397,15 @@ class Config:
         return cls().replace(flat)
 
 
-def describe() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
+def describe(fleet: bool = False) -> Iterator[tuple[str, dataclasses.Field[Any]]]:
     """Yield (full name, field) of every setting, those for experts after the others.
 
+    fleet: with those of FleetConfig, for which one drive, and the node, have no use.
     field.metadata has reason, minimum, maximum, choices, pattern and expert.
     """
     for wanted in (False, True):
         for name, spec, _ in _settings(Config()):
-            if spec.metadata['expert'] is wanted:
+            if spec.metadata['expert'] is wanted and (fleet or not name.startswith('fleet.')):
                 yield name, spec
 
 

@@ -1,18 +1,20 @@
-"""The table of input kinds; open_frames() finds the kind of a path.
+"""The table of input kinds; open_frames() finds what its paths are.
 
 Nothing here loads OpenCV or rosbags before a drive is opened: `--help` stays quick.
 """
 from __future__ import annotations
 
+import glob
 import math
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dashcalib_ros.bags.names import METADATA, is_bag_file
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames.source import IMAGE_SUFFIXES, FrameSource, os_error
+from dashcalib_ros.frames.source import IMAGE_SUFFIXES, FrameSource, by_name, os_error
 from dashcalib_ros.limits import check_file, irregular_entry
 
 # not whatever FFmpeg takes: it would play a text file
@@ -21,24 +23,120 @@ VIDEO_SUFFIXES = frozenset(
      '.wmv', '.flv', '.3gp', '.ogv', '.mjpg', '.mjpeg', '.h264', '.264', '.h265', '.265', '.hevc'))
 
 
-def open_frames(path: str | os.PathLike[str], topic: str | None = None,
-                fps: float | None = None) -> FrameSource:
+Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
+
+def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
+                start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
     """Open a drive; its path tells the kind of input.
 
     path: a ROS 2 bag (folder, .mcap, .db3, zstd or not), a ROS 1 .bag, a video file, or a folder
-    of images, which are taken in the order of their names (2.png before 10.png).
+    of images, which are taken in the order of their names (2.png before 10.png). Also several of
+    these, of one camera: a sequence, taken in its order; a folder of videos or bags, or a pattern
+    (drives/*.mp4): bags by their time, all else by name. No turn spans two of them unless their
+    stamps go on; one that cannot be read is left out, with a warning.
     topic: the image topic of a bag; needed only when it has several.
     fps: images per second of a folder (default 10), or instead of what a video says (Hz).
+    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
 
     Raises InputError when there is nothing to read, or several topics and no choice among them.
     """
+    _check_numbers(fps, start_s, duration_s)
+    given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
+    groups = [_expanded(os.fspath(each)) for each in given]
+    if not groups:
+        raise InputError('no input was given: name a bag, a video or a folder of images')
+    if len(groups) == 1 and len(groups[0].paths) == 1:
+        source = _open_one(groups[0].paths[0], topic, fps)
+    else:
+        source = _joined(groups, topic, fps)
+    return source if not start_s and duration_s is None else source.excerpt(start_s, duration_s)
+
+
+def _check_numbers(fps: float | None, start_s: float, duration_s: float | None) -> None:
     if fps is not None and not (math.isfinite(fps) and 0 < fps <= 1000):
         raise InputError(f'fps must be above 0 and at most 1000, not {fps!r}')
-    place = Path(path)
+    if not (math.isfinite(start_s) and start_s >= 0):
+        raise InputError(f'the start must be 0 s or later, not {start_s!r}')
+    if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
+        raise InputError(f'the duration must be above 0 s, not {duration_s!r}')
+
+
+@dataclass(frozen=True)
+class _Group:
+    """The recordings that one argument names, by name."""
+
+    paths: tuple[Path, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def _expanded(text: str) -> _Group:
+    """Return the recordings that an argument names: itself, those in a folder, or a pattern's."""
+    _check_recorded(text)
+    path = Path(text)
+    try:
+        if path.is_dir():
+            return _in_folder(path)
+    except OSError as error:
+        raise InputError(os_error(path, error)) from error
+    if path.exists() or not glob.has_magic(text):
+        return _Group((path,))
+    found = sorted(map(Path, glob.glob(text, recursive=True)), key=lambda each: by_name(str(each)))
+    known = tuple(each for each in found if _kind_of(each) is not None)
+    if not known:
+        raise InputError(_unknown(found[0]) if found else
+                         f'no file is named like {text}: check the pattern')
+    return _Group(known, _left_out(text, len(found) - len(known)))
+
+
+def _in_folder(folder: Path) -> _Group:
+    """Return a bag or a folder of images itself, or else the videos and bags that are in it."""
+    if _fits_bag(folder):
+        return _Group((folder,))
+    entries = sorted(folder.iterdir(), key=lambda each: by_name(each.name))
+    found = tuple(each for each in entries if not each.name.startswith('.')
+                  and (_is_video(each) or (each.is_dir() and _fits_bag(each))))
+    images = sum(each.suffix.lower() in IMAGE_SUFFIXES for each in entries)
+    # cameras leave thumbnails beside their videos
+    if not found or images > len(found):
+        return _Group((folder,))
+    return _Group(found, _left_out(str(folder), images))
+
+
+def _left_out(where: str, count: int) -> tuple[str, ...]:
+    return (f'{where}: left out {count} other file{"s" * (count > 1)}',) if count else ()
+
+
+def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> FrameSource:
+    """Open all recordings of all groups as one drive; those that cannot be read are left out."""
+    from dashcalib_ros.frames.joined import JoinedSource
+    parts: list[FrameSource] = []
+    warnings = [line for group in groups for line in group.warnings]
+    failures: list[str] = []
+    for group in groups:
+        opened = []
+        for path in group.paths:
+            try:
+                opened.append(_open_one(path, topic, fps))
+            except InputError as error:
+                failures.append(str(error))
+        begins = [source.begin_ns for source in opened]
+        if None not in begins:
+            opened = [source for _, source in sorted(
+                zip(begins, opened, strict=True), key=lambda pair: pair[0] or 0)]
+        parts += opened
+    if not parts:
+        more = f' (and {len(failures) - 1} more like it)' if len(failures) > 1 else ''
+        raise InputError(f'none of the files can be read: {failures[0]}{more}')
+    return JoinedSource(parts, (*warnings, *(f'one of the files is left out: {each}'
+                                             for each in failures)))
+
+
+def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
     try:
         if not place.is_dir():
             _check_readable(place)
-        kind = next((kind for kind in KINDS if kind.fits(place)), None)
+        kind = _kind_of(place)
         if kind is None:
             raise InputError(_unknown(place))
         return kind.open(place, topic, fps)
@@ -81,13 +179,34 @@ def _open_folder(path: Path, topic: str | None, fps: float | None) -> FrameSourc
     return FolderSource(path, topic, fps)
 
 
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
+
+
 #: the first that fits is taken: a folder with a bag in it is no folder of images
 KINDS = (
     InputKind('bag', _fits_bag, _open_bag),
-    InputKind('video', lambda path: path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir(),
-              _open_video),
+    InputKind('video', _is_video, _open_video),
     InputKind('folder of images', Path.is_dir, _open_folder),
 )
+
+
+def _kind_of(path: Path) -> InputKind | None:
+    return next((kind for kind in KINDS if kind.fits(path)), None)
+
+
+def _check_recorded(text: str) -> None:
+    """Raise InputError for a live stream: a drive is read from its beginning to its end."""
+    if re.match(r'[a-z][a-z0-9+.-]+://', text, re.IGNORECASE):
+        raise InputError(
+            f'{text} is a stream: record it first (ffmpeg -i {text} -c copy -t 900 drive.mp4) and '
+            f'give that file, or publish it in ROS and run the node (ros2 run dashcalib_ros '
+            f'calibrator)')
+    if re.match(r'/dev/video\d', text):
+        raise InputError(
+            f'{text} is a live camera: record it first (ffmpeg -f v4l2 -i {text} -t 900 '
+            f'drive.mp4) and give that file, or run v4l2_camera and the node (ros2 run '
+            f'dashcalib_ros calibrator)')
 
 
 def _check_readable(path: Path) -> None:

@@ -2,11 +2,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.reconstruction.picture import TurnPicture
 from dashcalib_ros.reconstruction.repeated import without_repeated
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
@@ -19,6 +20,10 @@ from dashcalib_ros.workers.worker import Worker
 
 Progress = Callable[[str, float], None]
 
+# why a turn is not used, in words
+NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow enough points, or '
+            'the car hardly moved')
+
 
 class SceneSelection:
     """Lets the pool reconstruct the best turns; chooses scenes among these and stored turns.
@@ -27,10 +32,11 @@ class SceneSelection:
 
     Threads: the Calibrator's lock guards the detection, the places and the stored turns. It is
     held only briefly, as push() needs it for each frame: no thread that holds it waits for a
-    worker or for a file (except in load(), once). load(), submit(), chosen(), built(), stored()
-    and stored_before() must be called with the lock held; all other methods without it, as they
-    take it themselves. Locks are taken in this order: the store's (of its files), this one, the
-    pool's. The pool's threads call _store() without any lock.
+    worker or for a file (except in load(), once). load(), want(), submit(), chosen(), built(),
+    stored(), pictures(), left_out() and stored_before() must be called with the lock held; all
+    other methods without it, as they take it themselves. Locks are taken in this order: the
+    store's (of its files), this one, the pool's. The pool's threads call _store() without any
+    lock.
     """
 
     def __init__(self, config: Config, detection: Detection, lock: threading.Lock,
@@ -49,6 +55,8 @@ class SceneSelection:
         self._warn = warn
         self._on_trouble = on_trouble
         self._closed = False
+        # why turns were taken out
+        self._rejected: dict[TurnId, str] = {}
         turns = config.turns
         self._kept = TurnStore(turns.store, max(turns.capacity, turns.wanted), turns.half_width,
                                self._store_failed)
@@ -61,7 +69,7 @@ class SceneSelection:
 
         self._pool = ScenePool(config, InlineWorker if inline else child,
                                queue=turns.wanted if live else None, on_built=self._store,
-                               on_lost=self._lost, on_trouble=on_trouble)
+                               on_lost=self._lost, on_trouble=on_trouble, keep_pictures=not live)
 
     # with the lock held
 
@@ -70,6 +78,11 @@ class SceneSelection:
         assert self._detection.size is not None
         self._kept.load(Origin(self._detection.size, self._detection.scale, frame_id),
                            self._use_stored)
+
+    def want(self, turns: int) -> None:
+        """Use so many turns from now on; more again where these leave a result weak."""
+        self._config = self._config.replace({'turns.wanted': turns})
+        self._places = turns
 
     def submit(self, replace_failed: bool = False) -> None:
         """Have the best turns reconstructed; live: all, as a scene is a fiftieth of its images.
@@ -81,6 +94,7 @@ class SceneSelection:
         self._kept.drop_repeated(turn.stamp_s for turn in turns.values())
         built = self._pool.scenes()
         self._pool.keep_only(set(turns))
+        self._rejected = {key: why for key, why in self._rejected.items() if key in turns}
         places = self._places
         for key in self._ranked():
             turn = turns.get(key)
@@ -97,6 +111,15 @@ class SceneSelection:
     def built(self) -> Collection[Scene | None]:
         """Return the results of this drive's turns: scenes, None for a turn that gave none."""
         return self._pool.scenes().values()
+
+    def pictures(self) -> dict[TurnId, TurnPicture]:
+        """Return one picture of each turn that is done; none in a live drive."""
+        return self._pool.pictures()
+
+    def left_out(self) -> dict[TurnId, str]:
+        """Return why turns that were tried are without a scene now, in words."""
+        failed = {turn for turn, scene in self._pool.scenes().items() if scene is None}
+        return {turn: NO_SCENE for turn in failed} | self._rejected
 
     def stored_before(self) -> tuple[StoredTurn, ...]:
         """Return the turns of earlier drives that the last wanted() had to choose from."""
@@ -169,7 +192,8 @@ class SceneSelection:
                     # the next best turns take their places
                     self.warnings += [_repeated_text(turn, other)
                                       for turn, other in sorted(repeated.items())]
-                    self.reject(repeated)
+                    self.reject({turn: f'shows the same pictures as {other}, which counts'
+                                 for turn, other in repeated.items()})
                     continue
                 with self._lock:
                     self._stored_before = self.stored()
@@ -185,10 +209,11 @@ class SceneSelection:
             self._places = most
             return True
 
-    def reject(self, keys: Iterable[TurnId]) -> None:
-        """Take out scenes that do not fit the others."""
+    def reject(self, reasons: Mapping[TurnId, str]) -> None:
+        """Take out scenes that do not fit the others, each for a reason in words."""
         with self._lock:
-            for key in keys:
+            self._rejected.update(reasons)
+            for key in reasons:
                 if self._kept.turns.pop(key, None) is None:
                     self._pool.reject(key)
         self._store()

@@ -13,9 +13,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 
 from dashcalib_ros.arrays import Mask
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.checking import Check, Odometry, Poses, Reading
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames import Frame
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.frames.scale import Scale
+from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.judgement.conclude import Evidence, conclude
 from dashcalib_ros.reconstruction.scene import Draft, Scene
 from dashcalib_ros.solve.solution import Solution
@@ -92,3 +96,43 @@ def solve(scenes: Sequence[Scene], config: Config,
 def judge(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
     """Return the calibration with its verdict; solution: None if there is none."""
     return conclude(solution, evidence, config)
+
+
+def check(given: Camera, image_size: tuple[int, int], solution: Solution | None, verdict: Verdict,
+          config: Config, progress: Progress = lambda stage, done: None) -> Check:
+    """Say whether a given camera explains a drive of which these are the solution and verdict.
+
+    image_size: (width, height) of the drive's pictures.
+    """
+    from dashcalib_ros import checking
+    progress('the turns with the given camera', 0.0)
+    return checking.check(given, image_size, solution, verdict, config)
+
+
+def odometry(given: Camera, image_size: tuple[int, int], solution: Solution, poses: Poses,
+             config: Config, progress: Progress = lambda stage, done: None) -> Odometry:
+    """Return what a given camera, the drive's own and a trivial guess make of its true motion.
+
+    Raises InputError where given is for pictures of another size, or no turn has poses.
+    """
+    from dashcalib_ros import checking
+    if given.image_size != image_size:
+        raise InputError(
+            f'the calibration is for {given.image_size[0]}x{given.image_size[1]} pictures, and '
+            f'those of the drive have {image_size[0]}x{image_size[1]}: poses tell nothing of it')
+    progress('the turns beside the poses', 0.0)
+    own = solution.camera
+    small = given.resized(1 / Scale.of(image_size, config).px, own.image_size)
+    cameras = {'given': small, 'ours': own, 'guess': checking.trivial_guess(own.image_size)}
+    return checking.odometry(solution.scenes, cameras, poses, config)
+
+
+def read(scenes: Sequence[Scene], camera: Camera, config: Config,
+         progress: Progress = lambda stage, done: None) -> tuple[Reading, ...]:
+    """Return what each turn says of a camera in use, and of how it is mounted.
+
+    camera: of the scenes' pictures.
+    """
+    from dashcalib_ros.checking.reading import reading_of
+    progress('the turns with the camera in use', 0.0)
+    return tuple(reading_of(scene, camera, config) for scene in scenes)

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -304,10 +304,16 @@ def _count(files: list[Any]) -> str:
 
 
 def _arrays(turn: StoredTurn, origin: Origin) -> dict[str, Any]:
-    scene = turn.scene
     values = {
         'format': FORMAT, 'image_size': origin.image_size, 'shrink': origin.scale.shrink,
-        'enlarge': origin.scale.enlarge, 'frame_id': origin.frame_id,
+        'enlarge': origin.scale.enlarge, 'frame_id': origin.frame_id}
+    return {**{name: np.asarray(value) for name, value in values.items()}, **turn_arrays(turn)}
+
+
+def turn_arrays(turn: StoredTurn) -> dict[str, npt.NDArray[Any]]:
+    """Return a turn as plain arrays by name; turn_of() is the inverse."""
+    scene = turn.scene
+    values = {
         'stamp_s': turn.stamp_s, 'prominence': turn.prominence,
         'frames': scene.tracks.frames, 'xy': scene.tracks.xy, 'size': scene.tracks.image_size,
         'stamps_ns': scene.tracks.stamps_ns,
@@ -336,7 +342,7 @@ def _read(path: Path) -> tuple[Origin, StoredTurn]:
     """
     try:
         data = _loaded(path)
-        origin, turn = _origin(data), _turn(data)
+        origin, turn = _origin(data), turn_of(data)
         if turn.scene.tracks.image_size != origin.scale.size(origin.image_size):
             raise ValueError('its numbers are no valid scene')
         return origin, turn
@@ -355,19 +361,28 @@ def _loaded(path: Path) -> dict[str, npt.NDArray[Any]]:
         about = os.fstat(stream.fileno())
         if not stat.S_ISREG(about.st_mode):
             raise ValueError('it is no regular file')
-        if about.st_size > LARGEST:
-            raise ValueError('it is too large')
-        with zipfile.ZipFile(stream) as members:
-            _check_sizes(members)
-        stream.seek(0)
-        with np.load(stream, allow_pickle=False) as data:
-            return dict(data)
+        return arrays_in(stream, about.st_size)
 
 
-def _check_sizes(members: zipfile.ZipFile) -> None:
+def arrays_in(stream: BinaryIO, size: int, largest: int = LARGEST,
+              largest_unpacked: int = LARGEST_UNPACKED) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of an npz file of this size in bytes, without pickle.
+
+    Raises ValueError, among others, before it takes more memory than largest_unpacked.
+    """
+    if size > largest:
+        raise ValueError('it is too large')
+    with zipfile.ZipFile(stream) as members:
+        _check_sizes(members, largest_unpacked)
+    stream.seek(0)
+    with np.load(stream, allow_pickle=False) as data:
+        return dict(data)
+
+
+def _check_sizes(members: zipfile.ZipFile, largest_unpacked: int) -> None:
     """Raise ValueError when the arrays would take too much memory, or more than they fill."""
     found = members.infolist()
-    if sum(member.file_size for member in found) > LARGEST_UNPACKED:
+    if sum(member.file_size for member in found) > largest_unpacked:
         raise ValueError('it is too large when unpacked')
     for member in found:
         if member.compress_type not in COMPRESSIONS:
@@ -395,8 +410,8 @@ def _origin(data: Mapping[str, npt.NDArray[Any]]) -> Origin:
     return Origin((width, height), scale, str(_array(data, 'frame_id', str, ())))
 
 
-def _turn(data: Mapping[str, npt.NDArray[Any]]) -> StoredTurn:
-    """Return the turn; raises ValueError unless its numbers are valid for the core."""
+def turn_of(data: Mapping[str, npt.NDArray[Any]]) -> StoredTurn:
+    """Return the turn; raises ValueError, or KeyError, unless it is valid for the core."""
     xy = np.asarray(data['xy'])
     k, t = xy.shape[:2] if xy.ndim == 3 else (0, 0)
     tracks = Tracks(

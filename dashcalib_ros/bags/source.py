@@ -1,12 +1,12 @@
 """A bag as a drive."""
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dashcalib_ros.arrays import GreyImage
 from dashcalib_ros.bags.storage import CURE, Bag, Topic, open_bag
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.decode import BitDepth, decode
@@ -22,6 +22,7 @@ class BagSource(FrameSource):
     """
 
     _cure = CURE
+    recorded = True
 
     def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:
         self._bag = open_bag(path)
@@ -31,43 +32,50 @@ class BagSource(FrameSource):
             warnings.append(f'{path} is a bag, its images have stamps: fps is ignored')
         super().__init__(str(path), chosen.count, chosen.name, tuple(warnings))
 
-    def _pictures(self, reading: Reading) -> Iterator[Picture]:
+    @property
+    def begin_ns(self) -> int | None:
+        """Return when the first image was recorded; None where that cannot be read."""
+        try:
+            first = next(self._bag.records([str(self.topic)], lambda _: None), None)
+        except (InputError, OSError):
+            return None
+        return None if first is None else first.receive_ns
+
+    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
         gate, depth = StampGate(RECORDED), BitDepth()
         damage: list[str] = []
-        count = 0
+        first_ns: int | None = None
         try:
             for record in self._bag.records([str(self.topic)], damage.append):
-                index, count = count, count + 1
+                index = reading.images
+                reading.images += 1
                 try:
                     message = record.message()
                 except InputError as error:
-                    yield index, record.receive_ns, error, ''
+                    reading.failed(index, error)
                     continue
                 stamp_ns = gate.take(_header_ns(message), record.receive_ns)
-                if stamp_ns is not None:
-                    yield index, stamp_ns, _image(message, depth), str(message.header.frame_id)
-            reading.warnings += self._losses(count, damage)
+                if stamp_ns is None:
+                    continue
+                first_ns = stamp_ns if first_ns is None else first_ns
+                if stamp_ns - first_ns >= start_ns:
+                    yield Picture(index, stamp_ns, partial(decode, message, depth),
+                                  str(message.header.frame_id))
+            reading.warnings += self._losses(reading.images, damage)
         finally:
             reading.warnings += gate.warnings()
 
     def _losses(self, read: int, damage: list[str]) -> list[str]:
-        lost = (self.count or 0) - read if self._bag.indexed else 0
+        lost = (self._promised or 0) - read if self._bag.indexed else 0
         if not damage and lost <= 0:
             return []
         why = f' ({"; ".join(damage[:2])}{" ..." if len(damage) > 2 else ""})' if damage else ''
         start = f'the bag is damaged{why}: read {read}'
         if lost > 0:
-            return [f'{start} of {self.count} images; {lost} are lost']
+            return [f'{start} of {self._promised} images; {lost} are lost']
         if self._bag.indexed:
-            return [f'{start} of {self.count} images; none is lost']
+            return [f'{start} of {self._promised} images; none is lost']
         return [f'{start} images; how many are lost is not known']
-
-
-def _image(message: Any, depth: BitDepth) -> GreyImage | InputError:
-    try:
-        return decode(message, depth)
-    except InputError as error:
-        return error
 
 
 def _header_ns(message: Any) -> int:

@@ -29,6 +29,17 @@ def grid_of(camera: Camera) -> Floats:
 def mapping_error(camera: Camera, reference: Camera) -> float | None:
     """Return the RMS pixel distance between both cameras' images of the same rays.
 
+    None where mapping_difference() is.
+    """
+    difference = mapping_difference(camera, reference)
+    if difference is None:
+        return None
+    return float(np.sqrt(np.mean(np.sum(difference**2, -1))))
+
+
+def mapping_difference(camera: Camera, reference: Camera) -> Floats | None:
+    """Return (n, 2) by how many pixels both cameras' images of the same rays differ.
+
     The rays are those of a grid over the reference's image, without those that no camera of this
     kind can see (unseen_share()). None when the reference has no ray for a pixel of the grid, or
     the camera cannot see one of the others.
@@ -53,7 +64,7 @@ def mapping_error(camera: Camera, reference: Camera) -> float | None:
             rest = least_squares(residual, np.zeros(3)).fun
         except ValueError:  # a ray left the camera's view on the way
             return None
-    return float(np.sqrt(np.mean(np.sum(rest.reshape(-1, 2)**2, -1))))
+    return np.asarray(rest.reshape(-1, 2))
 
 
 def unseen_share(camera: Camera, reference: Camera) -> float:

@@ -1,7 +1,9 @@
 """A folder of images as a drive."""
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Generator
+from functools import partial
 from pathlib import Path
 
 from dashcalib_ros.arrays import GreyImage
@@ -33,17 +35,17 @@ class FolderSource(FrameSource):
         if topic is not None:
             warnings.append(f'{path} is a folder of images: topic {topic} is ignored')
         super().__init__(str(path), len(self._names), warnings=tuple(warnings))
+        self.length_ns = round(len(self._names) * 1e9 / self._fps)
 
-    def _pictures(self, reading: Reading) -> Iterator[Picture]:
+    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
         depth = BitDepth()
-        for index, name in enumerate(self._names):
-            yield index, round(index * 1e9 / self._fps), self._image(name, depth), ''
+        reading.images = len(self._names)
+        for index in range(math.ceil(start_ns * self._fps / 1e9), len(self._names)):
+            yield Picture(index, round(index * 1e9 / self._fps),
+                          partial(self._image, self._names[index], depth))
 
-    def _image(self, name: str, depth: BitDepth) -> GreyImage | InputError:
-        try:
-            return decode_file(read_file(self._path / name, PICTURE_BYTES, name), depth, name)
-        except InputError as error:
-            return error
+    def _image(self, name: str, depth: BitDepth) -> GreyImage:
+        return decode_file(read_file(self._path / name, PICTURE_BYTES, name), depth, name)
 
 
 def _is_image(name: str) -> bool:

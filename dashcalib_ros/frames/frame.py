@@ -14,12 +14,14 @@ class Frame:
     stamp_ns: time of exposure in nanoseconds (the message header's stamp, or index / rate).
     image: (height, width) uint8, grey. Never written to after the Frame is made.
     frame_id: the message header's; empty where there is none.
+    after_gap: it does not continue the one before, as the first of another video file.
     """
 
     index: int
     stamp_ns: int
     image: GreyImage
     frame_id: str = ''
+    after_gap: bool = False
 
     @property
     def size(self) -> tuple[int, int]:

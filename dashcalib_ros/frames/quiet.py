@@ -9,4 +9,6 @@ import cv2
 
 os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')  # read when the first video is opened
 if 'OPENCV_LOG_LEVEL' not in os.environ:
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    # OpenCV 4 has it elsewhere
+    set_log_level = getattr(cv2, 'setLogLevel', None) or cv2.utils.logging.setLogLevel
+    set_log_level(0)  # LOG_LEVEL_SILENT

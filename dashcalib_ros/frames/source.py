@@ -1,18 +1,17 @@
 """What every kind of input has in common."""
 from __future__ import annotations
 
+import copy
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from dashcalib_ros.arrays import GreyImage
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.frame import Frame
-
-#: index, stamp in ns, the image or why it could not be decoded, frame_id or ''
-Picture = tuple[int, int, GreyImage | InputError, str]
 
 IMAGE_SUFFIXES = frozenset(
     ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'))
@@ -34,19 +33,40 @@ def os_error(path: Path, error: OSError) -> str:
     return f'{path} cannot be read ({error.strerror}): check the disk or copy it again'
 
 
+@dataclass(frozen=True)
+class Picture:
+    """One image of the drive that is not decoded yet; index, stamp_ns and others as a Frame's.
+
+    decode: returns the image; raises InputError where that is not possible. file: that it is in,
+    where the drive has several.
+    """
+
+    index: int
+    stamp_ns: int
+    decode: Callable[[], GreyImage]
+    frame_id: str = ''
+    after_gap: bool = False
+    file: str = ''
+
+
 @dataclass
 class Reading:
-    """What went wrong in one pass over the images."""
+    """What happened in one pass over the images.
+
+    images: how many there were, also those that are no frames; complete after the last one.
+    """
 
     warnings: list[str] = field(default_factory=list)
+    images: int = 0
     decoded: int = 0
     undecodable: int = 0
     first_failure: str = ''
 
-    def failed(self, index: int, error: InputError) -> None:
+    def failed(self, index: int, error: InputError, file: str = '') -> None:
         """Count an image that cannot be decoded."""
         self.undecodable += 1
-        self.first_failure = self.first_failure or f'image {index}: {error}'
+        where = f'{file}: image {index}' if file else f'image {index}'
+        self.first_failure = self.first_failure or f'{where}: {error}'
 
     def summary(self) -> tuple[str, ...]:
         """Return all warnings, one line each."""
@@ -61,6 +81,9 @@ class FrameSource(ABC):
     name: of the drive, for messages.
     count: how many images to expect (for a progress bar), None if unknown.
     topic: the bag's image topic; None for videos and folders.
+    size: (width, height) where it is known before the first image, else None.
+    length_ns: how long the drive is where its stamps are counted from 0, else None.
+    recorded: its stamps are times of recording, as a bag has them. begin_ns: when it began, if so.
     warnings: what the user should know about the input; complete after the last frame.
 
     Frames are read one by one; no memory grows with the drive. Their stamps always increase.
@@ -68,20 +91,43 @@ class FrameSource(ABC):
     Iterating raises InputError when no image can be decoded or when their size changes.
     """
 
+    size: tuple[int, int] | None = None
+    length_ns: int | None = None
+    recorded = False
     _cure = 'check that it plays in another program, or record it again'
+    _start_ns = 0
+    _duration_ns: int | None = None
 
     def __init__(self, name: str, count: int | None, topic: str | None = None,
                  warnings: tuple[str, ...] = ()) -> None:
         self.name = name
-        self.count = count
+        self.count = self._promised = count
         self.topic = topic
         self._opening_warnings = warnings
         self._reading_warnings: tuple[str, ...] = ()
 
     @property
+    def begin_ns(self) -> int | None:
+        """Return when the recording began, None where that is not known."""
+        return None
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Return what the user should know, one line each; complete after the last frame."""
         return self._opening_warnings + self._reading_warnings
+
+    def excerpt(self, start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
+        """Return the part of the drive from start_s on, duration_s long; None: to its end."""
+        part = copy.copy(self)
+        part._start_ns = round(start_s * 1e9)
+        part._duration_ns = None if duration_s is None else round(duration_s * 1e9)
+        if self.count and self.length_ns:
+            left = max(0, self.length_ns - part._start_ns)
+            used = left if part._duration_ns is None else min(left, part._duration_ns)
+            part.count = round(self.count * used / self.length_ns) or None
+        else:
+            part.count = None
+        return part
 
     def __iter__(self) -> Iterator[Frame]:
         reading = Reading()
@@ -94,29 +140,53 @@ class FrameSource(ABC):
 
     def _frames(self, reading: Reading) -> Iterator[Frame]:
         size: tuple[int, int] | None = None
-        for index, stamp_ns, image, frame_id in self._pictures(reading):
-            if isinstance(image, InputError):
-                reading.failed(index, image)
-                continue
-            frame = Frame(index, stamp_ns, image, frame_id)
-            size = size or frame.size
-            if frame.size != size:
-                raise InputError(
-                    f'{self.name}: image {index} is {_by(frame.size)}, those before are '
-                    f'{_by(size)}: a calibration holds for one size; split the drive there')
-            reading.decoded += 1
-            yield frame
+        after_gap = False
+        with closing(self._excerpted(reading)) as pictures:
+            for picture in pictures:
+                after_gap |= picture.after_gap
+                try:
+                    image = picture.decode()
+                except InputError as error:
+                    reading.failed(picture.index, error, picture.file)
+                    continue
+                frame = Frame(picture.index, picture.stamp_ns, image, picture.frame_id, after_gap)
+                size = size or frame.size
+                if frame.size != size:
+                    raise InputError(
+                        f'{picture.file or self.name}: image {frame.index} is {_by(frame.size)}, '
+                        f'those before are {_by(size)}: a calibration holds for one size; '
+                        f'split the drive there')
+                reading.decoded += 1
+                after_gap = False
+                yield frame
         if not reading.decoded:
             raise InputError(self._no_image(reading))
 
+    def _excerpted(self, reading: Reading) -> Generator[Picture, None, None]:
+        """Yield the pictures from the excerpt's start to its end."""
+        first_ns: int | None = None
+        with closing(self._pictures(reading, self._start_ns)) as pictures:
+            for picture in pictures:
+                first_ns = picture.stamp_ns if first_ns is None else first_ns
+                passed = picture.stamp_ns - first_ns
+                if self._duration_ns is not None and passed >= self._duration_ns:
+                    return
+                yield picture
+
     def _no_image(self, reading: Reading) -> str:
+        if self._start_ns and not reading.undecodable and not reading.warnings:
+            return (f'{self.name} has no image from {self._start_ns / 1e9:g} s on: '
+                    f'give a smaller --start')
         reasons = [reading.first_failure] if reading.first_failure else reading.warnings
         why = '; '.join(reasons) or 'it has none'
         return f'{self.name} gave no image ({why}): {self._cure}'
 
     @abstractmethod
-    def _pictures(self, reading: Reading) -> Iterator[Picture]:
-        """Yield every image once, in order; add warnings for the user to reading."""
+    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
+        """Yield every image once, in order; add warnings and the number of images to reading.
+
+        start_ns: what is earlier, counted from the drive's first image, is left out.
+        """
 
 
 def _by(size: tuple[int, int]) -> str:

@@ -2,14 +2,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 import dashcalib_ros.frames.quiet  # noqa: F401
+from dashcalib_ros.arrays import GreyImage
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.source import FrameSource, Picture, Reading
 from dashcalib_ros.limits import check_pixels
@@ -29,26 +31,51 @@ class VideoSource(FrameSource):
             self._rate = fps or _rate(video, path)
             count = int(max(0.0, min(video.get(cv2.CAP_PROP_FRAME_COUNT), 1e9)))
             turn = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
+            self.size = (int(video.get(cv2.CAP_PROP_FRAME_WIDTH)),
+                         int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)))
         if turn:
             warnings.append(f'{path} says to turn its pictures by {turn} degrees: '
                             f'the calibration is for the turned pictures')
         super().__init__(str(path), count or None, warnings=tuple(warnings))
+        self.length_ns = round(count * 1e9 / self._rate) if count else None
 
-    def _pictures(self, reading: Reading) -> Iterator[Picture]:
-        index = 0
+    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
+        index = math.ceil(start_ns * self._rate / 1e9)
+        reading.images = min(index, self._promised or index)
         with _capture(self._path) as video:
-            while True:
-                found, image = video.read()
-                if not found:
-                    break
-                grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-                yield index, round(index * 1e9 / self._rate), np.asarray(grey, np.uint8), ''
+            found = _skip(video, index)
+            while found and video.grab():
+                reading.images = index + 1
+                yield Picture(index, round(index * 1e9 / self._rate), partial(_grey, video))
                 index += 1
+        if not found:
+            return
         # some containers only estimate how many pictures they hold
-        if self.count and index < 0.99 * self.count - 1:
+        if self._promised and index < 0.99 * self._promised - 1:
             reading.warnings.append(
-                f'the video is cut off or damaged: read {index} of {self.count} images; '
-                f'{self.count - index} are lost')
+                f'the video is cut off or damaged: read {index} of {self._promised} images; '
+                f'{self._promised - index} are lost')
+
+
+def _skip(video: cv2.VideoCapture, index: int) -> bool:
+    """Make the next picture the one with this index; return False where the video ends before."""
+    if index == 0:
+        return True
+    # seeking decodes only what follows the last complete picture before it
+    if video.set(cv2.CAP_PROP_POS_FRAMES, index) and video.get(cv2.CAP_PROP_POS_FRAMES) == index:
+        return True
+    video.set(cv2.CAP_PROP_POS_FRAMES, 0)
+    return all(video.grab() for _ in range(index))
+
+
+def _grey(video: cv2.VideoCapture) -> GreyImage:
+    """Return the picture that was grabbed. Raises InputError where it cannot be decoded."""
+    found, image = video.retrieve()
+    if not found:
+        raise InputError('the picture cannot be decoded: convert the video '
+                         '(ffmpeg -i IN -c:v libx264 OUT.mp4)')
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+    return np.asarray(grey, np.uint8)
 
 
 def _rate(video: cv2.VideoCapture, path: Path) -> float:

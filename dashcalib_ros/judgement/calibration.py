@@ -2,18 +2,26 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera import Camera, Fisheye
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.lines import Bend
+from dashcalib_ros.reconstruction.picture import TurnPicture
+from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.solve.opinions import HeldOut
 from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turns.turn import TurnId
 
 Level = Literal['accepted', 'weak', 'refused']
@@ -21,10 +29,14 @@ Level = Literal['accepted', 'weak', 'refused']
 
 @dataclass(frozen=True)
 class Verdict:
-    """accepted: use it. weak: look at the sigmas before using it. refused: there is no result."""
+    """accepted: use it. weak: look at the sigmas before using it. refused: there is no result.
+
+    reasons: one line each, what is wrong: what to do. cures: what to do, the gravest first.
+    """
 
     level: Level
     reasons: tuple[str, ...] = ()
+    cures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -32,6 +44,7 @@ class TurnSummary:
     """How one turn was used. center, first, last count the input's frames from 0.
 
     misfit: its cost with the shared camera, divided by that with its own: about 1, or less.
+    unused_because: why it is not used, in words.
     """
 
     center: int
@@ -45,6 +58,7 @@ class TurnSummary:
     yaw_deg: float | None = None
     reprojection_error_px: float | None = None
     misfit: float | None = None
+    unused_because: str | None = None
 
     @property
     def id(self) -> TurnId:
@@ -63,6 +77,7 @@ class StoredTurnSummary:
     images: int
     used: bool
     misfit: float | None = None
+    unused_because: str | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +95,20 @@ class Stabiliser:
     largest_px: float
 
 
+@dataclass(frozen=True)
+class Material:
+    """What the report draws. px: of the input, in one pixel of the scenes.
+
+    scenes: of all turns that were reconstructed, adjusted where the solution uses them. pictures:
+    of turns of this drive.
+    """
+
+    px: float = 1.0
+    solution: Solution | None = None
+    scenes: Mapping[TurnId, Scene] = field(default_factory=dict)
+    pictures: Mapping[TurnId, TurnPicture] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, repr=False)
 class Calibration:
     """The complete result. camera and sigma are None when the verdict is refused.
@@ -91,7 +120,10 @@ class Calibration:
     mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
     rolling_shutter: the one that was found, and whose effect was removed; None for a global one.
     stabiliser: the one that was found, and whose effect was removed; None for a fixed picture.
-    sigma_px: how far the whole camera may be off over the picture.
+    sigma_px: how far the whole camera may be off over the picture. held_out: what each turn says
+    of the calibration without it, in the full-size images' pixels; () for fewer than three turns.
+    straight_lines: what upright lines of the world say of the distortion; None: too few of them.
+    start_s: stamp of the first image. material: what the report draws, None in a live drive.
     """
 
     verdict: Verdict
@@ -113,6 +145,10 @@ class Calibration:
     rolling_shutter: Shutter | None = None
     sigma_px: PictureSigma | None = None
     stabiliser: Stabiliser | None = None
+    held_out: tuple[HeldOut, ...] = ()
+    straight_lines: Bend | None = None
+    start_s: float = 0.0
+    material: Material | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
@@ -136,6 +172,32 @@ class Calibration:
         """
         return np.array(self._camera.ros_distortion())
 
+    @property
+    def covariance(self) -> Floats:
+        """Return the covariance of the n parameters (n, n), in the order of camera.named.
+
+        Its diagonal is sigma squared. Raises InputError where there is no camera, or where the
+        correlations are not known.
+        """
+        names = self._camera.names()
+        correlation = np.array(self.details.get('correlation', ()), np.float64)
+        if self.sigma is None or correlation.shape != (len(names), len(names)):
+            raise InputError('this calibration does not know how its parameters are correlated: '
+                             'calibrate the drive again')
+        sigma = np.array([self.sigma[name] for name in names])
+        return np.asarray(correlation * np.outer(sigma, sigma))
+
+    def save(self, folder: str | os.PathLike[str] = 'calibration') -> tuple[Path, ...]:
+        """Write what `dashcalib run` writes into a folder, and return the files' paths.
+
+        These are result.json, report.html and calibration.yaml (calibration.weak.yaml where it is
+        weak, none where it is refused). Raises OutputError, which tells what to do.
+        """
+        # report/ is built on this room: it is loaded at the first use, as the package's names are
+        write_results = import_module('dashcalib_ros.report').write_results
+        files: tuple[Path, ...] = write_results(self, folder).files
+        return files
+
     def undistort(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return an image without distortion, as a camera with the matrix K sees it.
 
@@ -146,7 +208,7 @@ class Calibration:
         if image.shape[1::-1] != camera.image_size:
             raise InputError(f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
                              f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}')
-        if camera.sees_behind:
+        if camera.ros_model == Fisheye.ros_model:
             return np.asarray(cv2.fisheye.undistortImage(image, self.K, self.D, Knew=self.K))
         return np.asarray(cv2.undistort(image, self.K, self.D))
 
@@ -164,15 +226,21 @@ class Calibration:
     @property
     def misfits(self) -> dict[TurnId, float]:
         """Return the misfits of all turns that were in the adjustment, by turn."""
-        return {turn.id: turn.misfit for turn in self._all_turns if turn.misfit is not None}
+        return {turn.id: turn.misfit for turn in self.all_turns if turn.misfit is not None}
 
     @property
     def used_turns(self) -> set[TurnId]:
         """Return the turns that the result is based on, including those of earlier drives."""
-        return {turn.id for turn in self._all_turns if turn.used}
+        return {turn.id for turn in self.all_turns if turn.used}
 
     @property
-    def _all_turns(self) -> tuple[TurnSummary | StoredTurnSummary, ...]:
+    def yaw_deg(self) -> float:
+        """Return the yaw of the used turns together, degrees."""
+        return sum(turn.yaw_deg or 0.0 for turn in self.all_turns if turn.used)
+
+    @property
+    def all_turns(self) -> tuple[TurnSummary | StoredTurnSummary, ...]:
+        """Return the turns of this drive, then the stored ones."""
         return (*self.turns, *self.stored_turns)
 
     @property

@@ -3,8 +3,9 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib import metadata
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,20 +16,28 @@ from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.judgement.agreement import focal_disagreement
 from dashcalib_ros.judgement.calibration import (
     Calibration,
+    Material,
     Shutter,
     Stabiliser,
     StoredTurnSummary,
     TurnSummary,
     Verdict,
 )
-from dashcalib_ros.judgement.verdict import judge, profile_contrast
+from dashcalib_ros.judgement.verdict import Finding, judge, profile_contrast, verdict_of
+from dashcalib_ros.lines import Bend, Lines, bend
+from dashcalib_ros.reconstruction.picture import TurnPicture, picture_of
 from dashcalib_ros.reconstruction.scene import Scene, errors_px
 from dashcalib_ros.solve.departures import largest_crop
+from dashcalib_ros.solve.opinions import HeldOut, held_out
 from dashcalib_ros.solve.picture import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turn_store import StoredTurn
 from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.turns.turn import Turn, TurnId
+
+# why turns are not used
+CONTRADICTS = 'the camera of the other turns does not explain it'
+NOT_NEEDED = 'more prominent turns were enough'
 
 # result.json has their versions: a result's last digits depend on them
 PACKAGES = ('dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'pycolmap', 'pyceres')
@@ -39,7 +48,10 @@ class Evidence:
     """What a calibration needs beside the solution.
 
     image_size: of the input; scale: how it was resized for the scenes. built: scenes by their
-    turn. stored: the turns of earlier drives that were available.
+    turn. stored: the turns of earlier drives that were available. left_out: why turns were taken
+    out, in words. pictures: of turns whose images are gone; None: the report is not wanted.
+    start_s: stamp of the first image. lines: upright ones, in the resized images; None where they
+    were not looked for.
     """
 
     image_size: tuple[int, int]
@@ -52,32 +64,45 @@ class Evidence:
     timing: dict[str, float]
     warnings: tuple[str, ...] = ()
     stored: tuple[StoredTurn, ...] = ()
+    left_out: Mapping[TurnId, str] = field(default_factory=dict)
+    pictures: Mapping[TurnId, TurnPicture] | None = field(default_factory=dict)
+    start_s: float = 0.0
+    lines: Lines | None = None
 
 
 def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] = (),
                           timing: Mapping[str, float] | None = None,
                           warnings: tuple[str, ...] = (),
-                          stored: tuple[StoredTurn, ...] = ()) -> Evidence:
+                          stored: tuple[StoredTurn, ...] = (),
+                          left_out: Mapping[TurnId, str] | None = None,
+                          pictures: Mapping[TurnId, TurnPicture] | None = MappingProxyType({})
+                          ) -> Evidence:
     """Return the evidence from the first stage and from the scenes of its turns.
 
-    scenes: in any order; a turn without one is listed as not reconstructed.
+    scenes: in any order; a turn without one is listed as not reconstructed. left_out, pictures:
+    as Evidence's.
     """
     return Evidence(
         image_size=detection.size or (0, 0), scale=detection.scale, frames=detection.frames,
         turns=detection.turns(), magnitudes=detection.magnitudes(), mask=detection.valid(),
         built={scene.turn: scene for scene in scenes if scene is not None},
-        timing=dict(timing or {}), warnings=(*detection.warnings(), *warnings), stored=stored)
+        timing=dict(timing or {}), warnings=(*detection.warnings(), *warnings), stored=stored,
+        left_out=left_out or {}, pictures=pictures, start_s=detection.start_s,
+        lines=detection.lines())
 
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
     """Return the calibration; a refused one has no intrinsics, so that they cannot be used."""
-    verdict = judge(solution, config.verdict) if solution else _verdict_without_solution(evidence)
-    camera = sigma = error = shutter = sigma_px = stabiliser = None
+    witness = _witness(solution, evidence, config)
+    verdict = (judge(solution, config.verdict, witness) if solution
+               else _verdict_without_solution(evidence))
+    camera = sigma = error = shutter = sigma_px = stabiliser = straight_lines = None
     details: dict[str, object] = {}
+    without: tuple[HeldOut, ...] = ()
     warnings = evidence.warnings
     if solution is not None and verdict.level != 'accepted' and config.model != AUTO:
-        warnings += (f'the model {config.model} was asked for; {AUTO} takes the one that the '
-                     f'turns prove',)
+        warnings += (f'the lens model {config.model} was asked for and may be why the result is '
+                     f'{verdict.level}: --model {AUTO} takes the one that the turns prove',)
     if solution is not None:
         details = _details(solution)
         if verdict.level != 'refused':
@@ -88,6 +113,8 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
             sigma = dict(zip(camera.names(), (solution.sigma * units).tolist(), strict=True))
             error = solution.reprojection_error_px * px
             sigma_px = PictureSigma(solution.picture.rms * px, solution.picture.worst * px)
+            without = tuple(each.times(px) for each in held_out(solution, config.intrinsics))
+            straight_lines = witness and witness.resized(px)
             warnings += _model_error_warnings(solution, px, config)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
@@ -103,10 +130,18 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
         frames=evidence.frames, reprojection_error_px=error, timing=evidence.timing,
         versions=_versions(), config=config, magnitudes=evidence.magnitudes,
-        mask=_of_size(evidence.mask, evidence.image_size),
+        mask=_of_size(evidence.mask, evidence.image_size), held_out=without,
         details=details, rolling_shutter=shutter, stabiliser=stabiliser, sigma_px=sigma_px,
-        warnings=warnings,
-        stored_turns=tuple(_stored_summary(turn, solution) for turn in evidence.stored))
+        warnings=warnings, start_s=evidence.start_s, straight_lines=straight_lines,
+        material=_material(solution, evidence),
+        stored_turns=tuple(_stored_summary(turn, evidence, solution) for turn in evidence.stored))
+
+
+def _witness(solution: Solution | None, evidence: Evidence, config: Config) -> Bend | None:
+    """Return what straight lines say of the solution, in the resized images."""
+    if solution is None or evidence.lines is None:
+        return None
+    return bend(evidence.lines, solution.camera, config.lines, solution.covariance)
 
 
 def _of_size(mask: Mask | None, size: tuple[int, int]) -> Mask | None:
@@ -132,22 +167,23 @@ def _model_error_warnings(solution: Solution, px: float, config: Config) -> tupl
     changes = ', '.join(f'{name} by {px * shift:+.1f}'
                         for name, shift in zip(names, shifts, strict=False))
     found = [f'{name} {value:+.4f}' for name, value in zip(names[count:], others, strict=True)]
-    return (f'the lens seems to have {", ".join(found)}, which are not calibrated: they would '
-            f'change {changes} px; sigma allows for that',)
+    return (f'the lens seems to have more distortion than the model {solution.camera.model} tells '
+            f'({", ".join(found)}), which would change {changes} px: the sigmas allow for that',)
 
 
 def _verdict_without_solution(evidence: Evidence) -> Verdict:
     """Return the verdict on a drive that gave no scene."""
     if evidence.frames < 2:
-        return Verdict('refused', (f'there is only {evidence.frames} image: record a drive with '
-                                   f'turns',))
-    if not evidence.turns:
-        return Verdict('refused', (
-            'no turn was found: the car did not move, or drove straight on, or the pictures show '
-            'too little; record a drive with turns, in daylight',))
-    return Verdict('refused', (
-        f'none of the {len(evidence.turns)} turns could be reconstructed: the pictures are too '
-        f'dark or blurred, or the camera turned without moving',))
+        what, cure = f'there is only {evidence.frames} image', 'record a drive with turns'
+    elif not evidence.turns:
+        what = ('no turn was found: the car stood or drove straight on, or the pictures show too '
+                'little')
+        cure = 'record a drive with turns at crossings, in daylight'
+    else:
+        what = (f'none of the {len(evidence.turns)} turns could be reconstructed: the pictures '
+                f'are too dark or blurred, or the camera turned without moving')
+        cure = 'drive through turns at town speed, in daylight'
+    return verdict_of([Finding('refused', what, cure)])
 
 
 def _summary(turn: Turn, evidence: Evidence, solution: Solution | None) -> TurnSummary:
@@ -164,15 +200,52 @@ def _summary(turn: Turn, evidence: Evidence, solution: Solution | None) -> TurnS
         registered=int(scene.structure.registered.sum()) if scene else 0,
         used=turn.id in used, yaw_deg=scene.yaw_deg if scene else None,
         reprojection_error_px=error,
-        misfit=solution.misfits.get(turn.id) if solution else None)
+        misfit=solution.misfits.get(turn.id) if solution else None,
+        unused_because=None if turn.id in used else _unused_because(turn, evidence, solution))
 
 
-def _stored_summary(turn: StoredTurn, solution: Solution | None) -> StoredTurnSummary:
+def _unused_because(turn: Turn, evidence: Evidence, solution: Solution | None) -> str:
+    """Return why a turn of this drive is not used, in words."""
+    if turn.id in evidence.left_out:
+        return evidence.left_out[turn.id]
+    if turn.id in evidence.built:
+        return _scene_unused_because(turn.id, solution)
+    return NOT_NEEDED if solution else 'it was not reconstructed'
+
+
+def _scene_unused_because(turn: TurnId, solution: Solution | None) -> str:
+    if solution is None:
+        return 'no camera explains what was seen in it'
+    misfit = solution.misfits.get(turn)
+    if misfit is None:
+        return NOT_NEEDED
+    return f'{CONTRADICTS}, with {misfit:.1f} times the error of a camera of its own'
+
+
+def _material(solution: Solution | None, evidence: Evidence) -> Material | None:
+    """Return what the report draws; None where none is wanted."""
+    if evidence.pictures is None:
+        return None
+    scenes = {turn.scene.turn: turn.scene for turn in evidence.stored} | evidence.built
+    if solution is not None:
+        scenes |= {scene.turn: scene for scene in solution.scenes}
+    pictures = dict(evidence.pictures)
+    for turn in evidence.turns:
+        picture = None if turn.id in pictures else picture_of(turn, scenes.get(turn.id))
+        if picture is not None:
+            pictures[turn.id] = picture
+    return Material(evidence.scale.px, solution, scenes, pictures)
+
+
+def _stored_summary(turn: StoredTurn, evidence: Evidence, solution: Solution | None
+                    ) -> StoredTurnSummary:
     scene = turn.scene
     used = {each.turn for each in solution.scenes} if solution else set()
     return StoredTurnSummary(scene.turn, turn.stamp_s, turn.prominence, scene.yaw_deg,
                              len(scene.tracks.frames), scene.turn in used,
-                             solution.misfits.get(scene.turn) if solution else None)
+                             solution.misfits.get(scene.turn) if solution else None,
+                             None if scene.turn in used else evidence.left_out.get(
+                                 scene.turn, _scene_unused_because(scene.turn, solution)))
 
 
 def _details(solution: Solution) -> dict[str, object]:

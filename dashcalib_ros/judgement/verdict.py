@@ -6,7 +6,7 @@ RULES.
 """
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +19,7 @@ from dashcalib_ros.judgement.agreement import (
     turns_of_another_camera,
 )
 from dashcalib_ros.judgement.calibration import Verdict
+from dashcalib_ros.lines import Bend
 from dashcalib_ros.solve.departures import Departure
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turns.turn import TurnId
@@ -29,34 +30,58 @@ ON_BOUND = 0.01
 
 @dataclass(frozen=True)
 class Finding:
-    """A rule's objection to a solution: the verdict it leads to, and the reason, with a cure."""
+    """A rule's objection to a solution: the verdict it leads to, what is wrong, and what to do.
+
+    Both are in the words of the driver, with the figures; docs/troubleshooting.md explains each.
+    """
 
     level: Literal['weak', 'refused']
-    text: str
+    what: str
+    cure: str
 
 
-def judge(solution: Solution, config: VerdictConfig) -> Verdict:
-    """Return the verdict on a solution, its reasons sorted: those that refuse it come first."""
+def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None) -> Verdict:
+    """Return the verdict on a solution, its reasons sorted: those that refuse it come first.
+
+    lines: what straight lines say of it, if there are enough of them.
+    """
     findings = [found for rule in RULES if (found := rule(solution, config)) is not None]
+    if lines is not None and (found := _lines_disagree(lines, solution, config)) is not None:
+        findings.append(found)
+    return verdict_of(sorted(findings, key=lambda found: found.level != 'refused'))
+
+
+def verdict_of(findings: Sequence[Finding]) -> Verdict:
+    """Return the verdict that findings lead to, the gravest first; without any it is accepted."""
     if not findings:
         return Verdict('accepted')
-    findings.sort(key=lambda found: found.level != 'refused')
-    return Verdict(findings[0].level, tuple(found.text for found in findings))
+    return Verdict(findings[0].level, tuple(f'{found.what}: {found.cure}' for found in findings),
+                   tuple(dict.fromkeys(found.cure for found in findings)))
+
+
+def lacks_knowledge_only(solution: Solution, config: VerdictConfig) -> bool:
+    """Return whether nothing contradicts a solution: where it is weak, its turns know too little.
+
+    Another focal length may explain them as well, but not clearly better.
+    """
+    return (profile_contrast(solution) > -config.min_contrast
+            and not any(rule(solution, config) for rule in SOUND))
 
 
 def _too_few_turns(solution: Solution, config: VerdictConfig) -> Finding | None:
     count = len(solution.scenes)
     if count >= config.min_turns:
         return None
-    return Finding('weak', f'only {count} of at least {config.min_turns} turns could be used: '
-                           f'drive more turns')
+    return Finding('weak', f'only {count} of at least {config.min_turns} turns could be used',
+                   'drive more turns, as at crossings')
 
 
 def _too_little_yaw(solution: Solution, config: VerdictConfig) -> Finding | None:
     yaw = sum(scene.yaw_deg for scene in solution.scenes)
     return _graded(
         yaw < config.refused_yaw_deg, yaw < config.min_yaw_deg,
-        f'the turns add up to {yaw:.0f} degrees of yaw only: drive sharper turns')
+        f'{yaw:.0f}° of yaw in all turns; at least {config.min_yaw_deg:.0f}° needed',
+        'drive sharper turns, as at crossings')
 
 
 def _flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -65,8 +90,9 @@ def _flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
     return _graded(
         # written with not: a contrast of NaN is refused, too
         not contrast >= config.refused_contrast, contrast < config.min_contrast,
-        f'the turns hardly tell one focal length from another (the error rises by '
-        f'{100 * max(contrast, 0.0):.1f} % when it is 20 % off): drive sharper turns in daylight')
+        f'a focal length 20 % off would explain the pictures almost as well (the error rises by '
+        f'{100 * max(contrast, 0.0):.1f} %; at least {100 * config.min_contrast:.0f} % needed)',
+        'drive sharper turns, in daylight')
 
 
 def profile_contrast(solution: Solution) -> float:
@@ -89,15 +115,19 @@ def _far_from_profile(solution: Solution, config: VerdictConfig) -> Finding | No
     best = solution.around.best * solution.camera.image_size[0]
     if np.isclose(best, solution.camera.fx):
         return None
-    return Finding('refused', f'the focal length {solution.camera.fx:.0f} px contradicts the one '
-                              f'that explains most observations, about {best:.0f} px')
+    return Finding('refused', f'two ways to find the focal length contradict each other, with '
+                              f'{solution.camera.fx:.0f} px and about {best:.0f} px, so that '
+                              f'neither can be trusted',
+                   'record another drive, with sharper turns and less traffic')
 
 
 def _sigma_too_large(solution: Solution, config: VerdictConfig) -> Finding | None:
     relative = float(solution.sigma[0] / solution.camera.fx)
+    known = f'to {100 * relative:.1f} % only' if np.isfinite(relative) else 'not at all'
     return _graded(
         not np.isfinite(relative) or relative > config.refused_sigma, relative > config.max_sigma,
-        f'fx is uncertain by {100 * relative:.1f} %: more or sharper turns are needed')
+        f'the focal length is known {known}; {100 * config.max_sigma:.1f} % or better needed',
+        'drive more turns, or sharper ones')
 
 
 def _one_turn_dominates(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -106,8 +136,9 @@ def _one_turn_dominates(solution: Solution, config: VerdictConfig) -> Finding | 
     turn = max(shares, key=lambda turn: shares[turn])
     if len(shares) < 2 or shares[turn] <= config.max_leverage:
         return None
-    return Finding('weak', f'{_turns([turn])} alone gives {100 * min(shares[turn], 1.0):.0f} '
-                           f'% of the information about fx: drive another turn that is as sharp')
+    return Finding('weak', f'no other turn confirms {_turns([turn])}, which gives '
+                           f'{100 * min(shares[turn], 1.0):.0f} % of what is known about the '
+                           f'focal length', 'drive another turn that is as sharp')
 
 
 def _turns_disagree(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -115,8 +146,9 @@ def _turns_disagree(solution: Solution, config: VerdictConfig) -> Finding | None
     spread = focal_disagreement(solution)
     if spread <= config.max_disagreement:
         return None
-    return Finding('weak', f'the turns disagree about fx by {100 * spread:.1f} %: was the camera '
-                           f'moved, or is there much traffic?')
+    return Finding('weak', f'the turns disagree about the focal length by {100 * spread:.1f} %; '
+                           f'at most {100 * config.max_disagreement:.0f} % is usual',
+                   'check that nobody moved or zoomed the camera, and avoid heavy traffic')
 
 
 def _other_camera(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -124,8 +156,9 @@ def _other_camera(solution: Solution, config: VerdictConfig) -> Finding | None:
     if not turns:
         return None
     fit = f'{_turns(turns)} fit{"s" * (len(turns) == 1)}'
-    return Finding('weak', f'{fit} another camera far better than the one of the other turns: was '
-                           f'the camera zoomed or exchanged, or its picture cropped?')
+    return Finding('weak', f'{fit} another camera far better than the one of the other turns, as '
+                           f'if it was zoomed, exchanged or cropped in between',
+                   'calibrate what was recorded before and after that apart')
 
 
 def _turns(turns: list[TurnId]) -> str:
@@ -145,26 +178,28 @@ def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
     clear = [each for each in solution.departures if each.clear]
     if not clear:
         return None
-    return Finding('weak', _departure_text(clear[0], solution))
+    return Finding('weak', *_departure_texts(clear[0], solution))
 
 
-def _departure_text(departure: Departure, solution: Solution) -> str:
+def _departure_texts(departure: Departure, solution: Solution) -> tuple[str, str]:
+    """Return what is wrong, and what to do."""
     if departure.kind == 'shift':
         share = 100 * departure.size / solution.camera.image_size[0]
         return (f'the picture moves against the lens by about {share:.1f} % of its width, as that '
-                f'of a stabilised video does: switch the stabiliser off')
+                f'of a stabilised video does', 'switch the stabiliser off')
     if departure.kind == 'bend':
-        return (f'the picture is bent locally, as no lens of the model {solution.camera.model} '
-                f'bends it: is there a windscreen or a cover that does so, or another kind of '
-                f'lens?')
+        return (f'the picture is bent in places, as no lens of the model {solution.camera.model} '
+                f'bends it', 'take away the windscreen or cover that does so, or try another '
+                             '--model')
     zooms = departure.by_turn
     larger = sorted(turn for turn, zoom in zooms.items() if zoom > np.mean(list(zooms.values())))
     apart = max(zooms.values()) - min(zooms.values())
+    cure = 'fix the zoom and the focus'
     if apart < departure.size:
-        return (f'the zoom changes from image to image, by about {100 * departure.size:.1f} %: '
-                f'fix the zoom and the focus')
-    return (f'the zoom changes by about {100 * apart:.1f} %: it is larger in {_turns(larger)} '
-            f'than in the others; fix the zoom and the focus')
+        return (f'the zoom changes from image to image, by about {100 * departure.size:.1f} %',
+                cure)
+    return (f'the zoom changes by about {100 * apart:.1f} %, it is larger in {_turns(larger)} '
+            f'than in the others', cure)
 
 
 def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -172,17 +207,20 @@ def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None
     aspect = solution.camera.fy / solution.camera.fx
     if abs(aspect - 1) <= config.max_aspect:
         return None
-    return Finding('weak', f'fy is {100 * (aspect - 1):+.1f} % off fx, more than pixels are out '
-                           f'of square: a decentred lens or a strong rolling shutter looks like '
-                           f'this')
+    return Finding('weak', f'the pixels seem to be out of square (fy is {100 * (aspect - 1):+.1f} '
+                           f'% off fx), as a decentred lens or a strong rolling shutter makes '
+                           f'them look',
+                   'check the stamps (--fps), which a rolling shutter is found by, or try '
+                   '--model brown')
 
 
 def _strange_shutter(solution: Solution, config: VerdictConfig) -> Finding | None:
     readout_ms = 1e3 * abs(solution.readout_s)
     if readout_ms <= config.max_readout_ms:
         return None
-    return Finding('weak', f'the rows seem to be exposed over {readout_ms:.0f} ms, longer than '
-                           f'rolling shutters are: are the stamps right?')
+    return Finding('weak', f'the rows of a picture seem to be exposed over {readout_ms:.0f} ms, '
+                           f'longer than rolling shutters take',
+                   'check that the stamps, or --fps, are right')
 
 
 def _on_bound(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -192,24 +230,46 @@ def _on_bound(solution: Solution, config: VerdictConfig) -> Finding | None:
              if not ON_BOUND < value < 1 - ON_BOUND]
     if not names:
         return None
-    return Finding('weak', f'{", ".join(names)} reached the bound: do not trust the scene')
+    return Finding('weak', f'the search for {", ".join(names)} ended at the limit of what lenses '
+                           f'have', 'record another drive; mirrors and lenses of more than 190° '
+                                    'cannot be calibrated')
 
 
 def _folds_over(solution: Solution, config: VerdictConfig) -> Finding | None:
     if solution.camera.covers_picture():
         return None
-    return Finding('weak', 'the distortion folds over inside the picture: points near its corners '
-                           'are missing')
+    return Finding('weak', 'the distortion near the corners of the picture is no real one (it '
+                           'folds over), as nothing was seen there',
+                   'drive where there is something to see up to the corners, or try --model '
+                   'fisheye for a wide lens')
 
 
-def _graded(refused: bool, weak: bool, text: str) -> Finding | None:
+def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Poles and the edges of houses must be straight: nothing of this comes from motion."""
+    moved = lines.picture_px / solution.camera.image_size[0]
+    if not (lines.sigmas > config.max_line_sigmas and moved > config.max_line_move):
+        return None
+    return Finding('weak', f'poles and the edges of houses are not straight with this distortion '
+                           f'({lines.lines} upright lines ask for k1 {lines.k1:+.3f}, '
+                           f'{lines.sigmas:.0f} times what both may be off)',
+                   'look for a curved windscreen or cover before the lens, try another --model, '
+                   'or drive more turns')
+
+
+def _graded(refused: bool, weak: bool, what: str, cure: str) -> Finding | None:
     """Return a finding of the graver condition that holds, None if neither does."""
     if refused:
-        return Finding('refused', text)
-    return Finding('weak', text) if weak else None
+        return Finding('refused', what, cure)
+    return Finding('weak', what, cure) if weak else None
 
 
-RULES: tuple[Callable[[Solution, VerdictConfig], Finding | None], ...] = (
+Rule = Callable[[Solution, VerdictConfig], Finding | None]
+# whether the turns know enough: where they do not, a fleet's prior may help
+ENOUGH: tuple[Rule, ...] = (
     _too_few_turns, _too_little_yaw, _flat_profile, _far_from_profile, _sigma_too_large,
-    _one_turn_dominates, _turns_disagree, _other_camera, _not_fixed, _strange_aspect,
-    _strange_shutter, _on_bound, _folds_over)
+    _one_turn_dominates)
+# whether anything contradicts the result
+SOUND: tuple[Rule, ...] = (
+    _turns_disagree, _other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,
+    _folds_over)
+RULES = (*ENOUGH, *SOUND)

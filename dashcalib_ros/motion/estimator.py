@@ -16,7 +16,7 @@ from dashcalib_ros.frames.shrink import shrink_image
 from dashcalib_ros.frames.stamps import EARLY, least_step_ns
 from dashcalib_ros.motion.epipoles import epipoles_of, turning
 from dashcalib_ros.motion.mask import EgoMask
-from dashcalib_ros.motion.motion import Motion
+from dashcalib_ros.motion.motion import Motion, TrackedPoints
 from dashcalib_ros.motion.points import Tracking, find_corners, follow_points
 from dashcalib_ros.motion.segmentation import SegmentationMask, open_segmentation
 
@@ -49,6 +49,7 @@ class MotionEstimator:
     _ego: EgoMask | None = None
     _segmented: SegmentationMask | None = None
     _valid: Mask | None = None
+    _factor: int = 1
 
     def __init__(self, config: MotionConfig, mask: MaskConfig | None = None,
                  valid: Mask | None = None) -> None:
@@ -74,7 +75,7 @@ class MotionEstimator:
             self._start(frame.image.shape)
         if self._seen:
             gap = frame.stamp_ns - self._seen[-1].stamp_ns
-            if gap < 0:
+            if gap < 0 or frame.after_gap:
                 self._reset()
             elif gap < least_step_ns(self.config.rate):
                 return None
@@ -117,6 +118,18 @@ class MotionEstimator:
             if hidden is not None:
                 valid = ~hidden if valid is None else valid & ~hidden
         return valid
+
+    def points(self) -> TrackedPoints:
+        """Return the points in the newest image, and where they were one spacing before."""
+        now = self._xy.copy()
+        before = now.copy()
+        earlier = self._earlier(self._seen[-1]) if self._seen else None
+        if earlier is not None:
+            _, here, there = np.intersect1d(self._ids, earlier.ids, assume_unique=True,
+                                            return_indices=True)
+            before[here] = earlier.xy[there]
+        factor = np.float32(self._factor)
+        return TrackedPoints(*((xy + 0.5) * factor - 0.5 for xy in (before, now)))
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings about the masks for the user, one line each."""

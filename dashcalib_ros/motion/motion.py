@@ -3,6 +3,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dashcalib_ros.arrays import Floats32
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -23,3 +25,14 @@ class Motion:
     points: int = 0
     center: int | None = None
     center_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class TrackedPoints:
+    """The points in the newest image, (n, 2) px of the full image: now, and one spacing before.
+
+    before is equal to now for points that are new.
+    """
+
+    before: Floats32
+    now: Floats32

@@ -111,6 +111,18 @@ def adjust_step2(scenes: Sequence[Scene], camera: Camera, solver: Solver, prior:
             camera.with_params(model.params(reconstruction.cameras[1].params)))
 
 
+def adjust_poses(scenes: Sequence[Scene], camera: Camera, solver: Solver) -> list[Scene]:
+    """Adjust poses and points with the camera held as it is."""
+    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
+    reconstruction = _reconstruction(scenes, camera, camera.step2)
+    adjuster = _adjuster(reconstruction, solver, refine_focal=False, refine_centre=False)
+    values = reconstruction.cameras[1].params
+    if adjuster.problem.has_parameter_block(values):
+        adjuster.problem.set_parameter_block_constant(values)
+        adjuster.solve()
+    return _with_used(_updated(scenes, reconstruction), all_used)
+
+
 def _in_front(scenes: Sequence[Scene]) -> list[Scene]:
     """Return the scenes with those observations only that COLMAP can adjust.
 

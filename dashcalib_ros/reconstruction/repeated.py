@@ -105,11 +105,7 @@ def _seconds(scene: Scene) -> Floats:
 
 def _yaw_deg(scene: Scene) -> tuple[Floats, Floats]:
     """Return the times of the registered keyframes and the yaw there, degrees."""
-    registered = scene.structure.registered
-    rotations = scene.structure.rotations[registered]
-    ahead = rotations[:, 2] @ rotations[0].T
-    return (_seconds(scene)[registered],
-            np.degrees(np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))))
+    return _seconds(scene)[scene.structure.registered], scene.yaws_deg
 
 
 def _offsets(scene: Scene, other: Scene, direction: float) -> Floats:

@@ -73,11 +73,15 @@ class Scene:
     @property
     def yaw_deg(self) -> float:
         """Return by how much the camera turned about its vertical axis, in degrees."""
+        return float(np.ptp(self.yaws_deg))
+
+    @property
+    def yaws_deg(self) -> Floats:
+        """Return the yaw of each registered keyframe since the first one, degrees."""
         rotations = self.structure.rotations[self.structure.registered]
         # the optical axes in the first camera's frame: pitch and roll do not count
         ahead = rotations[:, 2] @ rotations[0].T
-        yaw = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))
-        return float(np.degrees(np.ptp(yaw)))
+        return np.asarray(np.degrees(np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))))
 
     @property
     def explained(self) -> float:

@@ -25,7 +25,7 @@ from dashcalib_ros.solve.normal import (
     normal_equations,
     used_keyframes,
 )
-from dashcalib_ros.solve.prior import extra_sigma_of, prior_of
+from dashcalib_ros.solve.prior import extra_sigma_of, prior_information, prior_of
 from dashcalib_ros.solve.shutter import row_shift
 from dashcalib_ros.turns.turn import TurnId
 
@@ -69,7 +69,7 @@ class Step:
 
     gain: by how much it lowers the cost, at unit noise; chance: how much noise alone would, each
     track counted as one measurement. shared: (s,) of the camera, of the wider model and of what
-    follows it; images: (p,) of each scene's free image parameters. variance: (s, s).
+    follows it; images: (p,) of each scene's free image parameters. covariance: (s, s) of shared.
     """
 
     gain: float
@@ -78,13 +78,18 @@ class Step:
     images: tuple[Floats, ...]
     covariance: Floats
 
+    def strength(self, base: Step) -> float:
+        """Return what this step gains over one without its parameters, over what chance would."""
+        return (self.gain - base.gain) / max(self.chance - base.chance, 1e-9)
+
 
 @dataclass(frozen=True)
 class Problem:
     """The linearised problem of all scenes, about the camera and all that it may depart in.
 
     prior_pull: (n,) the negative gradient of the camera's prior; prior: (n, n) its information.
-    extra: variances of the shared parameters that follow the camera's own.
+    extra: variances of the shared parameters that follow the camera's own. noise: variance of a
+    residual, px^2.
     """
 
     scenes: tuple[Scene, ...]
@@ -98,8 +103,8 @@ class Problem:
                inflation: float = 1.0) -> Step:
         """Return the step with these parameters free; images: a prior for each scene.
 
-        shared: indices behind the camera's own. inflation: of the noise: smaller steps where the
-        present solution is far from the right one.
+        shared: indices of those behind the camera's own. inflation: of the noise: it makes the
+        camera's prior count more where the present solution is far from the right one.
         """
         count, noise = len(self.prior), self.noise * inflation
         free = np.array([*range(count), *shared])
@@ -107,35 +112,24 @@ class Problem:
         total[:count, :count] = self.prior
         pull = np.concatenate([self.prior_pull, np.zeros(len(shared))])
         gain = chance = 0.0
-        maps = []
+        scatter = np.zeros_like(total)
         for n, normal in enumerate(self.normals):
-            own = IMAGE * normal.images + free
-            combine = np.zeros((len(free), len(normal.score)))
-            combine[np.arange(len(free)), own] = 1.0
-            hessian = normal.hessian[np.ix_(own, own)]
-            if images is not None:
-                inverse, mixed = images[n].inverse(normal), normal.hessian[np.ix_(
-                    images[n].free, own)]
-                combine[:, images[n].free] = -mixed.T @ inverse
-                hessian = hessian - mixed.T @ inverse @ mixed
-                own_pull = images[n].pull(normal)
-                pull -= mixed.T @ inverse @ own_pull / noise
-                gain += float(own_pull @ inverse @ own_pull) / noise
-                scatter = normal.by_track[np.ix_(images[n].free, images[n].free)]
-                chance += float(np.sum(inverse * scatter)) / noise
-            pull += normal.score[own] / noise
-            total += hessian / noise
-            maps.append(combine)
+            if images is None:
+                hessian, score, by_track = normal.without_images()
+            else:
+                hessian, score, by_track = images[n].eliminated(normal)
+                own = images[n].gain_and_chance(normal)
+                gain, chance = gain + own[0] / noise, chance + own[1] / noise
+            total += hessian[np.ix_(free, free)] / noise
+            pull += score[free] / noise
+            scatter += by_track[np.ix_(free, free)] / noise**2
         covariance = np.linalg.inv(total)
         step = covariance @ pull
-        for combine, normal in zip(maps, self.normals, strict=True):
-            scatter = combine @ normal.by_track @ combine.T
-            chance += float(np.sum(covariance * scatter)) / noise**2
         steps = () if images is None else tuple(
-            each.inverse(normal) @ (each.pull(normal) - normal.hessian[np.ix_(
-                each.free, IMAGE * normal.images + free)] @ step)
+            each.step(normal, free, step)
             for each, normal in zip(images, self.normals, strict=True))
-        return Step(gain + float(pull @ step), chance, step, steps, covariance)
+        return Step(gain + float(pull @ step), chance + float(np.sum(covariance * scatter)), step,
+                    steps, covariance)
 
 
 def problem_of(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: float,
@@ -149,24 +143,21 @@ def problem_of(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: 
         for n, scene in enumerate(scenes))
     noise = (sum(normal.squares for normal in normals)
              / sum(normal.freedom for normal in normals))
-    prior = prior_of(step1, config, 1.0)
-    information = np.asarray(np.linalg.inv(prior.covariance), np.float64)
+    information = prior_information(step1, config)
     extra = np.square(extra_sigma_of(camera))
     count = by_extra[0].shape[-1] if by_extra else 0
     return Problem(tuple(scenes), normals, information,
-                   information @ (prior.mean - camera.params),
+                   information @ (prior_of(step1, config, 1.0).mean - camera.params),
                    np.concatenate([extra, np.full(count, FIELD_PX**2)]), noise)
 
 
-def image_priors(problem: Problem, kind: Kind, config: IntrinsicsConfig, crops: Crops | None = None
-                 ) -> list[ImagePrior]:
-    """Return for each scene the prior of its images' shifts, or of their zooms.
+def shift_priors(problem: Problem, config: IntrinsicsConfig, crops: Crops) -> list[ImagePrior]:
+    """Return for each scene the prior of its images' shifts.
 
-    crops: shifts that were taken out of the tracks already.
+    crops: shifts that were taken out of the tracks already; empty for none.
     """
-    crops = crops or {}
-    prior = shift_prior if kind == 'shift' else _zoom_prior
-    return [prior(scene, problem.noise, config, crops.get(scene.turn)) for scene in problem.scenes]
+    return [shift_prior(scene, problem.noise, config, crops.get(scene.turn))
+            for scene in problem.scenes]
 
 
 def shift_prior(scene: Scene, noise: float, config: IntrinsicsConfig, crop: Floats | None = None
@@ -184,8 +175,7 @@ def shift_prior(scene: Scene, noise: float, config: IntrinsicsConfig, crop: Floa
     return ImagePrior(_indices(keyframes, 0, 1), np.block([[inner, zero], [zero, inner]]), values)
 
 
-def _zoom_prior(scene: Scene, noise: float, config: IntrinsicsConfig, crop: Floats | None = None
-                ) -> ImagePrior:
+def _zoom_prior(scene: Scene, noise: float, config: IntrinsicsConfig) -> ImagePrior:
     """Return the prior of the zooms of a scene's images."""
     keyframes = used_keyframes(scene)
     spread = (ZOOM_STRETCH**2 * np.exp(-_apart(scene, config))
@@ -214,16 +204,17 @@ def departures(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: 
     crops: of a stabilised video, as taken out already. bent: False leaves out the field. rolling:
     a rolling shutter was taken out: what is left of it is no departure.
     """
-    by_extra: list[list[Floats]] = [[] for _ in scenes]
-    for scene, found in zip(scenes, by_extra, strict=True):
-        found += [row_shift(scene, camera)[..., None]] * rolling
-        found += [_field(scene, camera)] * bent
+    columns = []
+    if rolling:
+        columns.append([row_shift(scene, camera)[..., None] for scene in scenes])
+    if bent:
+        columns.append([_field(scene, camera) for scene in scenes])
     problem = problem_of(scenes, camera, step1, loss_px, config,
-                         [np.concatenate(found, axis=-1) for found in by_extra if found])
+                         [np.concatenate(parts, axis=-1) for parts in zip(*columns, strict=True)])
     count, lens = len(camera.names()), len(camera.widened().names())
     wide = range(count, lens + rolling)
-    shifts = image_priors(problem, 'shift', config, crops)
-    zooms = image_priors(problem, 'zoom', config)
+    shifts = shift_priors(problem, config, crops or {})
+    zooms = [_zoom_prior(scene, problem.noise, config) for scene in scenes]
     fixed = problem.solved(None, wide)
     # what a stabiliser's removal leaves over makes sigma larger, and may be larger itself
     limit = (config.left_shift if crops else
@@ -242,10 +233,9 @@ def departures(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: 
 def _departure(kind: Kind, step: Step, base: Step, scenes: Sequence[Scene], limit: float
                ) -> Departure:
     """Return the departure that a step finds. base: the step without its parameters."""
-    strength = (step.gain - base.gain) / max(step.chance - base.chance, 1e-9)
     parts = step.images if kind != 'bend' else (step.shared[len(base.shared):],)
     turns = {scene.turn: float(part.mean()) for scene, part in zip(scenes, parts, strict=False)}
-    return Departure(kind, strength, limit,
+    return Departure(kind, step.strength(base), limit,
                      float(np.sqrt(np.mean(np.square(np.concatenate(parts))))),
                      turns if kind == 'zoom' else {})
 

@@ -67,9 +67,8 @@ def information(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats |
     normal = normal_equations(scene, camera, loss_px,
                               None if by_extra is None else by_extra[..., None],
                               by_image=images is not None)
-    hessian, score, by_track = normal.hessian, normal.score, normal.by_track
-    if images is not None:
-        hessian, score, by_track = images.eliminated(normal)
+    hessian, score, by_track = (normal.without_images() if images is None
+                                else images.eliminated(normal))
     return Information(hessian, score, by_track, normal.squares, normal.freedom, normal.lens)
 
 

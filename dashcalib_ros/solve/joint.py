@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,13 +20,11 @@ from dashcalib_ros.solve.prior import (
     bounds_of,
     extra_sigma_of,
     floor_of,
-    loss_px_of,
 )
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.solve.stabiliser import Steadied, fixed_crops, without_crops, without_stabiliser
+from dashcalib_ros.solve.stabiliser import without_crops, without_stabiliser
 from dashcalib_ros.solve.steps import (
     ByTurn,
-    Fit,
     Progress,
     Result,
     step1,
@@ -75,14 +73,14 @@ def solve(separate: Sequence[Scene], config: Config,
     result = Result(final, roughly.step1, config.intrinsics)
     if crops:
         # a part of the tracks leaves the crops uncertain
-        result = _without_stabiliser(result, config, FINAL_ROUNDS)
+        result = without_stabiliser(result, config, FINAL_ROUNDS)
     elif config.model == AUTO:
-        progress('model of the lens', 0.0)
+        progress('choosing the lens model', 0.0)
         result, others = with_model_chosen(result, full_scenes, config)
         tried = _merged(tried, others)
-    progress('focal profile', 0.0)
+    progress('trying other focal lengths', 0.0)
     around = profile_around(result.fit.scenes, result.fit.camera, start.profile, config)
-    progress('sigma', 0.0)
+    progress('estimating the uncertainty', 0.0)
     return _solution(result, separate, (start.profile, around), tried, config)
 
 
@@ -95,20 +93,7 @@ def _steadied(first: Result, config: Config) -> Result:
     # the bend takes longer, and is asked for only where the picture moves
     if not rounds or not moves(first.departures(bent=False)) or not moves(first.departures()):
         return first
-    return _without_stabiliser(first, config, rounds)
-
-
-def _without_stabiliser(first: Result, config: Config, rounds: int) -> Result:
-    """Return the result with the movement of the crop taken out; the same if a turn is lost."""
-    fit = first.fit
-    found = without_stabiliser(
-        Steadied(fit.scenes, fit.camera, first.step1, fit.readout_s,
-                 fit.crops or fixed_crops(fit.scenes)), config, rounds)
-    if len(found.scenes) < len(fit.scenes):
-        return first
-    solver = replace(fit.solver, loss_px=loss_px_of(found.scenes, found.camera, config.intrinsics))
-    return Result(Fit(found.scenes, found.camera, solver, found.readout_s, found.crops),
-                   found.step1, config.intrinsics)
+    return without_stabiliser(first, config, rounds)
 
 
 def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progress
@@ -124,7 +109,7 @@ def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progr
     first = step1(full_scenes, start, config, progress)
     if not first.scenes:
         return None
-    progress('step 2: all parameters', 0.0)
+    progress('adjusting all parameters', 0.0)
     rough = step2_roughly(first, config)
     return _Begun(Result(rough, first.camera, config.intrinsics), full_scenes, profile)
 
@@ -153,5 +138,5 @@ def _solution(result: Result, separate: Sequence[Scene], profiles: tuple[Profile
         bounds=np.array(bounds_of(step1, settings)), prior_information=prior, readout_s=readout_s,
         readout_sigma_s=float(np.sqrt(spread[count, count])) if readout_s else 0.0,
         misfits=misfits(separate, scenes, camera, config.scene.error_px), tried=tried,
-        picture=result.picture_sigma(systematic), departures=departed,
+        sigma_map=result.sigma_map(systematic), systematic=systematic, departures=departed,
         crops=final.crops)

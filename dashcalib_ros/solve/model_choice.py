@@ -142,4 +142,4 @@ def _refitted(first: Result, model: type[Camera], full_scenes: ByTurn, config: C
 def _alike(larger: Result, simpler: Result, config: Config) -> bool:
     """Return whether two models map rays alike, as far as the turns can tell."""
     apart = mapping_error(larger.fit.camera, simpler.fit.camera)
-    return apart is not None and apart < larger.picture_sigma().rms
+    return apart is not None and apart < larger.sigma_map().whole.rms

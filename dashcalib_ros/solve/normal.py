@@ -75,6 +75,11 @@ class Normal:
     images: int
     eliminated: Eliminated
 
+    def without_images(self) -> tuple[Floats, Floats, Floats]:
+        """Return hessian, score and by_track of the other parameters, the images' held."""
+        shared = slice(IMAGE * self.images, None)
+        return self.hessian[shared, shared], self.score[shared], self.by_track[shared, shared]
+
 
 def used_keyframes(scene: Scene) -> Ints:
     """Return the rows (k,) of the keyframes of which observations are used."""
@@ -113,6 +118,20 @@ class ImagePrior:
         hessian = normal.hessian[shared, shared] - mixed.T @ inverse @ mixed
         score = normal.score[shared] - mixed.T @ inverse @ self.pull(normal)
         return hessian, score, combine @ normal.by_track @ combine.T
+
+    def step(self, normal: Normal, others: Ints, step: Floats) -> Floats:
+        """Return (p,) their step, given that (s,) of others, indices behind the images'."""
+        mixed = normal.hessian[np.ix_(self.free, IMAGE * normal.images + others)]
+        return np.asarray(self.inverse(normal) @ (self.pull(normal) - mixed @ step))
+
+    def gain_and_chance(self, normal: Normal) -> tuple[float, float]:
+        """Return by how much their own step lowers the cost, and how much chance would, px^2.
+
+        The first times the noise, the second times its square: neither is at unit noise.
+        """
+        inverse, pull = self.inverse(normal), self.pull(normal)
+        scatter = normal.by_track[np.ix_(self.free, self.free)]
+        return float(pull @ inverse @ pull), float(np.sum(inverse * scatter))
 
 
 def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats | None = None,

@@ -33,34 +33,61 @@ class PictureSigma:
     worst: float
 
 
-def picture_sigma(camera: Camera, parts: Sequence[Information], prior: Floats, floor: Floats,
-                  step: Floats, systematic: float = 1.0) -> PictureSigma:
-    """Return the sigma over the picture.
+@dataclass(frozen=True)
+class SigmaMap:
+    """The same at single pixels. pixels: (m, 2), a grid over the picture; sigma: (m,), px."""
+
+    pixels: Floats
+    sigma: Floats
+
+    @property
+    def whole(self) -> PictureSigma:
+        """Return the sigma over the whole picture."""
+        return PictureSigma(float(np.sqrt(np.mean(self.sigma**2))), float(self.sigma.max()))
+
+
+def sigma_map(camera: Camera, parts: Sequence[Information], prior: Floats, floor: Floats,
+              step: Floats, systematic: float = 1.0) -> SigmaMap:
+    """Return the sigma at a grid of pixels, those for which the camera has a viewing ray.
+
+    The arguments are those of picture_covariance().
+    """
+    moves, pixels = sensitivity(camera.widened())
+    covariance = picture_covariance(camera, parts, prior, floor, step, systematic)
+    return SigmaMap(pixels, sigma_over(moves, covariance))
+
+
+def sigma_over(moves: Floats, covariance: Floats) -> Floats:
+    """Return (m,) the sigma of pixels, px, where the parameters have a covariance (n, n).
+
+    moves: (m, 2, n) derivatives of pixels by the parameters, as sensitivity() returns them.
+    """
+    variances = np.einsum('mai,ij,maj->m', moves, covariance, moves)
+    return np.asarray(np.sqrt(variances))
+
+
+def picture_covariance(camera: Camera, parts: Sequence[Information], prior: Floats, floor: Floats,
+                       step: Floats, systematic: float = 1.0) -> Floats:
+    """Return the (lens, lens) covariance of the wider model's parameters that the picture shows.
 
     parts, prior: (n, n) and systematic as for covariance(). floor: (n,) sigmas of systematic
-    errors. step: (lens,) to the wider model; what it would change counts as an error.
+    errors. step: (lens,) to the wider model; what it would change counts as an error. The wider
+    model's first n parameters are the camera's own; of the others, only the step is known.
     """
-    wide, _ = sensitivity(camera.widened())
-    # the wider model's first parameters are the camera's own
-    moves = wide[:, :, :len(floor)]
-    variances = _variances(moves, parts, prior, systematic) + _squares(moves * floor).sum(axis=1)
-    variances += _squares(wide @ step[:, None])[:, 0]
-    return PictureSigma(float(np.sqrt(np.mean(variances))), float(np.sqrt(np.max(variances))))
+    count = len(floor)
+    covariance = np.outer(step, step)
+    covariance[:count, :count] += np.diag(floor**2) + _covariance(camera, parts, prior, systematic)
+    return covariance
 
 
-def _squares(moves: Floats) -> Floats:
-    """Return (m, n) squared lengths of moves (m, 2, n)."""
-    return np.asarray(np.sum(moves**2, axis=1))
-
-
-def _variances(moves: Floats, parts: Sequence[Information], prior: Floats, systematic: float
-               ) -> Floats:
-    """Return (m,) the variances of pixels, px^2. moves: (m, 2, n) by the parameters."""
+def _covariance(camera: Camera, parts: Sequence[Information], prior: Floats, systematic: float
+                ) -> Floats:
+    """Return the (n, n) covariance of the camera's own parameters."""
     together, count = pooled(parts, prior), len(prior)
     inverse = together.inverse
     root = np.linalg.cholesky(inverse)
     # the readout, if there is one, moves nothing in the picture of a camera that stands
-    flat = moves.reshape(-1, count) @ root[:count]
+    flat = sensitivity(camera)[0].reshape(-1, count) @ root[:count]
     _, _, modes = np.linalg.svd(flat, full_matrices=False)
     basis = root @ modes.T
     back = modes @ np.linalg.inv(root)
@@ -70,8 +97,8 @@ def _variances(moves: Floats, parts: Sequence[Information], prior: Floats, syste
         scatter = scatter_between_turns(basis.T @ together.hessians @ basis,
                                         together.scores @ basis)
         estimates.append(np.full(len(modes), scatter))
-    largest = np.max(estimates, axis=0)
-    return np.asarray(_squares(moves @ basis[:count]) @ largest)
+    own = basis[:count]
+    return np.asarray(own * np.max(estimates, axis=0) @ own.T)
 
 
 def scatter_between_turns(hessians: Floats, scores: Floats) -> float:

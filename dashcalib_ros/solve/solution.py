@@ -12,7 +12,7 @@ from dashcalib_ros.reconstruction.scene import Profile, Scene, errors_px
 from dashcalib_ros.solve.choice import Candidate
 from dashcalib_ros.solve.departures import Crops, Departure
 from dashcalib_ros.solve.information import Information, step_to_wider_model
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.picture import PictureSigma, SigmaMap
 from dashcalib_ros.solve.prior import extra_sigma_of
 from dashcalib_ros.turns.turn import TurnId
 
@@ -30,8 +30,9 @@ class Solution:
     the scenes' tracks; 0 for a global one. readout_sigma_s: its standard deviation.
     misfits: of every turn that was given: the ratio of its cost with this camera to its cost
     with its own camera. tried: the models that were compared, the simplest first; empty where
-    the first one left nothing to explain. picture: the sigma over the picture. departures: from a
-    fixed camera, the strongest first. crops: of a stabilised video, taken out of the tracks.
+    the first one left nothing to explain. sigma_map: over the picture. departures: from a fixed
+    camera, the strongest first. crops: of a stabilised video, taken out of the tracks. systematic:
+    as for covariance().
     """
 
     camera: Camera
@@ -43,18 +44,24 @@ class Solution:
     around: Profile
     bounds: Floats
     prior_information: Floats
-    picture: PictureSigma
+    sigma_map: SigmaMap
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     misfits: Mapping[TurnId, float] = field(default_factory=dict)
     tried: tuple[Candidate, ...] = ()
     departures: tuple[Departure, ...] = ()
     crops: Crops = field(default_factory=dict)
+    systematic: float = 1.0
 
     @property
     def sigma(self) -> Floats:
         """Return the n standard deviations (n,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def picture(self) -> PictureSigma:
+        """Return the sigma over the picture."""
+        return self.sigma_map.whole
 
     @property
     def step_to_wider_model(self) -> Floats:

@@ -9,44 +9,25 @@ tracks are moved to where a fixed crop would have seen them, and all is adjusted
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruction.adjust import Solver, adjust_step2
 from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.solve.departures import Crops, Problem, image_priors, problem_of
+from dashcalib_ros.solve.departures import Crops, Problem, problem_of, shift_priors
 from dashcalib_ros.solve.fitting import retriangulate_all
 from dashcalib_ros.solve.normal import IMAGE
 from dashcalib_ros.solve.prior import bounds_of, loss_px_of, prior_of
 from dashcalib_ros.solve.shutter import row_shift
+from dashcalib_ros.solve.steps import Result
 
 # of the width; the longest step of a shift in one round
 LONGEST_STEP = 0.04
 # times what chance gains; a step that gains less is the last one
 SETTLED = 2.0
-
-
-@dataclass(frozen=True)
-class Steadied:
-    """Scenes with the tracks of a fixed crop. crops: what was taken out of them.
-
-    step1: the camera that the prior is centred at. readout_s: of the rolling shutter.
-    """
-
-    scenes: list[Scene]
-    camera: Camera
-    step1: Camera
-    readout_s: float
-    crops: Crops
-
-
-def fixed_crops(scenes: Sequence[Scene]) -> Crops:
-    """Return the crops of a camera that has no stabiliser."""
-    return {scene.turn: np.zeros((len(scene.tracks.frames), 2)) for scene in scenes}
 
 
 def without_crops(scene: Scene, crops: Crops) -> Scene:
@@ -55,44 +36,50 @@ def without_crops(scene: Scene, crops: Crops) -> Scene:
     return replace(scene, tracks=replace(scene.tracks, xy=moved))
 
 
-def without_stabiliser(given: Steadied, config: Config, rounds: int) -> Steadied:
-    """Return the scenes with the movement of their crop taken out, in so many rounds at the most.
+def without_stabiliser(given: Result, config: Config, rounds: int) -> Result:
+    """Return the result with the movement of the crop taken out, in so many rounds at the most.
 
-    given: at its solution. A rolling shutter that was taken out before is estimated anew together
-    with the crop.
+    The same result if a turn is lost. A rolling shutter that was taken out before is estimated
+    anew together with the crop.
     """
-    settings, now = config.intrinsics, given
+    settings = config.intrinsics
+    crops = given.fit.crops or {scene.turn: np.zeros((len(scene.tracks.frames), 2))
+                                for scene in given.fit.scenes}
+    now = replace(given, fit=replace(given.fit, crops=crops))
     for _ in range(rounds):
-        loss_px = loss_px_of(now.scenes, now.camera, settings)
-        shutter = [row_shift(scene, now.camera) for scene in now.scenes] if now.readout_s else []
-        problem = problem_of(now.scenes, now.camera, now.step1, loss_px, settings,
+        fit = now.fit
+        loss_px = loss_px_of(fit.scenes, fit.camera, settings)
+        shutter = [row_shift(scene, fit.camera) for scene in fit.scenes] if fit.readout_s else []
+        problem = problem_of(fit.scenes, fit.camera, now.step1, loss_px, settings,
                              [shift[..., None] for shift in shutter])
-        now, strength = _step(now, problem, shutter, config)
+        now, strength = _step(now, problem, shutter)
         found, camera = adjust_step2(
-            now.scenes, now.camera, Solver(loss_px, config.scene.iterations),
+            now.fit.scenes, now.fit.camera, Solver(loss_px, config.scene.iterations),
             prior_of(now.step1, settings, problem.noise), bounds_of(now.step1, settings))
-        now = replace(now, scenes=retriangulate_all(found, camera, config.scene), camera=camera)
-        if strength < SETTLED or len(now.scenes) < len(given.scenes):
+        scenes = retriangulate_all(found, camera, config.scene)
+        if len(scenes) < len(given.fit.scenes):
+            return given
+        now = replace(now, fit=replace(now.fit, scenes=scenes, camera=camera))
+        if strength < SETTLED:
             break
-    return now
+    loss_px = loss_px_of(now.fit.scenes, now.fit.camera, settings)
+    return replace(now, fit=replace(now.fit, solver=replace(now.fit.solver, loss_px=loss_px)))
 
 
-def _step(now: Steadied, problem: Problem, shutter: Sequence[Floats], config: Config
-          ) -> tuple[Steadied, float]:
+def _step(now: Result, problem: Problem, shutter: Sequence[Floats]) -> tuple[Result, float]:
     """Return what one Gauss-Newton step makes of it, and how clear the step is."""
-    camera = now.camera
+    fit, camera = now.fit, now.fit.camera
     count, lens = len(camera.names()), len(camera.widened().names())
     shared = range(count, lens + bool(shutter))
-    priors = image_priors(problem, 'shift', config.intrinsics, now.crops)
-    fixed, moving = problem.solved(None, shared), problem.solved(priors, shared)
-    strength = (moving.gain - fixed.gain) / max(moving.chance - fixed.chance, 1e-9)
-    # as long as much is unexplained, small steps
+    priors = shift_priors(problem, now.settings, fit.crops)
+    moving = problem.solved(priors, shared)
+    strength = moving.strength(problem.solved(None, shared))
     moving = problem.solved(priors, shared, max(strength, 1.0))
     longest = float(np.abs(np.concatenate(moving.images)).max())
     part = min(1.0, LONGEST_STEP * camera.image_size[0] / max(longest, 1e-9))
     step_s = part * float(moving.shared[-1]) if shutter else 0.0
-    scenes, crops = [], dict(now.crops)
-    for n, (scene, normal) in enumerate(zip(now.scenes, problem.normals, strict=True)):
+    scenes, crops = [], dict(fit.crops)
+    for n, (scene, normal) in enumerate(zip(fit.scenes, problem.normals, strict=True)):
         step = np.zeros(len(normal.score))
         step[priors[n].free] = part * moving.images[n]
         step[IMAGE * normal.images:IMAGE * normal.images + count] = part * moving.shared[:count]
@@ -108,5 +95,5 @@ def _step(now: Steadied, problem: Problem, shutter: Sequence[Floats], config: Co
     if nearer.covers_picture():
         camera = nearer
     step1 = type(camera).centred(camera.image_size, camera.fx, *now.step1.params[4:])
-    return Steadied(scenes, camera, step1, now.readout_s + step_s, crops), strength
-
+    fit = replace(fit, scenes=scenes, camera=camera, readout_s=fit.readout_s + step_s, crops=crops)
+    return replace(now, step1=step1, fit=fit), strength

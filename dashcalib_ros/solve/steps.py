@@ -21,7 +21,7 @@ from dashcalib_ros.solve.fitting import (
     with_poses_of,
 )
 from dashcalib_ros.solve.information import Information, information, noise_in, step_to_wider_model
-from dashcalib_ros.solve.picture import PictureSigma, picture_sigma
+from dashcalib_ros.solve.picture import SigmaMap, sigma_map
 from dashcalib_ros.solve.prior import (
     bounds_of,
     extra_sigma_of,
@@ -63,7 +63,7 @@ class Result:
     def parts(self) -> tuple[Information, ...]:
         """Return what each turn says of the lens."""
         fit, loss_px = self.fit, self.fit.solver.loss_px
-        noise = noise_in(fit.scenes, fit.camera, loss_px)
+        noise = noise_in(fit.scenes, fit.camera, loss_px) if fit.crops else 0.0
         return tuple(information(
             scene, fit.camera, loss_px, row_shift(scene, fit.camera) if fit.readout_s else None,
             shift_prior(scene, noise, self.settings, fit.crops[scene.turn]) if fit.crops else None)
@@ -81,10 +81,10 @@ class Result:
         return departures(scenes, fit.camera, self.step1, fit.solver.loss_px, self.settings,
                           fit.crops, bent, bool(fit.readout_s))
 
-    def picture_sigma(self, systematic: float = 1.0) -> PictureSigma:
+    def sigma_map(self, systematic: float = 1.0) -> SigmaMap:
         """Return the sigma over the picture; systematic: as for covariance()."""
         camera = self.fit.camera
-        return picture_sigma(
+        return sigma_map(
             camera, self.parts, self.prior, floor_of(camera, self.settings),
             step_to_wider_model(self.parts, self.prior, extra_sigma_of(camera)), systematic)
 
@@ -100,7 +100,7 @@ def step1(full_scenes: ByTurn, start: Camera, config: Config, progress: Progress
     few = [subsample_tracks(scene, settings.first_tracks) for scene in full_scenes.values()]
     camera = start
     for n in range(settings.rounds):
-        progress('step 1: one focal length', n / settings.rounds)
+        progress('adjusting one focal length', n / settings.rounds)
         few, camera = adjust_step1(few, camera, solver, reach)
         few = retriangulate_all(few, camera, config.scene)
     kept = explained_by(few, full_scenes, camera, config)
@@ -159,7 +159,7 @@ def step2(complete: Fit, full_scenes: ByTurn, step1: Camera, config: Config,
     settings = config.intrinsics
     fit, bounds = complete, bounds_of(step1, settings)
     for n in range(settings.rounds):
-        progress('step 2: all parameters', (n + 1) / (settings.rounds + 1))
+        progress('adjusting all parameters', (n + 1) / (settings.rounds + 1))
         if n > 0:
             ready = _retriangulated(fit, full_scenes, step1, config)
             if not fit.readout_s and _changed(fit, ready) < settings.settled:

@@ -11,13 +11,17 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.frames.mask_file import check_mask
 from dashcalib_ros.frames.scale import FULL_SIZE, Scale
+from dashcalib_ros.lines import LineCollector, Lines
 from dashcalib_ros.motion import MotionEstimator
+from dashcalib_ros.motion.motion import TrackedPoints
 from dashcalib_ros.turns.detector import TurnDetector
 from dashcalib_ros.turns.turn import Turn
 
-# images after which the stamps' unit is checked; ns between images of the fastest camera, 10 kHz
+# images after which the stamps' unit is checked; ns between images of a camera of 2 kHz: in
+# microseconds, any camera above 2 Hz seems to be faster
 FIRST_FRAMES = 10
-SHORTEST_NS = 100_000
+SHORTEST_NS = 500_000
+
 
 class Detection:
     """Takes the images of one camera; keeps the best turns, with their images.
@@ -34,13 +38,20 @@ class Detection:
         self.size: tuple[int, int] | None = None
         self.scale = FULL_SIZE
         self.frames = 0
-        self._first_ns = 0
+        self._first_ns = self._last_ns = 0
+        self._rises = 0
         self.standing = False
         self._config = config
         self._motion = MotionEstimator(config.motion, config.mask, mask)
+        self._lines = LineCollector(config.lines)
         # more turns than wanted replace those without a scene; --turns may be above the capacity
         self._turns = TurnDetector(replace(
             config.turns, capacity=max(config.turns.capacity, config.turns.wanted)))
+
+    @property
+    def start_s(self) -> float:
+        """Return the stamp of the first image, s."""
+        return self._first_ns / 1e9
 
     @property
     def magnitude(self) -> float:
@@ -62,6 +73,8 @@ class Detection:
         if motion is None:
             return []
         self.standing = motion.standing
+        if not motion.standing:
+            self._lines.push(frame.image, frame.stamp_ns)
         return self._fixed(self._turns.push(frame, motion))
 
     def finish(self) -> list[Turn]:
@@ -83,6 +96,15 @@ class Detection:
     def valid(self) -> Mask | None:
         """Return (h, w) of the resized images, False where the ego vehicle is; None: nowhere."""
         return self._motion.valid()
+
+    def points(self) -> TrackedPoints:
+        """Return the points tracked in the newest image, in px of the input."""
+        points, px = self._motion.points(), np.float32(self.scale.px)
+        return TrackedPoints(*((xy + 0.5) * px - 0.5 for xy in (points.before, points.now)))
+
+    def lines(self) -> Lines:
+        """Return the upright lines of the drive so far, in the resized images."""
+        return self._lines.lines().within(self.valid())
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings for the user, one line each."""
@@ -113,9 +135,15 @@ class Detection:
     def _check_stamps(self, frame: Frame) -> None:
         """Check once that time passes between the first images, in the right unit."""
         if self.frames == 0:
-            self._first_ns = frame.stamp_ns
+            self._first_ns = self._last_ns = frame.stamp_ns
+        if self.frames > FIRST_FRAMES:
+            return
+        # a clock may be set back once, but then it goes on
+        self._rises += frame.stamp_ns > self._last_ns
+        self._last_ns = frame.stamp_ns
         passed = frame.stamp_ns - self._first_ns
-        if self.frames == FIRST_FRAMES and 0 <= passed < FIRST_FRAMES * SHORTEST_NS:
+        too_short = 0 <= passed < FIRST_FRAMES * SHORTEST_NS
+        if self.frames == FIRST_FRAMES and (too_short or self._rises < FIRST_FRAMES // 2):
             raise InputError(
                 f'{FIRST_FRAMES} images pass in {passed} ns: Frame.stamp_ns must rise, and count '
                 f'nanoseconds, not seconds, milliseconds or images')

@@ -46,7 +46,7 @@ class TurnDetector:
         if self._last_ns is not None:
             step = frame.stamp_ns - self._last_ns
             # no turn extends over a gap, or over a clock that was set back
-            if step < 0 or step > self.config.half_width * 1e9:
+            if frame.after_gap or step < 0 or step > self.config.half_width * 1e9:
                 changed += self._end()
         self._last_ns = frame.stamp_ns
         self.bank.collect(frame, self._needed_ns(frame))

@@ -10,6 +10,7 @@ from dashcalib_ros import stages
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import DashcalibError, WorkerError
+from dashcalib_ros.reconstruction.picture import TurnPicture, picture_of
 from dashcalib_ros.reconstruction.scene import Draft, Scene
 from dashcalib_ros.turns.turn import Turn, TurnId
 from dashcalib_ros.workers.jobs import Job, Jobs, back_off_s
@@ -34,12 +35,14 @@ class ScenePool:
     def __init__(self, config: Config, make_worker: Callable[[], Worker],
                  queue: int | None = None, on_built: Callable[[], None] = lambda: None,
                  on_lost: Callable[[str], None] = lambda text: None,
-                 on_trouble: Callable[[str], None] = lambda text: None) -> None:
+                 on_trouble: Callable[[str], None] = lambda text: None,
+                 keep_pictures: bool = False) -> None:
         """queue: how many turns may wait for a worker, with their images; None: any number.
 
         If there are more, as in a live drive, the least prominent counts as one without a scene.
         on_built: called when a turn is done. on_lost: called with a line when a turn is given up.
         on_trouble: called with a line when a worker failed and its work is tried again.
+        keep_pictures: pictures() has one of each turn that is done.
         """
         self._config = config
         self._on_built, self._on_lost, self._on_trouble = on_built, on_lost, on_trouble
@@ -56,6 +59,8 @@ class ScenePool:
         # all turns without a result, also those that a worker has now
         self._unbuilt: set[TurnId] = set()
         self._scenes: dict[TurnId, Scene | None] = {}
+        self._keep_pictures = keep_pictures
+        self._pictures: dict[TurnId, TurnPicture] = {}
         # those that wait() has not raised yet
         self._errors: dict[TurnId, Exception] = {}
 
@@ -81,6 +86,7 @@ class ScenePool:
             for turn in (self._scenes.keys() | self._errors.keys()) - turns:
                 self._scenes.pop(turn, None)
                 self._errors.pop(turn, None)
+                self._pictures.pop(turn, None)
 
     def reject(self, turn: TurnId) -> None:
         """Take out a scene that does not fit the others; its turn counts as one without."""
@@ -96,6 +102,11 @@ class ScenePool:
         """Return the results by turn: scenes, None for a turn that gave none."""
         with self._changed:
             return dict(self._scenes)
+
+    def pictures(self) -> dict[TurnId, TurnPicture]:
+        """Return a picture of each turn that is done; none unless they are to be kept."""
+        with self._changed:
+            return dict(self._pictures)
 
     def pids(self) -> list[int]:
         """Return the process ids of the workers that have one."""
@@ -205,7 +216,8 @@ class ScenePool:
                 if job.turn.id in self._unbuilt:
                     self._put(job.drafted(done))
             return
-        self._settle(job.turn.id, done)
+        picture = picture_of(job.turn, done) if self._keep_pictures else None
+        self._settle(job.turn.id, done, picture)
         self._on_built()
 
     def _failed(self, worker: Worker, job: Job, error: Exception) -> None:
@@ -248,13 +260,16 @@ class ScenePool:
             self._settle(dropped.turn.id, None)
         self._notify()
 
-    def _settle(self, turn: TurnId, scene: Scene | None) -> None:
+    def _settle(self, turn: TurnId, scene: Scene | None,
+                picture: TurnPicture | None = None) -> None:
         with self._changed:
             # keep_only() may have dropped it meanwhile
             if turn in self._unbuilt:
                 self._unbuilt.remove(turn)
                 self._errors.pop(turn, None)
                 self._scenes[turn] = scene
+                if picture is not None:
+                    self._pictures[turn] = picture
 
     def _notify(self) -> None:
         self._changes += 1

@@ -1,0 +1,46 @@
+"""One picture of each turn, for people: small, and of a keyframe, so that tracks fit on it."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from dashcalib_ros.arrays import GreyImage
+from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.turns.turn import Turn
+
+# px; wider pictures are made smaller: several of them go into one report
+WIDTH = 720
+
+
+@dataclass(frozen=True)
+class TurnPicture:
+    """frame: its index among the input's frames. image: (h, w) uint8, grey, at most WIDTH wide."""
+
+    frame: int
+    image: GreyImage
+
+
+def picture_of(turn: Turn, scene: Scene | None) -> TurnPicture | None:
+    """Return the picture at the turn's centre: of a registered keyframe, if there is a scene.
+
+    None where the turn has no frames any more.
+    """
+    shown = {frame.index: frame.image for frame in turn.frames}
+    if scene is not None:
+        registered = scene.tracks.frames[scene.structure.registered]
+        shown = {index: shown[index] for index in map(int, registered) if index in shown}
+    if not shown:
+        return None
+    index = min(shown, key=lambda index: abs(index - turn.center))
+    return TurnPicture(index, _small(shown[index]))
+
+
+def _small(image: GreyImage) -> GreyImage:
+    height, width = image.shape
+    if width <= WIDTH:
+        # a view may keep much more than this picture in memory
+        return np.array(image)
+    size = (WIDTH, max(1, round(height * WIDTH / width)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
