@@ -1,0 +1,1 @@
+"""Many clips of many cameras, calibrated with one command: batch.py tells the story."""

@@ -1,0 +1,192 @@
+"""The second stage of a fleet: all clips of one camera -> one calibration.
+
+A clip that shows another camera (another device, a zoom, another mode of the sensor) is named and
+left out; it is never averaged.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dashcalib_ros import stages
+from dashcalib_ros.config import Config
+from dashcalib_ros.fleet.clip_shares import ClipShare, ClipTurn, contradicting, shares_of
+from dashcalib_ros.fleet.gathered import Gathered
+from dashcalib_ros.frames.scale import FULL_SIZE, Scale
+from dashcalib_ros.judgement import Calibration, Verdict
+from dashcalib_ros.judgement.conclude import Evidence
+from dashcalib_ros.judgement.verdict import lacks_knowledge_only
+from dashcalib_ros.reconstruction.repeated import without_repeated
+from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.turn_store import StoredTurn
+from dashcalib_ros.turns.turn import TurnId
+
+# solutions at the most; each leaves out the clips that contradict the one before
+ROUNDS = 3
+# of the input, and how it was resized
+Size = tuple[tuple[int, int], int, int]
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clip of the camera. time_s: when it was recorded, None where unknown."""
+
+    name: str
+    gathered: Gathered
+    time_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Fused:
+    """A camera's calibration from its own clips.
+
+    shares: by clip. solution: None where no turn could be used; scale: of its pictures. sound:
+    nothing but a lack of knowledge speaks against it: a prior of its make may help.
+    """
+
+    calibration: Calibration
+    shares: Mapping[str, ClipShare]
+    solution: Solution | None
+    scale: Scale
+    sound: bool
+
+
+def fuse(clips: Sequence[Clip], config: Config) -> Fused:
+    """Calibrate one camera from all its clips; the order of the clips does not count."""
+    clips = sorted(clips, key=lambda clip: (clip.name, clip.gathered.content))
+    left_out = _same_content(clips)
+    left_out.update(_other_sizes([clip for clip in clips if clip.name not in left_out]))
+    turns = _numbered([clip for clip in clips if clip.name not in left_out])
+    solution: Solution | None = None
+    scenes: list[Scene] = []
+    repeated: dict[TurnId, TurnId] = {}
+    for further in reversed(range(ROUNDS)):
+        scenes, repeated = _chosen(turns, left_out, config)
+        solution = stages.solve(scenes, config) if scenes else None
+        of_another = contradicting(solution, turns, _scale(clips, left_out).px, config.verdict)
+        if not (of_another and further):
+            break
+        left_out.update(of_another)
+    kept = [clip for clip in clips if clip.name not in left_out]
+    calibration = _judged(solution, kept, [turns[scene.turn].stored for scene in scenes],
+                          left_out, config)
+    scale = _scale(clips, left_out)
+    shares = shares_of(solution, turns, scale.px)
+    for turn, other in sorted(repeated.items()):
+        shares.setdefault(turns[turn].clip, ClipShare(
+            left_out=f'shows the same pictures as {turns[other].clip}'))
+    shares.update({name: ClipShare(left_out=why) for name, why in left_out.items()})
+    return Fused(calibration, {clip.name: shares.get(clip.name, ClipShare()) for clip in clips},
+                 solution, scale,
+                 solution is not None and lacks_knowledge_only(solution, config.verdict))
+
+
+def _scale(clips: Sequence[Clip], left_out: Mapping[str, str]) -> Scale:
+    """Return how the pictures of the clips that are left were resized: all alike."""
+    return next((clip.gathered.scale for clip in clips if clip.name not in left_out), FULL_SIZE)
+
+
+def _same_content(clips: Sequence[Clip]) -> dict[str, str]:
+    """Return the clips with the same content as another, which count once."""
+    first: dict[str, str] = {}
+    found = {}
+    for clip in clips:
+        other = first.setdefault(clip.gathered.content, clip.name)
+        if other != clip.name:
+            found[clip.name] = f'has the same content as {other}'
+    return found
+
+
+def _other_sizes(clips: Sequence[Clip]) -> dict[str, str]:
+    """Return the clips with another image size than most: a calibration holds for one.
+
+    Pictures that were resized differently, with other settings, are of another size, too.
+    """
+    def size_of(clip: Clip) -> Size:
+        scale = clip.gathered.scale
+        return clip.gathered.image_size, scale.shrink, scale.enlarge
+
+    def weight(size: Size) -> tuple[int, int, Size]:
+        of_size = [clip for clip in clips if size_of(clip) == size]
+        return sum(len(clip.gathered.scenes) for clip in of_size), len(of_size), size
+
+    sizes = {size_of(clip) for clip in clips}
+    if len(sizes) < 2:
+        return {}
+    main = max(sizes, key=weight)
+    return {clip.name: f'is {_by(clip.gathered.image_size)}, most of this camera are '
+                       f'{_by(main[0])}' if clip.gathered.image_size != main[0] else
+            'was gathered with other settings of max_width or min_width than most'
+            for clip in clips if size_of(clip) != main}
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f'{size[0]}x{size[1]}'
+
+
+def _numbered(clips: Sequence[Clip]) -> dict[TurnId, ClipTurn]:
+    """Return every reconstructed turn, under an identity that is unique in the camera."""
+    found: dict[TurnId, ClipTurn] = {}
+    for clip in clips:
+        for turn in clip.gathered.turns:
+            if turn.scene:
+                key = TurnId.stored(len(found))
+                scene = replace(clip.gathered.scenes[turn.center], turn=key)
+                found[key] = ClipTurn(clip.name, StoredTurn(scene, turn.stamp_s, turn.prominence))
+    return found
+
+
+def _chosen(turns: Mapping[TurnId, ClipTurn], left_out: Mapping[str, str], config: Config
+            ) -> tuple[list[Scene], dict[TurnId, TurnId]]:
+    """Return the scenes to use, and which turns repeat others.
+
+    Each clip's best turn first, then each clip's second, and so on, so that every clip has a say,
+    also about whether it is of this camera.
+    """
+    by_clip: dict[str, list[TurnId]] = {}
+    for key in sorted(turns, key=lambda key: (-turns[key].stored.prominence, key)):
+        if turns[key].clip not in left_out:
+            by_clip.setdefault(turns[key].clip, []).append(key)
+    ranked = [key for _, _, key in sorted(
+        (place, -turns[key].stored.prominence, key)
+        for keys in by_clip.values() for place, key in enumerate(keys))]
+    repeated: dict[TurnId, TurnId] = {}
+    while True:
+        best = [key for key in ranked if key not in repeated][:config.fleet.turns]
+        scenes, more = without_repeated([turns[key].stored.scene for key in best],
+                                        config.scene.min_images)
+        if not more:
+            return scenes, repeated
+        repeated.update(more)
+
+
+def _judged(solution: Solution | None, clips: Sequence[Clip], stored: Sequence[StoredTurn],
+            left_out: Mapping[str, str], config: Config) -> Calibration:
+    warnings = tuple(f'the clip {name} was left out: it {why}'
+                     for name, why in sorted(left_out.items()))
+    first = clips[0].gathered if clips else None
+    evidence = Evidence(
+        image_size=first.image_size if first else (0, 0),
+        frames=sum(clip.gathered.frames for clip in clips), turns=(), built={},
+        magnitudes=np.zeros((0, 2)), mask=None, scale=first.scale if first else FULL_SIZE,
+        timing={}, warnings=warnings, stored=tuple(stored))
+    calibration = stages.judge(solution, evidence, config)
+    if solution is None:
+        return replace(calibration, verdict=Verdict('refused', (_nothing_found(clips),)))
+    return calibration
+
+
+def _nothing_found(clips: Sequence[Clip]) -> str:
+    if not clips:
+        return 'none of its clips could be read'
+    turns = sum(len(clip.gathered.turns) for clip in clips)
+    scenes = sum(len(clip.gathered.scenes) for clip in clips)
+    what = f'{len(clips)} clip{"s" * (len(clips) > 1)}'
+    if not turns:
+        return f'no turn was found in {what}: more clips with turns are needed'
+    if not scenes:
+        return f'none of the {turns} turns in {what} could be reconstructed'
+    return f'no common camera explains the {scenes} turns of {what}'

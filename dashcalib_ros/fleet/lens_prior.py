@@ -1,0 +1,174 @@
+"""What units of one model have in common: a normal distribution of their lenses, from the fleet.
+
+The units of a make have nearly the same focal length and distortion (the centre is each unit's
+own). Each unit is measured with its own covariance S; between units the lenses differ by a
+covariance B, which is estimated by maximum likelihood (EM), so that S is not mistaken for B. The
+spreads of FleetConfig count as some more units. A unit with one turn has no scatter between turns
+in its S: by how much such S are too small is estimated, too. A unit that is several sigmas off is
+in another mode of its sensor: it is thrown out, and has no prior. A unit's prior is made without
+itself.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.config import FleetConfig
+
+# steps of EM, and how often units are thrown out and taken back
+STEPS, ROUNDS = 200, 10
+# of the change of B; EM has ended
+SETTLED = 1e-6
+# units that are left out together where there are many of them: one in so many changes nothing
+FOLDS = 40
+# candidates for the middle of the units
+CANDIDATES = 500
+# of the variance of units with one turn: real turns are off by 2 to 8 times the sigma of noise
+MOST_EXCESS = 64.0
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A camera's own estimate. make: with all that units must share, such as the image size.
+
+    lens: (d,) the logarithm of the focal length over the width, then the distortion coefficients.
+    covariance: (d, d). one_turn: it is made from one turn only.
+    """
+
+    name: str
+    make: tuple[str, ...]
+    lens: Floats
+    covariance: Floats
+    one_turn: bool = False
+
+
+@dataclass(frozen=True)
+class LensPrior:
+    """Of one unit: mean (d,), covariance (d, d). units: how many others it is made from.
+
+    excess: by how much the variances of units with one turn are too small, 1 or more.
+    """
+
+    mean: Floats
+    covariance: Floats
+    units: int
+    excess: float = 1.0
+
+    def excess_of(self, unit: Unit) -> float:
+        """Return by how much a unit's own variances are too small."""
+        return self.excess if unit.one_turn else 1.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A unit's prior; None with the reason, which may be that it is in another mode."""
+
+    prior: LensPrior | None
+    why_not: str = ''
+    other_mode: bool = False
+
+
+def priors(units: Sequence[Unit], config: FleetConfig) -> dict[str, Verdict]:
+    """Return each unit's prior, from the other units of its make."""
+    makes: dict[tuple[str, ...], list[Unit]] = {}
+    for unit in sorted(units, key=lambda unit: unit.name):
+        makes.setdefault(unit.make, []).append(unit)
+    found: dict[str, Verdict] = {}
+    for of_make in makes.values():
+        found.update(_priors_of_make(of_make, config))
+    return found
+
+
+def _priors_of_make(units: Sequence[Unit], config: FleetConfig) -> dict[str, Verdict]:
+    found: dict[str, Verdict] = {}
+    folds = min(len(units), FOLDS)
+    for fold in range(folds):
+        others = [unit for n, unit in enumerate(units) if n % folds != fold]
+        prior = lens_prior(others, config)
+        for unit in units[fold::folds]:
+            found[unit.name] = _verdict(unit, prior, len(others), config)
+    return found
+
+
+def _verdict(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> Verdict:
+    if prior is None:
+        return Verdict(None, f'of its make there are {others} other usable cameras, '
+                             f'{config.least_units} that agree are needed')
+    if off_by(unit, prior) > config.other_mode:
+        percent = 100 * (np.exp(unit.lens[0] - prior.mean[0]) - 1)
+        return Verdict(None, f'its fx is {percent:+.1f} % off that of its make, or its distortion '
+                             f'is another: another mode of the sensor, or another device', True)
+    return Verdict(prior)
+
+
+def off_by(unit: Unit, prior: LensPrior) -> float:
+    """Return by how many sigmas a unit is off a prior, where it is off most."""
+    variance = np.diag(prior.excess_of(unit) * unit.covariance + prior.covariance)
+    return float(np.max(np.abs(unit.lens - prior.mean) / np.sqrt(variance)))
+
+
+def lens_prior(units: Sequence[Unit], config: FleetConfig) -> LensPrior | None:
+    """Return the distribution of the lenses of those units that agree; None if they are few."""
+    if len(units) < config.least_units:
+        return None
+    focal = np.array([unit.lens[0] for unit in units])
+    agree = _densest(focal, np.array([unit.covariance[0, 0] for unit in units]), config)
+    prior = _fitted([unit for unit, kept in zip(units, agree, strict=True) if kept], config)
+    for _ in range(ROUNDS):
+        now = np.array([off_by(unit, prior) <= config.other_mode for unit in units])
+        if now.sum() < config.least_units:
+            return None
+        if np.array_equal(now, agree):
+            break
+        agree = now
+        prior = _fitted([unit for unit, kept in zip(units, agree, strict=True) if kept], config)
+    return prior
+
+
+def _densest(focal: Floats, variance: Floats, config: FleetConfig) -> Mask:
+    """Return (n,) the units around the value that most others agree with: the make's main mode.
+
+    focal: (n,) logarithms; variance: (n,) of each. A unit that knows little counts little.
+    """
+    total = variance + config.focal_spread**2
+    weight = config.focal_spread**2 / total
+    # the candidates are the best known units
+    best = np.argsort(-weight, kind='stable')[:CANDIDATES]
+    near = np.abs(focal[best, None] - focal) < config.other_mode / 2 * np.sqrt(total)
+    middle = focal[best[int(np.argmax(near @ weight))]]
+    return np.asarray(np.abs(focal - middle) < config.other_mode * np.sqrt(total))
+
+
+def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:
+    """Return the most likely distribution of units that are all of one mode."""
+    lenses = np.array([unit.lens for unit in units])
+    own = np.array([unit.covariance for unit in units])
+    vague = np.array([unit.one_turn for unit in units])
+    count, size = lenses.shape
+    assumed = np.diag([config.focal_spread**2] + [config.distortion_spread**2] * (size - 1))
+    between, excess = assumed, 1.0
+    for _ in range(STEPS):
+        noise = own * np.where(vague, excess, 1.0)[:, None, None]
+        weights = np.linalg.inv(between + noise)
+        of_mean = np.linalg.inv(weights.sum(axis=0))
+        mean = of_mean @ np.einsum('nij,nj->i', weights, lenses)
+        gain = between @ weights
+        offset = np.einsum('nij,nj->ni', gain, lenses - mean)
+        # what a unit's own data, and the mean, leave unknown of its offset
+        rest = between - gain @ between + gain @ of_mean @ gain.transpose(0, 2, 1)
+        total = offset.T @ offset + rest.sum(axis=0) + config.spread_units * assumed
+        new = total / (count + config.spread_units)
+        change = np.max(np.abs(new - between)) / np.max(np.diag(new))
+        between = (new + new.T) / 2
+        if vague.any():
+            # of fx: its sigma is what matters
+            error = (lenses - mean - offset)[:, 0]
+            ratios = (error**2 + rest[:, 0, 0]) / own[:, 0, 0]
+            now = min(max(float(ratios[vague].mean()), 1.0), MOST_EXCESS)
+            change, excess = max(change, abs(now - excess)), now
+        if change < SETTLED:
+            break
+    return LensPrior(mean, between + of_mean, count, excess)

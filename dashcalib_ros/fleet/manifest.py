@@ -1,0 +1,234 @@
+"""Which clips there are: a table, a folder or a glob -> rows."""
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import posixpath
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from typing import Any
+
+from dashcalib_ros.bags.names import is_bag_file
+from dashcalib_ros.errors import ConfigError, InputError, one_line, shortened
+from dashcalib_ros.fleet import storage
+from dashcalib_ros.fleet.extra import needs
+from dashcalib_ros.fleet.gathered import SUFFIX as GATHERED
+from dashcalib_ros.frames.source import IMAGE_SUFFIXES
+from dashcalib_ros.inputs import VIDEO_SUFFIXES
+
+# bytes of a manifest: ten million rows
+LARGEST = 2**31
+COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time')
+KNOWN_SUFFIXES = ('.csv', '.jsonl', '.ndjson', '.parquet')
+
+
+@dataclass(frozen=True)
+class Row:
+    """A clip. number: of the manifest's row, from 1. place: its path or URL; clip: as written.
+
+    camera: '' where it is unknown, then the clip is a camera of its own. make: '' where unknown.
+    time_s: when it was recorded, s since 1970; None where unknown. problem: why this row cannot
+    be used, '' if it can.
+    """
+
+    number: int
+    clip: str
+    place: str
+    camera: str = ''
+    make: str = ''
+    fps: float | None = None
+    topic: str | None = None
+    time_s: float | None = None
+    problem: str = ''
+
+
+def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
+    """Return the rows of a manifest: .csv, .jsonl, .parquet, a folder or a glob.
+
+    group_by: a regular expression that takes the camera from a clip's name: its group `camera`, or
+    its first group, or all that it matches; its group `make`, too. Raises InputError where the
+    manifest cannot be read at all; what is wrong with a row stands in the row.
+    """
+    pattern = _pattern(group_by)
+    suffix = next((each for each in KNOWN_SUFFIXES if place.lower().endswith(each)), '')
+    if suffix and not storage.is_folder(place):
+        folder = storage.parent(place)
+        rows = [_row(number, values, folder) for number, values in _table(place, suffix)]
+    else:
+        rows = [Row(number, found, found) for number, found in enumerate(_found(place), 1)]
+    if not rows:
+        raise InputError(f'{place} names no clip; give a CSV with a column clip, a folder or a '
+                         f'glob')
+    return [_grouped(row, pattern) for row in rows]
+
+
+def _pattern(group_by: str | None) -> re.Pattern[str] | None:
+    try:
+        return None if group_by is None else re.compile(group_by)
+    except re.error as error:
+        raise ConfigError(f'--group-by {shortened(group_by or "")} is no regular expression '
+                          f'({error})') from error
+
+
+def _found(place: str) -> list[str]:
+    """Return what lies in a folder, or what a glob finds."""
+    if any(sign in place for sign in '*?['):
+        return storage.listed(place)
+    if not storage.is_folder(place):
+        if storage.stamp(place) is None:
+            raise InputError(f'there is no manifest {place}; check the path')
+        raise InputError(f'{place} is no manifest: give a .csv, .jsonl or .parquet file, a folder '
+                         f'of clips, or a glob in quotes')
+    found = storage.listed(place)
+    if found and all(name.lower().endswith(tuple(IMAGE_SUFFIXES)) for name in found):
+        return [place]  # the images of one drive
+    return [name for name in found if _may_be_a_clip(name)]
+
+
+def _may_be_a_clip(name: str) -> bool:
+    """Return whether a folder's entry may be a clip: notes and tables lie there, too."""
+    suffix = posixpath.splitext(name)[1].lower()
+    return suffix in (*VIDEO_SUFFIXES, GATHERED) or is_bag_file(name) or storage.is_folder(name)
+
+
+def _table(place: str, suffix: str) -> Iterator[tuple[int, Mapping[str, Any] | str]]:
+    """Yield each row's number and its values, or why there are none."""
+    data = storage.read(place, LARGEST)
+    if data is None:
+        raise InputError(f'there is no manifest {place}; check the path')
+    if suffix == '.parquet':
+        yield from _parquet(place, data)
+        return
+    try:
+        text = data.decode('utf-8-sig')
+    except UnicodeDecodeError as error:
+        line = data[:error.start].count(b'\n') + 1
+        raise InputError(f'{place} is not UTF-8 (line {line}); save it as UTF-8') from error
+    yield from (_csv if suffix == '.csv' else _json_lines)(place, text)
+
+
+def _csv(place: str, text: str) -> Iterator[tuple[int, Mapping[str, Any] | str]]:
+    reader = csv.reader(io.StringIO(text.replace('\0', ''), newline=''))
+    try:
+        head = [name.strip().lower() for name in next(reader, [])]
+        if 'clip' not in head:
+            raise InputError(f'{place} has no column clip; its first line must name the columns: '
+                             f'{", ".join(COLUMNS)}')
+        number = 0
+        for values in reader:
+            if not any(value.strip() for value in values):
+                continue
+            number += 1
+            if len(values) > len(head):
+                yield number, f'has {len(values)} values for {len(head)} columns'
+            else:
+                yield number, dict(zip(head, values, strict=False))
+    except csv.Error as error:
+        raise InputError(f'{place} is no CSV (line {reader.line_num}: {error})') from error
+
+
+def _json_lines(place: str, text: str) -> Iterator[tuple[int, Mapping[str, Any] | str]]:
+    for number, line in enumerate(filter(str.strip, text.split('\n')), 1):
+        try:
+            values = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            yield number, f'is no JSON ({one_line(error, 80)})'
+            continue
+        yield number, values if isinstance(values, dict) else 'is no JSON object'
+
+
+def _parquet(place: str, data: bytes) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    needs('pyarrow', 'Parquet manifests')
+    import pyarrow as arrow
+    from pyarrow import parquet
+    try:
+        table = parquet.read_table(arrow.BufferReader(data))
+    except (arrow.ArrowException, OSError) as error:
+        raise InputError(f'{place} is no Parquet file ({one_line(error)})') from error
+    if 'clip' not in table.column_names:
+        raise InputError(f'{place} has no column clip; the columns may be {", ".join(COLUMNS)}')
+    kept = table.select([name for name in COLUMNS if name in table.column_names])
+    yield from enumerate(kept.to_pylist(), 1)
+
+
+def _row(number: int, values: Mapping[str, Any] | str, folder: str) -> Row:
+    if isinstance(values, str):
+        return Row(number, '', '', problem=values)
+    clip, camera, make, topic = (_text(values, name)
+                                 for name in ('clip', 'camera', 'make', 'topic'))
+    if not clip:
+        return Row(number, '', '', camera, make, problem='names no clip')
+    row = Row(number, clip, storage.joined(folder, clip), camera, make, topic=topic or None)
+    try:
+        return replace(row, fps=_rate(values), time_s=_time(values))
+    except ValueError as error:
+        return replace(row, problem=str(error))
+
+
+def _text(values: Mapping[str, Any], name: str) -> str:
+    value = values.get(name)
+    return '' if value is None else str(value).strip()
+
+
+def _rate(values: Mapping[str, Any]) -> float | None:
+    text = _text(values, 'fps')
+    if not text:
+        return None
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = math.nan
+    if not 0 < rate <= 1000:
+        raise ValueError(f'fps must be above 0 and at most 1000, not {shortened(text, 40)}')
+    return rate
+
+
+def _time(values: Mapping[str, Any]) -> float | None:
+    """Return s since 1970 from a number or an ISO date; a date without a zone is UTC."""
+    text = _text(values, 'time')
+    if not text:
+        return None
+    try:
+        seconds = float(text)
+    except ValueError:
+        try:
+            date = datetime.fromisoformat(text.replace('Z', '+00:00'))
+        except ValueError:
+            raise ValueError(f'time must be like 2026-01-31T12:00:00, or s since 1970, not '
+                             f'{shortened(text, 40)}') from None
+        if date.tzinfo is None:
+            date = date.replace(tzinfo=timezone.utc)
+        seconds = date.timestamp()
+    if not math.isfinite(seconds):
+        raise ValueError('time must be a finite number')
+    return seconds
+
+
+def _grouped(row: Row, pattern: re.Pattern[str] | None) -> Row:
+    """Return the row with the camera, and the make, that its clip's name tells."""
+    if pattern is None or not row.clip:
+        return row
+    found = pattern.search(row.clip)
+    if found is None:
+        return row if row.camera else replace(
+            row, problem=row.problem or '--group-by finds no camera in its name')
+    named = found.groupdict()
+    camera = named.get('camera') or (found.group(1) if pattern.groups else found.group(0))
+    return replace(row, camera=row.camera or camera or '',
+                   make=row.make or named.get('make') or '')
+
+
+def by_camera(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Return the rows of each camera, cameras sorted by name, rows as they stand.
+
+    A clip whose camera is unknown is one of its own, and its name is the clip's. Rows that name
+    neither are under ''.
+    """
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row.camera or row.clip, []).append(row)
+    return dict(sorted(found.items()))

@@ -1,0 +1,151 @@
+"""A camera's own result as a JSON text, from which its calibration can be made again."""
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera import Camera, camera_of
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.fleet.clip_shares import ClipShare
+from dashcalib_ros.fleet.fuse import Fused
+from dashcalib_ros.judgement import Calibration, Verdict
+from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.turns.turn import TurnId
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A camera as its own turns have it, whatever the verdict, in px of the input.
+
+    covariance: (n, n). sound: nothing but a lack of knowledge speaks against it.
+    """
+
+    camera: Camera
+    covariance: Floats
+    sigma_px: PictureSigma
+    reprojection_error_px: float
+    sound: bool
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A camera's result from its own clips. estimate: None where nothing was solved.
+
+    shares: by clip.
+    """
+
+    camera: str
+    make: str
+    calibration: Calibration
+    estimate: Estimate | None
+    shares: Mapping[str, ClipShare]
+
+
+def solved_of(camera: str, make: str, fused: Fused) -> Solved:
+    """Return what is kept of a camera's fused clips."""
+    calibration = replace(fused.calibration, input_name=camera)
+    return Solved(camera, make, calibration, _estimate(fused), fused.shares)
+
+
+def _estimate(fused: Fused) -> Estimate | None:
+    solution = fused.solution
+    if solution is None:
+        return None
+    px = fused.scale.px
+    units = np.where(np.arange(len(solution.sigma)) < 4, px, 1.0)
+    return Estimate(
+        solution.camera.resized(px, fused.calibration.image_size),
+        solution.covariance * np.outer(units, units),
+        PictureSigma(solution.picture.rms * px, solution.picture.worst * px),
+        solution.reprojection_error_px * px, fused.sound)
+
+
+def encoded(solved: Solved) -> bytes:
+    """Return the JSON text; the same result gives the same bytes."""
+    c, estimate = solved.calibration, solved.estimate
+    data = plain_values({
+        'format': FORMAT, 'camera': solved.camera, 'make': solved.make,
+        'shares': {name: dataclasses.asdict(share) for name, share in solved.shares.items()},
+        'estimate': None if estimate is None else {
+            'model': estimate.camera.model, 'params': estimate.camera.params,
+            'image_size': estimate.camera.image_size, 'covariance': estimate.covariance,
+            'sigma_px': estimate.sigma_px, 'sound': estimate.sound,
+            'reprojection_error_px': estimate.reprojection_error_px},
+        'calibration': {
+            'verdict': c.verdict.level, 'reasons': c.verdict.reasons, 'frames': c.frames,
+            'image_size': c.image_size, 'versions': c.versions, 'warnings': c.warnings,
+            'details': c.details, 'config': c.config.flat(), 'shutter': c.rolling_shutter,
+            'stabiliser': c.stabiliser,
+            'turns': [{**dataclasses.asdict(turn), 'id': turn.id.number}
+                      for turn in c.stored_turns]}})
+    return json.dumps(data, allow_nan=False, sort_keys=True).encode()
+
+
+def decoded(data: bytes, name: str) -> Solved:
+    """Return the result that a text holds; raises InputError, in which `name` names the file."""
+    try:
+        content = json.loads(data)
+        if content['format'] != FORMAT:
+            raise ValueError(f'it has format {content["format"]}, this version has {FORMAT}')
+        estimate = _decoded_estimate(content['estimate'])
+        return Solved(
+            content['camera'], content['make'], _calibration(content, estimate), estimate,
+            {clip: ClipShare(**share) for clip, share in content['shares'].items()})
+    except Exception as error:  # damaged files raise errors of all kinds
+        raise InputError(f'{name} is no result of a camera ({one_line(error, 120)}); remove it, '
+                         f'and the camera is solved again') from error
+
+
+def _decoded_estimate(data: Mapping[str, Any] | None) -> Estimate | None:
+    if data is None:
+        return None
+    camera = camera_of(data['model'], _size(data['image_size']), data['params'])
+    # JSON has no infinity: what was not finite is not known at all
+    covariance = np.array([[np.inf if value is None else value for value in row]
+                           for row in data['covariance']], float)
+    return Estimate(camera, covariance, _picture(data['sigma_px']),
+                    data['reprojection_error_px'], data['sound'])
+
+
+def _calibration(content: Mapping[str, Any], estimate: Estimate | None) -> Calibration:
+    c = content['calibration']
+    verdict = Verdict(c['verdict'], tuple(c['reasons']))
+    known = estimate if verdict.level != 'refused' else None
+    return Calibration(
+        verdict=verdict, image_size=_size(c['image_size']),
+        camera=None if known is None else known.camera,
+        sigma=None if known is None else sigmas(known.camera, known.covariance), turns=(),
+        frames=c['frames'], timing={}, versions=c['versions'],
+        reprojection_error_px=None if known is None else known.reprojection_error_px,
+        config=Config().replace(c['config']), input_name=content['camera'],
+        warnings=tuple(c['warnings']), details=c['details'],
+        stored_turns=tuple(StoredTurnSummary(**{**turn, 'id': TurnId.stored(turn['id'])})
+                           for turn in c['turns']),
+        rolling_shutter=None if c['shutter'] is None else Shutter(**c['shutter']),
+        stabiliser=None if c['stabiliser'] is None else Stabiliser(**c['stabiliser']),
+        sigma_px=None if known is None else known.sigma_px)
+
+
+def sigmas(camera: Camera, covariance: Floats) -> dict[str, float]:
+    """Return the standard deviations by the parameters' names."""
+    return dict(zip(camera.names(), np.sqrt(np.diag(covariance)).tolist(), strict=True))
+
+
+def _size(data: Any) -> tuple[int, int]:
+    width, height = data
+    return int(width), int(height)
+
+
+def _picture(data: Mapping[str, Any]) -> PictureSigma:
+    return PictureSigma(*(np.inf if data[key] is None else data[key] for key in ('rms', 'worst')))

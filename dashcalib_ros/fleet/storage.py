@@ -1,0 +1,201 @@
+"""Files here and on object stores, read and written whole: paths, and URLs such as s3://.
+
+Only URLs need fsspec.
+"""
+from __future__ import annotations
+
+import errno
+import os
+import posixpath
+import re
+import secrets
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dashcalib_ros.errors import InputError, OutputError, one_line
+from dashcalib_ros.fleet.extra import needs
+
+URL = re.compile(r'[a-z][a-z0-9+.-]+://')
+
+
+def is_url(place: str) -> bool:
+    """Return whether a place is a URL, and not a path of this machine."""
+    return URL.match(place) is not None
+
+
+def joined(folder: str, name: str) -> str:
+    """Return a name relative to a folder; a name that is a URL or absolute stands for itself."""
+    if is_url(name) or Path(name).is_absolute():
+        return name
+    return posixpath.join(folder, name) if is_url(folder) else str(Path(folder) / name)
+
+
+def parent(place: str) -> str:
+    """Return the folder that a file is in."""
+    return posixpath.dirname(place) if is_url(place) else str(Path(place).parent)
+
+
+def listed(pattern: str) -> list[str]:
+    """Return the files and folders that a folder has, or that a glob finds, sorted."""
+    if is_url(pattern):
+        system, path = _system(pattern)
+        scheme = pattern.partition('://')[0]
+        try:
+            found = (system.glob(path) if _is_glob(path) else system.ls(path, detail=False))
+        except Exception as error:  # each kind of store has errors of its own
+            raise InputError(f'cannot list {pattern} ({one_line(error)}); check the address and '
+                             f'your access to it') from error
+        return sorted(f'{scheme}://{name}' for name in found)
+    here = Path(pattern)
+    if not _is_glob(pattern):
+        return sorted(str(entry) for entry in here.iterdir() if not entry.name.startswith('.'))
+    base = Path(here.anchor or '.')
+    return sorted(str(found) for found in base.glob(str(here.relative_to(here.anchor))))
+
+
+def _is_glob(pattern: str) -> bool:
+    return any(sign in pattern for sign in '*?[')
+
+
+def is_folder(place: str) -> bool:
+    """Return whether a place is a folder of this machine, or one of an object store."""
+    if not is_url(place):
+        return Path(place).is_dir()
+    system, path = _system(place)
+    return bool(system.isdir(path))
+
+
+def stamp(place: str) -> str | None:
+    """Return a text that changes with a file's or folder's content; None where there is none."""
+    if is_url(place):
+        system, path = _system(place)
+        try:
+            about = system.info(path)
+        except FileNotFoundError:
+            return None
+        except Exception as error:
+            raise InputError(f'cannot read {place} ({one_line(error)})') from error
+        changes = [about.get(key) for key in ('size', 'ETag', 'etag', 'mtime', 'created',
+                                              'LastModified', 'generation')]
+        return ' '.join(str(each) for each in changes if each is not None)
+    try:
+        found = Path(place).stat()
+    except (OSError, ValueError):
+        return None
+    return f'{found.st_size} {found.st_mtime_ns}'
+
+
+@contextmanager
+def local_copy(place: str) -> Iterator[Path]:
+    """Copy what a URL names to the scratch disk (TMPDIR) and remove it later; a path is itself.
+
+    Raises InputError, OSError where the scratch disk is full.
+    """
+    if not is_url(place):
+        yield Path(place)
+        return
+    system, path = _system(place)
+    scratch = Path(tempfile.mkdtemp(prefix='dashcalib-'))
+    try:
+        copy = scratch / posixpath.basename(path.rstrip('/'))
+        try:
+            system.get(path, str(copy), recursive=system.isdir(path))
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise InputError(f'cannot copy {place} ({one_line(error)})') from error
+        except Exception as error:
+            raise InputError(f'cannot copy {place} ({one_line(error)})') from error
+        yield copy
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def read(place: str, limit: int) -> bytes | None:
+    """Return a file's bytes, None where there is none; raises InputError beyond the limit."""
+    try:
+        if is_url(place):
+            system, path = _system(place)
+            data = bytes(system.cat_file(path, start=0, end=limit + 1))
+        else:
+            with open(place, 'rb') as stream:
+                data = stream.read(limit + 1)
+    except FileNotFoundError:
+        return None
+    except Exception as error:
+        raise InputError(f'cannot read {place} ({one_line(error)})') from error
+    if len(data) > limit:
+        raise InputError(f'{place} is larger than {limit / 2**20:.0f} MB: is it the right file?')
+    return data
+
+
+@dataclass(frozen=True)
+class Folder:
+    """An output folder: its files appear whole or not at all. place: a path or a URL."""
+
+    place: str
+
+    def read(self, name: str, limit: int = 2**28) -> bytes | None:
+        """Return a file's bytes, None where there is none; raises InputError."""
+        return read(joined(self.place, name), limit)
+
+    def exists(self, name: str) -> bool:
+        """Return whether there is such a file."""
+        if is_url(self.place):
+            system, path = _system(joined(self.place, name))
+            return bool(system.exists(path))
+        return (Path(self.place) / name).is_file()
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file: others see all of it or nothing. Raises OutputError."""
+        place = joined(self.place, name)
+        try:
+            if is_url(place):
+                system, path = _system(place)
+                system.pipe_file(path, data)  # object stores show complete objects only
+            else:
+                _write_local(Path(place), data)
+        except OSError as error:
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            raise OutputError(
+                f'cannot write {place}: {error.strerror or one_line(error)}; '
+                + ('free some space, and start again: what is done stays' if full
+                   else 'choose an output folder you may write to')) from error
+
+    def remove(self, name: str) -> None:
+        """Remove a file, if there is one."""
+        if is_url(self.place):
+            system, path = _system(joined(self.place, name))
+            with suppress(FileNotFoundError):
+                system.rm_file(path)
+        else:
+            (Path(self.place) / name).unlink(missing_ok=True)
+
+
+def _write_local(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f'.{path.name}.{secrets.token_hex(4)}.tmp')
+    try:
+        with temporary.open('xb') as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def _system(url: str) -> tuple[Any, str]:
+    """Return fsspec's file system of a URL, and the path there; raises InputError."""
+    fsspec = needs('fsspec', f'{url.partition("://")[0]}:// addresses')
+    try:
+        system, path = fsspec.core.url_to_fs(url)
+    except (ImportError, ValueError) as error:
+        raise InputError(f'cannot use {url} ({one_line(error)})') from error
+    return system, str(path)

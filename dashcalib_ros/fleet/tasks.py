@@ -1,0 +1,248 @@
+"""What workers do: read a clip, solve a camera, publish its result. Done is what has a file.
+
+Each task is a function of its arguments and of files; it may run anywhere, and twice.
+"""
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import TypeVar
+
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import DashcalibError, InputError, one_line
+from dashcalib_ros.fleet import gathered, solved
+from dashcalib_ros.fleet.effort import Clock, Effort
+from dashcalib_ros.fleet.fuse import Clip, fuse
+from dashcalib_ros.fleet.gather import content_hash, gather, settings_hash
+from dashcalib_ros.fleet.lens_prior import Verdict
+from dashcalib_ros.fleet.manifest import Row
+from dashcalib_ros.fleet.posterior import Final, final_of
+from dashcalib_ros.fleet.storage import Folder, is_url, local_copy, stamp
+from dashcalib_ros.report import write_results
+from dashcalib_ros.report.files import ACCEPTED, NAMES, WEAK
+
+T = TypeVar('T')
+
+
+@dataclass(frozen=True)
+class ClipResult:
+    """What became of a clip. file: its gathered turns, '' if there are none; problem: why.
+
+    kept: a result that need not be tried again. stamp: as storage.stamp() when it was read.
+    time_s: of its first turn, s; only a date if the clip has dates.
+    """
+
+    clip: str
+    file: str = ''
+    problem: str = ''
+    stamp: str = ''
+    kept: bool = True
+    content: str = ''
+    image_size: tuple[int, int] | None = None
+    frames: int = 0
+    seconds: float = 0.0
+    turns: int = 0
+    scenes: int = 0
+    time_s: float | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def gather_clip(row: Row, out: str, config: Config) -> tuple[ClipResult, Effort]:
+    """Read a clip, unless that was done; never raises what a clip can cause."""
+    folder, started = Folder(out), Clock()
+    name = clip_file(row, config)
+    before = _earlier(folder, name, row)
+    if before is not None:
+        return before, started.effort(again=True)
+    try:
+        result = _gathered(row, folder, config)
+    except DashcalibError as error:
+        # what is not the clip's own fault is tried again the next time
+        result = ClipResult(row.clip, problem=one_line(error, 300),
+                            kept=isinstance(error, InputError))
+    except OSError as error:
+        result = ClipResult(row.clip, problem=f'cannot be read here: {one_line(error)}',
+                            kept=False)
+    return _noted(folder, name, result, row), started.effort()
+
+
+def set_aside(row: Row, out: str, config: Config, attempts: int) -> ClipResult:
+    """Note that a clip is not tried again, as it killed its worker so many times."""
+    result = ClipResult(row.clip, problem=f'killed its worker {attempts} times: it is set aside; '
+                                          f'is it damaged, or is there too little memory?')
+    return _noted(Folder(out), clip_file(row, config), result, row)
+
+
+def clip_file(row: Row, config: Config) -> str:
+    """Return the name of the file that tells what became of a clip."""
+    key = _hash([row.place, settings_hash(config, row.fps, row.topic)])
+    return f'clips/{key[:2]}/{key}.json'
+
+
+def _earlier(folder: Folder, name: str, row: Row) -> ClipResult | None:
+    """Return what became of the clip before, if that still holds.
+
+    A clip that changed since is read again. One that is gone is not needed any more.
+    """
+    data = folder.read(name)
+    if data is None:
+        return None
+    try:
+        values = json.loads(data)
+        size = values['image_size']
+        result = ClipResult(**{**values, 'warnings': tuple(values['warnings']),
+                               'image_size': None if size is None else tuple(size)})
+    except (ValueError, KeyError, TypeError):
+        return None
+    now = stamp(row.place)
+    if now is None and not result.file:
+        return None
+    if now not in (None, result.stamp) or (result.file and not folder.exists(result.file)):
+        return None
+    return replace(result, clip=row.clip)
+
+
+def _gathered(row: Row, folder: Folder, config: Config) -> ClipResult:
+    now = stamp(row.place)
+    if now is None:
+        return ClipResult(row.clip, problem='there is no such file; check the path', kept=False)
+    with local_copy(row.place) as path:
+        try:
+            if path.suffix == gathered.SUFFIX:
+                return _given(row, path, folder)
+            content = content_hash(path)
+            name = gathered_file(content, settings_hash(config, row.fps, row.topic))
+            data = folder.read(name)
+            found = None if data is None else gathered.decoded(data, name)
+            if found is None:
+                found = gather(path, content, row.fps, row.topic, config)
+                folder.write(name, gathered.encoded(found))
+        except InputError as error:
+            # the tables must not depend on where the clip, or its copy, lies
+            raise InputError(str(error).replace(str(path), row.clip)) from error
+    return _result(row, name, found, now)
+
+
+def _given(row: Row, path: Path, folder: Folder) -> ClipResult:
+    """Take turns that were gathered elsewhere, with whatever settings."""
+    data = path.read_bytes()
+    found = gathered.decoded(data, path.name)
+    name = gathered_file(found.content, found.settings)
+    if not folder.exists(name):
+        folder.write(name, data)
+    return _result(row, name, found, stamp(row.place) or '')
+
+
+def gathered_file(content: str, settings: str) -> str:
+    """Return the name of a clip's file of gathered turns."""
+    return f'gathered/{content[:2]}/{content}-{settings}{gathered.SUFFIX}'
+
+
+def _result(row: Row, name: str, found: gathered.Gathered, now: str) -> ClipResult:
+    time_s = found.turns[0].stamp_s if found.turns else None
+    return ClipResult(row.clip, name, '', now, True, found.content, found.image_size,
+                      found.frames, found.seconds, len(found.turns), len(found.scenes), time_s,
+                      found.warnings)
+
+
+def _noted(folder: Folder, name: str, result: ClipResult, row: Row) -> ClipResult:
+    if result.kept:
+        result = replace(result, stamp=result.stamp or stamp(row.place) or '')
+        try:
+            folder.write(name, json.dumps(asdict(result), sort_keys=True).encode())
+        except DashcalibError as error:
+            return replace(result, problem=one_line(error, 300), file='', kept=False)
+    return result
+
+
+def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]], out: str,
+                 config: Config) -> tuple[str, solved.Solved, Effort]:
+    """Solve a camera from its gathered clips, unless that was done; return the result's file."""
+    folder, started = Folder(out), Clock()
+    # a clip that the manifest names twice counts once
+    files = {result.clip: (result.file, row.time_s) for row, result in reversed(clips)
+             if result.file}
+    usable = [(clip, *files[clip]) for clip in sorted(files)]
+    name = solved_file(camera, make, usable, config)
+    data = folder.read(name)
+    if data is not None:
+        return name, solved.decoded(data, name), started.effort(again=True)
+    loaded = []
+    for clip, file, time_s in usable:
+        content = folder.read(file)
+        if content is None:
+            raise InputError(f'{file} has gone while the fleet was solved; start again')
+        loaded.append(Clip(clip, gathered.decoded(content, file), time_s))
+    text = solved.encoded(solved.solved_of(camera, make, fuse(loaded, config)))
+    result = solved.decoded(text, name)
+    publish(folder, result, None, config)
+    folder.write(name, text)
+    return name, result, started.effort()
+
+
+def solved_file(camera: str, make: str, usable: Sequence[tuple[str, str, float | None]],
+                config: Config) -> str:
+    """Return the name of a camera's own result.
+
+    Other clips, other settings and another version of this package have another one.
+    """
+    settings = {key: value for key, value in config.flat().items() if key != 'threads'}
+    try:
+        version = metadata.version('dashcalib_ros')
+    except metadata.PackageNotFoundError:
+        version = ''
+    key = _hash([solved.FORMAT, version, camera, make, list(usable), settings])
+    return f'solved/{key[:2]}/{key}.json'
+
+
+def publish_camera(name: str, prior: Verdict | None, out: str, config: Config) -> Final:
+    """Write a camera's files with the prior of its make; return the final result."""
+    folder = Folder(out)
+    data = folder.read(name)
+    if data is None:
+        raise InputError(f'{name} has gone while the fleet was solved; start again')
+    return publish(folder, solved.decoded(data, name), prior, config)
+
+
+def publish(folder: Folder, result: solved.Solved, prior: Verdict | None, config: Config) -> Final:
+    """Write calibration.yaml, result.json and report.html of a camera."""
+    final = final_of(result, prior)
+    place = camera_folder(result.camera)
+    yaml_name = re.sub(r'[^A-Za-z0-9_]+', '_', result.camera).strip('_') or 'camera'
+    yaml_name = 'camera_narrow_stereo' if yaml_name == 'narrow_stereo' else yaml_name
+    if not is_url(folder.place):
+        write_results(final.calibration, Path(folder.place) / place, yaml_name)
+        return final
+    with tempfile.TemporaryDirectory(prefix='dashcalib-') as scratch:
+        written = write_results(final.calibration, scratch, yaml_name).files
+        for path in written:
+            folder.write(f'{place}/{path.name}', path.read_bytes())
+    for name in {ACCEPTED, WEAK} & set(NAMES) - {path.name for path in written}:
+        folder.remove(f'{place}/{name}')
+    return final
+
+
+def camera_folder(camera: str) -> str:
+    """Return the folder of a camera's files; different names never share one."""
+    plain = re.sub(r'[^A-Za-z0-9._-]+', '_', camera).strip('._')[:80]
+    return f'cameras/{camera}' if plain == camera else f'cameras/{plain}-{_hash([camera])[:8]}'
+
+
+def _hash(values: object) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def one_thread(function: Callable[..., T], *arguments: object) -> T:
+    """Run a task in this process, which must have one thread for numpy; raises WorkerError."""
+    import cv2
+
+    from dashcalib_ros.workers.inline import InlineWorker
+    cv2.setNumThreads(1)
+    result: T = InlineWorker().call(function, *arguments)
+    return result
