@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """The command dashcalib: argument parsing, terminal output, exit codes.
 
 Only what --help needs is imported here; each command imports its own in its function.

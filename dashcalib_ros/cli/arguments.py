@@ -3,30 +3,45 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from dashcalib_ros.cli.values import crop, path_or, positive, seconds, size
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import write_stdout
 
 PROGRAM = 'dashcalib'
-INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, '
-              'or a folder of images')
+INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, or a folder of images; '
+              "several of one camera, in this order; or a folder of videos, or a pattern "
+              "('clips/*.mp4'): bags by their time, all else by name")
 EXIT_HELP = ('exit codes: 0 accepted; 3 weak or refused (the input was fine, the evidence was '
              'not enough); 2 bad input or usage')
+SHORT_EXIT_HELP = 'exit codes: 0 done; 2 bad input or usage'
+CHECK_EXIT_HELP = 'exit codes: 0 right; 1 wrong; 3 the drive cannot tell; 2 bad input or usage'
+BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera refused; 3 some were not; '
+                   '2 bad manifest or usage')
+MODELS = ('auto', 'radial', 'brown', 'fisheye')
+KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'ros')
 
 
 class UsageError(DashcalibError):
     """The arguments are wrong."""
 
 
+class _Lines(argparse.HelpFormatter):
+    """Keeps the lines of an epilog apart."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return '\n'.join(super(_Lines, self)._fill_text(line, width, indent)
+                         for line in text.split('\n'))
+
+
 class Parser(argparse.ArgumentParser):
     """argparse's parser; usage errors are one line, and an unusable stdout is an error."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(allow_abbrev=False, **options)
+        super().__init__(allow_abbrev=False, formatter_class=_Lines, **options)
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError: one line that names --help."""
@@ -57,7 +72,7 @@ class Version(argparse.Action):
 def make_parser() -> Parser:
     """Return the parser; the parsed arguments have the function to call with them as `command`."""
     parser = Parser(
-        prog=PROGRAM, epilog=EXIT_HELP,
+        prog=PROGRAM, epilog=f'{PROGRAM} COMMAND --help tells more\n{EXIT_HELP}',
         description='Calibrates a dashcam from the turns the car takes anyway.')
     parser.add_argument('--version', action=Version)
     commands = parser.add_subparsers(metavar='COMMAND', required=True, parser_class=Parser)
@@ -66,44 +81,64 @@ def make_parser() -> Parser:
     _add_demo(commands)
     _add_compare(commands)
     _add_export(commands)
+    _add_check(commands)
+    _add_batch(commands)
     return parser
 
 
 def _add_run(commands: Any) -> None:
-    parser = _command(commands, 'run', 'calibrate a recorded drive',
-                      'Writes calibration.yaml (accepted), result.json and report.html to DIR.')
+    parser = _command(
+        commands, 'run', 'calibrate a recorded drive',
+        'Finds the turns of a drive, reconstructs the best and calibrates the camera from them. '
+        'Writes result.json, report.html and, when accepted, calibration.yaml to DIR.',
+        "dashcalib run 'clips/*.mp4' --out calibration", EXIT_HELP)
     _add_drive_arguments(parser)
     _add_model(parser)
+    _add_seed(parser)
     parser.add_argument('--threads', type=int, metavar='N',
                         help='processes that reconstruct turns side by side; the result is the '
                              'same with any')
     parser.add_argument('--write-bag', type=Path, metavar='OUT',
-                        help='when accepted: write a copy of the bag INPUT with a camera_info for '
-                             'each image')
-    _add_out(parser, 'calibration')
+                        help='when accepted: write a copy of the one bag INPUT with a '
+                             'camera_info for each image')
+    _add_out(parser, 'calibration', 'the results are several files: give a folder; '
+                                    '--json - prints result.json')
+    parser.add_argument('--json', choices=('-',), metavar='-',
+                        help='print result.json on stdout, all else on stderr')
+    _add_quiet(parser)
+    _add_verbose(parser)
 
 
 def _add_turns(commands: Any) -> None:
     parser = _command(commands, 'turns', 'find the turns of a drive, without calibrating',
-                      'Lists the turns a calibration would use, best first.')
+                      'Lists the turns that a calibration would choose from, best first.',
+                      'dashcalib turns drive.mp4 --start 60 --duration 300')
     _add_drive_arguments(parser)
     parser.add_argument('--json', action='store_true', help='print JSON')
+    _add_quiet(parser, 'no progress')
+    # they were taken here before, and change nothing
+    parser.add_argument('--seed', type=int, help=argparse.SUPPRESS)
+    parser.add_argument('--verbose', action='store_true', help=argparse.SUPPRESS)
 
 
 def _add_demo(commands: Any) -> None:
     parser = _command(commands, 'demo', 'render a drive, calibrate it, compare with the truth',
-                      'Renders a drive with a known lens into a ROS 2 bag and calibrates that.')
+                      'Renders a drive with a known lens into a ROS 2 bag, calibrates that and '
+                      'compares the result with the truth.',
+                      'dashcalib demo --keep-bag --out demo', EXIT_HELP)
     _add_model(parser)
     _add_seed(parser)
-    _add_verbose(parser)
-    _add_out(parser, 'demo')
+    _add_out(parser, 'demo', 'the results are several files: give a folder')
     parser.add_argument('--keep-bag', action='store_true', help='leave the bag in DIR/bag')
+    _add_quiet(parser)
+    _add_verbose(parser)
 
 
 def _add_compare(commands: Any) -> None:
     parser = _command(commands, 'compare', 'compare two calibrations',
                       'Per-parameter difference, and the RMS distance in pixels between the '
-                      'images of the same rays over the image, best common rotation removed.')
+                      'images of the same rays over the image, best common rotation removed.',
+                      'dashcalib compare calibration /etc/camera/old.yaml')
     what = 'a result.json (or its folder), a camera_info YAML or a truth JSON'
     parser.add_argument('a', metavar='A', type=Path, help=what)
     parser.add_argument('b', metavar='B', type=Path, help=f'the reference: {what}')
@@ -112,41 +147,81 @@ def _add_compare(commands: Any) -> None:
 
 def _add_export(commands: Any) -> None:
     parser = _command(commands, 'export', "write a calibration as another program's camera file",
-                      'Prints the camera in the format of another program, or writes it to FILE.')
+                      'Prints the camera in the format of another program, or writes it to FILE.',
+                      'dashcalib export calibration --to colmap --out cameras.txt')
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
                         help='a result.json (or its folder), a camera_info YAML or a truth JSON')
     # the names are not taken from the table of exports: that would load numpy and OpenCV
-    parser.add_argument('--to', required=True, metavar='KIND',
-                        help='opencv, colmap, kalibr, opensfm, nerfstudio or ros')
+    kind = parser.add_argument('--to', required=True, metavar='KIND',
+                               help=f'{", ".join(KINDS[:-1])} or {KINDS[-1]}')
+    _completed(kind, KINDS)
     view = parser.add_mutually_exclusive_group()
-    view.add_argument('--size', type=_size, metavar='WxH',
+    view.add_argument('--size', type=size, metavar='WxH',
                       help='for pictures that were resized to this')
-    view.add_argument('--crop', type=_crop, metavar='X,Y,W,H',
+    view.add_argument('--crop', type=crop, metavar='X,Y,W,H',
                       help='for this part of the pictures')
-    parser.add_argument('--out', type=Path, metavar='FILE', help='default: standard output')
+    parser.add_argument('--out', type=path_or('leave --out away for standard output'),
+                        metavar='FILE', help='default: standard output')
 
 
-def _size(text: str) -> tuple[int, int]:
-    """Return a size that is given as WxH."""
-    width, height = _whole_numbers(text, 'x', 2, '1280x720')
-    return width, height
+def _add_check(commands: Any) -> None:
+    parser = _command(commands, 'check', 'tell whether a calibration explains a drive',
+                      'Says whether CALIBRATION is right (to so many pixels), wrong (in which way '
+                      'and by how much), or whether the drive cannot tell.',
+                      'dashcalib check calibration drive.mcap', CHECK_EXIT_HELP)
+    parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
+                        help='a result.json (or its folder), a camera_info YAML or a truth JSON')
+    _add_drive_arguments(parser)
+    _add_model(parser)
+    _add_seed(parser)
+    parser.add_argument('--poses', type=Path, metavar='FILE',
+                        help="true poses, in KITTI's or TUM's format: compare the rotation and "
+                             'the scale that each camera finds with them')
+    parser.add_argument('--out', type=path_or('--out is a folder'), metavar='DIR',
+                        help='with --poses: write a plot of the paths, and the paths for evo')
+    parser.add_argument('--json', action='store_true', help='print JSON')
+    _add_quiet(parser, 'no progress')
+    _add_verbose(parser)
 
 
-def _crop(text: str) -> list[int]:
-    """Return a part of the picture that is given as X,Y,W,H."""
-    return _whole_numbers(text, ',', 4, '0,100,1280,520')
+def _add_batch(commands: Any) -> None:
+    parser = _command(commands, 'batch', 'calibrate many cameras from many clips',
+                      'Writes to DIR: a folder for each camera, tables of cameras and of clips, '
+                      'overview.html. Started again, it does what is missing.',
+                      'dashcalib batch clips.csv --out fleet', BATCH_EXIT_HELP)
+    parser.add_argument('manifest', metavar='MANIFEST',
+                        help='.csv, .jsonl or .parquet with a column clip, and where known '
+                             'camera, make, fps, topic, time; a folder of clips; or a glob in '
+                             'quotes')
+    parser.add_argument('--out', required=True, metavar='DIR',
+                        help='a folder, or an address such as s3://bucket/fleet')
+    parser.add_argument('--group-by', metavar='REGEX',
+                        help="takes the camera from a clip's name: its first group, or its groups "
+                             '(?P<camera>...) and (?P<make>...)')
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument('--workers', type=_count, metavar='N',
+                       help='processes (default: one a core); 1 needs no Ray; the result is the '
+                            'same with any')
+    where.add_argument('--address', metavar='A', help="a Ray cluster's; auto: the one here")
+    where.add_argument('--shard', metavar='I/N',
+                       help='do the I-th of N parts, with one process and without Ray; a run '
+                            'without --shard then makes the tables')
+    _add_settings(parser)
+    _add_model(parser)
+    _add_seed(parser)
+    _add_quiet(parser)
 
 
-def _whole_numbers(text: str, between: str, count: int, like: str) -> list[int]:
-    parts = text.lower().split(between)
-    if len(parts) != count or not all(part.strip().isdecimal() for part in parts):
-        raise argparse.ArgumentTypeError(f'{text!r} is not like {like}')
-    return [int(part) for part in parts]
+def _count(text: str) -> int:
+    if not (text.isdecimal() and 1 <= int(text) <= 10_000):
+        raise argparse.ArgumentTypeError(f'must be a number from 1 on, not {text!r}')
+    return int(text)
 
 
-def _command(commands: Any, name: str, summary: str, description: str) -> argparse.ArgumentParser:
+def _command(commands: Any, name: str, summary: str, description: str, example: str,
+             exit_codes: str = SHORT_EXIT_HELP) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=summary, description=description, epilog=EXIT_HELP)
+        name, help=summary, description=description, epilog=f'example: {example}\n{exit_codes}')
     parser.set_defaults(command=_lazily(name))
     return parser
 
@@ -160,47 +235,55 @@ def _lazily(name: str) -> Callable[[argparse.Namespace], int]:
 
 
 def _add_drive_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('input', metavar='INPUT', help=INPUT_HELP)
+    parser.add_argument('input', metavar='INPUT', nargs='+', help=INPUT_HELP)
     parser.add_argument('--topic', metavar='T', help="the bag's image topic")
-    parser.add_argument('--fps', type=_rate, metavar='F', help='rate of a video or image folder')
+    parser.add_argument('--fps', type=positive, metavar='F',
+                        help='rate of a video or image folder')
+    parser.add_argument('--start', type=seconds, default=0.0, metavar='S',
+                        help='leave out the first S seconds of the drive')
+    parser.add_argument('--duration', type=positive, metavar='S',
+                        help='use S seconds of the drive')
     parser.add_argument('--turns', type=int, metavar='N', help='how many turns are wanted')
     parser.add_argument('--mask', type=Path, metavar='PNG',
                         help='black pixels are not used; as large as the images')
     parser.add_argument('--segmentation', metavar='MODEL.onnx',
                         help='a segmentation network that finds the own car, used in addition to '
                              'the automatic mask')
+    _add_settings(parser)
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', type=Path, metavar='YAML', help='settings from a file')
     parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
                         help='one setting, over those of --config; may be repeated')
-    _add_seed(parser)
-    _add_verbose(parser)
 
 
 def _add_model(parser: argparse.ArgumentParser) -> None:
     # the names are not taken from the table of models: that would load numpy and OpenCV
-    parser.add_argument('--model', metavar='NAME',
-                        help='of the lens: radial, brown, fisheye, or auto: the one that the '
-                             'turns prove (default)')
+    model = parser.add_argument('--model', metavar='NAME',
+                                help='of the lens: radial, brown, fisheye, or auto: the one that '
+                                     'the turns prove (default)')
+    _completed(model, MODELS)
+
+
+def _completed(action: argparse.Action, names: Sequence[str]) -> None:
+    """Let the shell complete these names; argcomplete looks for this attribute."""
+    action.completer = lambda **_: names  # type: ignore[attr-defined]
 
 
 def _add_seed(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--seed', type=int, metavar='S', help='same input and seed: same result')
 
 
+def _add_quiet(parser: argparse.ArgumentParser, what: str = 'no progress and no summary: only '
+                                                            'warnings and errors') -> None:
+    parser.add_argument('--quiet', action='store_true', help=what)
+
+
 def _add_verbose(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--verbose', action='store_true', help="show COLMAP's own log")
 
 
-def _add_out(parser: argparse.ArgumentParser, default: str) -> None:
-    parser.add_argument('--out', type=Path, default=Path(default), metavar='DIR',
+def _add_out(parser: argparse.ArgumentParser, default: str, cure: str) -> None:
+    parser.add_argument('--out', type=path_or(cure), default=Path(default), metavar='DIR',
                         help=f'where the results go (default: ./{default})')
-
-
-def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f'must be a positive number, not {text!r}')
-    return value

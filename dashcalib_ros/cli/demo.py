@@ -15,9 +15,9 @@ from rich.text import Text
 from dashcalib_ros.camera import Radial, camera_of
 from dashcalib_ros.cli import exit_codes
 from dashcalib_ros.cli.drive import calibrate
-from dashcalib_ros.cli.run import now, set_aside_lines
+from dashcalib_ros.cli.run import files_line, now, set_aside_lines
 from dashcalib_ros.cli.settings import read_config
-from dashcalib_ros.cli.terminal import Stages, show, show_text, summary_of_files, warn
+from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.errors import OutputError
 from dashcalib_ros.inputs import open_frames
@@ -31,7 +31,7 @@ from dashcalib_ros.report import (
     write_text,
 )
 from dashcalib_ros.report.files import TRUTH
-from dashcalib_ros.report.tables import against_truth, summary
+from dashcalib_ros.report.tables import against_truth, conclusion, summary
 
 
 def demo(args: argparse.Namespace) -> int:
@@ -40,20 +40,22 @@ def demo(args: argparse.Namespace) -> int:
     config = read_config(args)
     drive = demo_drive(config.seed)
     with output_folder(args.out) as out:
-        with Stages() as stages, _bag_path(out, args.keep_bag) as bag:
+        with Stages(args.quiet) as stages, _bag_path(out, args.keep_bag) as bag:
             stages.show('rendering the drive')
             render_to_bag(drive, bag)
             calibration = calibrate(open_frames(bag), config, None, args.verbose, stages)
         calibration = dataclasses.replace(calibration, input_name=f'demo drive {config.seed}')
-        written = write_results(calibration, out, created=now())
+        written = write_results(calibration, out, created=now(),
+                                truth=_true_camera(drive.truth, calibration.image_size))
         truth = _write_truth(out, drive.truth, calibration.image_size)
     warn((*calibration.warnings, *set_aside_lines(written)))
-    files = (*written.files, truth, *((out / 'bag',) if args.keep_bag else ()))
-    with summary_of_files():
-        show(summary(calibration))
-        _show_errors(calibration, drive.truth)
-        show_text('written: ' + ', '.join(map(str, files)))
-        show_text(f'rendered and calibrated in {perf_counter() - started:.0f} s')
+    files = [*written.files, truth, *([out / 'bag'] if args.keep_bag else [])]
+    screen = Screen(args.quiet)
+    screen.show(summary(calibration))
+    _show_errors(calibration, drive.truth, screen)
+    screen.show(Text(files_line(out, files)))
+    screen.show(Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'))
+    screen.show(conclusion(calibration.verdict))
     return exit_codes.of_verdict(calibration.verdict.level)
 
 
@@ -75,11 +77,14 @@ def _write_truth(out: Path, truth: dict[str, float], size: tuple[int, int]) -> P
     return path
 
 
-def _show_errors(calibration: Calibration, truth: dict[str, float]) -> None:
+def _true_camera(truth: dict[str, float], size: tuple[int, int]) -> NamedCamera:
+    return NamedCamera('truth', camera_of(Radial.model, size, list(truth.values())))
+
+
+def _show_errors(calibration: Calibration, truth: dict[str, float], screen: Screen) -> None:
     if calibration.camera is None:
-        show(Text('no estimate to compare with the truth'))
+        screen.show(Text('no estimate to compare with the truth'))
         return
-    reference = NamedCamera('truth', camera_of(
-        Radial.model, calibration.image_size, list(truth.values())))
-    show(Text('\nagainst the truth'))
-    show(against_truth(compare(calibrated_camera(calibration), reference)))
+    reference = _true_camera(truth, calibration.image_size)
+    screen.show(Text('\nagainst the truth'))
+    screen.show(against_truth(compare(calibrated_camera(calibration), reference)))

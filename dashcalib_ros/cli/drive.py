@@ -1,7 +1,7 @@
 """Feeding a drive to the calibrator, which is closed in any case."""
 from __future__ import annotations
 
-import dataclasses
+import argparse
 import signal
 import threading
 from collections.abc import Iterator
@@ -9,13 +9,19 @@ from contextlib import contextmanager
 from typing import Any, Protocol
 
 from dashcalib_ros.arrays import Mask
-from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.calibrator import Calibrator, with_source
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.frames import Frame, FrameSource
 from dashcalib_ros.frames.mask_file import check_mask
+from dashcalib_ros.inputs import open_frames
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.turns import Turn
+
+
+def open_drive(args: argparse.Namespace) -> FrameSource:
+    """Open what the arguments name. Raises InputError."""
+    return open_frames(args.input, args.topic, args.fps, args.start, args.duration)
 
 
 @contextmanager
@@ -60,9 +66,7 @@ def calibrate(source: FrameSource, config: Config, mask: Mask | None, verbose: b
     with open_calibrator(config, mask, verbose) as calibrator:
         feed(calibrator, source, mask, stages)
         calibration: Calibration = calibrator.calibrate(stages.show)
-    new = tuple(line for line in source.warnings if line not in calibration.warnings)
-    return dataclasses.replace(calibration, input_name=calibration.input_name or source.name,
-                               warnings=(*new, *calibration.warnings))
+    return with_source(calibration, source)
 
 
 @contextmanager

@@ -1,17 +1,19 @@
 """main: from arguments to an exit code; here known errors become one line on stderr."""
 from __future__ import annotations
 
+import argparse
 import errno
+import os
 import signal
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from dashcalib_ros.cli.arguments import PROGRAM, make_parser
 from dashcalib_ros.cli.exit_codes import BAD_INPUT, INTERRUPTED
 from dashcalib_ros.errors import DashcalibError
-from dashcalib_ros.standard_streams import open_closed_streams, write_stderr
+from dashcalib_ros.standard_streams import folded, open_closed_streams, write_stderr
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -19,7 +21,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     open_closed_streams()
     # the handler is set inside try: a signal may also come while it is set or restored
     try:
-        args = make_parser().parse_args(argv)
+        parser = make_parser()
+        _complete(parser)
+        args = parser.parse_args(argv)
         with _sigterm_like_ctrl_c():
             code: int = args.command(args)
             return code
@@ -44,6 +48,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(_os_error(error))
 
 
+def _complete(parser: argparse.ArgumentParser) -> None:
+    """Answer the shell and end, if it asks for the completions of a command line."""
+    if '_ARGCOMPLETE' not in os.environ:
+        return
+    with suppress(ImportError):
+        import argcomplete
+        argcomplete.autocomplete(parser)
+
+
 @contextmanager
 def _sigterm_like_ctrl_c() -> Iterator[None]:
     """Let SIGTERM unwind the program as Ctrl-C does, so that everything is closed."""
@@ -58,7 +71,7 @@ def _sigterm_like_ctrl_c() -> Iterator[None]:
 
 
 def _fail(message: str, code: int = BAD_INPUT) -> int:
-    write_stderr(f'{PROGRAM}: error: {" ".join(message.split())}')
+    write_stderr(folded(f'{PROGRAM}: error: {" ".join(message.split())}'))
     return code
 
 

@@ -2,52 +2,72 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from datetime import datetime, timezone
+from pathlib import Path
+
+from rich.text import Text
 
 from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.drive import calibrate
+from dashcalib_ros.cli.drive import calibrate, open_drive
 from dashcalib_ros.cli.settings import read_config
-from dashcalib_ros.cli.terminal import Stages, show, show_text, summary_of_files, warn
+from dashcalib_ros.cli.terminal import Screen, Stages, show_text, warn
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.frames import FrameSource
 from dashcalib_ros.frames.mask_file import read_mask
-from dashcalib_ros.inputs import open_frames
 from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.report import Written, output_folder, write_results
+from dashcalib_ros.report import Written, output_folder, result_json, write_results
 from dashcalib_ros.report.files import ACCEPTED
-from dashcalib_ros.report.tables import summary
+from dashcalib_ros.report.tables import conclusion, summary
 
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate, write the results, show them; return the verdict's exit code."""
     config = read_config(args)
     mask = None if args.mask is None else read_mask(args.mask)
-    source = open_frames(args.input, topic=args.topic, fps=args.fps)
+    source = open_drive(args)
     if args.write_bag is not None:
-        from dashcalib_ros.bags.camera_info import check_bag
-        check_bag(args.input, source.topic, args.write_bag)
+        _check_bag(args, source)
     with output_folder(args.out):
-        with Stages() as stages:
+        with Stages(args.quiet) as stages:
             calibration = calibrate(source, config, mask, args.verbose, stages)
         written = write_results(calibration, args.out, created=now())
     warn((*calibration.warnings, *set_aside_lines(written)))
-    with summary_of_files():
-        show(summary(calibration))
-        show_text('written: ' + ', '.join(map(str, written.files)))
+    if args.json:
+        show_text(result_json(calibration).rstrip('\n'))
+    screen = Screen(args.quiet, to_stderr=bool(args.json))
+    screen.show(summary(calibration))
+    screen.show(Text(files_line(args.out, written.files)))
     if args.write_bag is not None:
-        _write_bag(args, str(source.topic), calibration)
+        _write_bag(args, str(source.topic), calibration, screen)
+    screen.show(conclusion(calibration.verdict))
     return exit_codes.of_verdict(calibration.verdict.level)
 
 
-def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration) -> None:
+def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:
+    from dashcalib_ros.bags.camera_info import check_bag
+    if len(args.input) > 1 or source.name != str(Path(args.input[0])):
+        raise InputError('--write-bag copies one bag: calibrate with all of them, then run it on '
+                         'each bag alone')
+    check_bag(args.input[0], source.topic, args.write_bag)
+
+
+def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration, screen: Screen
+               ) -> None:
     from dashcalib_ros.bags.camera_info import camera_info_topic, write_bag
     if calibration.verdict.level != 'accepted':
         warn([f'no bag was written: the calibration is {calibration.verdict.level}, not accepted'])
         return
     assert calibration.camera is not None
-    count = write_bag(args.input, topic, calibration.camera, args.write_bag,
+    count = write_bag(args.input[0], topic, calibration.camera, args.write_bag,
                       calibration.config.rectified)
-    with summary_of_files():
-        show_text(f'written: {args.write_bag} with {count} messages on '
-                  f'{camera_info_topic(topic)}')
+    screen.show(Text(f'written: {args.write_bag} with {count} messages on '
+                     f'{camera_info_topic(topic)}'))
+
+
+def files_line(folder: Path, files: Sequence[Path]) -> str:
+    """Return a line that tells which files are in the output folder now."""
+    return f'written to {folder}: {", ".join(file.name for file in files)}'
 
 
 def set_aside_lines(written: Written) -> tuple[str, ...]:

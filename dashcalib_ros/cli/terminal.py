@@ -1,10 +1,13 @@
-"""stdout for results, stderr for progress, warnings and errors; plain text in a pipe."""
+"""stdout for results, stderr for progress, warnings and errors; plain text in a pipe.
+
+Colours are left out where NO_COLOR is set.
+"""
 from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Iterable
 from types import TracebackType
 
 from rich.console import Console, RenderableType
@@ -19,22 +22,27 @@ from rich.progress import (
 )
 
 from dashcalib_ros.errors import OutputError
-from dashcalib_ros.standard_streams import write_stderr, write_stdout
+from dashcalib_ros.standard_streams import folded, write_stderr, write_stdout
 
-PIPE_WIDTH = 100  # columns where there is no terminal
+PIPE_WIDTH = 80  # columns where there is no terminal
+EVERY_S = 10.0  # where there is no terminal, progress is told so often
 STEPS = 1000  # a stage's fraction is shown in thousandths
 
 
-def show(renderable: RenderableType) -> None:
-    """Print a result on stdout. Raises OutputError where it is closed or full."""
-    terminal = sys.stdout is not None and sys.stdout.isatty()
+def show(renderable: RenderableType, to_stderr: bool = False) -> None:
+    """Print on stdout, or on stderr. Raises OutputError where stdout is closed or full."""
+    stream = sys.stderr if to_stderr else sys.stdout
+    terminal = stream is not None and stream.isatty()
     text = io.StringIO()
     console = Console(file=text, force_terminal=terminal, highlight=False,
                       width=None if terminal else PIPE_WIDTH,
                       color_system='auto' if terminal else None)
     console.print(renderable)
-    lines = text.getvalue().splitlines()
-    show_text('\n'.join(line.rstrip() for line in lines))
+    plain = '\n'.join(line.rstrip() for line in text.getvalue().splitlines())
+    if to_stderr:
+        write_stderr(plain)
+    else:
+        show_text(plain)
 
 
 def show_text(text: str) -> None:
@@ -42,30 +50,47 @@ def show_text(text: str) -> None:
     write_stdout(text)
 
 
-@contextmanager
-def summary_of_files() -> Iterator[None]:
-    """Make an unusable stdout only a warning: the results shown inside are in files already."""
-    try:
-        yield
-    except OutputError as error:
-        warn([str(error)])
+class Screen:
+    """Shows a summary of results that are in files already: an unusable stdout is a warning only.
+
+    quiet: nothing is shown. to_stderr: stdout is used for something else.
+    """
+
+    def __init__(self, quiet: bool, to_stderr: bool = False) -> None:
+        self._quiet, self._to_stderr = quiet, to_stderr
+
+    def show(self, renderable: RenderableType) -> None:
+        """Print a part of the summary."""
+        if self._quiet:
+            return
+        try:
+            show(renderable, self._to_stderr)
+        except OutputError as error:
+            self._quiet = True  # one warning is enough
+            warn([str(error)])
 
 
 def warn(lines: Iterable[str]) -> None:
     """Print warnings on stderr, one line each."""
     for line in lines:
-        write_stderr(f'dashcalib: warning: {" ".join(line.split())}')
+        write_stderr(folded(f'dashcalib: warning: {" ".join(line.split())}'))
 
 
 class Stages:
-    """The progress of one command, a stage at a time; nothing is shown in a pipe."""
+    """The progress of one command, a stage at a time.
 
-    def __init__(self) -> None:
+    It is drawn on a terminal; elsewhere there is a line from time to time, in long runs only.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
         console = Console(stderr=True)
+        self._lines = not console.is_terminal and not quiet
+        self._told = time.monotonic()
+        # as wide as it may become, it fits 80 columns
         self._progress = Progress(
-            SpinnerColumn(), TextColumn('{task.description}', markup=False), BarColumn(),
+            SpinnerColumn(), TextColumn('{task.description}', markup=False), BarColumn(16),
             TaskProgressColumn(), TimeElapsedColumn(), console=console, transient=True,
-            disable=not console.is_terminal)
+            disable=quiet or not console.is_terminal)
         self._stage = ''
         self._task: TaskID | None = None
 
@@ -81,12 +106,21 @@ class Stages:
 
     def show(self, stage: str, fraction: float | None = None, note: str = '') -> None:
         """Show a stage at fraction 0..1 (None: unknown), and a note beside its name."""
+        text = f'{stage}: {note}' if note else stage
+        done = None if fraction is None else min(max(fraction, 0.0), 1.0)
+        if self._lines:
+            self._tell(text, done)
+            return
         if stage != self._stage or self._task is None:
             if self._task is not None:
                 self._progress.remove_task(self._task)
             self._task = self._progress.add_task(stage, total=None)
             self._stage = stage
-        self._progress.update(
-            self._task, description=f'{stage}: {note}' if note else stage,
-            total=None if fraction is None else STEPS,
-            completed=0 if fraction is None else STEPS * min(max(fraction, 0.0), 1.0))
+        self._progress.update(self._task, description=text, total=None if done is None else STEPS,
+                              completed=0 if done is None else STEPS * done)
+
+    def _tell(self, text: str, done: float | None) -> None:
+        now = time.monotonic()
+        if now - self._told >= EVERY_S:
+            self._told = now
+            write_stderr(f'dashcalib: {text}' + ('' if done is None else f', {100 * done:.0f} %'))

@@ -8,26 +8,27 @@ from typing import Any
 from rich.text import Text
 
 from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.drive import feed
+from dashcalib_ros.cli.drive import feed, open_drive
 from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
 from dashcalib_ros.frames.mask_file import read_mask
-from dashcalib_ros.inputs import open_frames
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.tables import text_table
 from dashcalib_ros.turns import Turn
 from dashcalib_ros.turns.detection import Detection
 
-COLUMNS = ('frame', 'from', 'to', 'at s', 'prominence', 'images')
+COLUMNS = ('at s', 'frame', 'from', 'to', 'images', 'prominence')
+PROMINENCE = ('prominence: how far a turn stands out from the driving before and after it, as a '
+              'share of the picture width; frames are counted from 0')
 
 
 def turns(args: argparse.Namespace) -> int:
     """List the turns found, best first. The exit code is 0, also if there are none."""
     config = read_config(args)
     mask = None if args.mask is None else read_mask(args.mask)
-    source = open_frames(args.input, topic=args.topic, fps=args.fps)
+    source = open_drive(args)
     detection = Detection(config, mask)
-    with Stages() as stages:
+    with Stages(args.quiet) as stages:
         frames = feed(detection, source, mask, stages)
     detection.finish()
     found = [_row(turn) for turn in detection.turns()]
@@ -38,9 +39,17 @@ def turns(args: argparse.Namespace) -> int:
             'warnings': (*source.warnings, *detection.warnings())}), indent=2, allow_nan=False))
         return exit_codes.ACCEPTED
     if found:
-        show(text_table(COLUMNS, [_cells(row) for row in found]))
-    show(Text(f'{len(found)} of {config.turns.wanted} turns wanted, in {frames} frames'))
+        show(text_table(COLUMNS, [_cells(row, detection.start_s) for row in found]))
+        show(Text(PROMINENCE))
+    show(Text(_conclusion(len(found), config.turns.wanted, frames)))
     return exit_codes.ACCEPTED
+
+
+def _conclusion(found: int, wanted: int, frames: int) -> str:
+    text = f'{found} of {wanted} turns wanted, in {frames} frames'
+    if found:
+        return f'{text}\nnext: dashcalib run, with the same INPUT'
+    return f'{text}\nnext: record a drive with turns at crossings, in daylight'
 
 
 def _row(turn: Turn) -> dict[str, Any]:
@@ -48,6 +57,6 @@ def _row(turn: Turn) -> dict[str, Any]:
             'stamp': turn.stamp_s, 'prominence': turn.prominence, 'images': turn.images}
 
 
-def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    return (str(row['center']), str(row['first']), str(row['last']), f'{row["stamp"]:.1f}',
-            f'{row["prominence"]:.4f}', str(row['images']))
+def _cells(row: dict[str, Any], start_s: float) -> tuple[str, ...]:
+    return (f'{row["stamp"] - start_s:.1f}', str(row['center']), str(row['first']),
+            str(row['last']), str(row['images']), f'{row["prominence"]:.4f}')

@@ -1,5 +1,6 @@
 """calibration.yaml, result.json, report.html; comparisons; what a terminal shows: tables.py."""
 from dashcalib_ros.camera.mapping import mapping_error
+from dashcalib_ros.report.answer import answer_dict
 from dashcalib_ros.report.camera_file import load_camera
 from dashcalib_ros.report.camera_yaml import calibration_yaml, load_calibration_yaml
 from dashcalib_ros.report.compare import Comparison, Difference, compare
@@ -21,6 +22,7 @@ __all__ = [
     'Difference',
     'NamedCamera',
     'Written',
+    'answer_dict',
     'calibrated_camera',
     'calibration_yaml',
     'check_writable',

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import yaml
 
-from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera import Camera, Fisheye
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.report.camera_yaml import camera_info_yaml
@@ -98,29 +98,33 @@ def _opensfm(camera: Camera) -> str:
     width, height = camera.image_size
     longer = max(width, height)
     kind = 'fisheye_opencv' if _is_fisheye(camera) else 'brown'
-    names = ('k1', 'k2', 'k3', 'k4') if _is_fisheye(camera) else ('k1', 'k2', 'p1', 'p2', 'k3')
     return json.dumps({f'v2 dashcam {width} {height} {kind} 0': {
         'projection_type': kind, 'width': width, 'height': height,
         'focal_x': camera.fx / longer, 'focal_y': camera.fy / longer,
         'c_x': (camera.cx + HALF_PIXEL - width / 2) / longer,
         'c_y': (camera.cy + HALF_PIXEL - height / 2) / longer,
-        **dict(zip(names, camera.ros_distortion(), strict=True))}}, indent=2) + '\n'
+        **_coefficients(camera)}}, indent=2) + '\n'
 
 
 def _nerfstudio(camera: Camera) -> str:
     """Return the camera's part of nerfstudio's transforms.json; the frames are to be added."""
     width, height = camera.image_size
-    fisheye = _is_fisheye(camera)
-    names = ('k1', 'k2', 'k3', 'k4') if fisheye else ('k1', 'k2', 'p1', 'p2', 'k3')
     return json.dumps({
-        'camera_model': 'OPENCV_FISHEYE' if fisheye else 'OPENCV', 'w': width, 'h': height,
+        'camera_model': 'OPENCV_FISHEYE' if _is_fisheye(camera) else 'OPENCV',
+        'w': width, 'h': height,
         'fl_x': camera.fx, 'fl_y': camera.fy, 'cx': camera.cx + HALF_PIXEL,
         'cy': camera.cy + HALF_PIXEL,
-        **dict(zip(names, camera.ros_distortion(), strict=True)), 'frames': []}, indent=2) + '\n'
+        **_coefficients(camera), 'frames': []}, indent=2) + '\n'
+
+
+def _coefficients(camera: Camera) -> dict[str, float]:
+    """Return the distortion coefficients by OpenCV's names."""
+    names = ('k1', 'k2', 'k3', 'k4') if _is_fisheye(camera) else ('k1', 'k2', 'p1', 'p2', 'k3')
+    return dict(zip(names, camera.ros_distortion(), strict=True))
 
 
 def _is_fisheye(camera: Camera) -> bool:
-    return camera.ros_model == 'equidistant'
+    return camera.ros_model == Fisheye.ros_model
 
 
 EXPORTS: dict[str, Callable[[Camera], str]] = {

@@ -20,6 +20,7 @@ from dashcalib_ros.report.camera_yaml import (
     calibration_yaml,
     load_calibration_yaml,
 )
+from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.result import result_json
 
@@ -42,23 +43,23 @@ class Written:
 
 
 def write_results(calibration: Calibration, out_dir: str | Path, camera_name: str = CAMERA_NAME,
-                  created: str | None = None) -> Written:
+                  created: str | None = None, truth: NamedCamera | None = None) -> Written:
     """Write the result's files into out_dir, which is made if needed, and return their paths.
 
     result.json and report.html are always written. An accepted calibration goes to
     calibration.yaml, a weak one to calibration.weak.yaml, which no driver loads. An existing
     calibration.yaml is set aside unless this one is accepted, and always if it is another
     program's. Everything is written to temporary files before the first file is replaced: no file
-    is ever half-written. Raises OutputError.
+    is ever half-written. truth: for the report, where it is known. Raises OutputError.
     """
     folder = Path(out_dir)
     texts: dict[str, str] = {}
     level = calibration.verdict.level
+    name = ACCEPTED if level == 'accepted' else WEAK
     if level != 'refused':
-        name = ACCEPTED if level == 'accepted' else WEAK
         texts[name] = calibration_yaml(calibration, camera_name, created)
     texts[RESULT] = result_json(calibration)
-    texts[REPORT] = report_html(calibration)
+    texts[REPORT] = report_html(calibration, truth, folder / name)
     with _output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with _prepared(folder, texts) as prepared:

@@ -2,146 +2,133 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
-from html import escape
-from typing import Any
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dashcalib_ros.config import Config
 from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.report.checks import checks
+from dashcalib_ros.report.compare import compare
 from dashcalib_ros.report.figures import magnitude_svg, mask_data_uri
+from dashcalib_ros.report.lens_sections import evidence_of, lens_of
+from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
 from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.report.turn_sections import turn_rows, turn_sections
+from dashcalib_ros.report.usage import field_of_view, snippets
 from dashcalib_ros.report.wording import (
     ADVICE,
-    TURN_COLUMNS,
+    digits_of,
+    key_figures,
+    next_steps,
+    number,
+    optional,
     parameter_rows,
-    picture_text,
-    shutter_text,
-    stabiliser_text,
-    stored_text,
-    turn_row,
+    removed_effects,
+    run_facts,
 )
 
-STYLE = """
-:root { color-scheme: light; }
-body { font: 16px/1.5 system-ui, sans-serif; color: #1f2430; background: #fff; max-width: 58rem;
-  margin: 2.5rem auto; padding: 0 1.25rem; }
-h1 { font-size: 1.15rem; font-weight: 600; margin: 0 0 .75rem; }
-h2 { font-size: 1.05rem; margin: 2.2rem 0 .6rem; }
-.verdict { border-left: .5rem solid; padding: .7rem 1.1rem; background: #f6f7f9; }
-.verdict strong { font-size: 2rem; line-height: 1.2; }
-.verdict ul { margin: .4rem 0 0; padding-left: 1.2rem; }
-.accepted { border-color: #1a7f4b; } .accepted strong { color: #1a7f4b; }
-.weak { border-color: #b26a00; } .weak strong { color: #b26a00; }
-.refused { border-color: #b3261e; } .refused strong { color: #b3261e; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th { text-align: left; font-weight: 600; color: #555c6b; font-size: .85rem; }
-th, td { padding: .3rem 1.1rem .3rem 0; border-bottom: 1px solid #e3e6eb; vertical-align: top; }
-td.number, th.number { text-align: right; }
-img, svg.plot { max-width: 100%; height: auto; }
-img { border: 1px solid #c9ced8; }
-svg.plot text { font: 11px system-ui, sans-serif; fill: #555c6b; }
-.mid { text-anchor: middle; } .end { text-anchor: end; }
-.grid { stroke: #e3e6eb; } .signal { fill: none; stroke: #24527a; stroke-width: 1.3; }
-.used { stroke: #1a7f4b; stroke-width: 2; }
-.unused { stroke: #9aa1ad; stroke-width: 2; stroke-dasharray: 4 3; }
-pre { white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem; }
-.note { color: #555c6b; font-size: .9rem; max-width: 44rem; }
-"""
+if TYPE_CHECKING:
+    import jinja2
+
+# the mask's element in the page; pictures refer to it
+MASK_ID = 'mask'
 
 
-def report_html(calibration: Calibration) -> str:
-    """Return the page's text; all text from the input is escaped."""
+def report_html(calibration: Calibration, truth: NamedCamera | None = None,
+                calibration_file: Path | None = None) -> str:
+    """Return the page's text; all text from the input is escaped.
+
+    truth: to compare with, where it is known. calibration_file: where the camera is written.
+    """
     c = calibration
-    title = f'Calibration of {c.input_name}' if c.input_name else 'Calibration'
-    parts = [
-        f'<h1>{escape(title)}</h1>', _verdict(c), _parameters(c),
-        _listed('Warnings', c.warnings), _turns(c), _plot(c), _mask(c), _drive(c),
-        _details('Details', c.details), _details('Configuration', c.config.flat()),
-        _details('Versions', c.versions)]
-    return ('<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            f'<title>{escape(title)}: {c.verdict.level}</title>\n<style>{STYLE}</style>\n'
-            '</head>\n<body>\n' + '\n'.join(filter(None, parts)) + '\n</body>\n</html>\n')
+    mask = c.mask is not None and not bool(c.mask.all())
+    mask_id = MASK_ID if mask else None
+    return _template().render(
+        c=c, title=f'Calibration of {c.input_name}' if c.input_name else 'Calibration',
+        headline=ADVICE[c.verdict.level], figures=key_figures(c, _field_of_view(c)),
+        steps=next_steps(c), checks=checks(c), parameters=parameter_rows(c),
+        removed=removed_effects(c),
+        truth=_truth_rows(c, truth), truth_px=_truth_px(c, truth),
+        snippets=_snippets(c, calibration_file), lens=lens_of(c),
+        drive=_drive(c), turns=turn_sections(c, mask_id), rows=turn_rows(c),
+        evidence=evidence_of(c, mask_id), facts=run_facts(c),
+        mask=mask_data_uri(c.mask) if mask and c.mask is not None else '', mask_id=MASK_ID,
+        masked=0.0 if c.mask is None else 100 * (1 - float(np.mean(c.mask))),
+        changed=_changed(c.config), settings=_text(c.config.flat()), details=_text(c.details),
+        versions=_text(c.versions))
 
 
-def _verdict(c: Calibration) -> str:
-    level = c.verdict.level
-    reasons = ''.join(f'<li>{escape(reason)}</li>' for reason in c.verdict.reasons)
-    return (f'<section class="verdict {level}"><strong>{level}</strong><br>{ADVICE[level]}'
-            + (f'<ul>{reasons}</ul>' if reasons else '') + '</section>')
+def page_style() -> str:
+    """Return the style sheet of the report, for other pages of the same look."""
+    folder = resources.files('dashcalib_ros.report')
+    return folder.joinpath('templates/style.css').read_text('utf-8')
 
 
-def _parameters(c: Calibration) -> str:
-    if c.camera is None:
-        return ''
-    rows = parameter_rows(c)
-    size = f'{c.image_size[0]} × {c.image_size[1]} px'
-    return (f'<h2>Parameters</h2>{_table(("parameter", "value", "sigma", "relative"), rows)}'
-            f'<p class="note">For images of {size}, full size; {c.camera.model} model, '
-            f'{c.camera.ros_model} in ROS, P: {c.config.rectified}; '
-            "the first pixel's centre is (0, 0), as in ROS and OpenCV.</p>")
+@lru_cache(maxsize=1)
+def _template() -> jinja2.Template:
+    # loaded here: only who writes a report needs it
+    import jinja2
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader('dashcalib_ros.report'), autoescape=True, trim_blocks=True,
+        lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+    return environment.get_template('report.html')
 
 
-def _turns(c: Calibration) -> str:
-    if not c.turns:
-        return ''
-    return f'<h2>Turns</h2>{_table(TURN_COLUMNS, [turn_row(turn) for turn in c.turns])}'
-
-
-def _plot(c: Calibration) -> str:
-    if c.magnitudes is None:
-        return ''
-    plot = magnitude_svg(c.magnitudes, c.turns)
-    return plot and (f'<h2>The drive</h2>{plot}<p class="note">Green: turns used. Dashed: turns '
-                     'found and not used. The numbers are their frames.</p>')
-
-
-def _mask(c: Calibration) -> str:
-    if c.mask is None:
-        return ''
-    share = 100 * (1 - float(np.mean(c.mask)))
-    return (f'<h2>Ego vehicle</h2><img alt="mask" src="{mask_data_uri(c.mask)}">'
-            f'<p class="note">Black ({share:.1f} % of the picture) moves with the camera and is '
-            'not used.</p>')
+def _field_of_view(c: Calibration) -> Any:
+    return None if c.camera is None else field_of_view(c.camera)
 
 
 def _drive(c: Calibration) -> str:
-    rows = [('frames', str(c.frames))]
-    if c.stored_turns:
-        rows.append(('earlier drives', stored_text(c.stored_turns)))
-    if c.reprojection_error_px is not None:
-        rows.append(('reprojection error', f'{c.reprojection_error_px:.3f} px'))
-    if c.sigma_px is not None:
-        rows.append(('sigma', picture_text(c.sigma_px)))
-    if c.rolling_shutter is not None:
-        rows.append(('shutter', shutter_text(c.rolling_shutter)))
-    if c.stabiliser is not None:
-        rows.append(('stabiliser', stabiliser_text(c.stabiliser)))
-    rows += [(f'time: {name}', f'{seconds:.1f} s') for name, seconds in c.timing.items()]
-    return f'<h2>Run</h2>{_table(("", ""), rows)}'
-
-
-def _listed(title: str, lines: Iterable[str]) -> str:
-    items = ''.join(f'<li>{escape(line)}</li>' for line in lines)
-    return items and f'<h2>{title}</h2><ul>{items}</ul>'
-
-
-def _details(title: str, values: dict[str, Any]) -> str:
-    if not values:
+    if c.magnitudes is None:
         return ''
-    text = '\n'.join(f'{key}: {value if isinstance(value, str) else json.dumps(value)}'
-                     for key, value in plain_values(values).items())
-    return f'<h2>{title}</h2><pre>{escape(text)}</pre>'
+    return magnitude_svg(c.magnitudes, c.turns, c.start_s if c.start_s else None)
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    def cells(tag: str, texts: Sequence[str]) -> str:
-        return '<tr>' + ''.join(
-            f'<{tag}{"" if i == 0 else " class=number"}>{escape(text)}</{tag}>'
-            for i, text in enumerate(texts)) + '</tr>'
+def _snippets(c: Calibration, path: Path | None) -> Any:
+    if c.camera is None or not np.isfinite(c.camera.params).all():
+        return ()
+    name = 'calibration.yaml' if c.verdict.level == 'accepted' else 'calibration.weak.yaml'
+    return snippets(c.camera, (path or Path(name)).absolute())
 
-    header = f'<thead>{cells("th", head)}</thead>' if any(head) else ''
-    body = ''.join(cells('td', row) for row in rows)
-    return f'<div class="scroll"><table>{header}<tbody>{body}</tbody></table></div>'
+
+def _truth_rows(c: Calibration, truth: NamedCamera | None) -> list[tuple[str, ...]]:
+    if truth is None or c.camera is None:
+        return []
+    return [(d.name, number(d.name, d.a), number(d.name, d.b),
+             f'{d.difference:+.{digits_of(d.name)}f}',
+             '' if d.percent is None else f'{d.percent:+.2f} %', optional(d.z, 1))
+            for d in compare(calibrated_camera(c), truth).differences]
+
+
+def _truth_px(c: Calibration, truth: NamedCamera | None) -> str:
+    if truth is None or c.camera is None:
+        return ''
+    return optional(compare(calibrated_camera(c), truth).mapping_px, 2, ' px')
+
+
+def _changed(config: Config) -> dict[str, Any]:
+    """Return the settings that are not the defaults."""
+    defaults = Config().flat()
+    return {key: value for key, value in config.flat().items() if value != defaults[key]}
+
+
+def _text(values: Mapping[str, Any]) -> str:
+    return '\n'.join(f'{key}: {value if isinstance(value, str) else json.dumps(value)}'
+                     for key, value in _rounded(plain_values(values)).items())
+
+
+def _rounded(value: Any) -> Any:
+    """Return values with at most four significant digits: result.json has them all."""
+    if isinstance(value, float):
+        return value if not value or not math.isfinite(value) else float(f'{value:.4g}')
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return value

@@ -15,6 +15,7 @@ from dashcalib_ros.judgement import Calibration, TurnSummary
 from dashcalib_ros.judgement.calibration import StoredTurnSummary
 from dashcalib_ros.limits import JSON_BYTES, read_text
 from dashcalib_ros.limits import parse_json as parse_any_json
+from dashcalib_ros.solve.opinions import HeldOut
 
 
 def result_dict(calibration: Calibration) -> dict[str, Any]:
@@ -38,6 +39,8 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'stored_turns': [_turn_dict(turn) for turn in c.stored_turns],
         'rolling_shutter': c.rolling_shutter,
         'stabiliser': c.stabiliser,
+        'held_out': [_held_out_dict(turn) for turn in c.held_out],
+        'straight_lines': c.straight_lines,
         'input': c.input_name,
         'warnings': c.warnings,
         'masked_fraction': None if c.mask is None else 1.0 - float(np.mean(c.mask)),
@@ -94,6 +97,13 @@ def plain_values(value: Any) -> Any:
     if isinstance(value, (set, frozenset)):
         return sorted((plain_values(item) for item in value), key=str)
     return str(value)
+
+
+def _held_out_dict(turn: HeldOut) -> dict[str, Any]:
+    # a stored turn has no place in this drive
+    center = turn.turn.number if turn.turn.of_this_drive else None
+    return {'center': center, 'px': turn.px, 'sigmas': turn.sigmas, 'sigma_px': turn.sigma_px,
+            'others_sigma_px': turn.others_sigma_px}
 
 
 def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:

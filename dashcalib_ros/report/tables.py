@@ -7,14 +7,15 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from rich import box
 from rich.console import Group, RenderableType
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from dashcalib_ros.judgement import Calibration, Verdict
+from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
 from dashcalib_ros.report.compare import Comparison, Difference
 from dashcalib_ros.report.wording import (
-    TURN_COLUMNS,
     digits_of,
+    lines_text,
     number,
     optional,
     parameter_rows,
@@ -22,30 +23,44 @@ from dashcalib_ros.report.wording import (
     shutter_text,
     stabiliser_text,
     stored_text,
-    turn_row,
 )
 
+# narrow enough for 80 columns
+TURNS = ('at s', 'frames', 'yaw °', 'images', 'error px', 'used')
+# where the reasons do not say it
+NEXT = {
+    'accepted': 'give calibration.yaml to the camera driver; report.html tells more',
+    'weak': 'read report.html before you use calibration.weak.yaml',
+    'refused': 'record a drive with turns at crossings, in daylight',
+}
 COLOURS = {'accepted': 'bold green', 'weak': 'bold yellow', 'refused': 'bold red'}
 
 
 def summary(calibration: Calibration) -> RenderableType:
-    """Return the verdict with its reasons, the estimate with its sigma, and the table of turns."""
+    """Return the estimate with its sigma, the table of turns, and a few facts."""
     c = calibration
-    parts: list[RenderableType] = [verdict_text(c.verdict)]
+    parts: list[RenderableType] = []
     if c.camera is not None:
         parts.append(text_table(('', 'estimate', 'sigma', ''), parameter_rows(c)))
     if c.turns:
-        parts.append(text_table(TURN_COLUMNS, [turn_row(turn) for turn in c.turns]))
+        parts.append(text_table(TURNS, [_turn_row(turn, c.start_s) for turn in c.turns]))
     parts.append(Text(_facts(c)))
     return Group(*parts)
 
 
-def verdict_text(verdict: Verdict) -> Text:
-    """Return the verdict, coloured, and its reasons, one a line."""
-    text = Text(verdict.level, COLOURS[verdict.level])
+def conclusion(verdict: Verdict) -> RenderableType:
+    """Return the verdict, coloured, its reasons, and what to do next."""
+    parts: list[RenderableType] = [Text(verdict.level, COLOURS[verdict.level])]
     for reason in verdict.reasons:
-        text.append(f'\n  {reason}', 'default')
-    return text
+        cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), None)
+        parts.append(Padding.indent(Text(reason.removesuffix(f': {cure}')), 2))
+    return Group(*parts, Text(f'next: {(verdict.cures or (NEXT[verdict.level],))[0]}'))
+
+
+def _turn_row(turn: TurnSummary, start_s: float) -> tuple[str, ...]:
+    return (f'{turn.stamp_s - start_s:.1f}', f'{turn.first} to {turn.last}',
+            optional(turn.yaw_deg, 1), f'{turn.registered} of {turn.images}',
+            optional(turn.reprojection_error_px, 2), 'yes' if turn.used else 'no')
 
 
 def comparison(found: Comparison) -> RenderableType:
@@ -110,6 +125,8 @@ def _facts(c: Calibration) -> str:
         facts.append(shutter_text(c.rolling_shutter))
     if c.stabiliser is not None:
         facts.append(stabiliser_text(c.stabiliser))
+    if c.straight_lines is not None:
+        facts.append(lines_text(c.straight_lines))
     if c.mask is not None:
         facts.append(f'{100 * (1 - float(np.mean(c.mask))):.0f} % masked as ego vehicle')
     if 'total' in c.timing:

@@ -6,12 +6,15 @@ from collections.abc import Sequence
 
 from dashcalib_ros.judgement import Calibration, TurnSummary
 from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.lines import Bend
+from dashcalib_ros.report.usage import FieldOfView
+from dashcalib_ros.solve.opinions import HeldOut
 from dashcalib_ros.solve.picture import PictureSigma
 
 ADVICE = {
-    'accepted': 'Good to use: calibration.yaml was written.',
-    'weak': 'Look at the sigmas before you use it: it is in calibration.weak.yaml only.',
-    'refused': 'There is no calibration: the evidence in this drive was not enough.',
+    'accepted': 'Good to use.',
+    'weak': 'There is a number, but the evidence for it is thin: read the reasons first.',
+    'refused': 'There is no calibration: this drive has not shown enough.',
 }
 
 # parameters that are lengths in the picture; the others have no unit
@@ -32,8 +35,13 @@ def parameter_rows(calibration: Calibration) -> list[tuple[str, str, str, str]]:
 def _parameter_row(name: str, value: float, sigma: float | None) -> tuple[str, str, str, str]:
     if sigma is None or not math.isfinite(sigma):
         return name, number(name, value), 'unknown', ''
-    relative = f'{100 * sigma / abs(value):.2f} %' if value else ''
+    relative = percent(100 * sigma / abs(value)) if value else ''
     return name, number(name, value), '± ' + number(name, sigma), relative
+
+
+def percent(value: float) -> str:
+    """Return a share with its sensible digits; a sigma as large as its value has none."""
+    return 'over 100 %' if value > 100 else f'{value:.0f} %' if value >= 10 else f'{value:.2f} %'
 
 
 def number(name: str, value: float) -> str:
@@ -74,9 +82,111 @@ def shutter_text(shutter: Shutter) -> str:
             'removed')
 
 
+def lines_text(lines: Bend) -> str:
+    """Return a line about what straight lines say of the distortion."""
+    return (f'{lines.lines} upright lines, bent by {lines.bend_px:.2f} px: k1 off by '
+            f'{lines.k1:+.4f} ± {lines.sigma:.4f}')
+
+
+def held_out_text(turns: Sequence[HeldOut]) -> str:
+    """Return a line about how far each turn is from the calibration that the others give."""
+    pixels = ', '.join(f'{turn.px:.1f} px ({turn.sigmas:.1f} sigma)' for turn in turns)
+    return f'each alone, from the calibration without it: {pixels}'
+
+
 def picture_text(sigma: PictureSigma) -> str:
     """Return a line about how far the whole camera may be off."""
     return f'{sigma.rms:.2f} px over the picture, {sigma.worst:.2f} px at the worst'
+
+
+def since_start(turn: TurnSummary, calibration: Calibration) -> str:
+    """Return when a turn was, in s since the start of the drive, as on the plot's axis."""
+    return f'{turn.stamp_s - calibration.start_s:.1f}'
+
+
+def key_figures(c: Calibration, view: FieldOfView | None) -> list[tuple[str, str, str]]:
+    """Return the figures that matter most: a name, a value, and what belongs to it."""
+    yaw = c.yaw_deg
+    found = [('turns used', f'{c.turns_used}',
+              f'of {len(c.turns) + len(c.stored_turns)} found, {yaw:.0f}° of yaw')]
+    if c.camera is None:
+        return [*found, ('images', f'{c.frames}', f'of {c.image_size[0]} × {c.image_size[1]} px'),
+                ('yaw of these turns', f'{yaw:.0f}°',
+                 f'at least {c.config.verdict.min_yaw_deg:.0f}° needed')]
+    front = []
+    if c.sigma_px is not None:
+        front.append(('uncertainty in the picture', optional(c.sigma_px.rms, 2, ' px'),
+                      f'RMS; {optional(c.sigma_px.worst, 2)} px at the worst'))
+    sigma = (c.sigma or {}).get('fx', math.nan)
+    front.append(('focal length fx', f'{c.camera.fx:.1f} px',
+                  f'± {sigma:.1f} px, {100 * sigma / c.camera.fx:.2f} %'
+                  if math.isfinite(sigma) else 'uncertainty unknown'))
+    if view is not None:
+        front.append(('field of view', optional(view.horizontal, 1, '°'),
+                      f'by {optional(view.vertical, 1, "°")}, '
+                      f'diagonal {optional(view.diagonal, 1, "°")}'))
+    return [*front, *found]
+
+
+def next_steps(c: Calibration) -> list[str]:
+    """Return what to do next, most useful first."""
+    needed = c.config.verdict
+    together = ('Short drives add up: with `--set turns.store=FOLDER`, each run uses the turns of '
+                'those before it.')
+    if c.verdict.level == 'accepted':
+        steps = ['Give `calibration.yaml` to the camera driver, or copy the lines below.']
+        if (c.sigma or {}).get('fx', 0.0) > 0.005 * (c.camera.fx if c.camera else 1.0):
+            steps.append('It can become more exact: another drive with sharp turns lowers the '
+                         'uncertainty. ' + together)
+        return [*steps,
+                'To check it, ask another drive of the same camera: '
+                '`dashcalib check calibration DRIVE`.',
+                'Calibrate again when the lens, the zoom, the focus or the video mode changes. '
+                'Moving the camera on the car changes nothing here.']
+    yaw = c.yaw_deg
+    steps = ['First mend what the reasons above name.']
+    if c.turns_used < c.config.turns.wanted or yaw < needed.min_yaw_deg:
+        steps.append(f'Then drive on: {c.config.turns.wanted} turns of 60° or more, at town '
+                     f'speed, in daylight. At least {needed.min_turns} turns and '
+                     f'{needed.min_yaw_deg:.0f}° together are needed; this drive has '
+                     f'{c.turns_used} and {yaw:.0f}°. Turning on the spot does not count.')
+    else:
+        steps.append('Then record another drive with turns of 60° or more, at town speed, in '
+                     'daylight, with little traffic ahead.')
+    steps.append(together)
+    if c.verdict.level == 'weak':
+        steps.append('To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.')
+    return steps
+
+
+def removed_effects(c: Calibration) -> list[str]:
+    """Return what was found and taken out: a rolling shutter, a stabiliser's movement."""
+    lines = []
+    if c.rolling_shutter is not None:
+        lines.append('Shutter: ' + shutter_text(c.rolling_shutter))
+    if c.stabiliser is not None:
+        lines.append('Stabiliser: ' + stabiliser_text(c.stabiliser))
+    return lines
+
+
+def run_facts(c: Calibration) -> list[tuple[str, str]]:
+    """Return what else is to be said of the run."""
+    facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
+    if c.camera is not None:
+        facts.append(('lens model', f'{c.camera.model} model, {c.camera.ros_model} in ROS'))
+        facts.append(('rectified pictures', f'P: {c.config.rectified}'))
+    if c.reprojection_error_px is not None:
+        facts.append(('reprojection error', f'{c.reprojection_error_px:.2f} px'))
+    if c.sigma_px is not None:
+        facts.append(('sigma', picture_text(c.sigma_px)))
+    if c.straight_lines is not None:
+        facts.append(('straight lines', lines_text(c.straight_lines)))
+    if c.held_out:
+        facts.append(('turns held out', held_out_text(c.held_out)))
+    if c.stored_turns:
+        facts.append(('earlier drives', stored_text(c.stored_turns)))
+    facts += [(f'time: {name}', f'{seconds:.1f} s') for name, seconds in c.timing.items()]
+    return facts
 
 
 def optional(value: float | None, digits: int, unit: str = '') -> str:

@@ -1,0 +1,79 @@
+"""dashcalib check: whether a calibration explains a drive."""
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+
+from rich.text import Text
+
+from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.checking import Check, Odometry, path_files, read_poses
+from dashcalib_ros.cli import exit_codes
+from dashcalib_ros.cli.arguments import UsageError
+from dashcalib_ros.cli.drive import feed, open_calibrator, open_drive
+from dashcalib_ros.cli.settings import read_config
+from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
+from dashcalib_ros.frames.mask_file import read_mask
+from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.report import answer_dict, check_writable, load_camera, write_text
+from dashcalib_ros.report.tables import text_table
+
+COLOURS = {'right': 'bold green', 'wrong': 'bold red', 'cannot tell': 'bold yellow'}
+# what is said of the poses, by its name in the JSON
+MEASURED = {'rotation_deg': ('rotation missed, degrees', 1.0),
+            'rotation_deg_per_100m': ('the same, in 100 m', 1.0),
+            'scale_drift': ('scale changes within a turn, %', 100.0)}
+
+
+def check(args: argparse.Namespace) -> int:
+    """Calibrate the drive, ask it about the calibration; return the answer's exit code."""
+    config = read_config(args)
+    given = load_camera(args.calibration).camera
+    poses = None if args.poses is None else read_poses(args.poses)
+    if args.out is not None:
+        if poses is None:
+            raise UsageError('--out is for the paths that --poses compares; add --poses FILE')
+        check_writable(args.out)
+    mask = None if args.mask is None else read_mask(args.mask)
+    source = open_drive(args)
+    motion = None
+    with open_calibrator(config, mask, args.verbose) as calibrator, Stages(args.quiet) as stages:
+        feed(calibrator, source, mask, stages)
+        calibration = calibrator.calibrate(stages.show)
+        found = calibrator.check(given, calibration, stages.show)
+        # one for pictures of another size is wrong, and explains no motion
+        changes = _changes(calibrator, given, calibration)
+        if poses is not None and given.image_size == calibration.image_size:
+            motion = calibrator.odometry(given, calibration, poses, stages.show)
+    warn((*source.warnings, *calibration.warnings))
+    if args.json:
+        show_text(json.dumps(answer_dict(found, changes, motion), indent=2, allow_nan=False))
+    else:
+        _show(found, motion, changes)
+    if motion is not None and args.out is not None:
+        for name, text in path_files(motion).items():
+            write_text(args.out / name, text)
+        if not args.json:
+            show_text(f'written: {args.out / "paths.svg"}, and beside it the paths for evo')
+    return exit_codes.of_answer(found.answer)
+
+
+def _changes(calibrator: Calibrator, given: Camera, calibration: Calibration) -> list[str]:
+    """Return in words what has changed during the drive: a long one may be of two cameras."""
+    if given.image_size != calibration.image_size:
+        return []
+    return [str(change) for change in calibrator.watch(given).changes]
+
+
+def _show(found: Check, motion: Odometry | None, changes: Sequence[str]) -> None:
+    show(Text(found.answer, COLOURS[found.answer]))
+    for reason in (*found.reasons, *changes):
+        show(Text(f'- {reason}'))
+    if motion is None:
+        return
+    medians = motion.medians()
+    rows = [(text, *(f'{unit * medians[key][name]:.3f}' for name in motion.names))
+            for key, (text, unit) in MEASURED.items()]
+    show(text_table((f'median of {len(motion.turns)} turns', *motion.names), rows))

@@ -1,0 +1,241 @@
+"""What is drawn of the lens and of the evidence for it: maps over the picture, and plots."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, GreyImage, Ints
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.rectified import WIDEST, rectified_matrix
+from dashcalib_ros.reconstruction.scene import Profile, Scene, residuals_px
+from dashcalib_ros.report.charts import (
+    Axes,
+    dots,
+    line,
+    log_ticks,
+    polyline,
+    segments,
+    svg,
+    text,
+    ticks,
+)
+from dashcalib_ros.report.figures import png_data_uri
+from dashcalib_ros.solve.picture import SigmaMap
+
+WIDTH = 440  # px of a plot
+CELLS = 18  # columns of the maps of observations
+FEWEST = 4  # observations of a cell whose mean residual is drawn
+GRID_LINES = 12  # over the picture's width
+# from little to much, BGR
+RAMP = np.array([(250, 243, 236), (238, 205, 160), (206, 148, 78), (142, 86, 34), (72, 38, 16)])
+
+
+def sigma_svg(found: SigmaMap, size: tuple[int, int], px: float) -> str:
+    """Return the uncertainty over the picture, numbers in px on it. px: of the input, in one."""
+    import cv2
+    columns, rows = (len(np.unique(found.pixels[:, n])) for n in (0, 1))
+    table = np.full((rows, columns), np.nan)
+    places = [np.unique(found.pixels[:, n], return_inverse=True)[1] for n in (0, 1)]
+    table[places[1], places[0]] = found.sigma * px
+    # a lens may see nothing in the corners
+    filled = np.where(np.isfinite(table), table, np.nanmax(table)).astype(np.float32)
+    smooth = np.asarray(cv2.resize(filled, None, fx=8, fy=8, interpolation=cv2.INTER_CUBIC),
+                        np.float64)
+    top = float(filled.max())
+    height = _height(size)
+    parts = [_heat(smooth / max(top, 1e-12), WIDTH, height)]
+    for v in (0.0, 0.5, 1.0):
+        for u in (0.0, 0.25, 0.5, 0.75, 1.0):
+            value = table[round(v * (rows - 1)), round(u * (columns - 1))]
+            if np.isfinite(value):
+                kind = 'mid on-dark' if value > 0.45 * top else 'mid on-light'
+                # at the edges, a little inside
+                parts.append(text(u * WIDTH + (0.5 - u) * 44, v * height + 4 + (0.5 - v) * 26,
+                                  f'{value:.2g}', kind))
+    return svg(WIDTH, height, 'uncertainty over the picture', ''.join(parts), 'plot map')
+
+
+def observations_of(scenes: Sequence[Scene], camera: Camera | None) -> tuple[Floats, Floats]:
+    """Return (n, 2) where points were observed and (n, 2) their residuals, px of the scenes."""
+    seen, residuals = [np.zeros((0, 2))], [np.zeros((0, 2))]
+    for scene in scenes:
+        used = scene.structure.used
+        seen.append(scene.tracks.xy[used])
+        residuals.append(residuals_px(scene, camera or scene.camera)[used])
+    xy, residual = np.concatenate(seen), np.concatenate(residuals)
+    known = np.isfinite(residual).all(axis=1)
+    return xy[known], residual[known]
+
+
+def residual_svg(xy: Floats, residual: Floats, size: tuple[int, int]) -> tuple[str, int]:
+    """Return the residuals over the picture, and by how much the arrows are magnified.
+
+    The tint is their root mean square in each cell, the arrow their mean. size: (width, height) of
+    the scenes' images.
+    """
+    cell, shape = _cells(xy, size)
+    count = np.bincount(cell, minlength=shape[0] * shape[1])
+    squares = np.bincount(cell, np.sum(residual**2, axis=1), len(count))
+    rms = np.sqrt(squares / np.maximum(count, 1))
+    sums = np.stack([np.bincount(cell, residual[:, n], len(count)) for n in (0, 1)], 1)
+    mean = sums / np.maximum(count, 1)[:, None]
+    enough = count >= FEWEST
+    height = _height(size)
+    top = float(np.quantile(rms[enough], 0.95)) if enough.any() else 1.0
+    shown = np.where(enough, np.minimum(rms / max(top, 1e-12), 1.0) * 0.75, np.nan)
+    row, column = np.divmod(np.flatnonzero(enough), shape[1])
+    centres = np.column_stack([(column + 0.5) * WIDTH / shape[1], (row + 0.5) * height / shape[0]])
+    lengths = np.linalg.norm(mean[enough], axis=1)
+    long = float(np.quantile(lengths, 0.9)) if len(lengths) else 0.0
+    magnified = next((m for m in (500, 200, 100, 50, 20, 10, 5, 2)
+                      if m * long * WIDTH / size[0] <= 0.8 * WIDTH / CELLS), 1)
+    arrows = segments(centres, magnified * mean[enough] * WIDTH / size[0], 'arrow')
+    content = _heat(shown.reshape(shape), WIDTH, height) + arrows + dots(centres, 'arrow-foot')
+    return svg(WIDTH, height, 'residuals over the picture', content, 'plot map'), magnified
+
+
+def coverage_svg(xy: Floats, size: tuple[int, int], mask_id: str | None) -> tuple[str, float]:
+    """Return how many observations each part of the picture has, and the share that has none."""
+    cell, shape = _cells(xy, size)
+    count = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
+    height = _height(size)
+    shown = np.sqrt(count.astype(np.float64) / max(int(count.max()), 1))
+    content = _heat(np.where(count > 0, shown, np.nan), WIDTH, height)
+    if mask_id is not None:
+        content += (f'<svg width="{WIDTH}" height="{height}" viewBox="0 0 100 100" '
+                    f'preserveAspectRatio="none"><use href="#{mask_id}"/></svg>')
+    return (svg(WIDTH, height, 'observations over the picture', content, 'plot map'),
+            float(np.mean(count == 0)))
+
+
+def histogram_svg(residual: Floats, px: float) -> str:
+    """Return how long the residuals are, in px of the input."""
+    length = np.linalg.norm(residual, axis=1) * px
+    top = max(float(np.quantile(length, 0.99)), 1e-9) if len(length) else 1.0
+    share, edges = np.histogram(np.minimum(length, top), bins=36, range=(0.0, top))
+    share = 100 * share / max(len(length), 1)
+    axes = Axes(WIDTH, 220, (0.0, top), (0.0, 1.08 * max(float(share.max()), 1e-9)))
+    bars = ''.join(
+        f'<rect class="column" x="{float(axes.across(low)) + 0.5:.1f}" '
+        f'y="{float(axes.down(value)):.1f}" '
+        f'width="{float(axes.across(high) - axes.across(low)) - 1:.1f}" '
+        f'height="{float(axes.down(0.0) - axes.down(value)):.1f}"/>'
+        for low, high, value in zip(edges[:-1], edges[1:], share, strict=True))
+    frame = axes.frame('residual, px', '% of the observations', ticks(0.0, top, 6),
+                       ticks(0.0, axes.y[1], 4))
+    return svg(WIDTH, axes.height, 'histogram of residuals', frame + bars)
+
+
+def profile_svg(each: Sequence[Profile], total: Profile | None, width_px: float,
+                fx: float | None) -> str:
+    """Return the error that is left at each focal length held fixed, by turn and for all.
+
+    width_px: of the input's pictures. fx: the result, px of the input.
+    """
+    ratios = np.concatenate([profile.ratios for profile in each])
+    costs = np.concatenate([profile.costs for profile in each])
+    ends = float(ratios.min() * width_px), float(ratios.max() * width_px)
+    if fx is not None:
+        ends = min(ends[0], fx / 1.05), max(ends[1], fx * 1.05)
+    axes = Axes(WIDTH, 220, ends, (0.0, 1.08 * float(costs.max())), log_x=True)
+
+    def curve(profile: Profile, kind: str) -> str:
+        return polyline(np.column_stack([axes.across(profile.ratios * width_px),
+                                         axes.down(profile.costs)]), kind)
+
+    frame = axes.frame('focal length, px', 'error left, px² per observation', log_ticks(*ends),
+                       ticks(0.0, axes.y[1], 4))
+    content = frame + ''.join(curve(profile, 'one-turn') for profile in each)
+    if total is not None:
+        content += curve(total, 'all-turns')
+    if fx is not None:
+        x = float(axes.across(fx))
+        content += line(x, axes.top, x, axes.height - axes.bottom, 'joint')
+    return svg(WIDTH, axes.height, 'focal profile', content)
+
+
+def growth_svg(percent: Sequence[float]) -> str:
+    """Return the sigma of fx, in %, with the first turn, with two of them, and so on."""
+    low, high = min(percent) / 1.5, max(percent) * 2
+    count = len(percent)
+    axes = Axes(WIDTH, 220, (0.5, count + 0.5), (low, high), log_y=True)
+    where = np.column_stack([axes.across(np.arange(1.0, count + 1)), axes.down(np.array(percent))])
+    frame = axes.frame('turns', 'sigma of fx, %', list(range(1, count + 1)), log_ticks(low, high))
+    labels = ''.join(text(x, y - 9, f'{value:.2g}', 'mid strong halo')
+                     for (x, y), value in zip(where, percent, strict=True))
+    # one turn does not show how much turns differ
+    drawn = polyline(where[1:], 'all-turns') if count > 2 else ''
+    return svg(WIDTH, axes.height, 'sigma of fx over the number of turns',
+               frame + drawn + dots(where[:1], 'dot other') + dots(where[1:], 'dot own') + labels)
+
+
+def undistorted(image: GreyImage, camera: Camera, rectified: str
+                ) -> tuple[GreyImage, str, str, float]:
+    """Return an image without distortion, and a grid over it and over the original.
+
+    camera: of images of this size. The grids are of the same rays: paths of an SVG in px, first
+    the bent one of the original, then the straight one. Last comes how far the lens moves a
+    point at the most, px, within 75 degrees of its axis.
+    """
+    import cv2
+    height, width = image.shape
+    with np.errstate(all='ignore'):
+        matrix = rectified_matrix(camera, rectified)
+        u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height))
+        source = _seen_at(np.stack([u, v], -1), matrix, camera).astype(np.float32)
+        straight = cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_LINEAR)
+        step = width / GRID_LINES
+        lines = []
+        for x in np.arange(step / 2, width, step):
+            lines.append(np.column_stack([np.full(60, x), np.linspace(0, height - 1, 60)]))
+        for y in np.arange(step / 2, height, step):
+            lines.append(np.column_stack([np.linspace(0, width - 1, 60), np.full(60, y)]))
+        bent = [_seen_at(each, matrix, camera) for each in lines]
+        places = np.concatenate(lines)
+        rays = camera.rays(places)
+        plain = rays[:, :2] / rays[:, 2:] * camera.params[:2] + camera.params[2:4]
+        moved = np.linalg.norm(plain - places, axis=1)[rays[:, 2] > np.cos(WIDEST)]
+    most = float(moved.max(initial=0.0))
+    ends = [each[[0, -1]] for each in lines]
+    return np.asarray(straight, np.uint8), _path(bent), _path(ends), most
+
+
+def _seen_at(pixels: Floats, matrix: Floats, camera: Camera) -> Floats:
+    """Return where the lens puts what the rectified picture with K shows at pixels (..., 2)."""
+    rays = np.concatenate([(pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]],
+                           np.ones((*pixels.shape[:-1], 1))], axis=-1)
+    return np.asarray(np.nan_to_num(camera.project(rays), nan=-1e6))
+
+
+def _path(lines: Sequence[Floats]) -> str:
+    parts = []
+    for xy in lines:
+        known = xy[np.abs(xy).max(axis=1) < 1e5]
+        if len(known) > 1:
+            parts.append('M' + 'L'.join(f'{x:.1f} {y:.1f}' for x, y in known))
+    return ''.join(parts)
+
+
+def _heat(share: Floats, width: float, height: float) -> str:
+    """Return values from 0 to 1 as colours, over width x height px; clear where NaN."""
+    known = np.isfinite(share)
+    at = np.clip(np.where(known, share, 0.0), 0.0, 1.0) * (len(RAMP) - 1)
+    below = np.minimum(at.astype(int), len(RAMP) - 2)
+    part = (at - below)[..., None]
+    colour = RAMP[below] * (1 - part) + RAMP[below + 1] * part
+    image = np.dstack([colour, np.where(known, 255, 0)]).round().astype(np.uint8)
+    smooth = '' if share.shape[1] > 40 else ' style="image-rendering:pixelated"'
+    return (f'<image href="{png_data_uri(image)}" width="{width:g}" height="{height:g}" '
+            f'preserveAspectRatio="none"{smooth}/>')
+
+
+def _cells(xy: Floats, size: tuple[int, int]) -> tuple[Ints, tuple[int, int]]:
+    """Return the cell of each pixel (n, 2), and how many (rows, columns) of them there are."""
+    rows = max(1, round(CELLS * size[1] / size[0]))
+    at = np.clip((xy + 0.5) / size * (CELLS, rows), 0, (CELLS - 1, rows - 1)).astype(int)
+    return at[:, 1] * CELLS + at[:, 0], (rows, CELLS)
+
+
+def _height(size: tuple[int, int]) -> float:
+    return round(WIDTH * size[1] / size[0])
