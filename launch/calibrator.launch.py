@@ -1,5 +1,6 @@
 """ros2 launch dashcalib_ros calibrator.launch.py [namespace:=front] [image:=image_raw] ..."""
 from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
@@ -14,7 +15,11 @@ ARGUMENTS = (
     ('use_sim_time', 'false', 'true with a bag that is played with --clock; not from the file'),
     ('config', PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'config',
                                      'calibrator.yaml']), 'the file of parameters'),
+    ('rviz', 'false', 'true starts RViz with the images, the overlay and the rectified picture'),
 )
+RVIZ = PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'config', 'dashcalib.rviz'])
+# topics in RVIZ that are in the namespace
+PICTURES = ('calibrator/overlay/compressed', 'calibrator/rectified/compressed')
 
 
 def generate_launch_description():
@@ -30,4 +35,9 @@ def generate_launch_description():
             parameters=[value['config'], {'image_transport': value['image_transport'],
                                           'use_sim_time': value['use_sim_time']}],
             remappings=[('image_raw', value['image']), ('camera_info', value['camera_info'])]),
+        Node(
+            package='rviz2', executable='rviz2', name='rviz', namespace=value['namespace'],
+            arguments=['-d', RVIZ], condition=IfCondition(value['rviz']),
+            remappings=[('/image_raw', value['image']),
+                        *((f'/{topic}', topic) for topic in PICTURES)]),
     ])

@@ -1,15 +1,17 @@
 """The ROS 2 node; the only room that imports rclpy, and only when the node is started."""
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
-from dashcalib_ros.standard_streams import open_closed_streams, write_stderr
+from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, write_stdout
 
 INSTALL = ("calibrator: error: the Python package {name} is missing: source your ROS 2 "
            "installation (. /opt/ros/jazzy/setup.sh), or pip install "
            "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces")
-ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'rcl_interfaces', 'sensor_msgs',
-                'std_msgs', 'std_srvs')
+ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'lifecycle_msgs',
+                'rcl_interfaces', 'sensor_msgs', 'std_msgs', 'std_srvs')
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -19,8 +21,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     stopping = Stopping()
     open_closed_streams()
     try:
+        from dashcalib_ros.ros.arguments import check_files, help_text, parse, ros_arguments
+        arguments = list(sys.argv[1:] if argv is None else argv)
+        wants_help, lifecycle = parse(arguments)
+        if wants_help:
+            write_stdout(help_text())
+            return 0
+        check_files(arguments)
         from dashcalib_ros.ros.program import run
-        return run(argv, stopping)
+        return run(ros_arguments(arguments), lifecycle, stopping)
+    except DashcalibError as error:
+        write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
+        return 2
     except ModuleNotFoundError as error:
         missing = (error.name or '').partition('.')[0]
         if missing not in ROS_PACKAGES:

@@ -2,31 +2,30 @@
 from __future__ import annotations
 
 from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import Header
 
+from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.ros.camera_in_use import CameraInUse
 from dashcalib_ros.ros.complaints import Complaints
+from dashcalib_ros.ros.news import Result
 from dashcalib_ros.ros.publication import Publication
 from dashcalib_ros.ros.state import Action, Rules, judge, sigma_text
 from dashcalib_ros.ros.store import Kept, Store
 from dashcalib_ros.ros.stream import Source
+from dashcalib_ros.ros.wording import outcome_text
 
 
-class CalibrationInUse:
-    """At most one calibration; its topics and its file are always changed together.
-
-    verdict: of the last calibration, used or not. contradictions: number of calibrations in a row
-    that contradict the one in use. stale: it was given up, and is published only because of
-    publish_stale.
-    """
+class CalibrationInUse(CameraInUse):
+    """At most one calibration; its topics and its file are always changed together."""
 
     def __init__(self, node: Node, name: str, store: Store, rules: Rules,
                  complaints: Complaints, rectified: str) -> None:
-        self.publication = Publication(node, rectified)
-        self.verdict: Verdict | None = None
-        self.contradictions = 0
-        self.stale = False
+        super().__init__(node)
+        self._node = node
+        self._publication = Publication(node, rectified)
         self._kept: Kept | None = None
         self._log = node.get_logger()
         self._name = name
@@ -49,6 +48,28 @@ class CalibrationInUse:
     def file(self) -> str:
         """Return the file's path."""
         return str(self._store.path)
+
+    @property
+    def published(self) -> int:
+        """Return how many camera_infos were published beside images."""
+        return self._publication.sent
+
+    @property
+    def info(self) -> CameraInfo | None:
+        """Return what is published now."""
+        return self._publication.info
+
+    def goal(self, config: Config) -> int:
+        """Return how many turns the next calibration needs.
+
+        The first one needs all turns wanted; to check a published one, a few are enough.
+        """
+        wanted = config.turns.wanted
+        return wanted if self.trusted is None else min(config.verdict.min_turns, wanted)
+
+    def accompany(self, header: Header, size: tuple[int, int]) -> None:
+        """Publish the camera_info of an image, if the camera has such images."""
+        self._publication.accompany(header, size)
 
     def load(self) -> None:
         """Use the file's calibration, if it is an accepted one of this node."""
@@ -76,17 +97,17 @@ class CalibrationInUse:
             self._log.warning(f'{self.file} is ignored: it is for {of}, the images are {source}')
             self._unpublish()
 
-    def judge(self, calibration: Calibration, complete: bool, frame_id: str,
-              publish_stale: bool) -> Action:
+    def judge(self, result: Result, frame_id: str, publish_stale: bool) -> Action:
         """Adopt a new calibration, or not (state.py has the reasons); return what was done.
 
-        complete: it had all the turns wanted. publish_stale: go on publishing a calibration that
-        is given up.
+        publish_stale: go on publishing a calibration that is given up.
         """
+        calibration = result.calibration
         self.verdict = calibration.verdict
         for text in calibration.warnings:
             self._complaints.once(text)
-        judged = judge(calibration, complete, self.trusted, self.contradictions, self._rules)
+        judged = judge(calibration, result.complete, self.trusted, self.contradictions,
+                       self._rules)
         self.contradictions = judged.contradictions
         if judged.action in ('adopt', 'replace'):
             if judged.action == 'replace':
@@ -100,9 +121,7 @@ class CalibrationInUse:
             else:
                 self._unpublish()
         else:
-            used = calibration.turns_used
-            text = (f'a calibration of {used} turn{"" if used == 1 else "s"} is '
-                    f'{calibration.verdict.level}' + (f': {judged.why}' if judged.why else ''))
+            text = outcome_text(calibration, judged.why)
             # rclpy takes one severity for each line of code
             if judged.contradictions:
                 self._log.warning(text)
@@ -141,22 +160,27 @@ class CalibrationInUse:
         return True, f'written: {self.file}'
 
     def warnings(self) -> list[str]:
-        """Return warnings about the file, for the operator."""
-        if not self._store.given_up:
-            return []
-        return [f'{self.file} was given up, but could not be moved aside: remove it, or the next '
-                f'start of the node publishes it again']
+        """Return warnings about the file and the topic, for the operator."""
+        found = []
+        if self._store.given_up:
+            found.append(f'{self.file} was given up, but could not be moved aside: remove it, or '
+                         f'the next start of the node publishes it again')
+        beside = self._publication.topic
+        if self._node.count_publishers(beside) > 1:
+            found.append(f'another node publishes {beside}: remap it, or its subscribers get both')
+        return found
 
     def _adopt(self, kept: Kept) -> None:
         self._use(kept)
         self.contradictions = 0
-        self._log.info(f'calibrated: {sigma_text(kept.camera)}')
-        self.save()
+        saved, text = self.save()
+        self._log.info(f'accepted: {sigma_text(kept.camera)}; '
+                       + (f'saved to {self.file}' if saved else f'not saved: {text}'))
 
     def _use(self, kept: Kept) -> None:
         self._kept, self.stale = kept, False
-        self.publication.set(kept.camera, kept.frame_id)
+        self._publication.set(kept.camera, kept.frame_id)
 
     def _unpublish(self) -> None:
         self._kept, self.stale = None, False
-        self.publication.retract()
+        self._publication.retract()

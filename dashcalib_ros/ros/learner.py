@@ -1,108 +1,49 @@
 """Runs the Calibrator in two threads beside the executor: one detects, the other calibrates."""
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import DashcalibError, InputError, one_line
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.decode import BitDepth, decode
-from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.judgement.agreement import outdated, turns_of_another_camera
+from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.backlog import Backlog
-from dashcalib_ros.turns import TurnId
+from dashcalib_ros.ros.bank import Bank, Job
+from dashcalib_ros.ros.detecting import detect
+from dashcalib_ros.ros.news import NOTHING, Activity, Listener, Result, call, named, new_turns
+from dashcalib_ros.ros.watch import Watch
 
-LOG = logging.getLogger(__name__)
 # s between two checks whether enough turns are built: scenes are finished without a push
 LOOK_S = 0.25
 LONGEST_BACK_OFF_S = 60.0
-NOTHING = Status(0, 0, 0, 0.0, 0.0, False)
-
-
-@dataclass(frozen=True)
-class Activity:
-    """What the learner does now. stage, share: of the calibration that runs."""
-
-    status: Status = NOTHING
-    calibrating: bool = False
-    stage: str = ''
-    share: float = 0.0
-
-
-@dataclass(frozen=True)
-class Result:
-    """A calibration; complete: it had all the turns wanted; bank: the number of their bank."""
-
-    calibration: Calibration
-    complete: bool
-    bank: int
-
-
-@dataclass(frozen=True)
-class Listener:
-    """Callbacks of the learner; its threads call them, so they must not wait.
-
-    result: called after each calibration. status: after each image. trouble: for each problem,
-    with its kind, for counting, and one line for the log. Their exceptions are logged.
-    """
-
-    result: Callable[[Result], None]
-    status: Callable[[Status], None]
-    trouble: Callable[[str, str], None]
-
-
-class _Bank:
-    """A Calibrator and what belongs to its images only.
-
-    depth: used by the detecting thread only. tried: the turns of the last calibration; used by the
-    calibrating thread only.
-    """
-
-    def __init__(self, number: int, calibrator: Calibrator) -> None:
-        self.number = number
-        self.calibrator = calibrator
-        self.depth = BitDepth()
-        self.tried: frozenset[TurnId] = frozenset()
-
-
-@dataclass(frozen=True)
-class _Job:
-    """An image that waits for detection, and the bank that it is for."""
-
-    bank: _Bank
-    index: int
-    stamp_ns: int
-    message: Any
-    size: tuple[int, int]
-    frame_id: str
 
 
 class Learner:
     """Learns in the background. All methods may be called from any thread; none of them waits.
 
     goal: calibrations start by themselves when so many turns are built, and again when others are
-    among the best.
+    among the best; None: only by request.
     """
 
     def __init__(self, config: Config, queue_size: int, listener: Listener,
                  mask: Mask | None = None) -> None:
         """mask: (h, w), False where the images are not to be used."""
-        self.goal = config.turns.wanted
+        self.goal: int | None = config.turns.wanted
         self._config = config
         self._mask = mask
         self._tell = listener
-        self._backlog: Backlog[_Job] = Backlog(queue_size)
+        self._backlog: Backlog[Job] = Backlog(queue_size)
         # the Learner's own lock: guards _bank, _activity, _requested and what follows them
         self._changed = threading.Condition()
-        self._bank = _Bank(0, self._calibrator(use_stored=True))
+        self._bank = Bank(0, self._calibrator(use_stored=True))
         self._activity = Activity()
+        self._watch = Watch(None)
+        self._checked: NamedCamera | None = None
         self._requested = False
         self._failures = 0
         self._not_before = 0.0
@@ -126,7 +67,7 @@ class Learner:
     def offer(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int],
               frame_id: str = '') -> None:
         """Take an image message; size and frame_id are what its header says."""
-        self._backlog.put(_Job(self._bank, index, stamp_ns, message, size, frame_id))
+        self._backlog.put(Job(self._bank, index, stamp_ns, message, size, frame_id))
 
     def activity(self) -> Activity:
         """Return what the learner does now."""
@@ -144,6 +85,25 @@ class Learner:
             self._changed.notify_all()
         return ''
 
+    def want(self, turns: int) -> None:
+        """Use so many turns from the next calibration on."""
+        with self._changed:
+            self._config = self._config.replace({'turns.wanted': turns})
+            self._changed.notify_all()
+
+    def compare(self, watched: NamedCamera | None, checked: NamedCamera | None = None) -> None:
+        """Compare turns with cameras from now on; both may be called again with the same ones.
+
+        watched: each new turn is compared with it, to find changes. checked: each calibration is
+        compared with it; the present turns at once.
+        """
+        with self._changed:
+            if watched is not self._watch.camera:
+                self._watch = Watch(watched)
+            if checked is not self._checked:
+                self._checked = checked
+                self._bank.tried = frozenset()
+
     def restart(self, keep_stored: bool = False) -> None:
         """Forget all turns and begin with an empty bank; a running calibration is cancelled.
 
@@ -154,7 +114,7 @@ class Learner:
             if self._closed:
                 return
             old = self._bank
-            self._bank = _Bank(old.number + 1, self._calibrator(use_stored=keep_stored))
+            self._bank = Bank(old.number + 1, self._calibrator(use_stored=keep_stored))
             self._backlog.clear()
             self._requested = False
             self._failures, self._not_before = 0, 0.0
@@ -191,35 +151,30 @@ class Learner:
 
     def _detect(self) -> None:
         while (job := self._backlog.get()) is not None:
-            try:
-                image = decode(job.message, job.bank.depth)
-                if image.shape[::-1] != job.size:
-                    raise InputError(
-                        f'an image is {image.shape[1]}x{image.shape[0]} but its header says '
-                        f'{job.size[0]}x{job.size[1]}: the camera driver is broken')
-                status = job.bank.calibrator.push(
-                    Frame(job.index, job.stamp_ns, image, job.frame_id))
-            except InputError as error:
-                self._trouble('undecodable', str(error))
-                continue
-            except Exception as error:
-                self._trouble('failed', f'an image could not be used: {_named(error)}')
-                continue
-            if self._note(job.bank, status):
-                _call(self._tell.status, status)
+            status = detect(job, self._tell)
+            if status is not None and self._note(job.bank, status):
+                call(self._tell.status, status)
 
-    def _note(self, bank: _Bank, status: Status) -> bool:
+    def _note(self, bank: Bank, status: Status) -> bool:
         with self._changed:
             if bank is not self._bank:
                 return False
             self._activity = replace(self._activity, status=status)
+            fresh = new_turns(bank.told, status)
+            bank.told |= set(status.ready)
             self._changed.notify_all()
-            return True
+        for turn in fresh:
+            call(self._tell.turn, turn)
+        return True
 
     def _calibrate(self) -> None:
         while (bank := self._wait_until_due()) is not None:
+            call(self._tell.started, self._activity.status)
+            given = self._checked
             try:
                 calibration = bank.calibrator.calibrate(self._progress, final=False)
+                check = None if given is None else bank.calibrator.check(
+                    given.camera, calibration, self._progress)
                 of_another = turns_of_another_camera(calibration.misfits, self._config.verdict)
                 bank.calibrator.reject(
                     outdated(of_another | calibration.used_turns, of_another))
@@ -227,23 +182,29 @@ class Learner:
                 self._failed(bank, error)
                 continue
             with self._changed:
-                bank.tried = frozenset(calibration.misfits)
+                if given is self._checked:
+                    bank.tried = frozenset(calibration.misfits)
                 self._failures = 0
                 self._activity = replace(self._activity, calibrating=False, stage='')
             complete = calibration.turns_used >= self._config.turns.wanted
-            _call(self._tell.result, Result(calibration, complete, bank.number))
+            call(self._tell.result, Result(calibration, complete, bank.number, given, check))
 
-    def _wait_until_due(self) -> _Bank | None:
+    def _wait_until_due(self) -> Bank | None:
         """Return the bank to calibrate, None when closed."""
         while not self._closed:
             bank = self._bank
             try:
-                self._note(bank, bank.calibrator.status())
+                # here, as it may wait for an image that is being searched for points
+                bank.calibrator.want(self._config.turns.wanted)
+                status = bank.calibrator.status()
+                self._note(bank, status)
+                self._read(bank, status)
             except Exception as error:
-                self._trouble('failed', f'the turns could not be counted: {_named(error)}')
+                self._trouble('failed', f'the turns could not be counted: {named(error)}')
             with self._changed:
                 ready = self._activity.status.ready
-                news = len(ready) >= self.goal and not bank.tried.issuperset(ready)
+                news = (self.goal is not None and len(ready) >= self.goal
+                        and not bank.tried.issuperset(ready))
                 if (bank is self._bank and (self._requested or news)
                         and time.monotonic() >= self._not_before):
                     self._requested = False
@@ -253,11 +214,26 @@ class Learner:
                     self._changed.wait(LOOK_S)
         return None
 
+    def _read(self, bank: Bank, status: Status) -> None:
+        """Compare turns that are new with the camera in use."""
+        try:
+            found = self._watch.read(bank, status)
+        except Exception as error:
+            with self._changed:
+                cancelled = bank is not self._bank or self._closed
+            if not cancelled:
+                self._trouble('failed_watches', f'new turns could not be compared with the '
+                                                f'calibration in use ({named(error)}); the next '
+                                                f'turn tries again')
+            return
+        if found is not None:
+            call(self._tell.watched, found)
+
     def _progress(self, stage: str, share: float) -> None:
         with self._changed:
             self._activity = replace(self._activity, stage=stage, share=share)
 
-    def _failed(self, bank: _Bank, error: Exception) -> None:
+    def _failed(self, bank: Bank, error: Exception) -> None:
         with self._changed:
             self._activity = replace(self._activity, calibrating=False, stage='')
             if bank is not self._bank or self._closed:
@@ -267,25 +243,13 @@ class Learner:
             self._not_before = time.monotonic() + delay
             # the same turns are tried again
             self._requested = True
-        self._trouble('failed_calibrations', f'a calibration failed ({_named(error)}); the '
+        self._trouble('failed_calibrations', f'a calibration failed ({named(error)}); the '
                                              f'turns are kept, next try in {delay:.0f} s')
 
     def _trouble(self, kind: str, text: str) -> None:
-        _call(self._tell.trouble, kind, text)
-
-
-def _call(listener: Callable[..., None], *news: Any) -> None:
-    try:
-        listener(*news)
-    except Exception:
-        LOG.exception('a listener of the learner failed')
+        call(self._tell.trouble, kind, text)
 
 
 def _clear(calibrator: Calibrator) -> None:
     calibrator.close()
     calibrator.clear_store()
-
-
-def _named(error: Exception) -> str:
-    text = one_line(error, 500)
-    return text if isinstance(error, DashcalibError) else f'{type(error).__name__}: {text}'

@@ -4,14 +4,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from dashcalib_ros.calibrator import Status
-from dashcalib_ros.camera import Camera, ros_camera
+from dashcalib_ros.camera import Camera, camera_from_ros, ros_camera
+from dashcalib_ros.checking import Check
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.ros.learner import NOTHING
+from dashcalib_ros.report.named_camera import check_focal, read_size
+from dashcalib_ros.ros.news import NOTHING
 from dashcalib_ros.ros.state import State, sigma_text
 
 OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR,
@@ -26,6 +30,27 @@ def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:
                       distortion_model=c.distortion_model, d=c.d, k=c.k, r=c.r, p=c.p)
 
 
+def given_camera(message: CameraInfo, topic: str) -> NamedCamera:
+    """Return the camera that a driver publishes. Raises InputError where it cannot be used."""
+    what = f'the camera_info on {topic}'
+    if not message.k[0] > 0:
+        raise InputError(f'{what} is uncalibrated: K[0] is not positive; give the driver a '
+                         f'calibration')
+    if not np.isfinite([*message.k, *message.d]).all():
+        raise InputError(f'{what} has numbers that are not finite')
+    roi = message.roi
+    cut = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
+    if cut or max(message.binning_x, message.binning_y) > 1:
+        raise InputError(f'{what} has binning or a region of interest: publish the calibration of '
+                         f'the images as they are')
+    size = read_size(message.width, message.height, what)
+    try:
+        camera = camera_from_ros(size, message.distortion_model, message.k, message.d)
+    except InputError as error:
+        raise InputError(f'{what}: {error}') from error
+    return NamedCamera(topic, check_focal(camera, what))
+
+
 def uncalibrated(header: Header) -> CameraInfo:
     """Return an uncalibrated CameraInfo, K[0] = 0 (sensor_msgs). It replaces a latched one."""
     return CameraInfo(header=header)
@@ -36,7 +61,10 @@ class Health:
     """The content of the diagnostics. Counts are of images, since the start.
 
     published: the camera that is published now. stale: it was given up. verdict, reasons: of
-    the last calibration. silent_s: s since the last image, None before the first.
+    the last calibration. silent_s: s since the last image, None before the first. listening:
+    False for a managed node that is not active. changes, suspicions: of the camera in use, in
+    words; misfit: why the calibration no longer fits it, '' where it does. check: with check_only,
+    what was found.
     """
 
     state: State
@@ -50,9 +78,14 @@ class Health:
     verdict: str = ''
     reasons: tuple[str, ...] = ()
     silent_s: float | None = None
+    listening: bool = True
     file: str = ''
     warnings: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
+    changes: tuple[str, ...] = ()
+    suspicions: tuple[str, ...] = ()
+    misfit: str = ''
+    check: Check | None = None
 
 
 # s; a camera that is silent for longer has stopped
@@ -83,6 +116,10 @@ def diagnostic_status(health: Health, name: str, hardware_id: str) -> Diagnostic
         'topic': health.topic,
         'reliability': health.reliability,
         'warnings': '; '.join(health.warnings),
+        'check': health.check.answer if health.check else '',
+        'check reasons': '; '.join(health.check.reasons) if health.check else '',
+        'change': '; '.join(health.changes),
+        'suspected change': '; '.join(health.suspicions),
         **health.counts,
     }
     return DiagnosticStatus(
@@ -99,6 +136,8 @@ def _summary(health: Health) -> tuple[bytes, str]:
     status = health.status
     turns = (f'{min(status.built, health.wanted)} of {health.wanted} turns, '
              f'{status.yaw_deg:.0f}° of yaw')
+    if not health.listening:
+        return WARN, 'inactive: the node subscribes no images until it is activated'
     if health.silent_s is None or health.silent_s > SILENT_S:
         since = 'yet' if health.silent_s is None else f'for {health.silent_s:.0f} s'
         return STALE, f'no image on {health.topic} {since}'
@@ -106,6 +145,10 @@ def _summary(health: Health) -> tuple[bytes, str]:
         return ERROR, f'the published calibration is contradicted; new turns: {turns}'
     if health.warnings:
         return WARN, f'{health.state}: {health.warnings[0]}'
+    if health.misfit:
+        return WARN, health.misfit
+    if health.check is not None:
+        return _checked(health.check, turns)
     if health.published is not None:
         return OK, f'calibrated; {turns} for the next check of it'
     if health.state == 'calibrating':
@@ -114,6 +157,15 @@ def _summary(health: Health) -> tuple[bytes, str]:
         why = health.reasons[0] if health.reasons else health.verdict
         return WARN, f'not calibrated, {turns}; so far {health.verdict}: {why}'
     return WARN, f'not calibrated yet: {turns}'
+
+
+def _checked(found: Check, turns: str) -> tuple[bytes, str]:
+    """Return level and message about a driver's calibration of which no change is known."""
+    if found.answer == 'wrong':
+        return WARN, f'the calibration is wrong: {found.reasons[0]}'
+    if found.answer == 'right':
+        return OK, f'the calibration is right; {turns} for the next check'
+    return OK, f'checking the calibration, {turns}: {found.reasons[0]}'
 
 
 def _sigma(camera: NamedCamera | None) -> str:

@@ -5,7 +5,6 @@ import dataclasses
 import difflib
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -17,46 +16,11 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dashcalib_ros.config import Config, _check, describe, expert, setting
+from dashcalib_ros.config import Config, describe
 from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig
 
-# these take effect at once; the others affect turns that are already found: they are read-only
-CHANGEABLE = ('commit', 'publish_stale')
 OF_ROS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
-
-
-@dataclass(frozen=True)
-class NodeConfig:
-    """What only the node needs. Raises ConfigError like Config."""
-
-    image_transport: str = setting(
-        'raw', 'compressed subscribes image_raw/compressed instead',
-        choices=('raw', 'compressed'))
-    reliability: str = setting(
-        'auto', 'auto does as the publishers do: best effort if any of them does',
-        choices=('auto', 'best_effort', 'reliable'))
-    camera_name: str = setting(
-        '', "in the file and its name; empty: the last part of the node's namespace, or dashcam")
-    camera_info_file: str = setting(
-        '', 'of the accepted calibration; empty: $ROS_HOME/camera_info/CAMERA_NAME.yaml')
-    mask_file: str = setting(
-        '', 'picture as large as the images, black where they are not used; empty: none')
-    commit: bool = setting(
-        False, 'give an accepted calibration to the camera driver: service set_camera_info')
-    publish_stale: bool = setting(
-        False, 'go on publishing a calibration that new turns contradict')
-    queue_size: int = expert(
-        10, 'images that may wait for detection, a second of them; the oldest is dropped', 1, 1000)
-    commit_timeout: float = expert(5.0, 's; how long the driver may take to answer', 0.1, 600.0)
-    better: float = expert(
-        0.7, "ratio; a new calibration replaces the old one when fx's sigma falls to this",
-        0.1, 1.0)
-    contradictions: int = expert(
-        3, 'in a row, before the old calibration is given up: one or two may be chance', 1, 20)
-
-    def __post_init__(self) -> None:
-        for spec in dataclasses.fields(self):
-            _check(spec.name, spec, getattr(self, spec.name))
 
 
 def declare(node: Node) -> tuple[Config, NodeConfig]:
@@ -69,27 +33,50 @@ def declare(node: Node) -> tuple[Config, NodeConfig]:
     return Config().replace(changes), NodeConfig(**_floats(own))
 
 
-def unknown(names: Iterable[str]) -> list[str]:
-    """Return a line for each name that is no parameter of this node."""
-    known = [*Config().flat(), *(spec.name for spec in dataclasses.fields(NodeConfig))]
-    lines = []
+def check_known(names: Iterable[str], known: Iterable[str]) -> None:
+    """Check that each parameter that was given is one of this node.
+
+    Raises ConfigError with the nearest name that there is.
+    """
+    known = list(known)
     for name in names:
-        if name in known or name.partition('.')[0] in OF_ROS:
+        if name in known:
             continue
         near = difflib.get_close_matches(name, known, 1)
-        lines.append(f'there is no parameter {name!r}'
-                     + (f': did you mean {near[0]}?' if near else '; it is ignored'))
-    return lines
+        raise ConfigError(f'there is no parameter {name!r}' + (
+            f': did you mean {near[0]}?' if near else
+            ': remove it; if it is for another node, name that node in the file, not /**'))
 
 
-def changed(config: NodeConfig, parameters: Iterable[Parameter]
-            ) -> tuple[NodeConfig, SetParametersResult]:
-    """Return the changed settings, or the same ones and the reason for the refusal."""
+def changed(core: Config, own: NodeConfig, parameters: Iterable[Parameter], most_turns: int
+            ) -> tuple[Config, NodeConfig, SetParametersResult]:
+    """Return the changed settings, or the same ones and the reason for the refusal.
+
+    most_turns: how many turns the learner was made for.
+    """
     values = {each.name: each.value for each in parameters if each.name in CHANGEABLE}
+    of_core = {name: values.pop(name) for name in list(values) if '.' in name}
     try:
-        return dataclasses.replace(config, **values), SetParametersResult(successful=True)
+        new = core.replace(of_core), dataclasses.replace(own, **values)
     except ConfigError as error:
-        return config, SetParametersResult(successful=False, reason=str(error))
+        return core, own, SetParametersResult(successful=False, reason=str(error))
+    if new[0].turns.wanted > most_turns:
+        return core, own, SetParametersResult(successful=False, reason=(
+            f'turns.wanted can be {most_turns} at the most while the node runs, as so many turns '
+            f'are kept; for more, start the node with it'))
+    return *new, SetParametersResult(successful=True)
+
+
+def why_read_only(name: str) -> str:
+    """Return why a parameter cannot be changed while the node runs, and what to do instead."""
+    if name in Config().flat():
+        why = 'the turns found so far were made with it'
+    elif name.startswith('qos_overrides'):
+        why = 'the topic was made with it'
+    else:
+        why = 'it is read when the node starts'
+    return (f'{name} is read-only while the node runs: {why}; start the node with '
+            f'-p {name}:=VALUE. These can be changed: {", ".join(CHANGEABLE)}')
 
 
 def camera_name(config: NodeConfig, namespace: str) -> str:

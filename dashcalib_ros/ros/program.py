@@ -1,6 +1,7 @@
 """From the command line to a spinning node and back to an exit code."""
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Sequence
 
@@ -9,7 +10,7 @@ import rclpy.utilities
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.errors import ConfigError, DashcalibError
 from dashcalib_ros.ros.memory import give_images_back
 from dashcalib_ros.ros.node import CalibratorNode, SetupError
 from dashcalib_ros.ros.stopping import Stopping
@@ -20,30 +21,54 @@ FAILED = 2
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.01, 1.0
 
 
-def run(argv: Sequence[str] | None, stopping: Stopping) -> int:
-    """Run the node: 0 when it was asked to stop, 2 when its parameters are wrong."""
+def run(argv: Sequence[str], lifecycle: bool, stopping: Stopping) -> int:
+    """Run the node: 0 when it was asked to stop, 2 when its parameters are wrong.
+
+    argv: ROS's arguments. lifecycle: it waits for configure and activate.
+    """
     node: CalibratorNode | None = None
     give_images_back()
     try:
-        # rclpy takes the program's name for the first argument
-        rclpy.init(args=None if argv is None else ['calibrator', *argv])
+        start_ros(argv)
         if not stopping.requested:
-            node = CalibratorNode()
+            node = make_node(lifecycle)
             spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except (DashcalibError, ParameterException) as error:
-        write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
-        return FAILED
-    except Exception:
-        # a context that is shut down in the middle of a call makes rclpy raise nearly anything
+    except Exception as error:
+        # a context that is shut down in the middle of a call makes rclpy raise nearly anything,
+        # which may look like a wrong parameter
         if not stopping.requested:
-            raise
+            if not isinstance(error, (DashcalibError, ParameterException)):
+                raise
+            write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
+            return FAILED
     finally:
         if node is not None:
             node.close()
         rclpy.utilities.try_shutdown()
     return 0
+
+
+def make_node(lifecycle: bool) -> CalibratorNode:
+    """Make the node; what only a managed one needs is imported for it only."""
+    if not lifecycle:
+        return CalibratorNode()
+    from dashcalib_ros.ros.lifecycle import LifecycleCalibratorNode
+    return LifecycleCalibratorNode()
+
+
+def start_ros(argv: Sequence[str]) -> None:
+    """Start rclpy; raises ConfigError for arguments and files that it does not understand."""
+    try:
+        # rclpy takes the program's name for the first argument
+        rclpy.init(args=['calibrator', *argv])
+    except (RuntimeError, ValueError) as error:
+        # without the lines of rcl's sources
+        text = re.sub(r', at [^ ,]*:\d+', '', str(error))
+        text = text.removeprefix('failed to initialize rcl: ')
+        raise ConfigError(f'{text}; remappings are -r FROM:=TO, parameters -p NAME:=VALUE, '
+                          f'files --params-file FILE') from error
 
 
 def spin(node: CalibratorNode) -> None:

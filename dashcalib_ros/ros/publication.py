@@ -8,6 +8,7 @@ from std_msgs.msg import Header
 
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.messages import camera_info, uncalibrated
+from dashcalib_ros.ros.qos import make_publisher
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -27,8 +28,8 @@ class Publication:
         self.sent = 0
         self._rectified = rectified
         self._clock = node.get_clock()
-        self._beside = node.create_publisher(CameraInfo, 'camera_info', BESIDE_IMAGES)
-        self._latched = node.create_publisher(CameraInfo, '~/calibration', LATCHED)
+        self._beside = make_publisher(node, CameraInfo, 'camera_info', BESIDE_IMAGES)
+        self._latched = make_publisher(node, CameraInfo, '~/calibration', LATCHED)
         # the full name of the topic beside the images
         self.topic = str(self._beside.topic_name)
 

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from dashcalib_ros.config import describe
-from dashcalib_ros.ros.parameters import CHANGEABLE, NodeConfig
+from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig
 
 HEAD = """\
 # Every parameter of the node 'calibrator' with its default: first those that users set, then those

@@ -7,26 +7,16 @@ the second turn of a bank on; several in a row mean that the camera was moved.
 """
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from dashcalib_ros.camera import Camera
+from dashcalib_ros.checking.contradiction import contradicted
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.wording import digits_of
 
-State = Literal['collecting', 'calibrating', 'calibrated', 'refused_so_far']
+State = Literal['collecting', 'calibrating', 'calibrated', 'refused_so_far', 'checking']
 Action = Literal['wait', 'adopt', 'keep', 'replace', 'give_up']
-
-# combined sigmas; a larger difference is a contradiction
-CONTRADICTION = 3.0
-# of fx; least sigma: good calibrations of one lens differ by this much, also with smaller sigmas
-LEAST_SIGMA = 0.0025
-# in every model fx and fy are the scale on the axis, so that two models of one lens agree in them;
-# the coefficients of distortion are not compared: they are correlated with the focal length
-COMPARED = ('fx', 'fy', 'cx', 'cy')
 
 
 @dataclass(frozen=True)
@@ -58,7 +48,7 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
         return Judgement(action, '; '.join(new.verdict.reasons), contradictions)
     if published is None:
         return Judgement('adopt')
-    against = contradicted(published, new.camera, new.sigma)
+    against = contradicted(published.camera, published.sigma, new.camera, new.sigma)
     if against:
         count = contradictions + 1
         why = (f'{count} of {rules.contradictions} calibrations in a row contradict the published '
@@ -69,21 +59,9 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
     assert published.sigma is not None
     before, after = published.sigma['fx'], new.sigma['fx']
     if complete and after <= rules.replace_ratio * before:
-        return Judgement('replace', f"fx's sigma falls from {before:.2f} to {after:.2f} px")
+        return Judgement('replace', f'it is more exact: fx is known to ± {after:.2f} px, it was ± '
+                                    f'{before:.2f} px')
     return Judgement('keep', 'it confirms the published one')
-
-
-def contradicted(old: NamedCamera, new: Camera, sigma: Mapping[str, float]) -> list[str]:
-    """Return texts for the parameters in which the two contradict each other."""
-    found = []
-    floor = LEAST_SIGMA * old.camera.fx
-    for name in COMPARED:
-        before, after = getattr(old.camera, name), getattr(new, name)
-        own = old.sigma[name] if old.sigma is not None else 0.0
-        spread = math.hypot(max(own, floor), max(sigma[name], floor))
-        if abs(after - before) > CONTRADICTION * spread:
-            found.append(f'{name} {after:.1f} instead of {before:.1f} px')
-    return found
 
 
 def state_of(published: bool, calibrating: bool, refused: bool) -> State:

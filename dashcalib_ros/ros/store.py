@@ -1,7 +1,6 @@
 """The last accepted calibration on disk, by default where camera_info_manager finds it."""
 from __future__ import annotations
 
-import os
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -72,18 +71,8 @@ def _equal(data: Any, p: list[float]) -> bool:
 class Store:
     """One file. If another program has written it, it is set aside, never overwritten."""
 
-    def __init__(self, path: str, camera_name: str) -> None:
-        """path: empty for camera_info_manager's folder and name; ~ is expanded.
-
-        Raises InputError for the home folder of an unknown user.
-        """
-        place = Path(path) if path else (
-            Path(os.environ.get('ROS_HOME') or '~/.ros', 'camera_info', f'{camera_name}.yaml'))
-        try:
-            self.path = place.expanduser()
-        except RuntimeError as error:  # the user, or the own home folder, is unknown
-            raise InputError(f'there is no home folder for {place}; set camera_info_file to a '
-                             f'path without ~') from error
+    def __init__(self, path: Path) -> None:
+        self.path = path
         # the text that this node last read or wrote: a different one is another program's
         self._text: str | None = None
         # the text of a calibration that was given up, but could not be moved aside
@@ -129,7 +118,7 @@ class Store:
             self.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f'cannot make {self.path.parent}: {error.strerror}; set '
-                              f'camera_info_file to a place you may write to') from error
+                              f'camera_info_url to a place you may write to') from error
         ours = self._text is not None and self._read() == self._text
         moved = None if ours else set_aside(self.path)
         write_text(self.path, kept.text)

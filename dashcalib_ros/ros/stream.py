@@ -1,15 +1,16 @@
-"""Whether the images of a stream are of one camera, judged by their headers.
+"""Whether the messages of a stream are of one camera, judged by what they share.
 
 This runs in the image callback, so that no pixels are read.
 """
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
-# images in a row of another size or frame that count as a change: those of a second publisher
-# alternate with the first one's
+# messages in a row of another size, frame or calibration that count as a change: those of a
+# second publisher alternate with the first one's
 LASTING = 10
+T = TypeVar('T')
 
 
 @dataclass(frozen=True)
@@ -23,17 +24,20 @@ class Source:
         return f'{self.size[0]}x{self.size[1]} in frame {self.frame_id!r}'
 
 
-class SourceWatch:
-    """Distinguishes a changed camera from single stray images. previous: before the change."""
+class SourceWatch(Generic[T]):
+    """Distinguishes a changed camera from single stray messages. previous: before the change.
+
+    T: what the messages of one camera share.
+    """
 
     def __init__(self) -> None:
-        self.current: Source | None = None
-        self.previous: Source | None = None
-        self._other: Source | None = None
+        self.current: T | None = None
+        self.previous: T | None = None
+        self._other: T | None = None
         self._run = 0
 
-    def take(self, source: Source) -> Literal['first', 'same', 'stray', 'changed']:
-        """Take the next image's source."""
+    def take(self, source: T) -> Literal['first', 'same', 'stray', 'changed']:
+        """Take the next message's source."""
         if source == self.current:
             self._run = 0
             return 'same'

@@ -1,0 +1,127 @@
+"""The command line of the node: its help, and arguments that ROS would silently ignore."""
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+from dashcalib_ros.config import describe
+from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
+from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig
+
+HELP = """\
+usage: ros2 run dashcalib_ros calibrator [--lifecycle]
+           [--ros-args -r FROM:=TO -p NAME:=VALUE --params-file FILE ...]
+       calibrator ...     where it was installed by pip
+
+Learns a camera from the turns that the car takes. Nothing is published on
+camera_info until a calibration is accepted; from then on each image has its
+camera_info.
+
+options:
+  -h, --help     show this help and exit
+  --lifecycle    be a managed node: it waits for configure and activate
+
+topics, in the node's namespace:
+  image_raw               in   sensor_msgs/Image, or image_raw/compressed with
+                               image_transport:=compressed; remap image_raw
+  camera_info             out  sensor_msgs/CameraInfo, one for each image; with
+                               check_only it is the driver's, and comes in
+  ~/calibration           out  the same, latched; K[0] = 0 when it is taken back
+  ~/check                 out  std_msgs/String, JSON, latched: is the driver's
+                               calibration right? with check_only only
+  ~/turn_magnitude        out  std_msgs/Float64, for plotting
+  ~/overlay/compressed    out  tracks, mask and state, while someone subscribes
+  ~/rectified/compressed  out  without distortion, while someone subscribes
+  /diagnostics            out  what is missing, once a second
+
+services (std_srvs/Trigger): ~/calibrate, ~/reset, ~/save
+
+main parameters (* may be changed while the node runs):
+{parameters}
+All {count} parameters: config/calibrator.yaml in the package's share folder.
+
+example:
+  ros2 run dashcalib_ros calibrator --ros-args -r __ns:=/front \\
+      -r image_raw:=image -p image_transport:=compressed -p turns.wanted:=3
+"""
+COLUMNS = 80
+# settings of the core that are most often set
+CORE = ('model', 'rectified', 'turns.wanted', 'turns.store', 'motion.rate', 'verdict.max_sigma')
+
+
+def help_text() -> str:
+    """Return what --help prints."""
+    core = list(describe())
+    own = [(spec.name, spec) for spec in dataclasses.fields(NodeConfig)]
+    main = [each for each in own if not each[1].metadata['expert']]
+    main += [each for each in core if each[0] in CORE]
+    return HELP.format(parameters='\n'.join(_row(*each) for each in main),
+                       count=len(own) + len(core))
+
+
+def parse(argv: Sequence[str]) -> tuple[bool, bool]:
+    """Return whether help is wanted, and whether the node is to be a lifecycle node.
+
+    argv: without the program's name. Raises ConfigError for arguments that there are not.
+    """
+    wanted = {'--help': False, '--lifecycle': False}
+    for argument in _own(argv):
+        name = '--help' if argument == '-h' else argument
+        if name not in wanted:
+            raise ConfigError(f'unknown argument {argument!r}: topics and parameters go after '
+                              f'--ros-args, as in --ros-args -r image_raw:=/camera/image_raw; '
+                              f'--help tells more')
+        wanted[name] = True
+    return wanted['--help'], wanted['--lifecycle']
+
+
+def ros_arguments(argv: Sequence[str]) -> list[str]:
+    """Return the arguments without the node's own."""
+    return [each for each in argv if each != '--lifecycle']
+
+
+def check_files(argv: Sequence[str]) -> None:
+    """Check the files of parameters; raises InputError in one line, where rcl prints several."""
+    for option, name in itertools.pairwise(argv):
+        if option != '--params-file':
+            continue
+        data = parse_yaml(read_text(Path(name), YAML_BYTES), name)
+        if not _has_parameters(data):
+            raise InputError(f"{name} is no file of parameters: it begins with '/**:' (or the "
+                             f"node's name), then 'ros__parameters:', each indented below")
+
+
+def _has_parameters(data: object) -> bool:
+    """Return whether ros__parameters stands below a node's name, in namespaces or not."""
+    if not isinstance(data, dict):
+        return False
+    return any(isinstance(value, dict) and (isinstance(value.get('ros__parameters'), dict)
+                                            or _has_parameters(value))
+               for value in data.values())
+
+
+def _own(argv: Sequence[str]) -> list[str]:
+    """Return the arguments outside of --ros-args ... [--]."""
+    own, of_ros = [], False
+    for argument in argv:
+        if argument == '--ros-args':
+            of_ros = True
+        elif of_ros:
+            of_ros = argument != '--'
+        else:
+            own.append(argument)
+    return own
+
+
+def _row(name: str, spec: dataclasses.Field[object]) -> str:
+    about = spec.metadata
+    value = f'{spec.default}'.lower() if isinstance(spec.default, bool) else f'{spec.default!r}'
+    text = f'{about["reason"]}; default {value}'
+    if about['choices']:
+        text += f'; one of {", ".join(about["choices"])}'
+    name += ' *' if name in CHANGEABLE else ''
+    return textwrap.fill(text, COLUMNS, initial_indent=f'  {name:<21}', subsequent_indent=' ' * 23)

@@ -1,0 +1,104 @@
+"""What the node's pictures show: tracks, mask and state; the picture without distortion."""
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.arrays import GreyImage, Mask
+from dashcalib_ros.calibrator import View
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.rectified import rectified_matrix
+
+# blue, green, red
+TRACK, INK = (90, 230, 90), (255, 255, 255)
+# the tint: what is taken away, and what is added
+LESS, MORE = (80.0, 80.0, 0.0, 0.0), (0.0, 0.0, 60.0, 0.0)
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+# binary digits after the point that cv2 draws with
+SHIFT = 4
+# outside of the picture, for pixels that the camera does not see
+NOWHERE = -1e6
+# rows that are projected at a time: rays of a whole large picture are some 100 MB
+BAND = 64
+
+
+def overlay(image: GreyImage, view: View, text: str) -> npt.NDArray[np.uint8]:
+    """Return (h, w, 3), bgr: the image with tracks, the ego vehicle tinted, and a line of text."""
+    drawn: Any = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    if view.valid is not None:
+        _tint(drawn, view.valid)
+    thickness = max(1, round(image.shape[1] / 640))
+    before, now = (np.rint(xy * (1 << SHIFT)).astype(np.int32)
+                   for xy in (view.points.before, view.points.now))
+    cv2.polylines(drawn, list(np.stack([before, now], axis=1)), False, TRACK, thickness,
+                  cv2.LINE_AA, SHIFT)
+    for x, y in now.tolist():
+        cv2.circle(drawn, (x, y), thickness << (SHIFT + 1), TRACK, -1, cv2.LINE_AA, SHIFT)
+    if text:
+        _write(drawn, text)
+    return np.asarray(drawn)
+
+
+def _tint(drawn: Any, valid: Mask) -> None:
+    """Tint what is not valid, in place; valid may be of the image in another size."""
+    size = drawn.shape[1::-1]
+    hidden = cv2.resize((~valid).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    # both: white and black places become red, too; cv2's stubs do not know numbers for pictures
+    subtract: Any = cv2.subtract
+    add: Any = cv2.add
+    subtract(drawn, LESS, drawn, hidden)
+    add(drawn, MORE, drawn, hidden)
+
+
+def _write(drawn: Any, text: str) -> None:
+    """Write a line at the bottom on a dark bar, as large as fits."""
+    # cv2's fonts have ASCII only
+    text = text.replace('°', ' deg').replace('±', '+-').encode('ascii', 'replace').decode()
+    height, width = drawn.shape[:2]
+    margin = max(4, width // 100)
+    (needed, _), _ = cv2.getTextSize(text, FONT, 1.0, 1)
+    scale = min(width / 1100, (width - 2 * margin) / needed)
+    thickness = max(1, round(1.6 * scale))
+    (_, tall), below = cv2.getTextSize(text, FONT, scale, thickness)
+    bar = min(height, tall + below + margin)
+    drawn[height - bar:] //= 4
+    cv2.putText(drawn, text, (margin, height - below - margin // 2), FONT, scale, INK, thickness,
+                cv2.LINE_AA)
+
+
+class Rectifier:
+    """Takes the distortion out of images; what that needs is made once for each camera."""
+
+    def __init__(self, rectified: str) -> None:
+        """rectified: what the picture shows, the setting of this name."""
+        self._rectified = rectified
+        self._camera: Camera | None = None
+        self._maps: tuple[Any, Any] | None = None
+
+    def rectified(self, image: GreyImage, camera: Camera) -> GreyImage:
+        """Return (h, w), as a camera with P of camera_info sees it; black where it sees nothing.
+
+        image: of the camera's size.
+        """
+        if self._maps is None or camera != self._camera:
+            self._maps, self._camera = self._maps_of(camera), camera
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR), np.uint8)
+
+    def _maps_of(self, camera: Camera) -> tuple[Any, Any]:
+        """Return where each pixel of the rectified picture is in the image, as cv2 has it."""
+        matrix = rectified_matrix(camera, self._rectified)
+        width, height = camera.image_size
+        places = np.empty((height, width, 2), np.float32)
+        for top in range(0, height, BAND):
+            band = places[top:top + BAND]
+            y, x = np.mgrid[top:top + len(band), :width]
+            rays = np.stack([(x - matrix[0, 2]) / matrix[0, 0], (y - matrix[1, 2]) / matrix[1, 1],
+                             np.ones(x.shape)], axis=-1)
+            band[:] = np.nan_to_num(camera.project(rays), nan=NOWHERE)
+        # cv2's stubs do not know that both maps may be in one
+        convert: Any = cv2.convertMaps
+        whole, fractions = convert(places, None, cv2.CV_16SC2)
+        return whole, fractions
