@@ -1,4 +1,5 @@
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -6,13 +7,25 @@ PACKAGE = 'dashcalib_ros'
 
 setup(
     name=PACKAGE,
-    version='0.1.0',
+    version='0.2.0',
     description='Calibrates a dashcam from the turns the car takes anyway',
+    long_description=Path(__file__).with_name('README.md').read_text('utf-8'),
+    long_description_content_type='text/markdown',
+    keywords=['camera calibration', 'dashcam', 'ROS 2', 'structure from motion'],
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Developers',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Topic :: Scientific/Engineering :: Image Processing',
+        'Typing :: Typed',
+    ],
     maintainer='dashcalib_ros maintainers',
     maintainer_email='maintainers@example.com',
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={PACKAGE: ['py.typed']},
+    package_data={PACKAGE: ['py.typed', 'report/templates/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
@@ -34,12 +47,17 @@ setup(
         'lz4>=4',
         'PyYAML>=6',
         'rich>=13',
+        'jinja2>=3.0',
     ],
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        'completion': ['argcomplete>=3'],
         'segmentation': ['onnxruntime>=1.17'],
+        'fleet': ['ray>=2.40', 'pyarrow>=15', 'fsspec>=2024.2'],
         'test': ['pytest>=8', 'pytest-xdist>=3', 'hypothesis>=6', 'ruff', 'mypy', 'types-PyYAML',
-                 'onnxruntime>=1.17', 'onnx>=1.16'],
+                 'onnxruntime>=1.17', 'onnx>=1.16', 'argcomplete>=3', 'wheel', 'nbclient>=0.10',
+                 'ipykernel>=6', 'matplotlib>=3.8', 'ray>=2.40', 'pyarrow>=15',
+                 'fsspec>=2024.2'],
         'benchmark': ['matplotlib>=3.8'],
     },
     entry_points={
