@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-pytest.register_assert_rewrite('ros_bench')
+pytest.register_assert_rewrite('ros_bench', 'ros_desk')
 
 
 def pytest_configure(config):
@@ -18,7 +18,8 @@ def pytest_configure(config):
 
 # the files that take longest, the longest first: begun last, each would keep one core alone
 LONG_FILES = ('test_run.py', 'test_calibrator.py', 'test_stages.py', 'test_node.py',
-              'test_drive.py', 'test_judging.py', 'test_solve.py', 'test_install.py')
+              'test_drive.py', 'test_judging.py', 'test_solve.py', 'test_install.py',
+              'test_docs_commands.py', 'test_example.py')
 
 
 def pytest_collection_modifyitems(items):
@@ -65,6 +66,21 @@ def make_bench(ros_context):
 
     def make(**options):
         made.append(Bench(ros_context, **options))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+@pytest.fixture
+def make_desk(ros_context, tmp_path):
+    """Make nodes in this process; they are closed after the test."""
+    from ros_desk import Desk
+    made = []
+
+    def make(**parameters):
+        made.append(Desk(ros_context, tmp_path, **parameters))
         return made[-1]
 
     yield make

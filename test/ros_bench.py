@@ -193,6 +193,41 @@ def compressed_message(picture, stamp_ns, frame_id='camera', suffix='.jpg'):
     return _stamped(message, stamp_ns, frame_id)
 
 
+def noise(index, size=(320, 240)):
+    """Return a picture without meaning."""
+    return np.random.default_rng(index).integers(0, 256, size[::-1], np.uint8)
+
+
+def stream(bench, count, first=0, make=image_message, size=(320, 240), **options):
+    """Publish images without meaning at 10 Hz of their own time, faster than that."""
+    for index in range(first, first + count):
+        bench.publish(make(noise(index, size), START + index * SECOND // 10, **options))
+
+
+CAMERA_FILE = """\
+image_width: {width}
+image_height: 240
+camera_name: dashcam
+camera_matrix: {{rows: 3, cols: 3, data: [200.0, 0.0, 160.0, 0.0, 201.0, 120.0, 0.0, 0.0, 1.0]}}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: [-0.1, 0.01, 0.0, 0.0, 0.0]}}
+"""
+OURS = """\
+dashcalib:
+  verdict: accepted
+  sigma: {fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0, k1: 0.01, k2: 0.01}
+  frame_id: camera
+"""
+
+
+def keep_file(home, text, name='dashcam'):
+    """Leave a calibration where the node looks for it."""
+    path = home / '.ros' / 'camera_info' / f'{name}.yaml'
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
 def _stamped(message, stamp_ns, frame_id):
     message.header.frame_id = frame_id
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import pickle
 import signal
@@ -105,6 +106,12 @@ def test_it_tells_of_its_turns(drive, result):
     assert set(result.timing) == {'detect', 'calibrate', 'total'}
     assert result.magnitudes.shape[1] == 2 and len(result.magnitudes) > 50
     assert result.versions['pycolmap'] != 'unknown'
+    # for the report: each turn's picture, of a keyframe
+    for turn in result.turns:
+        assert turn.unused_because is None
+        picture = result.material.pictures[turn.id]
+        assert picture.frame in result.material.scenes[turn.id].tracks.frames
+        assert abs(picture.frame - turn.center) < 10 and picture.image.shape == (360, 640)
 
 
 def test_one_thread_and_a_child_that_is_killed_change_nothing(frames, result):
@@ -140,6 +147,7 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way(frames, resul
         assert status.frames == 95 and status.turns == 1
         early = calibrator.calibrate(stages.__setitem__, final=False)
         assert calibrator.status().built == 1
+        assert calibrator.status().reconstructed == calibrator.status().ready
         assert calibrator.status().yaw_deg == pytest.approx(85.0, abs=8.0)
         for frame in frames[95:]:
             calibrator.push(frame)
@@ -153,6 +161,8 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way(frames, resul
     assert 'reconstructing turns' in stages and len(stages) >= 4
     assert all(0.0 <= done <= 1.0 for done in stages.values())
     assert same(result, late)
+    # the node writes no report
+    assert late.material is None
     # no process is left behind
     assert not any(os.path.exists(f'/proc/{pid}') for pid in pids)  # noqa: PTH110
 
@@ -291,6 +301,8 @@ def test_a_turn_that_is_played_in_a_loop_counts_once(drive, frames):
     assert looped.verdict.level != 'accepted' and looped.turns_used == 1
     assert any('only 1 of at least 2 turns' in text for text in looped.verdict.reasons)
     assert sum('played in a loop' in text for text in looped.warnings) >= 1
+    reasons = [turn.unused_because for turn in looped.turns if not turn.used]
+    assert any('shows the same pictures as the turn at frame' in text for text in reasons)
 
 
 def test_a_stored_turn_of_another_camera_is_told_and_stays(frames, tmp_path):
@@ -368,12 +380,34 @@ def test_a_picture_that_is_not_grey_is_named(image):
         calibrator.push(Frame(0, 0, image))
 
 
-@pytest.mark.parametrize('step', [0, 1, 100, 100_000 // 2])
+@pytest.mark.parametrize('step', [0, 1, 100, 100_000, -100, -100_000_000])
 def test_stamps_in_the_wrong_unit_are_named(step):
     image = np.zeros((64, 96), np.uint8)
     with limited(Calibrator(QUICK)) as calibrator, pytest.raises(InputError, match='nanoseconds'):
         for n in range(20):
             calibrator.push(Frame(n, 1_700_000_000 + n * step, image))
+
+
+def test_a_clock_that_is_set_back_at_once_is_no_wrong_unit():
+    image = np.zeros((64, 96), np.uint8)
+    with limited(Calibrator(QUICK)) as calibrator:
+        for n in range(20):
+            calibrator.push(Frame(n, 10**18 * (n < 3) + n * 100_000_000, image))
+
+
+def test_a_drive_in_two_files_gives_what_the_whole_gives(drive, frames, result):
+    """No turn is driven where the drive is cut, but both lose images of their straights there.
+
+    test/frames has what reads several files.
+    """
+    cut = sum(drive.turn_centers) // 2
+    found = calibrated([dataclasses.replace(frame, after_gap=frame.index == cut)
+                        for frame in frames])
+    assert len(found.turns) == 2 and all(turn.used for turn in found.turns)
+    assert all(turn.last < cut or turn.first >= cut for turn in found.turns)
+    for name, sigma in result.sigma.items():
+        off = abs(found.intrinsics[name] - result.intrinsics[name])
+        assert off < (0.5 if name in ('fx', 'fy', 'cx', 'cy') else 1.0) * sigma, name
 
 
 def test_a_folder_is_calibrated_in_one_call(tmp_path):

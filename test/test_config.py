@@ -18,7 +18,7 @@ from dashcalib_ros.config import (
 )
 from dashcalib_ros.errors import ConfigError
 
-SPECS = dict(describe())
+SPECS = dict(describe(fleet=True))
 
 
 def test_defaults_are_inside_their_ranges_and_not_on_the_edge_of_types():

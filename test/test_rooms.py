@@ -11,9 +11,9 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / 'dashcalib_ros'
 # in the order in which data flows: a room imports from those above it
-ROOMS = ('arrays', 'camera', 'frames', 'bags', 'inputs', 'motion', 'turns', 'reconstruction',
-         'solve', 'turn_store', 'judgement', 'stages', 'workers', 'selection', 'calibrator',
-         'report', 'standard_streams', 'ros', 'demo', 'cli')
+ROOMS = ('arrays', 'camera', 'frames', 'bags', 'inputs', 'motion', 'lines', 'turns',
+         'reconstruction', 'solve', 'turn_store', 'judgement', 'checking', 'stages', 'workers',
+         'selection', 'calibrator', 'report', 'standard_streams', 'fleet', 'ros', 'demo', 'cli')
 EVERYWHERE = {'config', 'errors', 'arrays', 'limits'}
 # what is not simply "all rooms above"
 ALLOWED: dict[str, set[str]] = {
@@ -25,9 +25,10 @@ ALLOWED: dict[str, set[str]] = {
     'demo': {'camera', 'frames', 'bags', 'judgement'},
 }
 # rooms that nobody but these may import
-BORDERS = {'ros': set(), 'cli': set(), 'demo': {'cli'}}
+BORDERS = {'ros': set(), 'cli': set(), 'demo': {'cli'}, 'fleet': {'cli'}}
 HOMES = {'pycolmap': {'reconstruction', 'solve'}, 'pyceres': {'reconstruction', 'solve'},
-         'rclpy': {'ros'}, 'onnxruntime': {'motion'}}
+         'rclpy': {'ros'}, 'onnxruntime': {'motion'},
+         'pyarrow': {'fleet'}}
 # what geometry has no use for
 MACHINERY = ('threading', 'multiprocessing', 'subprocess', 'concurrent', 'queue', 'signal', 'os',
              'pathlib', 'shutil', 'tempfile', 'io')

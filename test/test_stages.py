@@ -19,6 +19,8 @@ from dashcalib_ros.turns.detection import Detection
 
 # one term is all that this lens has
 LENS = Lens.of(640, 360, 70.0, -0.18, 0.0, offset=(5.0, -3.0))
+TRUE = Radial((640, 360), *LENS.truth.values())
+LONGER = TRUE.resized(1.03, TRUE.image_size)
 SPEC = DriveSpec(turns=(Turn(80.0), Turn(-75.0)), straight_m=20.0, lead_m=24.0, seed=5)
 QUICK = Config().replace({
     'turns.wanted': 2, 'tracks.points': 350, 'scene.tracks': 250, 'scene.profile_tracks': 150,
@@ -112,6 +114,10 @@ def test_the_stages_give_what_the_calibrator_gives(frames, detection):
         for frame in frames:
             calibrator.push(frame)
         whole = calibrator.calibrate()
+        asked = calibrator.check(TRUE, whole), calibrator.check(LONGER, whole)
+    # in a child process, as the calibration
+    assert [each.answer for each in asked] == ['right', 'wrong']
+    assert asked[1].loss > abs(asked[0].loss)
     by_hand = calibrated(detection, QUICK)
     assert whole.verdict.level == by_hand.verdict.level
     # numpy has more than one thread here: sums come in another order

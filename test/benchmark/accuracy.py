@@ -2,11 +2,12 @@
 """Accuracy, honesty and refusals, measured on rendered drives with exact truth and on real ones.
 
     python test/benchmark/accuracy.py [SETTING ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]
-                                      [--out DIR] [--again] [--list] [--summary]
+                                      [--out DIR] [--docs] [--again] [--list] [--summary]
 
 Runs every setting (or those named; part of a name will do) with every seed. Rows go to
 DIR/accuracy.json after each drive, and one that is there is not run again (--again: it is);
-DIR/accuracy.md has each drive, each setting, the bars and honesty. --data: a folder with kitti03/,
+DIR/accuracy.md has each drive, each setting, the bars and honesty; --docs writes the settings'
+table into docs/accuracy.md. --data: a folder with kitti03/,
 carnd/ and ntu_campus/ (bag, video or images beside a truth.json); kitti03 is seen through other
 lenses, too (views.py). --cache: where rendered pictures are kept, about 100 MB a drive; a second
 run renders nothing.
@@ -21,6 +22,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from documents import write_table
 from drives import BY_NAME, SETTINGS, Pictures, drive_of, pictures_of
 from measure import (
     ALL_KEYS,
@@ -38,7 +40,7 @@ from measure import (
     summarised,
     table,
 )
-from summary import summary
+from summary import settings_table, summary
 from views import BY_VIEW, INEXACT, SMALL, Viewed, inexact_view, recorded_view, small_view
 from wide import WIDE, wide_drive_of
 
@@ -158,7 +160,7 @@ def _real(name: str) -> bool:
 
 def main() -> None:
     """Run what is asked for."""
-    parser = parser_with(__doc__, 'seeds', 'data', 'cache', 'out', 'again')
+    parser = parser_with(__doc__, 'seeds', 'data', 'cache', 'out', 'docs', 'again')
     parser.add_argument('settings', nargs='*', help='default: all')
     parser.add_argument('--list', action='store_true', help='name the settings, and end')
     parser.add_argument('--summary', action='store_true', help='of the rows there are, and end')
@@ -195,6 +197,8 @@ def main() -> None:
     text = f'{drives_table(_ordered(rows))}\n\n{summary(rows.values())}\n'
     (arguments.out / 'accuracy.md').write_text(
         f'Measured on {os.cpu_count()} cores at {", ".join(_commits(rows))}.\n\n{text}')
+    if arguments.docs:
+        write_table('accuracy', settings_table(_ordered(rows)), _commits(rows))
     print(f'\n{text}')
 
 

@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from documents import write_table
 from drives import BY_NAME, drive_of, pictures_of
 from measure import (
     calibrate,
@@ -399,11 +400,9 @@ def wrong(row: Mapping[str, Any], film: str) -> bool:
     fx = (row.get('percent') or {}).get('fx') or 0.0
     # ntu_campus' truth knows no centre and no distortion
     known = film != 'ntu_campus'
-    # what the drive says when nothing is done to it
-    most = MOST_SIGMAS if film != 'kitti03' else MOST_SIGMAS + 1.5
     z = max((abs(value) for value in (row.get('z') or {}).values()), default=0.0)
     far = known and (row.get('mapping_px') or 0.0) > 3 * (row['sigma_px'] or {'rms': 0.0})['rms']
-    return bool(fx > MOST_FX_PERCENT or z > most or far)
+    return bool(fx > MOST_FX_PERCENT or z > MOST_SIGMAS or far)
 
 
 def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -448,7 +447,7 @@ def _lines(row: Mapping[str, Any]) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = parser_with(__doc__ or '', 'seeds', 'data', 'cache', 'out', 'again')
+    parser = parser_with(__doc__ or '', 'seeds', 'data', 'cache', 'out', 'docs', 'again')
     parser.add_argument('attacks', nargs='*', help='parts of names; default: all')
     parser.add_argument('--films', nargs='+', default=list(FILMS))
     parser.add_argument('--list', action='store_true', help='name the attacks, and end')
@@ -482,6 +481,8 @@ def main() -> None:
     text = summary(rows)
     if rows:
         (options.out / 'attacks.md').write_text(text + '\n')
+    if rows and options.docs:
+        write_table('attacks', text, [row['commit'] for row in rows.values()])
     print(text)
 
 

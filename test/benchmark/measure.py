@@ -43,6 +43,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     'data': {'type': Path, 'help': 'a folder with kitti03/ (and carnd/)'},
     'cache': {'type': Path, 'help': 'where rendered pictures are kept'},
     'out': {'type': Path, 'default': Path('benchmark')},
+    'docs': {'action': 'store_true', 'help': 'write the table into docs/, too'},
     'again': {'action': 'store_true', 'help': 'run what has a row, too'},
 }
 

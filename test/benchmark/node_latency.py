@@ -1,12 +1,14 @@
 """The node under load: image callback latency, losses, CPU and memory, while it calibrates.
 
-    python test/benchmark/node_latency.py --minutes 10
+    python test/benchmark/node_latency.py --minutes 10 [--preview]
 
 A second process publishes 1280x720 bgr8 at 30 Hz (a rendered drive with two turns, enlarged, over
 and over), with config/fastdds_large_images.xml, as a camera driver should. The node has a kept
 calibration, so each image gets its camera_info at once: the time from publishing an image to
 receiving its camera_info is the transport of both plus the wait for the node's callback. The
-turns make it calibrate again and again; the latencies are told apart by that.
+turns make it calibrate again and again; the latencies are told apart by that. With --preview, the
+overlay and the rectified picture are subscribed every other ten seconds, and told apart by that,
+too: the machine's other work is then the same for both.
 """
 from __future__ import annotations
 
@@ -24,7 +26,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 import rclpy
+from documents import write_table
+from measure import commit
 from ros_bench import REPOSITORY, Bench, NodeProcess, image_message, ros_environment
+from sensor_msgs.msg import CompressedImage
 
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 
@@ -34,17 +39,35 @@ TICKS = os.sysconf('SC_CLK_TCK')
 
 
 class Listener(Bench):
-    """Takes the time at which each camera_info comes. latencies: ms, by whether it calibrates."""
+    """Takes the time at which each camera_info comes.
+
+    latencies: ms, by whether it calibrates and whether the pictures are subscribed. pictures: the
+    size of each picture received, in bytes.
+    """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.latencies: dict[bool, list[float]] = {False: [], True: []}
+        self.latencies: dict[tuple[bool, bool], list[float]] = {}
+        self.pictures: dict[str, list[int]] = {'overlay': [], 'rectified': []}
+        self._watching: list[Any] = []
 
     def on_info(self, message: Any) -> None:
         """Compare with the time at which its image was sent."""
         stamp = message.header.stamp
         age = time.time_ns() - (stamp.sec * 10**9 + stamp.nanosec)
-        self.latencies[self.values.get('stage', '') != ''].append(age / 1e6)
+        key = self.values.get('stage', '') != '', bool(self._watching)
+        self.latencies.setdefault(key, []).append(age / 1e6)
+
+    def watch(self, on: bool) -> None:
+        """Subscribe the overlay and the rectified picture, or end that."""
+        if on and not self._watching:
+            self._watching = [self.node.create_subscription(
+                CompressedImage, f'calibrator/{name}/compressed',
+                lambda message, sizes=sizes: sizes.append(len(message.data)), 10)
+                for name, sizes in self.pictures.items()]
+        elif not on:
+            while self._watching:
+                self.node.destroy_subscription(self._watching.pop())
 
 
 def publish(seconds: float, rate: float) -> None:
@@ -95,8 +118,8 @@ def resident_mb(pid: int) -> float:
     return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
 
 
-def measure(minutes: float, rate: float) -> None:
-    """Run everything and print a table."""
+def measure(minutes: float, rate: float, preview: bool) -> str:
+    """Run everything and return a table."""
     home = Path(tempfile.mkdtemp(prefix='dashcalib-bench-'))
     os.environ.update(ros_environment(home))
     os.environ.pop('ROS_PYTHON_CHECK_FIELDS')  # not in the field either
@@ -111,38 +134,46 @@ def measure(minutes: float, rate: float) -> None:
              str(REPOSITORY / 'config' / 'fastdds_large_images.xml')})
     memory: list[float] = []
     try:
-        bench.until(lambda: bench.count('received') > 0, 120.0, node=node)
-        began, before = time.monotonic(), cpu_s(node.process.pid)
+        bench.until(lambda: bench.count('received') > 0, 300.0, node=node)
+        # processor time and time, by whether the pictures are subscribed
+        spent = {False: np.zeros(2), True: np.zeros(2)}
         while camera.poll() is None:
+            on = preview and len(memory) // 10 % 2 == 1
+            bench.watch(on)
+            before = np.array([cpu_s(node.process.pid), time.monotonic()])
             bench.spin(1.0)
+            spent[on] += [cpu_s(node.process.pid), time.monotonic()] - before
             memory.append(resident_mb(node.process.pid))
-        share = (cpu_s(node.process.pid) - before) / (time.monotonic() - began)
         bench.spin(2.0)
-        report(bench.values, round(minutes * 60 * rate), bench.latencies, share, memory)
+        return report(bench, round(minutes * 60 * rate), spent, memory)
     finally:
         camera.kill()
-        print(f'| exit code on SIGINT | {node.stop()} |')
+        print(f'exit code on SIGINT: {node.stop()}', file=sys.stderr)
         node.kill()
 
 
-def report(values: dict[str, str], sent: int, latencies: dict[bool, list[float]], share: float,
-           memory: list[float]) -> None:
-    """Print the table for the README."""
-    print('| | |\n|---|---|')
-    print(f'| images sent, received by the node | {sent}, {values["received"]} |')
-    print(f'| camera_info published | {values["camera_info published"]} |')
-    print(f'| dropped by the node | {values["dropped"]} |')
-    for name, calibrating in (('idle', False), ('while it calibrates', True)):
-        ages = latencies[calibrating]
-        if ages:
-            median, p99 = np.percentile(ages, [50, 99])
-            print(f'| image to camera_info, {name}: median, p99 ({len(ages)} images) | '
-                  f'{median:.1f}, {p99:.1f} ms |')
-    print(f'| CPU of the node\'s process (transport and detection), of one core | '
-          f'{100 * share:.0f} % |')
+def report(bench: Listener, sent: int, spent: dict[bool, Any], memory: list[float]) -> str:
+    """Return the table of docs/speed.md."""
+    values = bench.values
+    lines = ['| | |', '|---|---|',
+             f'| images sent, received by the node | {sent}, {values["received"]} |',
+             f'| camera_info published | {values["camera_info published"]} |',
+             f'| dropped by the node | {values["dropped"]} |']
+    for (calibrating, watched), ages in sorted(bench.latencies.items()):
+        name = ('while it calibrates' if calibrating else 'idle') + (
+            ', pictures subscribed' if watched else '')
+        median, p99 = np.percentile(ages, [50, 99])
+        lines.append(f'| image to camera_info, {name}: median, p99 ({len(ages)} images) | '
+                     f'{median:.1f}, {p99:.1f} ms |')
+    lines += [f'| CPU of the node\'s process (transport and detection), of one core'
+              f'{", pictures subscribed" if watched else ""} | {100 * cpu / passed:.0f} % |'
+              for watched, (cpu, passed) in spent.items() if passed]
+    lines += [f'| {name}: pictures, kB each | {len(sizes)}, {np.mean(sizes) / 1e3:.0f} |'
+              for name, sizes in bench.pictures.items() if sizes]
     minutes = [f'{np.mean(memory[n:n + 60]):.0f}' for n in range(0, len(memory), 60)]
-    print(f'| resident memory, mean of each minute | {", ".join(minutes)} MB '
-          f'(most {max(memory):.0f}) |')
+    lines.append(f'| resident memory, mean of each minute | {", ".join(minutes)} MB '
+                 f'(most {max(memory):.0f}) |')
+    return '\n'.join(lines)
 
 
 def main() -> None:
@@ -150,12 +181,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('--minutes', type=float, default=10.0)
     parser.add_argument('--rate', type=float, default=30.0)
+    parser.add_argument('--docs', action='store_true', help='write the table into docs/, too')
+    parser.add_argument('--preview', action='store_true', help='subscribe the pictures')
     parser.add_argument('--publish', action='store_true', help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.publish:
         publish(60 * args.minutes, args.rate)
-    else:
-        measure(args.minutes, args.rate)
+        return
+    text = measure(args.minutes, args.rate, args.preview)
+    if args.docs:
+        write_table('node_latency', text, [commit()])
+    print(text)
 
 
 if __name__ == '__main__':

@@ -26,6 +26,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from documents import write_table
 from drives import BY_NAME, DEMO, KITTI_RAW, NARROW, STREET, Setting, drive_of, pictures_of
 from measure import (
     commit,
@@ -241,7 +242,7 @@ def rivals_table(rows: Iterable[Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is asked for."""
-    parser = parser_with(__doc__, 'data', 'cache', 'out', 'again')
+    parser = parser_with(__doc__, 'data', 'cache', 'out', 'docs', 'again')
     parser.add_argument('settings', nargs='*', help=f'default: {OWN[0].name}')
     parser.add_argument('--rivals', nargs='+', choices=list(RIVALS), metavar='NAME',
                         help=f'of {", ".join(RIVALS)}')
@@ -281,6 +282,8 @@ def main() -> None:
     text = rivals_table(rows.values())
     (arguments.out / 'rivals.md').write_text(
         f'{os.cpu_count()} cores; s: from the turns\' frames to the result.\n\n{text}\n')
+    if arguments.docs:
+        write_table('rivals', text, [row['commit'] for row in rows.values() if 'commit' in row])
     print(f'\n{text}')
 
 

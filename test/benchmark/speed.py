@@ -25,6 +25,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from documents import write_table
 from drives import DEMO, FULL_HD, NARROW, STREET, VGA, Pictures, Setting, drive_of, pictures_of
 from measure import (
     Stopwatch,
@@ -252,7 +253,7 @@ def report(found: dict[str, Any]) -> str:
 def main() -> None:
     """Measure what is asked for."""
     every = ('detection', 'calibration', 'length', 'turns', 'hour')
-    parser = parser_with(__doc__, 'cache', 'out')
+    parser = parser_with(__doc__, 'cache', 'out', 'docs')
     parser.add_argument('parts', nargs='*', metavar='PART',
                         help=f'of {", ".join(every)}; default: all')
     parser.add_argument('--minutes', type=float, default=60.0, help='of the long drive')
@@ -268,6 +269,8 @@ def main() -> None:
             save(path, found)
     text = report(found)
     (arguments.out / 'speed.md').write_text(f'{found["cores"]} cores.\n\n{text}\n')
+    if arguments.docs:
+        write_table('speed', text, [found['commit']])
     print(text)
 
 

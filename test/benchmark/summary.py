@@ -23,13 +23,13 @@ FALSE_MAPPING_PERCENT = 0.8
 def summary(rows: Iterable[Row]) -> str:
     """Return the whole summary in Markdown."""
     rows = list(rows)
-    parts = [_settings(rows), _accuracy(rows), _bars(rows), _mapping(rows), _honesty(rows),
+    parts = [settings_table(rows), _accuracy(rows), _bars(rows), _mapping(rows), _honesty(rows),
              _mistakes(rows), _cost(rows)]
     return '\n\n'.join(part for part in parts if part)
 
 
-def _settings(rows: Sequence[Row]) -> str:
-    """Return a line for each setting, over its seeds: the README's table."""
+def settings_table(rows: Sequence[Row]) -> str:
+    """Return a line for each setting, over its seeds: the table of docs/accuracy.md."""
     lines = []
     for name in dict.fromkeys(row['setting'] for row in rows):
         drives = [row for row in rows if row['setting'] == name]

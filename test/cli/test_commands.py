@@ -25,11 +25,13 @@ from dashcalib_ros.bags.write import BagWriter
 from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import AUTO, MODELS, ros_camera
 from dashcalib_ros.cli import main
+from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.demo.drive import Drive
 from dashcalib_ros.errors import ConfigError, WorkerError
 from dashcalib_ros.frames import Frame
+from dashcalib_ros.standard_streams import folded
 from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.turns.turn import Turn
 
@@ -80,6 +82,8 @@ class FakeDetection:
     """Has found what the test wants as soon as the drive is over."""
 
     found = FakeCalibrator.found
+
+    start_s = 0.0
 
     def __init__(self, config, mask=None):
         self.finished = False
@@ -133,7 +137,9 @@ def test_run_writes_shows_and_says_the_verdict(
     assert main(['run', drive, '--fps', '10']) == code
     assert names(tmp_path / 'work' / 'calibration') == files
     shown = capsys.readouterr()
-    assert shown.out.startswith(level + '\n') and '\x1b' not in shown.out
+    lines = shown.out.splitlines()
+    assert lines[-1].startswith('next: ') and level in lines and '\x1b' not in shown.out
+    assert all(name in shown.out.partition('written to calibration: ')[2] for name in files)
     assert shown.err == 'dashcalib: warning: dark\n'  # no progress in a pipe
     assert fake.made[0].frames == 4 and fake.made[0].closed
     result = json.loads((tmp_path / 'work/calibration/result.json').read_text())
@@ -159,6 +165,63 @@ def test_an_earlier_calibration_that_is_moved_aside_is_told(
     lines = capsys.readouterr().err.splitlines()
     assert lines[-1] == ('dashcalib: warning: the calibration that was in calibration/'
                          'calibration.yaml is now calibration/calibration.previous.yaml')
+
+
+def test_the_result_alone_on_stdout(fake, drive, tmp_path, capsys):
+    assert main(['run', drive, '--fps', '10', '--json', '-']) == 0
+    shown = capsys.readouterr()
+    assert json.loads(shown.out) == json.loads(
+        (tmp_path / 'work/calibration/result.json').read_text())
+    assert shown.err.splitlines()[-1].startswith('next: ') and 'accepted' in shown.err
+
+
+def test_quiet(fake, drive, tmp_path, capsys):
+    assert main(['run', drive, '--fps', '10', '--quiet']) == 0
+    assert capsys.readouterr() == ('', 'dashcalib: warning: dark\n')
+    assert main(['run', drive, '--fps', '10', '--quiet', '--json', '-']) == 0
+    shown = capsys.readouterr()
+    assert json.loads(shown.out)['verdict'] == 'accepted' and 'next' not in shown.err
+
+
+def test_several_inputs_are_one_drive(fake, drive, tmp_path, capsys):
+    shutil.copytree(drive, tmp_path / 'drive2')
+    assert main(['run', drive, str(tmp_path / 'drive2'), '--fps', '10']) == 0
+    assert fake.made[0].frames == 8
+    assert main(['run', str(tmp_path / 'drive*'), '--fps', '10', '--start', '0.35', '--duration',
+                 '0.15']) == 0
+    assert fake.made[1].frames == 2
+    result = json.loads((tmp_path / 'work/calibration/result.json').read_text())
+    assert result['input'] == f'{drive} and 1 more'
+    capsys.readouterr()
+    assert main(['run', drive, str(tmp_path / 'drive2'), '--write-bag', 'out']) == 2
+    assert 'on each bag alone' in capsys.readouterr().err
+
+
+def test_in_a_pipe_progress_is_a_line_from_time_to_time(fake, drive, monkeypatch, capsys):
+    monkeypatch.setattr('dashcalib_ros.cli.terminal.EVERY_S', 0.0)
+    assert main(['run', drive, '--fps', '10']) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert 'dashcalib: reading: frame 4, 1 turn, 100 %' in lines
+    assert 'dashcalib: reconstructing, 50 %' in lines
+    assert main(['run', drive, '--fps', '10', '--quiet']) == 0
+    assert capsys.readouterr().err == 'dashcalib: warning: dark\n'
+    clock = iter(range(10**6))
+    monkeypatch.setattr('dashcalib_ros.cli.terminal.EVERY_S', 10.0)
+    monkeypatch.setattr('time.monotonic', lambda: next(clock))
+    stages = Stages()
+    for n in range(100):
+        stages.show('reading', n / 100)
+    assert len(capsys.readouterr().err.splitlines()) == 10
+
+
+def test_long_lines_are_broken_between_words_on_a_terminal_only(monkeypatch):
+    line = 'dashcalib: error: ' + 'words and words ' * 12 + '/a/path/' + 'x' * 90
+    assert folded(line) == line
+    monkeypatch.setattr('sys.stderr.isatty', lambda: True, raising=False)
+    monkeypatch.setenv('COLUMNS', '80')
+    lines = folded(line).splitlines()
+    assert len(lines) > 3 and ' '.join(map(str.strip, lines)) == line
+    assert max(map(len, lines[:-1])) <= 80
 
 
 def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
@@ -350,11 +413,14 @@ def test_turns_as_json(fake_detection, drive, tmp_path, capsys):
 def test_turns_as_a_table(fake_detection, drive, monkeypatch, capsys):
     assert main(['turns', drive, '--turns', '3']) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-2].split() == ['88', '58', '118', '8.8', '0.0600', '61']
-    assert lines[-1] == '1 of 3 turns wanted, in 4 frames'
+    assert ['8.8', '88', '58', '118', '61', '0.0600'] in [line.split() for line in lines]
+    assert any(line.startswith('prominence: ') for line in lines)  # the word is explained
+    assert lines[-2] == '1 of 3 turns wanted, in 4 frames' and 'dashcalib run' in lines[-1]
     monkeypatch.setattr(fake_detection, 'found', ())
     assert main(['turns', drive]) == 0
-    assert capsys.readouterr().out == '0 of 5 turns wanted, in 4 frames\n'
+    assert capsys.readouterr().out == (
+        '0 of 5 turns wanted, in 4 frames\n'
+        'next: record a drive with turns at crossings, in daylight\n')
 
 
 def test_progress_is_drawn_on_a_terminal(fake, drive, monkeypatch):

@@ -45,7 +45,12 @@ def test_help_names_the_exit_codes(command):
     done = dashcalib(*command, '--help')
     assert (done.returncode, done.stderr) == (0, '')
     assert done.stdout.startswith('usage: dashcalib')
-    assert '3 weak or refused' in ' '.join(done.stdout.split())
+    text = ' '.join(done.stdout.split())
+    # only these two end with a verdict
+    assert ('3 weak or refused' in text) == (command in ([], ['run'], ['demo']))
+    assert 'exit codes: 0 ' in text and '2 bad input or usage' in text
+    assert f'example: dashcalib {command[0]} ' in text if command else 'COMMAND --help' in text
+    assert max(map(len, done.stdout.splitlines())) <= 80
 
 
 def test_help_imports_nothing_heavy():
@@ -53,6 +58,22 @@ def test_help_imports_nothing_heavy():
             f'print(before, [name for name in {HEAVY} if name in sys.modules])')
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     assert done.stdout.splitlines()[-1] == '0 []', done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(('line', 'expected'), [
+    ('dashcalib ', ['run', 'turns', 'demo', 'compare', 'export', 'check',
+                    'batch']),
+    ('dashcalib run --mo', ['--model']), ('dashcalib export x --to n', ['nerfstudio']),
+    ('dashcalib demo --model f', ['fisheye'])])
+def test_the_shell_completes(tmp_path, line, expected):
+    pytest.importorskip('argcomplete')
+    out = tmp_path / 'completions'
+    done = dashcalib(env={**os.environ, '_ARGCOMPLETE': '1', 'COMP_LINE': line,
+                          'COMP_POINT': str(len(line)), '_ARGCOMPLETE_IFS': '\n',
+                          '_ARGCOMPLETE_STDOUT_FILENAME': str(out)})
+    assert done.stdout == ''
+    found = [each.strip() for each in out.read_text().splitlines()]
+    assert [each for each in found if not each.startswith('-') or len(found) == 1] == expected
 
 
 def test_version():
@@ -68,6 +89,12 @@ def test_version():
     (['run', 'x', '--fps', 'nan'], 'positive number'),
     (['run', 'x', '--turns', 'many'], '--turns'),
     (['run', 'x', '--thread', '2'], 'unrecognized'),
+    (['run', 'x', '--out', '-'], '--json -'),
+    (['run', 'x', '--json', 'file'], 'invalid choice'),
+    (['run', 'x', '--start', '-1'], '0 or more seconds'),
+    (['turns', 'x', '--duration', '0'], 'positive number'),
+    (['demo', '--out', '-'], 'give a folder'),
+    (['export', 'a', '--to', 'ros', '--out', '-'], 'leave --out away'),
     (['compare', 'a'], 'B'),
     (['export', 'a'], '--to'),
     (['export', 'a', '--to', 'ros', '--size', '640'], '1280x720'),

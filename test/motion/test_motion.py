@@ -116,11 +116,12 @@ def test_thinning_is_not_by_count():
     assert len(kept(steady(30.0, 10.0), rate=30.0)) == 300
 
 
-def test_clock_set_back_starts_anew():
+@pytest.mark.parametrize(('shift_ns', 'after_gap'), [(-10**12, False), (1_400_000_000, True)])
+def test_clock_set_back_and_the_next_file_start_anew(shift_ns, after_gap):
     drive = Drive(LENS, DriveSpec(turns=0, lead_m=20.0, seed=1))
     frames = list(drive.frames(0, 14))
-    frames += [dataclasses.replace(f, index=f.index + 14, stamp_ns=f.stamp_ns - 10**12)
-               for f in frames]
+    frames += [dataclasses.replace(f, index=f.index + 14, stamp_ns=f.stamp_ns + shift_ns,
+                                   after_gap=after_gap and f.index == 0) for f in frames]
     estimator = MotionEstimator(MotionConfig())
     motions = [estimator.push(frame) for frame in frames]
     assert all(motion is not None for motion in motions)

@@ -1,12 +1,14 @@
 """A Calibration in a program's hands: one line of text, K and D, pictures without distortion."""
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
 from made_calibration import EACH_MODEL, calibration_of, make_calibration
 
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, OutputError
 
 
 @pytest.fixture(params=EACH_MODEL)
@@ -54,6 +56,31 @@ def test_what_cannot_be_is_said(calibration):
         calibration.undistort(np.zeros((24, 32), np.uint8))
     refused = make_calibration('refused')
     for ask in (lambda: refused.K, lambda: refused.D,
+                lambda: refused.covariance,
                 lambda: refused.undistort(np.zeros((375, 1242), np.uint8))):
         with pytest.raises(InputError, match='refused'):
             ask()
+
+
+def test_the_covariance_is_that_of_the_sigmas(calibration):
+    names = calibration.camera.names()
+    correlation = np.eye(len(names))
+    correlation[0, 1] = correlation[1, 0] = 0.5
+    known = dataclasses.replace(calibration, details={'correlation': correlation.tolist()})
+    sigma = np.array([calibration.sigma[name] for name in names])
+    assert known.covariance.shape == (len(names), len(names))
+    np.testing.assert_allclose(np.diag(known.covariance), sigma**2)
+    assert known.covariance[0, 1] == known.covariance[1, 0] == pytest.approx(
+        0.5 * sigma[0] * sigma[1])
+    with pytest.raises(InputError, match='correlated'):
+        _ = calibration.covariance
+
+
+def test_a_calibration_writes_what_the_command_writes(calibration, tmp_path):
+    files = calibration.save(tmp_path / 'new' / 'folder')
+    assert [file.name for file in files] == ['calibration.yaml', 'result.json', 'report.html']
+    assert all(file.parent == tmp_path / 'new' / 'folder' and file.exists() for file in files)
+    refused = make_calibration('refused').save(tmp_path / 'refused')
+    assert [file.name for file in refused] == ['result.json', 'report.html']
+    with pytest.raises(OutputError, match='choose another output folder'):
+        calibration.save(files[0])

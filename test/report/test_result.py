@@ -22,7 +22,7 @@ def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
     result = strict(result_json(calibration))
     assert result['stored_turns'] == [{
         'stamp': 1.7e9, 'prominence': 0.05, 'yaw_deg': 88.0, 'images': 20, 'used': True,
-        'misfit': 0.9}]
+        'misfit': 0.9, 'unused_because': None}]
     assert len(result['turns']) == 2 and calibration.turns_used == 2
     assert '1 of 1 stored turn used' in report_html(calibration)
     assert result_dict(make_calibration())['stored_turns'] == []
@@ -48,7 +48,7 @@ def test_result_has_the_contract_s_keys_and_values():
     assert result['turns'][0] == {
         'center': 88, 'first': 58, 'last': 118, 'stamp': 8.8, 'prominence': 0.061,
         'images': 31, 'registered': 30, 'used': True, 'yaw_deg': 91.5,
-        'reprojection_error_px': 0.46, 'misfit': 1.1}
+        'reprojection_error_px': 0.46, 'misfit': 1.1, 'unused_because': None}
     assert result['masked_fraction'] == pytest.approx(75 / 375)
 
 

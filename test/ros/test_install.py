@@ -22,10 +22,13 @@ from rclpy.node import Node
 from ros_bench import REPOSITORY, SOON, Bench, NodeProcess
 
 from dashcalib_ros.config import Config, describe
-from dashcalib_ros.ros.parameters import NodeConfig, declare
+from dashcalib_ros.ros.parameters import declare
 from dashcalib_ros.ros.sample import sample
+from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig
 
 COLCON = shutil.which('colcon')
+# one drive, and the node, have no use for a fleet's settings
+CORE = {name: value for name, value in Config().flat().items() if not name.startswith('fleet.')}
 
 
 @pytest.fixture(scope='module')
@@ -48,7 +51,7 @@ def test_the_shipped_parameters_are_the_defaults():
     assert text == sample()
     values = yaml.safe_load(text)['/**']['ros__parameters']
     own = {spec.name: spec.default for spec in dataclasses.fields(NodeConfig)}
-    assert values == {**Config().flat(), **own}
+    assert values == {**CORE, **own}
 
 
 def test_the_shipped_parameters_list_what_users_set_first():
@@ -82,18 +85,19 @@ def test_every_parameter_is_declared_with_its_reason_and_range(node_and_bench):
     node, bench = node_and_bench
     request = ListParameters.Request(depth=0)
     names = list(ask(bench, node, ListParameters, 'list_parameters', request).result.names)
-    assert set(Config().flat()) <= set(names)
+    assert set(CORE) <= set(names)
     request = DescribeParameters.Request(names=names)
     about = {each.name: each for each in ask(
         bench, node, DescribeParameters, 'describe_parameters', request).descriptors}
-    assert all(about[name].description and about[name].read_only for name in Config().flat())
+    assert all(about[name].description for name in CORE)
+    assert {name for name in about if not about[name].read_only} - {'use_sim_time'} == set(
+        CHANGEABLE)
     assert about['scene.loss_px'].description.endswith('(for experts)')
     assert 'experts' not in about['turns.wanted'].description
     half_width = about['turns.half_width'].floating_point_range[0]
     assert (half_width.from_value, half_width.to_value) == (0.5, 10.0)
     wanted = about['turns.wanted'].integer_range[0]
     assert (wanted.from_value, wanted.to_value) == (1, 20)
-    assert not about['commit'].read_only
     assert 'best_effort' in about['reliability'].additional_constraints
     assert 'crop' in about['rectified'].additional_constraints
     assert 'fisheye' in about['model'].description
@@ -110,8 +114,16 @@ def test_parameters_that_may_not_change_say_so(node_and_bench):
         return ask(bench, node, SetParameters, 'set_parameters', request).results[0]
 
     whole = ParameterType.PARAMETER_INTEGER
-    refused = set_to('turns.wanted', type=whole, integer_value=3)
-    assert not refused.successful and 'read-only' in refused.reason
+    refused = set_to('turns.at_most', type=whole, integer_value=3)
+    assert not refused.successful and 'turns.at_most is read-only while' in refused.reason
+    assert 'the turns found so far were made with it; start the node with' in refused.reason
+    refused = set_to('queue_size', type=whole, integer_value=3)
+    assert not refused.successful and 'it is read when the node starts' in refused.reason
+    refused = set_to('turns.wanted', type=whole, integer_value=11)
+    assert not refused.successful and '10 at the most while the node runs' in refused.reason
+    for value in (3, 5):
+        assert set_to('turns.wanted', type=whole, integer_value=value).successful
+        bench.until(lambda value=value: bench.count('turns wanted') == value, node=node)
     text = ParameterType.PARAMETER_STRING
     for name, value in (('model', 'fisheye'), ('model', 'mirror'), ('rectified', 'crop')):
         refused = set_to(name, type=text, string_value=value)
@@ -144,7 +156,9 @@ def test_the_permissions_are_what_the_node_uses(node_and_bench):
     def used(function):
         return {name for name, _ in getattr(seen, function)('calibrator', '/')}
 
-    assert used('get_publisher_names_and_types_by_node') == allowed('topic', 'publish')
+    # ~/check: with check_only, test_check_only.py has it
+    assert used('get_publisher_names_and_types_by_node') == (
+        allowed('topic', 'publish') - {'/calibrator/check'})
     heard = used('get_subscriber_names_and_types_by_node')
     assert heard <= allowed('topic', 'subscribe') and '/image_raw' in heard
     assert used('get_service_names_and_types_by_node') == allowed('service', 'reply')
@@ -244,7 +258,8 @@ def test_colcon_builds_it_and_ros2_run_would_find_it(tmp_path, monkeypatch):
     assert Path(get_package_prefix('dashcalib_ros')) == prefix
     share = Path(get_package_share_directory('dashcalib_ros'))
     assert sorted(path.name for path in (share / 'config').iterdir()) == [
-        'calibrator.yaml', 'fastdds_large_images.xml', 'sros2_policy.xml']
+        'calibrator.yaml', 'dashcalib.rviz', 'fastdds_large_images.xml', 'foxglove_layout.json',
+        'sros2_policy.xml']
     assert sorted(path.name for path in (share / 'launch').iterdir()) == [
         'calibrator.launch.py', 'calibrator.launch.xml']
     executable = prefix / 'lib' / 'dashcalib_ros' / 'calibrator'

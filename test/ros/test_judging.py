@@ -5,7 +5,6 @@ since a camera that is bumped in the middle of a drive takes fifteen turns to sh
 """
 from __future__ import annotations
 
-import dataclasses
 import errno
 import os
 from pathlib import Path
@@ -15,10 +14,8 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from ros_bench import START, Bench, image_message
+from ros_desk import FIRST, SIGMA
 from sensor_msgs.srv import SetCameraInfo
-from std_srvs.srv import Trigger
 from synthetic import synthetic_turn
 
 from dashcalib_ros.camera import Radial
@@ -26,92 +23,9 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.report import load_calibration_yaml
-from dashcalib_ros.ros.learner import Result
-from dashcalib_ros.ros.node import CalibratorNode
+from dashcalib_ros.ros.news import Result
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.turns import TurnId
-
-FIRST = Radial((320, 240), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
-SIGMA = {'fx': 2.0, 'fy': 2.0, 'cx': 2.0, 'cy': 2.0, 'k1': 0.01, 'k2': 0.01}
-STAMPS = iter(range(START, START + 10**12, 10**8))
-
-
-class Desk:
-    """The node and a bench, spun in turns."""
-
-    def __init__(self, context, home, **parameters):
-        arguments = ['--ros-args', '-p', f'camera_info_file:={home}/camera.yaml']
-        for name, value in parameters.items():
-            arguments += ['-p', f'{name}:={value}']
-        rclpy.init(args=['calibrator', *arguments])
-        self.file = home / 'camera.yaml'
-        self.node = CalibratorNode()
-        self.spinner = SingleThreadedExecutor()
-        self.spinner.add_node(self.node)
-        self.bench = Bench(context)
-        self.until(lambda: self.bench.images.get_subscription_count() > 0
-                   and self.bench.values.get('reliability') == 'reliable')
-        self.show()
-
-    def until(self, condition):
-        def spun():
-            self.spinner.spin_once(timeout_sec=0.01)
-            return condition()
-        return self.bench.until(spun)
-
-    def give(self, level='accepted', complete=True, sigma=SIGMA, warnings=(), **changes):
-        """Let the learner's thread come up with a calibration."""
-        camera = dataclasses.replace(FIRST, **changes) if level != 'refused' else None
-        calibration = Calibration(
-            Verdict(level, () if level == 'accepted' else ('few turns',)), (320, 240), camera,
-            sigma if camera else None, (), 10, 0.3, {}, {}, Config(), warnings=warnings)
-        result = Result(calibration, complete, self.node._learner.bank)
-        done = []
-        self.node._later(lambda: self.node._on_result(result))
-        self.node._later(lambda: done.append(True))
-        self.until(lambda: done)
-
-    def show(self):
-        """Publish an image; return the fx of its camera_info, None if there is none."""
-        before, received = len(self.bench.infos), self.bench.count('received')
-        message = image_message(black(), next(STAMPS))
-        self.bench.images.publish(message)
-        self.until(lambda: self.bench.count('received') > received)
-        infos = self.bench.infos[before:]
-        return infos[0].k[0] if infos else None
-
-    def call(self, name):
-        """Call a service of the node."""
-        client = self.bench.node.create_client(Trigger, f'calibrator/{name}')
-        self.until(client.service_is_ready)
-        future = client.call_async(Trigger.Request())
-        self.until(future.done)
-        self.bench.node.destroy_client(client)
-        return future.result()
-
-    def close(self):
-        self.bench.close()
-        self.spinner.shutdown()
-        self.node.close()
-        rclpy.try_shutdown()
-
-
-def black():
-    import numpy as np
-    return np.zeros((240, 320), np.uint8)
-
-
-@pytest.fixture
-def make_desk(ros_context, tmp_path):
-    made = []
-
-    def make(**parameters):
-        made.append(Desk(ros_context, tmp_path, **parameters))
-        return made[-1]
-
-    yield make
-    for each in made:
-        each.close()
 
 
 def test_its_life_with_a_camera_that_is_bumped(make_desk):
@@ -141,6 +55,21 @@ def test_its_life_with_a_camera_that_is_bumped(make_desk):
     desk.give(fx=403.0, cx=350.0)
     assert desk.show() == 403.0
     desk.until(lambda: desk.bench.latched[-1].k[0] == 403.0)
+
+
+def test_each_outcome_is_one_line_that_says_what_comes_next(make_desk, capfd):
+    desk = make_desk()
+    desk.give('weak')
+    desk.give('refused')
+    desk.give()
+    said = [line for line in capfd.readouterr().err.splitlines() if ': a calibration' in line
+            or ': accepted' in line]
+    assert len(said) == 3, said
+    assert said[0].endswith('of 0 turns is weak: few turns; it is calculated again with each '
+                            'better turn')
+    assert 'is refused: few turns; it is tried again' in said[1]
+    assert ': accepted: fx 400.00 ± 2.00, fy' in said[2]
+    assert said[2].endswith(f'; saved to {desk.file}')
 
 
 def test_a_contradicted_one_goes_on_where_that_is_wanted(make_desk):
@@ -173,7 +102,7 @@ def test_a_disk_that_takes_nothing_is_counted_and_the_calibration_published(make
     assert desk.show() == 400.0
     assert desk.bench.values['unsaved'] == '1'
     saved, why = desk.node._in_use.save()
-    assert not saved and 'camera_info_file' in why
+    assert not saved and 'camera_info_url' in why
 
 
 def test_each_warning_of_a_calibration_is_logged_once(make_desk, capfd):

@@ -1,6 +1,7 @@
 """The learner's two threads: when it calibrates, what a failure costs, how it ends."""
 from __future__ import annotations
 
+import dataclasses
 import threading
 import time
 import types
@@ -10,17 +11,24 @@ import numpy as np
 import pytest
 from fakes import image_message, stands_in_for
 
-from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.calibrator import Calibrator, Status, View
+from dashcalib_ros.camera import Radial
+from dashcalib_ros.checking import Check, Reading, watch
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
 from dashcalib_ros.judgement.calibration import StoredTurnSummary
+from dashcalib_ros.motion.motion import TrackedPoints
+from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros import learner as room
-from dashcalib_ros.ros.learner import Learner, Listener
+from dashcalib_ros.ros.learner import Learner
+from dashcalib_ros.ros.news import Listener
 from dashcalib_ros.turns import TurnId
 
 LIMIT = 20.0
 CONFIG = Config().replace({'turns.wanted': 2})
+CAMERA = NamedCamera('in use', Radial((64, 48), 60.0, 60.0, 31.5, 23.5, -0.1, 0.01))
+ZERO = np.zeros((6, 6))
 
 
 @stands_in_for(Calibrator)
@@ -37,7 +45,7 @@ class Core:
                         'on_trouble': on_trouble}
         self.stored, self.pushed, self.done = (), [], []
         self.ready, self.frames, self.calls = (), 0, 0
-        self.strangers = ()
+        self.strangers, self.watched, self.checked = (), [], []
         self.hold, self.closed = threading.Event(), threading.Event()
         self.hold.set()
         Core.made.append(self)
@@ -49,7 +57,8 @@ class Core:
 
     def status(self):
         ready = self.ready + self.stored
-        return Status(self.frames, len(ready), len(ready), 0.0, 0.1, False, ready)
+        return Status(self.frames, len(ready), len(ready), 60.0 * len(ready), 0.1, False, ready,
+                      len(self.stored), (60.0,) * len(ready), self.ready)
 
     def calibrate(self, progress=None, final=True):
         assert not final
@@ -68,6 +77,23 @@ class Core:
                        for turn in self.stored)
         return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG,
                            stored_turns=stored)
+
+    def watch(self, camera, sigma=None):
+        self.watched.append((camera, self.ready))
+        if Core.failures:
+            raise Core.failures.pop()
+        return watch((Reading(turn, ZERO, ZERO[0], None, explained=turn not in self.strangers)
+                      for turn in self.ready), camera, sigma or {}, CONFIG.monitor)
+
+    def check(self, given, calibration, progress=None):
+        self.checked.append(given)
+        return Check('right', ('it fits',), 0.5, 1.0)
+
+    def want(self, turns):
+        self.wanted = turns
+
+    def view(self):
+        return View(TrackedPoints(None, None), None)
 
     def reject(self, turns):
         self.ready = tuple(turn for turn in self.ready if turn not in turns)
@@ -88,10 +114,13 @@ def desk(monkeypatch):
     """A learner over such cores, and all it tells."""
     monkeypatch.setattr(room, 'Calibrator', Core)
     Core.made, Core.failures = [], []
-    heard = types.SimpleNamespace(results=[], troubles=[], statuses=[])
+    heard = types.SimpleNamespace(results=[], troubles=[], statuses=[], turns=[], begun=[],
+                                  pictures=[], watching=False, watched=[])
     heard.learner = Learner(CONFIG, 10, Listener(
         heard.results.append, heard.statuses.append,
-        lambda kind, text: heard.troubles.append((kind, text))))
+        lambda kind, text: heard.troubles.append((kind, text)), heard.turns.append,
+        heard.begun.append, lambda: heard.watching, heard.pictures.append,
+        heard.watched.append))
     yield heard
     heard.learner.close()
 
@@ -148,6 +177,45 @@ def test_a_turn_that_fits_another_camera_is_not_tried_over_and_over(desk):
     until(lambda: core.ready == at(20, 30))
     time.sleep(3 * room.LOOK_S)
     assert core.calls == 2
+
+
+def test_each_turn_and_each_calibration_is_told_once(desk):
+    core = Core.made[0]
+    core.ready = at(10)
+    until(lambda: desk.turns)
+    assert desk.begun == []
+    core.ready = at(20, 10)
+    until(lambda: desk.results)
+    core.ready = at(10)
+    time.sleep(3 * room.LOOK_S)
+    core.ready = at(10, 20)
+    time.sleep(3 * room.LOOK_S)
+    assert [(turn.number, turn.total_deg) for turn in desk.turns] == [(1, 60.0), (2, 120.0)]
+    assert [status.built for status in desk.begun] == [2]
+
+
+def test_other_numbers_of_turns_can_be_wanted_while_it_runs(desk):
+    core = Core.made[0]
+    core.ready = at(10)
+    desk.learner.want(1)
+    desk.learner.goal = 1
+    until(lambda: desk.results)
+    assert core.wanted == 1 and desk.results[0].complete
+    desk.learner.restart()
+    until(lambda: getattr(Core.made[-1], 'wanted', None) == 1)
+
+
+def test_pictures_are_handed_on_only_while_someone_watches(desk):
+    message = image()
+    desk.learner.offer(0, 0, message, (64, 48))
+    until(lambda: len(desk.statuses) == 1)
+    assert desk.pictures == []
+    desk.watching = True
+    desk.learner.offer(1, 10**8, message, (64, 48))
+    until(lambda: len(desk.statuses) == 2)
+    picture, = desk.pictures
+    assert picture.header is message.header and picture.image.shape == (48, 64)
+    assert desk.troubles == []
 
 
 def test_a_lower_goal_calibrates_sooner_but_not_completely(desk):
@@ -285,6 +353,84 @@ def test_a_failing_core_ends_no_thread(desk, monkeypatch):
     assert failures == []
     # the first look at the turns may come before status is replaced, never after two results
     assert {'failed_calibrations'} <= {kind for kind, _ in desk.troubles}
+
+
+def test_new_turns_are_compared_with_the_camera_in_use_once(desk):
+    core = Core.made[0]
+    desk.learner.goal = None
+    core.ready = at(10)
+    time.sleep(2 * room.LOOK_S)
+    assert core.watched == []  # there is none in use
+    desk.learner.compare(CAMERA)
+    until(lambda: desk.watched)
+    time.sleep(2 * room.LOOK_S)
+    desk.learner.compare(CAMERA)
+    core.ready = at(10, 20)
+    until(lambda: len(desk.watched) == 2)
+    time.sleep(2 * room.LOOK_S)
+    assert core.watched == [(CAMERA.camera, at(10)), (CAMERA.camera, at(10, 20))]
+    assert desk.watched[0].camera is CAMERA and core.calls == 0
+
+
+def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
+    desk.learner.goal = None
+    desk.learner.compare(CAMERA)
+    Core.made[0].strangers = Core.made[0].ready = at(10, 20)
+    until(lambda: desk.watched)
+    assert desk.watched[-1].monitor.lens.confirmed
+    desk.learner.restart()
+    Core.made[1].ready = at(30)
+    until(lambda: len(desk.watched) == 2)
+    assert desk.watched[-1].monitor.lens.confirmed
+    # not with another calibration
+    desk.learner.compare(dataclasses.replace(CAMERA, name='another'))
+    until(lambda: len(desk.watched) == 3)
+    assert desk.watched[-1].monitor.lens is None
+
+
+def test_turns_that_could_not_be_compared_are_told_and_tried_with_the_next(desk):
+    desk.learner.goal = None
+    desk.learner.compare(CAMERA)
+    Core.failures = [WorkerError('the process died')]
+    core = Core.made[0]
+    core.ready = at(10)
+    until(lambda: desk.troubles)
+    time.sleep(2 * room.LOOK_S)
+    (kind, text), = desk.troubles
+    assert kind == 'failed_watches' and 'the process died' in text and len(core.watched) == 1
+    core.ready = at(10, 20)
+    until(lambda: desk.watched)
+    assert core.watched[-1][1] == at(10, 20) and len(desk.troubles) == 1
+
+
+def test_each_calibration_is_compared_with_a_camera_that_is_to_be_checked(desk):
+    core = Core.made[0]
+    desk.learner.goal = None
+    core.ready = at(10, 20)
+    time.sleep(2 * room.LOOK_S)
+    assert core.calls == 0
+    desk.learner.goal = 2
+    desk.learner.compare(None, CAMERA)
+    until(lambda: desk.results)
+    assert desk.results[0].given is CAMERA and desk.results[0].check.answer == 'right'
+    time.sleep(2 * room.LOOK_S)
+    assert core.calls == 1
+    # another one: the same turns are used again
+    other = dataclasses.replace(CAMERA, name='another')
+    desk.learner.compare(None, other)
+    until(lambda: len(desk.results) == 2)
+    assert desk.results[1].given is other and core.watched == []
+
+
+def test_a_camera_that_changes_during_a_calibration_is_checked_by_the_next(desk):
+    core = Core.made[0]
+    desk.learner.compare(None, CAMERA)
+    held(desk, core)
+    other = dataclasses.replace(CAMERA, name='another')
+    desk.learner.compare(None, other)
+    core.hold.set()
+    until(lambda: len(desk.results) == 2)
+    assert [result.given for result in desk.results] == [CAMERA, other]
 
 
 def test_closing_ends_both_threads_in_the_middle_of_a_calibration(desk):

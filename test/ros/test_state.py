@@ -7,10 +7,11 @@ import pytest
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model
+from dashcalib_ros.checking.contradiction import contradicted
 from dashcalib_ros.config import Config
 from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.ros.state import Rules, contradicted, judge, sigma_text, state_of
+from dashcalib_ros.ros.state import Rules, judge, sigma_text, state_of
 
 RULES = Rules(replace_ratio=0.7, contradictions=3)
 TRUTH = Radial((640, 360), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
@@ -68,7 +69,8 @@ def test_the_last_contradiction_replaces_it_when_its_turns_suffice():
     ({'k1': -0.5, 'k2': 0.5}, False),  # they trade with the focal length
 ])
 def test_a_contradiction_is_three_combined_sigmas(change, found):
-    assert bool(contradicted(OLD, dataclasses.replace(TRUTH, **change), SIGMA)) == found
+    new = dataclasses.replace(TRUTH, **change)
+    assert bool(contradicted(OLD.camera, OLD.sigma, new, SIGMA)) == found
 
 
 @pytest.mark.parametrize('model', [Brown, Fisheye])
@@ -77,8 +79,8 @@ def test_the_same_lens_in_another_model_confirms(model):
     other = as_model(narrow, model)
     old = NamedCamera('old', narrow, SIGMA, 'accepted')
     tiny = dict.fromkeys(other.names(), 1e-6)
-    assert not contradicted(old, other, tiny)
-    assert contradicted(old, dataclasses.replace(other, fx=other.fx + 10), tiny)
+    assert not contradicted(old.camera, old.sigma, other, tiny)
+    assert contradicted(old.camera, old.sigma, dataclasses.replace(other, fx=other.fx + 10), tiny)
     new = dataclasses.replace(calibration(), camera=other, sigma=tiny)
     assert judge(new, True, old, 0, RULES).action == 'replace'
     assert judge(calibration(), True, NamedCamera('old', as_model(TRUTH, model), dict.fromkeys(
@@ -96,7 +98,7 @@ def test_every_parameter_is_told_with_digits_enough():
 def test_sigmas_too_good_to_be_true_do_not_contradict():
     tiny = dict.fromkeys(SIGMA, 1e-6)
     old = dataclasses.replace(OLD, sigma=tiny)
-    assert not contradicted(old, dataclasses.replace(TRUTH, fx=402.0), tiny)
+    assert not contradicted(old.camera, old.sigma, dataclasses.replace(TRUTH, fx=402.0), tiny)
 
 
 def test_states():

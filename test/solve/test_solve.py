@@ -391,7 +391,7 @@ def test_too_little_yaw(good, yaw_deg, level):
     solution = replace(good, scenes=tuple(narrowed(scene, yaw_deg) for scene in good.scenes))
     assert solution.scenes[0].yaw_deg == pytest.approx(yaw_deg, abs=1e-3)
     found, reasons = levels(solution)
-    assert found == level and (f'{3 * yaw_deg:.0f} degrees' in reasons) == (level != 'accepted')
+    assert found == level and (f'{3 * yaw_deg:.0f}° of yaw' in reasons) == (level != 'accepted')
 
 
 def with_profile(solution: Solution, ratios: Sequence[float], costs: Sequence[float]) -> Solution:
@@ -414,12 +414,13 @@ def test_a_flat_profile(good, costs, contrast, level):
     with np.errstate(invalid='ignore'):
         assert profile_contrast(solution) == pytest.approx(contrast, abs=0.001, nan_ok=True)
         found, reasons = levels(solution)
-    assert found == level and ('hardly tell one focal length' in reasons) == (level != 'accepted')
+    assert found == level
+    assert ('would explain the pictures almost as well' in reasons) == (level != 'accepted')
 
 
 def test_another_focal_length_that_explains_more(good):
     level, reasons = levels(with_profile(good, (0.8, 1.0, 1.25, 1.9), (0.5, 0.4, 0.5, 0.2)))
-    assert level == 'refused' and 'contradicts' in reasons
+    assert level == 'refused' and 'contradict each other' in reasons
     assert f'about {1.9 * good.camera.fx:.0f} px' in reasons
     level, reasons = levels(with_profile(good, (0.5, 0.8, 1.0, 1.25), (0.9, 0.5, 0.4, 0.5)))
     assert (level, reasons) == ('accepted', '')
@@ -432,7 +433,7 @@ def test_sigma_too_large(good, relative, level):
     wide = good.covariance.copy()
     wide[0, 0] = (relative * good.camera.fx)**2
     found, reasons = levels(replace(good, covariance=wide))
-    assert found == level and ('fx is uncertain' in reasons) == (level != 'accepted')
+    assert found == level and ('the focal length is known' in reasons) == (level != 'accepted')
 
 
 @pytest.mark.parametrize('others, level', [(0.5, 'accepted'), (0.01, 'weak')])
@@ -444,9 +445,9 @@ def test_where_one_turn_knows_all_the_others_confirm_nothing(good, others, level
     shares = leverages(solution)
     assert sum(shares.values()) == pytest.approx(1.0)
     found, reasons = levels(solution)
-    assert found == level and ('of the information about fx' in reasons) == (level == 'weak')
+    assert found == level and ('no other turn confirms' in reasons) == (level == 'weak')
     if level == 'weak':
-        assert shares[at(0)] > 0.9 and 'the turn at frame 0 alone gives' in reasons
+        assert shares[at(0)] > 0.9 and 'confirms the turn at frame 0' in reasons
 
 
 def test_turns_that_disagree_are_weak(good):
@@ -456,7 +457,7 @@ def test_turns_that_disagree_are_weak(good):
     solution = replace(good, parts=tuple(parts))
     assert focal_disagreement(good) < 0.01 < 0.03 < focal_disagreement(solution)
     level, reasons = levels(solution)
-    assert level == 'weak' and 'disagree about fx' in reasons
+    assert level == 'weak' and 'disagree about the focal length' in reasons
     assert focal_disagreement(replace(good, parts=good.parts[:1])) == 0.0
 
 
@@ -465,7 +466,7 @@ def test_a_parameter_on_its_bound(good, name):
     index = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2').index(name)
     for side in (0, 1):
         level, reasons = levels(with_camera(good, **{name: float(good.bounds[side][index])}))
-        assert level != 'accepted' and f'{name} reached the bound' in reasons
+        assert level != 'accepted' and f'the search for {name} ended at the limit' in reasons
 
 
 def test_a_distortion_that_folds_over(good):
@@ -477,7 +478,7 @@ def test_refused_tells_the_doubts_too(good):
     solution = replace(with_camera(good, k1=-0.5, k2=0.0), around=replace(
         good.around, costs=np.ones_like(good.around.costs)))
     level, reasons = levels(solution)
-    assert level == 'refused' and 'hardly tell' in reasons and 'folds over' in reasons
+    assert level == 'refused' and 'almost as well' in reasons and 'folds over' in reasons
     assert '\n' not in reasons
 
 
@@ -625,7 +626,7 @@ def test_a_model_that_was_asked_for_and_does_not_do_is_told_of(good):
     assert not conclude(good, evidence_for(good), asked).warnings
     refused = replace(good, around=replace(good.around, costs=np.ones_like(good.around.costs)))
     [warning] = conclude(refused, evidence_for(refused), asked).warnings
-    assert 'model radial was asked for; auto' in warning
+    assert 'model radial was asked for' in warning and 'auto' in warning
 
 
 @pytest.mark.parametrize(('turns', 'frames', 'text'), [

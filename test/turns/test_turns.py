@@ -98,12 +98,13 @@ class Stream:
         self.ns = 0
         self.emitted = []
 
-    def feed(self, magnitudes):
+    def feed(self, magnitudes, after_gap=False):
         for value in np.atleast_1d(magnitudes):
             self.ns += round(1e9 / self.rate)
             motion = Motion(self.count, self.ns, float(value), False, 5.0, 300, self.count,
                             self.ns)
-            frame = Frame(self.count, self.ns, TINY)
+            frame = Frame(self.count, self.ns, TINY, after_gap=after_gap)
+            after_gap = False
             new = self.detector.push(frame, motion)
             assert all(turn.frames for turn in new)
             self.emitted += new
@@ -231,6 +232,18 @@ def test_gap_and_clock_set_back_end_a_turn():
             assert np.all((stamps > 0) & (stamps < 3_000_000_000))
         whole = Stream().feed(quiet(10)).feed(hump(6, 0.05)).feed(quiet(10)).finish()
         assert len(whole) == 1
+
+
+def test_no_turn_spans_two_files():
+    """Their stamps go on, but whether images are missing between them is not known."""
+    calm = Stream().feed(quiet(10)).feed(hump(4, 0.05)).feed(quiet(2)).feed(quiet(2), True)
+    turns = calm.feed(hump(4, 0.04)).feed(quiet(10)).finish()
+    assert sorted(turn.center // 160 for turn in turns) == [0, 1]
+    assert not any(turn.first < 160 <= turn.last for turn in turns)
+    assert all(turn.images >= 50 for turn in turns)
+    turning = Stream().feed(quiet(10)).feed(hump(6, 0.05)[:30])
+    turns = turning.feed(hump(6, 0.05)[30:], True).feed(quiet(10)).finish()
+    assert not any(turn.first < 130 <= turn.last for turn in turns)
 
 
 def test_end_of_drive_completes_a_turn_with_what_is_there():

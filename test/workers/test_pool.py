@@ -349,6 +349,23 @@ def test_inline_it_is_all_the_same(monkeypatch):
         pool.run(child_tasks.pid)
 
 
+@pytest.mark.parametrize('kept', [True, False])
+def test_pictures_are_kept_where_they_are_wanted_and_leave_with_their_turns(monkeypatch, kept):
+    for name in THREAD_VARIABLES:
+        monkeypatch.setenv(name, '1')
+    use(monkeypatch, lambda turn, config, valid: None)
+    pool = ScenePool(Config(), InlineWorker, keep_pictures=kept)
+    with contextlib.closing(pool):
+        for center in (10, 50):
+            pool.submit(replace(turn(center), frames=(
+                Frame(center, 0, np.zeros((4, 6), np.uint8)),)), None)
+        wait_until_built(pool)
+        assert {key: picture.frame for key, picture in pool.pictures().items()} == (
+            {at(10): 10, at(50): 50} if kept else {})
+        pool.keep_only({at(50)})
+        assert set(pool.pictures()) == ({at(50)} if kept else set())
+
+
 def test_the_condition_may_take_a_lock_that_a_submitter_holds(pool, monkeypatch):
     use(monkeypatch, child_tasks.build)
     lock = threading.Lock()

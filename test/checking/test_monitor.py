@@ -1,0 +1,113 @@
+"""Changes of a camera in use: what turns say that were taken with another lens or mounting."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from solving import CONFIG
+from synthetic import LENS, rotation, synthetic_turn
+
+from dashcalib_ros import stages
+from dashcalib_ros.checking import Reading, watch
+from dashcalib_ros.reconstruction.heading import Heading, heading
+from dashcalib_ros.turns.turn import TurnId
+
+ZOOMED = replace(LENS, fx=1.03 * LENS.fx, fy=1.03 * LENS.fy)
+EXCHANGED = replace(LENS, fx=1.3 * LENS.fx, fy=1.3 * LENS.fy, k1=0.0, k2=0.0)
+YAWS = (80.0, -70.0, 85.0)
+SIGMA = {'fx': 1.0, 'fy': 1.0, 'cx': 1.0, 'cy': 1.0, 'k1': 0.001, 'k2': 0.001}
+
+
+def scene_of(lens, yaw_deg, number):
+    return synthetic_turn(lens, yaw_deg, 14, 180, 0.25, world=number).scene(lens, number)
+
+
+@pytest.fixture(scope='module')
+def readings():
+    """What the camera in use makes of turns of three cameras, itself among them."""
+    return {name: stages.read([scene_of(lens, yaw, n) for n, yaw in enumerate(YAWS)], LENS, CONFIG)
+            for name, lens in (('same', LENS), ('zoomed', ZOOMED), ('exchanged', EXCHANGED))}
+
+
+def driven(*turns):
+    """Return readings as those of one drive: numbered in their order, without headings."""
+    return [replace(reading, turn=TurnId.at(n), heading=None) for n, reading in enumerate(turns)]
+
+
+def watched(turns):
+    return watch(turns, LENS, SIGMA, CONFIG.monitor)
+
+
+def test_the_same_camera_has_not_changed(readings):
+    monitor = watched(driven(*readings['same'], *readings['same'], *readings['same']))
+    assert monitor.changes == () and monitor.lens is None
+
+
+def test_a_zoom_is_suspected_after_one_turn_and_told_after_two(readings):
+    first = watched(driven(*readings['same'], readings['zoomed'][0]))
+    assert first.lens is not None and not first.lens.confirmed and first.changes == ()
+    [change] = watched(driven(*readings['same'], *readings['zoomed'][:2])).changes
+    assert change.kind == 'lens' and change.since == TurnId.at(3)
+    assert 0.015 < change.zoom < 0.06 and max(map(abs, change.shift)) < 0.01
+    assert 'since the turn at frame 3' in str(change) and 'focal length' in str(change)
+
+
+def test_one_odd_turn_is_no_change(readings):
+    turns = driven(*readings['same'], readings['zoomed'][0], *readings['same'])
+    assert watched(turns).lens is None
+
+
+def test_a_change_is_taken_back_only_when_two_turns_speak_against_it(readings):
+    turns = (*readings['same'], *readings['zoomed'][:2])
+    assert watched(driven(*turns, readings['same'][0])).changes
+    assert not watched(driven(*turns, *readings['same'][:2])).changes
+
+
+def test_another_camera_is_told_although_no_size_can_be(readings):
+    assert not any(reading.explained for reading in readings['exchanged'])
+    [change] = watched(driven(*readings['same'], *readings['exchanged'][:2])).changes
+    assert change.kind == 'lens' and np.isnan(change.zoom) and 'another camera' in str(change)
+
+
+def test_turns_that_know_nothing_say_nothing(readings):
+    nothing = replace(readings['same'][0], hessian=np.zeros((6, 6)), score=np.zeros(6))
+    assert watched(driven(*[nothing] * 5)).changes == ()
+
+
+def looking(yaw_deg, pitch_deg, number, sigma_deg=0.1):
+    return Reading(TurnId.at(number), np.zeros((6, 6)), np.zeros(6),
+                   Heading(yaw_deg, pitch_deg, sigma_deg, sigma_deg))
+
+
+def test_a_camera_that_is_moved_on_the_car_is_told_and_its_calibration_stays():
+    before = [looking(0.1 * (n % 2), 0.5, n) for n in range(4)]
+    after = [looking(1.2, 0.5 + 0.1 * (n % 2), n) for n in range(4, 7)]
+    assert watched(before).changes == ()
+    assert not watched([*before, after[0]]).changes
+    [change] = watched([*before, *after]).changes
+    assert change.kind == 'mount' and change.since == TurnId.at(4) and change.turns == 3
+    assert change.turned_deg == pytest.approx((1.15, 0.03), abs=0.05)
+    assert '1.1 degrees to the left' in str(change) and 'stays right' in str(change)
+
+
+def test_headings_that_are_not_known_well_do_not_count():
+    before = [looking(0.0, 0.0, n) for n in range(4)]
+    assert watched([*before, *(looking(5.0, 0.0, n, 2.0) for n in (4, 5))]).changes == ()
+
+
+@pytest.mark.parametrize('turned_deg', [0.0, 2.0, -3.0])
+def test_the_heading_follows_the_mounting(turned_deg):
+    """A camera that is turned to the left sees the car go to the right."""
+    scene = scene_of(LENS, 80.0, 0)
+    structure, turn = scene.structure, rotation(1, np.radians(turned_deg))
+    turned = replace(scene, structure=replace(
+        structure, rotations=turn @ structure.rotations,
+        translations=structure.translations @ turn.T))
+    assert heading(turned).yaw_deg - heading(scene).yaw_deg == pytest.approx(turned_deg, abs=0.05)
+
+
+def test_few_keyframes_show_no_heading():
+    scene = scene_of(LENS, 80.0, 0)
+    few = np.arange(len(scene.structure.registered)) < 4
+    assert heading(replace(scene, structure=replace(scene.structure, registered=few))) is None

@@ -1,0 +1,117 @@
+"""dashcalib check around a calibrator of our own making: what the command itself decides."""
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from fakes import stands_in_for
+from made_calibration import TRUTH, make_calibration
+
+from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.checking import Check, Odometry, Reading, watch
+from dashcalib_ros.checking.odometry import Path, TurnOdometry
+from dashcalib_ros.cli import main
+from dashcalib_ros.config import Config
+from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.turns import TurnId
+
+
+@stands_in_for(Calibrator)
+class FakeCalibrator:
+    """Answers at once with what the test wants."""
+
+    answer = 'right'
+    asked: object = None
+    zooms = False
+
+    def __init__(self, config=None, mask=None, verbose=False):
+        pass
+
+    def push(self, frame):
+        pass
+
+    def turns(self):
+        return ()
+
+    def calibrate(self, progress=None):
+        return make_calibration(warnings=('dark',))
+
+    def check(self, given, calibration, progress=None):
+        type(self).asked = given
+        return Check(self.answer, ('it is 0.2 px off',), 0.2, 0.5, PictureSigma(0.1, 0.2), 1.5,
+                     4.7, 0.001)
+
+    def odometry(self, given, calibration, poses, progress=None):
+        rotations, places = np.array([np.eye(3)] * 4), np.arange(12.0).reshape(4, 3)
+        path = Path(rotations, places)
+        turn = TurnOdometry(TurnId.at(88), np.arange(4) * 10**8, path,
+                            {'given': path, 'ours': path, 'guess': path})
+        return Odometry(('given', 'ours', 'guess'), (turn,))
+
+    def watch(self, camera, sigma=None, progress=None):
+        seen = [Reading(TurnId.at(n), np.zeros((6, 6)), np.zeros(6), None, n < 3)
+                for n in range(5 if self.zooms else 3)]
+        return watch(seen, camera, {}, Config().monitor)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """Make a drive, a calibration and a file of poses; return the command's first arguments."""
+    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', FakeCalibrator)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'drive').mkdir()
+    for n in range(3):
+        cv2.imwrite(str(tmp_path / 'drive' / f'{n}.png'), np.full((48, 64), 60 + n, np.uint8))
+    (tmp_path / 'camera.json').write_text(json.dumps(
+        {**TRUTH.named, 'width': TRUTH.image_size[0], 'height': TRUTH.image_size[1]}))
+    (tmp_path / 'poses.txt').write_text('1 0 0 0 0 1 0 0 0 0 1 0\n' * 3)
+    return ['check', 'camera.json', 'drive', '--fps', '10']
+
+
+@pytest.mark.parametrize(('answer', 'code'), [('right', 0), ('wrong', 1), ('cannot tell', 3)])
+def test_the_answer_is_shown_and_is_the_exit_code(files, monkeypatch, capfd, answer, code):
+    monkeypatch.setattr(FakeCalibrator, 'answer', answer)
+    assert main(files) == code
+    out, errors = capfd.readouterr()
+    assert out.splitlines()[0] == answer and 'it is 0.2 px off' in out
+    assert 'dark' in errors and FakeCalibrator.asked == TRUTH
+
+
+def test_json_has_what_programs_need(files, capfd):
+    assert main([*files, '--json', '--poses', 'poses.txt']) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert (found['answer'], found['rms_px'], found['worst_px']) == ('right', 0.2, 0.5)
+    assert found['reasons'] == ['it is 0.2 px off'] and found['changes'] == []
+    assert set(found['rotation_deg']) == {'given', 'ours', 'guess'}
+    assert found['turns'][0]['center'] == 88
+
+
+def test_a_change_during_the_drive_is_told(files, monkeypatch, capfd):
+    monkeypatch.setattr(FakeCalibrator, 'zooms', True)
+    assert main(files) == 0
+    assert 'since the turn at frame 3' in capfd.readouterr().out
+
+
+def test_poses_are_compared_and_paths_are_written(files, tmp_path, capfd):
+    assert main([*files, '--poses', 'poses.txt', '--out', 'paths']) == 0
+    out = capfd.readouterr().out
+    assert 'rotation missed' in out and 'paths/paths.svg' in out
+    assert (tmp_path / 'paths' / 'turn_000088_ours.tum').exists()
+
+
+@pytest.mark.parametrize(('arguments', 'match'), [
+    (['check', 'nothing.json', 'drive'], 'does not exist'),
+    (['check', 'camera.json', 'nothing'], 'does not exist'),
+    (['check', 'camera.json', 'drive', '--poses', 'camera.json'], 'no poses'),
+    (['check', 'camera.json', 'drive', '--out', 'x'], '--poses'),
+    (['check', 'camera.json'], '--help'),
+])
+def test_bad_input_is_one_line(files, capfd, arguments, match):
+    assert main(arguments) == 2
+    errors = capfd.readouterr().err.strip().splitlines()
+    assert len(errors) == 1 and match in errors[0]

@@ -1,0 +1,237 @@
+"""A fleet from its manifest to its tables: killed, started again, cut into shards, in memory."""
+from __future__ import annotations
+
+import csv
+import json
+
+import pytest
+from fleet_made import CONFIG, YAWS, Here, clip_of, lens_of, written
+from made_drives import smooth, write_video
+
+from dashcalib_ros.errors import ConfigError, OutputError
+from dashcalib_ros.fleet.batch import batch, problems, shard_of
+from dashcalib_ros.fleet.engine import Died, OneWorker, Task
+from dashcalib_ros.fleet.manifest import Row, read_manifest
+from dashcalib_ros.fleet.tasks import camera_folder
+
+FEW = {'tracks': 60, 'keyframes': 7}
+FILES = ('cameras.parquet', 'clips.parquet', 'overview.html')
+SETTINGS = CONFIG.replace({'fleet.least_units': 3})
+
+
+class Flaky(Here):
+    """A worker that is lost after some calls."""
+
+    def __init__(self, calls: int) -> None:
+        self.calls = calls
+
+    def call(self, function, *arguments, progress=None):
+        self.calls -= 1
+        if self.calls < 0:
+            raise KeyboardInterrupt
+        return super().call(function, *arguments)
+
+
+class Counting(Here):
+    """Counts the tasks that did something."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+
+    def call(self, function, *arguments, progress=None):
+        result = super().call(function, *arguments)
+        if function.__name__ != 'publish_camera' and not result[-1].again:
+            self.done.append(function.__name__)
+        return result
+
+
+@pytest.fixture(scope='module')
+def manifest(tmp_path_factory):
+    """Five cameras of a make with a turn each, one with two; one without turns; two bad clips."""
+    pytest.importorskip('pyarrow')
+    folder = tmp_path_factory.mktemp('fleet')
+    rows = []
+    for n in range(5):
+        written(clip_of(lens_of(1 + 0.004 * n), YAWS[n:n + 1], world=n, **FEW),
+                folder / f'{n}.npz')
+        rows.append([f'{n}.npz', f'cam {n}', 'acme'])
+    written(clip_of(lens_of(1.0), YAWS[5:6], world=9, **FEW), folder / 'second.npz')
+    write_video(folder / 'still.avi', smooth(), fps=10.0)
+    (folder / 'empty.mp4').write_bytes(b'')
+    rows += [['second.npz', 'cam 0', 'acme'], ['still.avi', 'cam 5', ''],
+             ['empty.mp4', 'cam 1', 'acme'], ['gone.mp4', 'cam 5', 'acme'],
+             ['0.npz', 'cam 0', 'acme']]
+    with (folder / 'm.csv').open('w', newline='') as stream:
+        csv.writer(stream).writerows([['clip', 'camera', 'make'], *rows])
+    return folder / 'm.csv'
+
+
+def run(manifest, out, worker=None, shard=None):
+    rows = read_manifest(str(manifest))
+    return batch(rows, str(out), SETTINGS, OneWorker(3, worker or Here()), shard)
+
+
+@pytest.fixture(scope='module')
+def reference(manifest, tmp_path_factory):
+    out = tmp_path_factory.mktemp('reference')
+    return out, run(manifest, out)
+
+
+def rows_of(path):
+    from pyarrow import parquet
+    return parquet.read_table(path).to_pylist()
+
+
+def test_the_tables_tell_everything(reference):
+    out, fleet = reference
+    cameras = {row['camera']: row for row in rows_of(out / 'cameras.parquet')}
+    clips = rows_of(out / 'clips.parquet')
+    assert list(cameras) == [f'cam {n}' for n in range(6)]
+    assert [row['row'] for row in clips] == list(range(1, 11))
+    status = {row['clip']: row['status'] for row in clips[:9]}
+    assert status == {**{f'{n}.npz': 'used' for n in range(5)}, 'second.npz': 'used',
+                      'still.avi': 'no turn', 'empty.mp4': 'unreadable', 'gone.mp4': 'unreadable'}
+    assert clips[9]['status'] == 'left out' and 'row 1 again' in clips[9]['reason']
+    assert 'empty' in clips[7]['reason'] and 'no such file' in clips[8]['reason']
+    two = cameras['cam 0']
+    assert two['turns_used'] == 2 == two['clips_used'] and two['clips'] == 3
+    assert cameras['cam 5']['verdict'] == 'refused'
+    assert cameras['cam 5']['reasons'] == [
+        'no turn was found in 1 clip: more clips with turns are needed']
+    for n in range(1, 5):
+        row = cameras[f'cam {n}']
+        assert (row['verdict'], row['verdict_alone'], row['prior_units']) == ('weak', 'weak', 4)
+        assert 'the prior of the make acme' in row['reasons'][0]
+        assert 0 < row['prior_share'] < 1
+        assert row['sigma_fx_alone'] > 0 and row['sigma_k1_alone'] > 0
+        folder = out / row['folder']
+        assert json.loads((folder / 'result.json').read_text())['intrinsics']['fx'] == row['fx']
+        assert (folder / 'calibration.weak.yaml').exists()
+    page = (out / 'overview.html').read_text()
+    assert '6 cameras, 10 clips' in page and camera_folder('cam 1').split('/')[1] in page
+    assert not fleet.all_well
+    assert {row.clip for row, _ in problems(fleet)} == {'empty.mp4', 'gone.mp4'}
+
+
+def same(one, other):
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in FILES)
+
+
+def test_killed_at_any_time_it_does_only_what_is_missing(manifest, reference, tmp_path):
+    done = []
+    for calls in (3, 9, 14, 99):
+        worker = Flaky(calls)
+        try:
+            run(manifest, tmp_path, worker)
+        except KeyboardInterrupt:
+            done.append(len(list(tmp_path.rglob('clips/*/*.json'))))
+            assert not list(tmp_path.rglob('*.tmp'))
+        else:
+            done.append(99)
+    assert done[-1] == 99 and done[0] == 2 and done == sorted(done)
+    assert same(tmp_path, reference[0])
+    again = Counting()
+    run(manifest, tmp_path, again)
+    # what is not there may be there the next time
+    assert again.done == ['gather_clip']
+    assert same(tmp_path, reference[0])
+
+
+def test_shards_and_a_merge_give_the_same_tables(manifest, reference, tmp_path):
+    parts = [run(manifest, tmp_path, shard=(n, 3)) for n in (3, 1, 2)]
+    assert [len(part.cameras) for part in parts] == [2, 2, 2] and not parts[0].files
+    worker = Counting()
+    run(manifest, tmp_path, worker)
+    assert worker.done == ['gather_clip'] and same(tmp_path, reference[0])
+
+
+def test_input_and_output_may_be_addresses(manifest, reference):
+    fsspec = pytest.importorskip('fsspec')
+    memory = fsspec.filesystem('memory')
+    memory.store.clear()
+    memory.put(str(manifest.parent) + '/', 'memory://bucket/in', recursive=True)
+    run('memory://bucket/in/m.csv', 'memory://bucket/out')
+    for name in FILES:
+        assert memory.cat(f'memory://bucket/out/{name}') == (reference[0] / name).read_bytes()
+    assert memory.exists(f'memory://bucket/out/{camera_folder("cam 0")}/result.json')
+
+
+def test_next_months_clips_need_no_old_video(manifest, tmp_path):
+    video = write_video(tmp_path / 'still.avi', smooth(), fps=10.0)
+    row = Row(1, 'still.avi', str(video), 'cam')
+    for _ in range(2):
+        fleet = batch([row], str(tmp_path / 'out'), SETTINGS, OneWorker(3, Here()))
+        assert not list(problems(fleet))
+        video.unlink(missing_ok=True)
+    # but another clip under its name is read
+    video.write_bytes(b'')
+    fleet = batch([row], str(tmp_path / 'out'), SETTINGS, OneWorker(3, Here()))
+    assert 'empty' in next(problems(fleet))[1]
+
+
+def test_a_clip_that_kills_its_worker_is_set_aside(manifest, tmp_path):
+    class Deadly(OneWorker):
+        def _outcome(self, task: Task):
+            if task.key == ('clip', '2'):
+                return Died(3, 'the worker died')
+            return super()._outcome(task)
+
+    for engine in (Deadly(3, Here()), OneWorker(3, Here())):
+        fleet = batch(read_manifest(str(manifest)), str(tmp_path), SETTINGS, engine)
+        found = {row.number: why for row, why in problems(fleet)}
+        # the second time it is not even tried
+        assert 'killed its worker 3 times' in found[2] and set(found) == {2, 8, 9}
+    assert {row['camera']: row['verdict'] for row in rows_of(tmp_path / 'cameras.parquet')}[
+        'cam 1'] == 'refused'
+
+
+def test_a_full_disk_is_told_of_each_clip_and_of_the_tables(manifest, tmp_path, monkeypatch):
+    import errno
+
+    def full(handle):
+        raise OSError(errno.ENOSPC, 'No space left on device')
+
+    monkeypatch.setattr('os.fsync', full)
+    rows = read_manifest(str(manifest))
+    told = []
+    with pytest.raises(OutputError, match='free some space'):
+        batch(rows, str(tmp_path), SETTINGS, OneWorker(3, Here()),
+              tell=lambda camera, clip, effort: told.append(clip and clip.problem))
+    assert sum('No space left' in (text or '') for text in told) >= 7
+    monkeypatch.undo()
+    assert not [path for path in tmp_path.rglob('*') if path.is_file()]
+
+
+def test_ten_thousand_unreadable_clips(tmp_path):
+    (tmp_path / 'bad.avi').write_bytes(b'')
+    rows = [Row(n, f'{n}.avi', str(tmp_path / 'gone.avi')) for n in range(10_000)]
+    rows.append(Row(10_000, 'bad.avi', str(tmp_path / 'bad.avi')))
+    for row in rows[:-1]:
+        assert row.camera == ''
+    engine = OneWorker(3, Here())
+    few = [Row(row.number, row.clip, row.place, 'cam') for row in rows]
+    fleet = batch(few, str(tmp_path / 'out'), SETTINGS, engine)
+    assert len(list(problems(fleet))) == 10_001
+    assert fleet.cameras[0].verdict == 'refused' and not fleet.all_well
+
+
+def test_without_pyarrow_the_tables_are_json_lines(manifest, tmp_path, monkeypatch):
+    monkeypatch.setattr('dashcalib_ros.fleet.tables.has', lambda name: None)
+    row = Row(1, 'gone.mp4', str(tmp_path / 'gone.mp4'))
+    fleet = batch([row], str(tmp_path), SETTINGS, OneWorker(3, Here()))
+    assert fleet.files == ('cameras.jsonl', 'clips.jsonl', 'overview.html')
+    line, = (tmp_path / 'clips.jsonl').read_text().splitlines()
+    assert json.loads(line)['status'] == 'unreadable'
+
+
+@pytest.mark.parametrize('text', ['0/2', '3/2', '1', '1/0', 'a/b', '-1/2', ''])
+def test_bad_shards(text):
+    with pytest.raises(ConfigError, match='1/8'):
+        shard_of(text)
+
+
+def test_names_of_cameras_never_share_a_folder():
+    names = ['a b', 'a_b', 'a/b', '../a', '..', 'CON', 'é', 'x' * 300, 'a b ', 'cameras']
+    folders = [camera_folder(name) for name in names]
+    assert len(set(folders)) == len(names)
+    assert all(folder.count('/') == 1 and '..' not in folder for folder in folders)

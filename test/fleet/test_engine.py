@@ -1,0 +1,56 @@
+"""Engines: every task has one outcome, whatever becomes of the workers."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import fleet_tasks
+import pytest
+
+from dashcalib_ros.errors import ConfigError, InputError, WorkerError
+from dashcalib_ros.fleet.engine import Died, OneWorker, RayEngine, Task
+
+
+def outcomes_of(engine, tmp_path):
+    """Run tasks of every kind; return the outcomes by name."""
+    tasks = {'a': (fleet_tasks.double, (1,)), 'b': (fleet_tasks.fail, ('no clip',)),
+             'c': (fleet_tasks.break_down, ()),
+             'once': (fleet_tasks.die_until, (str(tmp_path / 'once'), 1)),
+             'always': (fleet_tasks.die_until, (str(tmp_path / 'always'), 99))}
+    for name, (function, arguments) in tasks.items():
+        engine.submit(Task(('first', name), function, arguments))
+    found = {}
+    try:
+        for (kind, name), outcome in engine.outcomes():
+            assert name not in found
+            found[name] = outcome
+            if name == 'a':
+                # a task may follow from an outcome
+                engine.submit(Task((kind, 'later'), fleet_tasks.double, (21,)), first=True)
+    finally:
+        engine.close()
+    return found
+
+
+def check(found, tmp_path):
+    assert found['a'] == 2 and found['later'] == 42
+    assert isinstance(found['b'], InputError) and str(found['b']) == 'no clip'
+    assert isinstance(found['c'], WorkerError) and 'ZeroDivisionError' in str(found['c'])
+    assert found['once'] == 2
+    assert isinstance(found['always'], Died) and found['always'].attempts == 3
+    assert found['always'].reason
+    assert Path(tmp_path / 'always').read_text() == '3'
+
+
+def test_one_worker(tmp_path):
+    check(outcomes_of(OneWorker(3), tmp_path), tmp_path)
+
+
+def test_ray(tmp_path):
+    pytest.importorskip('ray')
+    check(outcomes_of(RayEngine(3, 100, workers=2), tmp_path), tmp_path)
+
+
+def test_several_workers_say_which_extra_they_need(monkeypatch):
+    monkeypatch.setattr('dashcalib_ros.fleet.extra.has', lambda name: None)
+    with pytest.raises(ConfigError, match=r'several workers .* need ray: .*\[fleet\]'):
+        RayEngine(3, 100, workers=2)

@@ -1,0 +1,103 @@
+"""Manifests of every kind, and bad ones: what is wrong with a row stands in the row."""
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.fleet.manifest import by_camera, read_manifest
+
+
+def rows_of(tmp_path, text, name='m.csv', **options):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_manifest(str(path), **options)
+
+
+def test_a_csv_names_clips_relative_to_itself(tmp_path):
+    text = ('\ufeffClip, camera ,make,fps,topic,time,notes\r\n'
+            'a/1.mp4,cam,acme,12.5,/image,2026-01-31T12:00:00,"x, y"\r\n\r\n'
+            '/abs/2.mp4\r\ns3://bucket/3.mp4,cam\r\n')
+    one, two, three = rows_of(tmp_path, text)
+    assert (one.number, one.clip, one.place) == (1, 'a/1.mp4', str(tmp_path / 'a/1.mp4'))
+    assert (one.camera, one.make, one.fps, one.topic) == ('cam', 'acme', 12.5, '/image')
+    assert one.time_s == 1769860800.0 and not one.problem
+    assert (two.number, two.place, two.camera, two.fps) == (2, '/abs/2.mp4', '', None)
+    assert three.place == 's3://bucket/3.mp4'
+    assert {name: len(rows) for name, rows in by_camera([one, two, three]).items()} == {
+        'cam': 2, '/abs/2.mp4': 1}
+
+
+@pytest.mark.parametrize(('values', 'problem'), [
+    ('a.mp4,cam,nine', 'fps must be above 0'), ('a.mp4,cam,-1', 'fps must be'),
+    ('a.mp4,cam,nan', 'fps must be'), (',cam,10', 'names no clip'),
+    ('a.mp4,cam,10,7', 'has 4 values for 3 columns')])
+def test_a_bad_row_says_why_and_the_others_stay(tmp_path, values, problem):
+    bad, good = rows_of(tmp_path, f'clip,camera,fps\n{values}\nb.mp4,cam,10\n')
+    assert problem in bad.problem and not good.problem and good.number == 2
+
+
+def test_bad_lines_of_json_are_rows(tmp_path):
+    text = '\n'.join([json.dumps({'clip': 'a.mp4', 'fps': 10}), '{', '[1]',
+                      json.dumps({'clip': 'b.mp4', 'time': 'noon'})])
+    good, cut, listed, late = rows_of(tmp_path, text, 'm.jsonl')
+    assert good.fps == 10 and 'no JSON' in cut.problem and 'object' in listed.problem
+    assert 'time must be like' in late.problem
+
+
+def test_parquet(tmp_path):
+    arrow = pytest.importorskip('pyarrow')
+    from pyarrow import parquet
+    parquet.write_table(arrow.table({'clip': ['a.mp4', None], 'fps': [10.0, None],
+                                     'other': [1, 2]}), tmp_path / 'm.parquet')
+    one, two = read_manifest(str(tmp_path / 'm.parquet'))
+    assert one.fps == 10 and two.problem == 'names no clip'
+    (tmp_path / 'bad.parquet').write_bytes(b'PAR1')
+    with pytest.raises(InputError, match='no Parquet'):
+        read_manifest(str(tmp_path / 'bad.parquet'))
+
+
+@pytest.mark.parametrize(('data', 'match'), [
+    (b'', 'no column clip'), (b'video\na.mp4\n', 'no column clip'), (b'clip\n', 'names no clip'),
+    ('clip\nstraße.mp4\n'.encode('latin-1'), r'not UTF-8 \(line 2\)'),
+    ('clip\na.mp4\n'.encode('utf-16'), 'not UTF-8'),
+    (b'clip\n"' + b'x' * 200_000, 'no CSV')])
+def test_a_manifest_that_is_bad_altogether(tmp_path, data, match):
+    with pytest.raises(InputError, match=match) as caught:
+        rows_of(tmp_path, data)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_no_manifest(tmp_path):
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'one.mp4').write_bytes(b'x')
+    for place, match in (('gone.csv', 'no manifest'), ('gone', 'no manifest'),
+                         ('empty', 'names no clip'), ('one.mp4', 'is no manifest'),
+                         ('*.avi', 'names no clip')):
+        with pytest.raises(InputError, match=match):
+            read_manifest(str(tmp_path / place))
+
+
+def test_folders_and_globs_in_the_order_of_their_names(tmp_path):
+    for name in ('b-2.mp4', 'a-1.avi', 'notes.txt', '.hidden.mp4', 'c-3.npz'):
+        (tmp_path / name).write_bytes(b'x')
+    (tmp_path / 'images').mkdir()
+    (tmp_path / 'images' / '0.png').write_bytes(b'x')
+    found = [row.clip.removeprefix(f'{tmp_path}/') for row in read_manifest(str(tmp_path))]
+    assert found == ['a-1.avi', 'b-2.mp4', 'c-3.npz', 'images']
+    assert len(read_manifest(str(tmp_path / '*-*.???'))) == 3
+    # images of one drive are one clip
+    assert [row.place for row in read_manifest(str(tmp_path / 'images'))] == [
+        str(tmp_path / 'images')]
+
+
+def test_the_camera_from_the_name(tmp_path):
+    text = 'clip,camera\nacme/cam7/1.mp4,\nacme/cam7/2.mp4,own\nother.mp4,\n'
+    grouped = rows_of(tmp_path, text, group_by=r'(?P<make>\w+)/(?P<camera>cam\d)')
+    assert [(row.camera, row.make) for row in grouped[:2]] == [('cam7', 'acme'), ('own', 'acme')]
+    assert 'finds no camera' in grouped[2].problem
+    assert rows_of(tmp_path, text, group_by=r'cam(\d)')[0].camera == '7'
+    assert rows_of(tmp_path, text, group_by=r'cam\d')[0].camera == 'cam7'
+    with pytest.raises(ConfigError, match='no regular expression'):
+        rows_of(tmp_path, text, group_by='(')

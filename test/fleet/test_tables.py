@@ -1,0 +1,62 @@
+"""The tables' rows: drift over time, texts of any kind, the overview."""
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from dashcalib_ros.fleet import tables
+from dashcalib_ros.fleet.clip_shares import ClipShare
+from dashcalib_ros.fleet.manifest import Row
+from dashcalib_ros.fleet.overview import overview_html
+from dashcalib_ros.fleet.storage import Folder
+from dashcalib_ros.fleet.tables import CAMERA_COLUMNS, CLIP_COLUMNS, camera_row, clip_row
+from dashcalib_ros.fleet.tasks import ClipResult
+
+START_S = 1.7e9
+
+
+def rows_at(times_s, focal, sigma=2.0):
+    return [clip_row(Row(n, f'{n}.mp4', f'/{n}.mp4', 'cam', time_s=time_s), 'cam', 'acme',
+                     ClipResult(f'{n}.mp4', 'x.npz', turns=1, scenes=1, seconds=10.0),
+                     ClipShare(1, '', fx, sigma))
+            for n, (time_s, fx) in enumerate(zip(times_s, focal, strict=True))]
+
+
+def drift_of(rows):
+    row = camera_row('cam', 'acme', None, 'failed', rows)
+    return row['drift_percent_per_year'], row['drift_sigma']
+
+
+def test_drift_over_time():
+    years = np.linspace(0, 2, 40)
+    noise = np.random.default_rng(0).normal(0, 2.0, 40)
+    times = START_S + years * tables.YEAR_S
+    drift, sigma = drift_of(rows_at(times, 1000 * (1 + 0.01 * years) + noise))
+    assert abs(drift - 1.0) < 3 * sigma and 0.02 < sigma < 0.2
+    # scatter beyond the clips' own sigmas counts
+    assert drift_of(rows_at(times, 1000 + 10 * noise))[1] > 5 * sigma
+
+
+@pytest.mark.parametrize('times', [[START_S] * 5, [0.0, 10.0, 20.0], [START_S, 2 * START_S]])
+def test_without_dates_there_is_no_drift(times):
+    assert drift_of(rows_at(times, [1000.0] * len(times))) == (None, None)
+
+
+def test_texts_that_are_no_unicode_and_numbers_that_are_none(tmp_path, monkeypatch):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    odd = 'b\udcff<script>.mp4'
+    clips = [clip_row(Row(1, odd, odd), odd, '', ClipResult(odd, problem='is <b>bad</b>'), None)]
+    cameras = [{**camera_row(odd, '', None, 'why', clips), 'drift_sigma': float('nan')}]
+    folder = Folder(str(tmp_path))
+    tables.write_table(folder, 'clips', clips, CLIP_COLUMNS)
+    tables.write_table(folder, 'cameras', cameras, CAMERA_COLUMNS)
+    row, = parquet.read_table(tmp_path / 'cameras.parquet').to_pylist()
+    assert row['camera'] == 'b?<script>.mp4' and row['drift_sigma'] is None
+    assert row['reasons'] == ['why'] and row['verdict'] == 'refused'
+    page = overview_html(cameras, clips)
+    assert '<script>' not in page and '<b>bad' not in page
+    monkeypatch.setattr('dashcalib_ros.fleet.tables.has', lambda name: None)
+    assert tables.write_table(folder, 'clips', clips, CLIP_COLUMNS) == 'clips.jsonl'
+    assert json.loads((tmp_path / 'clips.jsonl').read_text())['camera'] == 'b?<script>.mp4'

@@ -1,0 +1,61 @@
+"""Fleets without pictures: clips that are gathered turns with exact truth."""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from synthetic import LENS, SIZE, synthetic_turn
+
+from dashcalib_ros.camera import Camera, Radial
+from dashcalib_ros.config import Config
+from dashcalib_ros.fleet import gathered
+from dashcalib_ros.fleet.gathered import Gathered, GatheredTurn
+from dashcalib_ros.frames.scale import FULL_SIZE
+
+CONFIG = Config().replace({'intrinsics.profile_tracks': 60})
+FEW = {'tracks': 110, 'keyframes': 9, 'noise_px': 0.25}
+YAWS = (80.0, -70.0, 85.0, -90.0, 65.0, -78.0)
+
+
+class Here:
+    """A worker without a process: for files in memory, which no other process sees."""
+
+    pid = None
+
+    def call(self, function: Callable[..., Any], *arguments: Any, progress: Any = None) -> Any:
+        return function(*arguments)
+
+    def close(self) -> None:
+        pass
+
+
+def lens_of(focal_factor: float = 1.0, lens: Radial = LENS) -> Radial:
+    return replace(lens, fx=lens.fx * focal_factor, fy=lens.fy * focal_factor)
+
+
+def clip_of(lens: Radial = LENS, yaws: Sequence[float] = YAWS[:1], world: int = 0,
+            start_s: float = 0.0, start: Camera | None = None, **options: Any) -> Gathered:
+    """Return a clip with these turns. world: of its first one; each has a world of its own."""
+    # as a turn's own adjustment leaves it
+    start = start or Radial.centred(SIZE, lens.fx, lens.k1, lens.k2)
+    turns, scenes = [], {}
+    for n, yaw in enumerate(yaws):
+        scene = synthetic_turn(lens, yaw, seed=world + n, world=world + n,
+                               **{**FEW, **options}).scene(start, 100 * n)
+        # as in a file, so that what is read equals what is made
+        scene = replace(scene, tracks=replace(
+            scene.tracks, xy=scene.tracks.xy.astype(np.float32).astype(float)))
+        scenes[100 * n] = scene
+        turns.append(GatheredTurn(100 * n, start_s + 10.0 * n, 0.05 - 0.001 * n, True,
+                                  scene.yaw_deg))
+    return Gathered(f'{world:032x}', 'made', lens.image_size, FULL_SIZE, 100 * len(yaws) + 50,
+                    10.0 * len(yaws) + 5.0, tuple(turns), scenes)
+
+
+def written(clip: Gathered, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(gathered.encoded(clip))
+    return path

@@ -1,0 +1,88 @@
+"""The page in a real browser, where there is one: no error, no text over other text."""
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import pytest
+from drawn import drawn_calibration, solution
+from made_calibration import make_calibration
+
+from dashcalib_ros.report import report_html
+
+BROWSER = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which(
+    'google-chrome')
+# puts what it finds into the page's title
+CHECK = """<script>
+const errors = [];
+for (const kind of ['error', 'warn']) console[kind] = text => errors.push(String(text));
+addEventListener('error', event => errors.push(event.message));
+addEventListener('load', () => {
+  const boxes = [...document.querySelectorAll('svg text')].map(text =>
+    [text.textContent, text.getBoundingClientRect(), text.closest('svg')]);
+  const overlaps = [];
+  boxes.forEach(([a, p, own], n) => boxes.slice(n + 1).forEach(([b, q, other]) => {
+    // boxes have a little room above and below the letters
+    if (own === other && p.left < q.right && q.left < p.right
+        && p.top + 2 < q.bottom && q.top + 2 < p.bottom) overlaps.push([a, b]);
+  }));
+  const outside = boxes.filter(([text, box, own]) => {
+    const whole = own.getBoundingClientRect();
+    return box.left < whole.left - 1 || box.right > whole.right + 1
+      || box.top < whole.top - 1 || box.bottom > whole.bottom + 1;
+  }).map(([text]) => text);
+  document.title = JSON.stringify({errors, overlaps, outside, texts: boxes.length,
+    wide: document.documentElement.scrollWidth - document.documentElement.clientWidth});
+});
+</script>"""
+
+
+def found_by_the_browser(folder, text, width):
+    """Return what CHECK finds in a page that is so many px wide."""
+    (folder / 'page.html').write_text(text.replace('<head>', '<head>' + CHECK))
+    # a window cannot be as narrow as a phone, a frame can
+    (folder / 'frame.html').write_text(
+        f'<iframe id="f" src="page.html" style="width:{width}px;height:900px;border:0"></iframe>'
+        '<script>f.onload = () => setTimeout(() => {'
+        'document.body.append("FOUND" + f.contentDocument.title + "END")})</script>')
+    run = subprocess.run(
+        [BROWSER, '--headless', '--no-sandbox', '--disable-gpu', '--no-first-run',
+         '--disable-background-networking', '--disable-component-update', '--disable-sync',
+         '--allow-file-access-from-files', f'--user-data-dir={folder / "profile"}',
+         '--window-size=1300,900', '--virtual-time-budget=4000', '--enable-logging=stderr',
+         '--dump-dom', (folder / 'frame.html').as_uri()],
+        capture_output=True, text=True, timeout=120, check=True)
+    # what the parser of SVG says, too
+    console = re.findall(r'CONSOLE.*', run.stderr)
+    found = html.unescape(re.findall(r'FOUND({.*?})END', run.stdout)[-1])
+    return {**json.loads(found), 'console': console}
+
+
+@pytest.mark.skipif(BROWSER is None, reason='no chromium on the PATH')
+@pytest.mark.parametrize('width', [1200, 390])
+def test_no_error_and_no_text_over_other_text(tmp_path, width):
+    found = found_by_the_browser(tmp_path, report_html(drawn_calibration(solution())), width)
+    assert found.pop('texts') > 60
+    assert not any(found.values()), found
+
+
+@pytest.mark.skipif(BROWSER is None, reason='no chromium on the PATH')
+def test_turns_that_follow_each_other_closely_keep_their_numbers_apart(tmp_path):
+    [turn, _] = make_calibration().turns
+    turns = tuple(replace(turn, center=n, stamp_s=8.8 + 0.1 * n) for n in range(12))
+    found = found_by_the_browser(tmp_path, report_html(make_calibration(turns=turns)), 1200)
+    assert found.pop('texts') > 12
+    assert not any(found.values()), found
+
+
+@pytest.mark.skipif(BROWSER is None, reason='no chromium on the PATH')
+def test_the_browser_would_notice(tmp_path):
+    text = report_html(make_calibration()).replace(
+        '</body>', '<svg viewBox="0 0 99 20"><text x="5" y="12">one</text>'
+        '<text x="9" y="12">two</text><path d="M1 1lM"/></svg></body>')
+    found = found_by_the_browser(tmp_path, text, 1200)
+    assert found['overlaps'] == [['one', 'two']] and found['console']

@@ -1,0 +1,187 @@
+"""What the page draws: turns with their reasons, maps, plots, and lines that work when copied."""
+from __future__ import annotations
+
+import dataclasses
+import html
+import re
+import shlex
+import zlib  # noqa: F401, before pycolmap
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import yaml
+from drawn import START_S, drawn_calibration, solution
+from made_calibration import EACH_MODEL, calibration_of, make_calibration
+from page_reader import Page
+
+from dashcalib_ros.judgement import Verdict
+from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.judgement.focal_by_turn import focal_alone, sigma_by_count
+from dashcalib_ros.report import NamedCamera, report_html, write_results
+from dashcalib_ros.report.lens_figures import undistorted
+from dashcalib_ros.report.usage import field_of_view
+from dashcalib_ros.turns import TurnId
+
+
+@pytest.fixture(scope='module')
+def drawn():
+    return drawn_calibration(solution())
+
+
+@pytest.fixture(scope='module')
+def text(drawn):
+    return report_html(drawn)
+
+
+def copied(text, name):
+    """Return what a click on a block selects."""
+    return html.unescape(re.search(rf'<pre id="{name}"[^>]*>(.*?)</pre>', text, re.S)[1])
+
+
+def test_each_turn_is_drawn_with_tracks_residuals_path_and_what_it_says_of_fx(drawn, text):
+    page = Page(text)
+    for kind in ('track', 'residual', 'point', 'path'):
+        assert text.count(f'<path class="{kind}"') + text.count(f'<polyline class="{kind}"') == 3
+    assert text.count('class="picture"') == 5 + 1  # all five turns, and the slider's second one
+    assert re.search(r'residuals , from the point .* \d+ times as long', page.text)
+    assert page.text.count('Alone it says fx') == 3
+    assert len(text) < 3_000_000
+    assert all(link.startswith(('data:', '#mask')) for link in page.links)
+
+
+def test_every_unused_turn_has_its_reason(drawn, text):
+    assert [turn.unused_because for turn in drawn.turns] == [
+        None, None, None, 'it was too dark', 'more prominent turns were enough']
+    assert text.count('no: it was too dark') == text.count('not used: it was too dark') == 1
+
+
+def test_a_turn_that_contradicts_the_others_says_so():
+    found = solution()
+    left = dataclasses.replace(found, scenes=found.scenes[:2], parts=found.parts[:2],
+                               misfits={**found.misfits, found.scenes[2].turn: 7.0})
+    *_, contradicts, _, _ = drawn_calibration(left).turns
+    assert not contradicts.used and 'does not explain it' in contradicts.unused_because
+    assert '7.0 times' in contradicts.unused_because
+    *_, unexplained, _, untried = drawn_calibration(None).turns
+    assert 'no camera' in unexplained.unused_because
+    assert 'not reconstructed' in untried.unused_because
+
+
+def test_where_no_report_is_wanted_nothing_is_kept_for_it():
+    assert drawn_calibration(solution(), pictures=None).material is None
+
+
+def test_times_count_from_the_drive_s_start(drawn, text):
+    assert drawn.start_s == START_S
+    assert 'at 5.0 s' in Page(text).text and f'{START_S:.0f}' not in text
+
+
+def test_what_turns_say_alone_scatters_about_the_common_result(drawn):
+    found, config = solution(), drawn.config
+    alone = focal_alone(found, config)
+    assert set(alone) == {scene.turn for scene in found.scenes}
+    for each in alone.values():
+        assert abs(each.fx - found.camera.fx) < 5 * each.sigma
+        assert 0 < each.sigma < 0.1 * found.camera.fx
+    sigmas = sigma_by_count(found, config)
+    assert len(sigmas) == 3 and sigmas[-1] == pytest.approx(found.sigma[0])
+
+
+def test_a_refused_page_draws_the_evidence_and_has_no_camera(drawn):
+    refused = dataclasses.replace(
+        drawn, verdict=Verdict('refused', ('too little',)), camera=None, sigma=None,
+        sigma_px=None)
+    text = report_html(refused)
+    page = Page(text)
+    assert 'class="track"' in text and 'Focal profile' in page.text
+    assert 'Alone it says' not in page.text and 'Use it' not in page.text
+    assert f'{solution().camera.fx:.1f}' not in page.text and 'Parameters' not in page.text
+
+
+def test_stored_turns_have_plots_and_no_picture(drawn):
+    scene = dataclasses.replace(solution().scenes[0], turn=TurnId.stored(0))
+    summary = StoredTurnSummary(scene.turn, 1.6e9, 0.05, 80.0, 14, False, 1.0, 'not needed')
+    material = dataclasses.replace(drawn.material, scenes={scene.turn: scene}, pictures={})
+    text = report_html(dataclasses.replace(drawn, turns=(), stored_turns=(summary,),
+                                           material=material))
+    assert 'Stored turn s1' in text and '<svg class="above"' in text and 'jpeg' not in text
+
+
+def test_what_was_removed_is_told():
+    text = report_html(make_calibration('weak', rolling_shutter=Shutter(20.1, 0.4),
+                                        stabiliser=Stabiliser(31.0)))
+    assert 'rolling shutter of 20.1 ± 0.4 ms' in text and 'by up to 31 px' in text
+
+
+def test_the_truth_is_compared_where_it_is_known(drawn):
+    moved = dataclasses.replace(drawn.camera, fx=drawn.camera.fx + 3)
+    page = Page(report_html(drawn, NamedCamera('truth', moved)))
+    assert 'Against the truth' in page.text and re.search(r'fx [\d. px]+ -3\.00', page.text)
+
+
+# the lines to copy
+
+def test_the_address_is_that_of_the_file_that_is_written(tmp_path):
+    folder = tmp_path / 'a folder'
+    write_results(make_calibration(), folder)
+    line = copied((folder / 'report.html').read_text(), 'use-ros')
+    address = yaml.safe_load(line)['camera_info_url']
+    assert address.startswith('file:///')
+    path = Path(unquote(urlsplit(address).path))
+    assert yaml.safe_load(path.read_text())['image_width'] == 1242
+
+
+@pytest.mark.parametrize('model', EACH_MODEL)
+def test_the_lines_for_opencv_run(model):
+    calibration = calibration_of(EACH_MODEL[model])
+    scope = {'image': np.random.default_rng(1).integers(0, 255, (375, 1242), np.uint8)}
+    exec(copied(report_html(calibration), 'use-opencv'), scope)
+    assert np.abs(scope['straight'].astype(int)
+                  - calibration.undistort(scope['image'])).mean() < 0.1
+
+
+@pytest.mark.parametrize('model', EACH_MODEL)
+def test_the_line_for_colmap_is_colmap_s(model, tmp_path):
+    camera = EACH_MODEL[model]
+    words = shlex.split(copied(report_html(calibration_of(camera)), 'use-colmap'))
+    assert words[:2] == ['colmap', 'feature_extractor']
+    options = dict(zip(words[2::2], words[3::2], strict=True))
+    reader = pycolmap.ImageReaderOptions()
+    for name, value in options.items():
+        if name.startswith('--ImageReader.camera_'):
+            setattr(reader, name.removeprefix('--ImageReader.'), value)
+    (tmp_path / 'images').mkdir()
+    cv2.imwrite(str(tmp_path / 'images' / 'one.png'), np.zeros((375, 1242), np.uint8))
+    pycolmap.Database.open(tmp_path / 'database.db').close()
+    pycolmap.import_images(tmp_path / 'database.db', tmp_path / 'images',
+                           pycolmap.CameraMode.SINGLE, options=reader)
+    with pycolmap.Database.open(tmp_path / 'database.db') as database:
+        [found] = database.read_all_cameras()
+    assert found.model.name == camera.step2.name
+    ray = np.array([0.2, -0.1, 1.0])
+    np.testing.assert_allclose(found.img_from_cam(ray) - 0.5, camera.project(ray), atol=1e-3)
+
+
+# the lens
+
+def test_the_grid_is_straight_where_the_picture_is_undistorted():
+    camera = EACH_MODEL['radial']
+    image = np.random.default_rng(1).integers(0, 255, (375, 1242), np.uint8)
+    straight, bent, ruled, moved = undistorted(image, camera, 'same')
+    assert np.abs(straight.astype(int) - cv2.undistort(
+        image, camera.matrix, np.array(camera.ros_distortion()))).mean() < 1.5
+    assert ruled.count('L') == ruled.count('M') and bent.count('L') > 10 * ruled.count('M')
+    assert moved > 50
+
+
+def test_the_field_of_view_is_that_of_the_lens():
+    plain = dataclasses.replace(EACH_MODEL['radial'], k1=0.0, k2=0.0, cx=620.5, cy=187.0,
+                                fx=621.0, fy=187.5)
+    view = field_of_view(plain)
+    assert view.horizontal == pytest.approx(90) and view.vertical == pytest.approx(90)
+    assert view.diagonal > 90
+    assert field_of_view(EACH_MODEL['fisheye']).horizontal > 150

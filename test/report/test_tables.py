@@ -1,0 +1,129 @@
+"""The terminal's tables: what they show, within 80 columns."""
+from __future__ import annotations
+
+import dataclasses
+import io
+import re
+
+import pytest
+from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
+from rich.console import Console
+
+from dashcalib_ros.camera import Fisheye, Radial
+from dashcalib_ros.judgement import Verdict
+from dashcalib_ros.judgement.calibration import Shutter, Stabiliser
+from dashcalib_ros.report import NamedCamera, compare
+from dashcalib_ros.report.tables import against_truth, comparison, conclusion, summary
+from dashcalib_ros.solve.picture import PictureSigma
+
+
+def terminal(renderable, **options):
+    stream = io.StringIO()
+    Console(file=stream, width=80, **options).print(renderable)
+    return '\n'.join(line.rstrip() for line in stream.getvalue().splitlines())
+
+
+def test_the_terminal_shows_estimate_sigma_and_turns():
+    calibration = make_calibration('weak')
+    text = terminal(summary(calibration))
+    lines = text.splitlines()
+    assert any(re.search(r'fx\s+721\.54 px\s+± 3\.50 px\s+0\.49 %', line) for line in lines)
+    assert any(re.search(r'k1\s+-0\.3630\s+± 0\.0040\s+1\.10 %', line) for line in lines)
+    assert any(re.search(r'8\.8\s+58 to 118\s+91\.5\s+30 of 31\s+0\.46\s+yes', line)
+               for line in lines)
+    assert '300 frames, 1 of 2 turns used' in text
+    assert '20 % masked' in ' '.join(text.split())
+    assert '\x1b' not in text
+    # a bag's stamps are times of day; those of turns are told from the start on
+    late = [dataclasses.replace(turn, stamp_s=turn.stamp_s + 1.7e9) for turn in calibration.turns]
+    assert terminal(summary(dataclasses.replace(
+        calibration, turns=tuple(late), start_s=1.7e9))) == text
+
+
+def test_a_refused_summary_has_no_numbers_of_a_camera():
+    assert 'fx' not in terminal(summary(make_calibration('refused')))
+
+
+def test_the_conclusion_is_verdict_reasons_and_what_to_do():
+    assert terminal(conclusion(Verdict('weak', (
+        '28° of yaw in all turns; at least 60° needed: drive sharper turns',
+        'the zoom changes: fix the zoom', 'without cure'),
+        ('drive sharper turns', 'fix the zoom')))).splitlines() == [
+            'weak', '  28° of yaw in all turns; at least 60° needed', '  the zoom changes',
+            '  without cure', 'next: drive sharper turns']
+    last = terminal(conclusion(Verdict('accepted'))).splitlines()[-1]
+    assert last.startswith('next: ') and 'calibration.yaml' in last
+
+
+@pytest.mark.parametrize(('level', 'colour'), [('accepted', '32'), ('weak', '33'),
+                                               ('refused', '31')])
+def test_the_verdict_is_coloured_on_a_terminal(level, colour, monkeypatch):
+    monkeypatch.delenv('NO_COLOR', raising=False)
+    options = {'force_terminal': True, 'color_system': 'standard'}
+    text = terminal(conclusion(Verdict(level)), **options)
+    assert text.startswith(f'\x1b[1;{colour}m{level}\x1b[0m')
+    monkeypatch.setenv('NO_COLOR', '1')
+    assert f'{colour}m' not in terminal(conclusion(Verdict(level)), **options)
+
+
+def test_brackets_in_a_reason_are_text_and_no_markup():
+    assert '[red]x[/] [/nonsense]' in terminal(
+        conclusion(Verdict('weak', ('[red]x[/] [/nonsense]',))))
+
+
+@pytest.mark.parametrize('model', EACH_MODEL)
+def test_nothing_is_cut_within_80_columns(model):
+    calibration = calibration_of(EACH_MODEL[model], sigma_px=PictureSigma(10.41, 101.37),
+                                 rolling_shutter=Shutter(-20.1, 10.44),
+                                 stabiliser=Stabiliser(123.4))
+    long = dataclasses.replace(
+        calibration.turns[0], center=1_234_567, first=1_234_500, last=1_234_600,
+        stamp_s=123_456.7, yaw_deg=-123.4, images=123, registered=123,
+        reprojection_error_px=10.25)
+    calibration = dataclasses.replace(calibration, turns=(*calibration.turns, long),
+                                      frames=1_300_000)
+    lens = NamedCamera('mine', calibration.camera, calibration.sigma, 'accepted')
+    other = NamedCamera('truth', dataclasses.replace(calibration.camera, fx=1234.5))
+    for shown in (summary(calibration), comparison(compare(lens, other)),
+                  against_truth(compare(lens, other))):
+        text = terminal(shown)
+        assert '…' not in text and max(map(len, text.splitlines())) <= 80
+    assert '1234500 to 1234600' in terminal(summary(calibration))
+
+
+def test_comparisons_show_sigmas_only_where_known():
+    moved = dataclasses.replace(TRUTH, fx=TRUTH.fx + 7)
+    a, b = NamedCamera('mine', moved, SIGMA, 'weak'), NamedCamera('truth', TRUTH)
+    text = terminal(comparison(compare(a, b)))
+    assert re.search(r'fx\s+728\.54 px\s+721\.54 px\s+\+7\.0000\s+\+0\.970 %\s+2\.0', text)
+    assert 'A: mine (weak)' in text and re.search(r'mapping error: \d+\.\d\d px', text)
+    assert 'sigmas' not in terminal(comparison(compare(b, b)))
+
+
+def test_against_truth_has_error_in_percent_and_in_sigmas():
+    moved = dataclasses.replace(TRUTH, fx=TRUTH.fx + 7)
+    text = terminal(against_truth(compare(NamedCamera('a', moved, SIGMA),
+                                          NamedCamera('truth', TRUTH))))
+    assert re.search(r'fx\s+728\.54 px\s+± 3\.50 px\s+721\.54 px\s+\+0\.970 %\s+2\.0', text)
+
+
+def test_what_one_of_two_models_cannot_see_is_told():
+    wide = Fisheye((1280, 720), 390.0, 391.0, 630.0, 365.0)
+    pinhole = NamedCamera('pinhole', Radial((1280, 720), 390.0, 391.0, 630.0, 365.0))
+    text = terminal(comparison(compare(pinhole, NamedCamera('truth', wide))))
+    assert re.search(r'px, without the \d+ % of the picture that the radial model\scannot', text)
+    assert 'k1' not in text and 'cy' in text
+    assert 'without' not in terminal(comparison(compare(NamedCamera('truth', wide), pinhole)))
+
+
+def test_small_coefficients_differ_visibly():
+    lens = EACH_MODEL['brown']
+    moved = dataclasses.replace(lens, p1=lens.p1 + 0.00002)
+    text = terminal(comparison(compare(NamedCamera('a', moved), NamedCamera('b', lens))))
+    assert re.search(r'p1\s+0\.000360\s+0\.000340\s+\+0\.000020', text)
+
+
+def test_an_unknown_mapping_error_is_said_to_be_unknown():
+    folding = NamedCamera('f', dataclasses.replace(TRUTH, fx=300, fy=300, k1=-0.6, k2=0))
+    text = terminal(comparison(compare(NamedCamera('a', TRUTH), folding)))
+    assert 'mapping error: unknown' in text

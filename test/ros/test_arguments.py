@@ -1,0 +1,155 @@
+"""The command line: help, files of parameters, and where the calibration's file is."""
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.ros.arguments import check_files, help_text, parse, ros_arguments
+from dashcalib_ros.ros.camera_url import camera_info_path
+from dashcalib_ros.ros.settings import NodeConfig
+
+LIMIT = 60.0
+# ROS is not there, and nothing of it may be needed
+CODE = ("import sys; sys.modules['rclpy'] = None\n"
+        'from dashcalib_ros.ros import main; sys.exit(main(sys.argv[1:]))')
+
+
+def started(*arguments):
+    return subprocess.run([sys.executable, '-c', CODE, *arguments], capture_output=True,
+                          text=True, timeout=LIMIT, cwd=Path(__file__).parents[2],
+                          env={**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2])})
+
+
+@pytest.mark.parametrize('flag', ['--help', '-h'])
+def test_help_needs_no_ros_and_ends_with_0(flag):
+    done = started(flag)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.rstrip() == help_text().rstrip()
+
+
+def test_help_has_what_a_user_needs_in_80_columns():
+    text = help_text()
+    assert text.startswith('usage: ros2 run dashcalib_ros calibrator')
+    for words in ('image_raw', 'camera_info', '~/overlay/compressed', '/diagnostics', '~/save',
+                  'turns.wanted *', 'camera_info_url', 'example:', '--ros-args'):
+        assert words in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_arguments():
+    assert parse([]) == (False, False)
+    assert parse(['--lifecycle', '--ros-args', '-p', 'a:=b']) == (False, True)
+    assert parse(['--ros-args', '-p', 'help:=x', '--', '--help']) == (True, False)
+    assert ros_arguments(['--lifecycle', '--ros-args', '-r', 'a:=b']) == ['--ros-args', '-r',
+                                                                          'a:=b']
+    for wrong in (['image_raw:=/camera'], ['--ros-args', '-r', 'a:=b', '--', '/camera']):
+        with pytest.raises(ConfigError, match='go after --ros-args'):
+            parse(wrong)
+
+
+def test_a_wrong_argument_is_one_line():
+    done = started('/camera/image_raw')
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert "unknown argument '/camera/image_raw'" in done.stderr
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    (None, 'cannot read'),
+    ('{{{ no yaml', 'is not valid YAML'),
+    ('turns.wanted: 3\n', 'is no file of parameters'),
+    ('', 'is no file of parameters'),
+    ('/**:\n  turns.wanted: 3\n', "'ros__parameters:'"),
+    ('- 1\n', 'is no file of parameters'),
+])
+def test_a_bad_file_of_parameters_is_one_line(tmp_path, text, words):
+    path = tmp_path / 'parameters.yaml'
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match=words) as raised:
+        check_files(['--ros-args', '--params-file', str(path)])
+    assert str(path) in str(raised.value) and '\n' not in str(raised.value)
+
+
+def test_a_missing_file_of_parameters_ends_it_with_2(tmp_path):
+    done = started('--ros-args', '--params-file', str(tmp_path / 'missing.yaml'))
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert 'missing.yaml: it does not exist' in done.stderr
+
+
+@pytest.mark.parametrize('text', [
+    '/**:\n  ros__parameters:\n    turns.wanted: 3\n',
+    'front:\n  calibrator:\n    ros__parameters: {turns: {wanted: 3}}\n'])
+def test_good_files_of_parameters_pass(tmp_path, text):
+    path = tmp_path / 'parameters.yaml'
+    path.write_text(text)
+    check_files(['--ros-args', '--params-file', str(path)])
+
+
+# the calibration's file ----------------------------------------------------------------------
+
+@pytest.fixture(autouse=True)
+def homes(monkeypatch):
+    monkeypatch.setenv('HOME', '/home/someone')
+    monkeypatch.delenv('ROS_HOME', raising=False)
+
+
+@pytest.mark.parametrize(('url', 'path'), [
+    ('', '/home/someone/.ros/camera_info/front.yaml'),
+    ('file://${ROS_HOME}/camera_info/${NAME}.yaml', '/home/someone/.ros/camera_info/front.yaml'),
+    ('file:///data/${NAME}/camera.yaml', '/data/front/camera.yaml'),
+    ('FILE:///data/camera.yaml', '/data/camera.yaml'),
+    ('/data/camera.yaml', '/data/camera.yaml'),
+    ('~/camera.yaml', '/home/someone/camera.yaml'),
+    ('${ROS_HOME}/${NAME}.yaml', '/home/someone/.ros/front.yaml'),
+    # as camera_info_manager: a $ that begins no variable stays
+    ('file:///data/$5.yaml', '/data/$5.yaml'),
+])
+def test_urls_are_camera_info_managers_and_paths_are_taken_too(url, path):
+    assert camera_info_path(url, 'front') == Path(path)
+
+
+def test_ros_home_comes_first(monkeypatch):
+    monkeypatch.setenv('ROS_HOME', '/ros')
+    assert camera_info_path('', 'front') == Path('/ros/camera_info/front.yaml')
+
+
+def test_a_package_is_looked_up(monkeypatch, tmp_path):
+    pytest.importorskip('ament_index_python')
+    index = tmp_path / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    index.mkdir(parents=True)
+    (index / 'my_car').touch()
+    (tmp_path / 'share' / 'my_car').mkdir()
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    assert camera_info_path('package://my_car/config/${NAME}.yaml', 'front') == (
+        tmp_path / 'share' / 'my_car' / 'config' / 'front.yaml')
+    with pytest.raises(InputError, match='there is no package your_car; source its workspace'):
+        camera_info_path('package://your_car/a.yaml', 'front')
+    monkeypatch.delenv('AMENT_PREFIX_PATH')
+    with pytest.raises(InputError, match='there is no package my_car'):
+        camera_info_path('package://my_car/a.yaml', 'front')
+
+
+@pytest.mark.parametrize(('url', 'words'), [
+    ('ftp://host/camera.yaml', 'nothing can be kept at ftp://; use file:///'),
+    ('flash:///camera.yaml', 'nothing can be kept at flash://'),
+    ('file://camera.yaml', 'begins with /'),
+    ('file:///data/', 'names no file'),
+    ('package://my_car', 'names no file in a package'),
+    ('file:///data/${CAMERA}.yaml', r'there is no \$\{CAMERA\}'),
+    ('~nobody-of-this-name/camera.yaml', 'without ~'),
+])
+def test_other_urls_are_refused_with_the_cure(url, words):
+    with pytest.raises(InputError, match=words):
+        camera_info_path(url, 'front')
+
+
+def test_the_older_name_of_the_file_is_taken_but_not_both():
+    assert NodeConfig(camera_info_file='/a.yaml').calibration_url == '/a.yaml'
+    assert NodeConfig(camera_info_url='/b.yaml').calibration_url == '/b.yaml'
+    with pytest.raises(ConfigError, match='set only camera_info_url'):
+        NodeConfig(camera_info_file='/a.yaml', camera_info_url='/b.yaml')

@@ -1,0 +1,183 @@
+"""The node among other programs: QoS overrides, lifecycle, missing images, viewers."""
+from __future__ import annotations
+
+import json
+
+import pytest
+import yaml
+
+pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
+
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.qos import ReliabilityPolicy
+from ros_bench import (
+    CAMERA_FILE,
+    COMMAND,
+    OURS,
+    REPOSITORY,
+    SOON,
+    START,
+    NodeProcess,
+    image_message,
+    keep_file,
+    noise,
+    stream,
+)
+from sensor_msgs.msg import CompressedImage
+
+CONFIG = REPOSITORY / 'config'
+
+
+# QoS -----------------------------------------------------------------------------------------
+
+def test_qos_is_overridden_in_the_running_node(start_node, make_bench):
+    """Best-effort publishers: without the override the subscription would follow them."""
+    camera = make_bench(reliable=False)
+    node = start_node('-p', 'qos_overrides./camera_info.publisher.reliability:=best_effort',
+                      '-p', 'qos_overrides./image_raw.subscription.reliability:=reliable')
+    camera.until(lambda: camera.values.get('reliability') == 'reliable', node=node)
+    camera.spin(1.0)
+    asked, = camera.node.get_subscriptions_info_by_topic('/image_raw')
+    offered, = camera.node.get_publishers_info_by_topic('/camera_info')
+    assert asked.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    assert offered.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    # a reliable subscription does not hear this camera: the node tells why
+    camera.publish(image_message(noise(0), START))
+    node.wait_for('its publisher is best effort, which a reliable subscription does not hear')
+    assert camera.count('received') == 0 and 'Traceback' not in node.text
+
+
+@pytest.mark.parametrize(('override', 'words'), [
+    ('qos_overrides./camera_info.publisher.reliability:=perfect', 'best_effort'),
+    ('qos_overrides./camera_inf.publisher.depth:=3', 'did you mean qos_overrides./camera_info'),
+])
+def test_an_override_that_there_is_not_ends_it(start_node, override, words):
+    node = start_node('-p', override)
+    assert node.process.wait(SOON) == 2
+    assert words in node.text and len(node.text.splitlines()) == 1, node.text
+
+
+# missing images ------------------------------------------------------------------------------
+
+def test_it_says_which_images_there_are(start_node, make_bench):
+    make_bench(topic='front/image_raw', listen=False)
+    make_bench(topic='rear/image/compressed', image_type=CompressedImage, listen=False)
+    raw, compressed = start_node(), start_node(image_transport='compressed')
+    raw.wait_for('no images on /image_raw yet; publishers of sensor_msgs/Image: '
+                 '/front/image_raw; remap with -r image_raw:=/front/image_raw')
+    compressed.wait_for('no images on /image_raw/compressed yet; publishers of '
+                        'sensor_msgs/CompressedImage: /rear/image/compressed; remap with '
+                        '-r image_raw:=/rear/image')
+    assert 'WARN' not in raw.text + compressed.text
+
+
+# lifecycle -----------------------------------------------------------------------------------
+
+@pytest.fixture
+def managed(ros_context, make_bench, tmp_path):
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS)
+    camera = make_bench()
+    node = NodeProcess(tmp_path, command=[*COMMAND, '--lifecycle'])
+    yield node, camera
+    node.kill()
+
+
+def test_a_managed_node_listens_only_while_it_is_active(managed):
+    node, camera = managed
+
+    def ask(kind, name, request):
+        client = camera.node.create_client(kind, f'calibrator/{name}')
+        camera.until(client.service_is_ready, node=node)
+        future = client.call_async(request)
+        camera.until(future.done, node=node)
+        camera.node.destroy_client(client)
+        return future.result()
+
+    def change(transition):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert ask(ChangeState, 'change_state', request).success
+
+    camera.until(lambda: camera.latched, node=node)
+    change(Transition.TRANSITION_CONFIGURE)
+    camera.until(lambda: camera.status and 'inactive' in camera.status.message, node=node)
+    assert camera.images.get_subscription_count() == 0
+    change(Transition.TRANSITION_ACTIVATE)
+    camera.connect(node)
+    stream(camera, 3)
+    camera.until(lambda: len(camera.infos) == 3, node=node)
+    change(Transition.TRANSITION_DEACTIVATE)
+    camera.until(lambda: camera.images.get_subscription_count() == 0, node=node)
+    change(Transition.TRANSITION_CLEANUP)
+    assert ask(GetState, 'get_state', GetState.Request()).current_state.id == (
+        State.PRIMARY_STATE_UNCONFIGURED)
+    # it begins anew, with the kept calibration
+    change(Transition.TRANSITION_CONFIGURE)
+    change(Transition.TRANSITION_ACTIVATE)
+    camera.connect(node)
+    stream(camera, 3, 10)
+    camera.until(lambda: len(camera.infos) == 6, node=node)
+    assert node.stop() == 0 and 'Traceback' not in node.text
+
+
+# viewers -------------------------------------------------------------------------------------
+
+def topics_of(text):
+    return {part.partition('.')[0] for part in text}
+
+
+def foxglove_topics(layout):
+    """Return the topics of a layout's panels."""
+    found = set()
+    for panel in layout['configById'].values():
+        found |= {panel.get('topicToRender'), panel.get('imageMode', {}).get('imageTopic')}
+        found |= topics_of(path['value'] for path in panel.get('paths', ()))
+    return found - {None}
+
+
+def panels_in(place):
+    return {place} if isinstance(place, str) else (
+        panels_in(place['first']) | panels_in(place['second']))
+
+
+def test_viewers_show_topics_that_there_are(start_node, make_bench):
+    layout = json.loads((CONFIG / 'foxglove_layout.json').read_text())
+    displays = yaml.safe_load((CONFIG / 'dashcalib.rviz').read_text())[
+        'Visualization Manager']['Displays']
+    in_foxglove = foxglove_topics(layout)
+    in_rviz = {each['Topic']['Value'] for each in displays}
+    camera, node = make_bench(), start_node()
+    camera.connect(node)
+    published = {name for name, _ in camera.node.get_publisher_names_and_types_by_node(
+        'calibrator', '/')}
+    heard = {name for name, _ in camera.node.get_subscriber_names_and_types_by_node(
+        'calibrator', '/')}
+    assert in_foxglove <= published | heard and in_rviz <= published | heard
+    pictures = {'/image_raw', '/calibrator/overlay/compressed', '/calibrator/rectified/compressed'}
+    assert in_rviz == pictures
+    assert in_foxglove == pictures | {'/diagnostics', '/calibrator/turn_magnitude', '/rosout'}
+
+
+def test_the_layout_for_foxglove_places_each_panel_once():
+    """As the program's own exports: panels by id, TYPE!name, and a tree of their places."""
+    layout = json.loads((CONFIG / 'foxglove_layout.json').read_text())
+    assert set(layout) == {'configById', 'globalVariables', 'userNodes', 'playbackConfig',
+                           'layout'}
+    assert panels_in(layout['layout']) == set(layout['configById'])
+    kinds = sorted(name.partition('!')[0] for name in layout['configById'])
+    assert kinds == ['DiagnosticStatusPanel', 'Image', 'Image', 'Image', 'Plot', 'RosOut',
+                     'StateTransitions']
+    for name, panel in layout['configById'].items():
+        # a path without them draws nothing
+        assert all(path['timestampMethod'] == 'receiveTime' for path in panel.get('paths', ()))
+        assert name.startswith('Plot') is False or panel['paths'][0]['enabled']
+
+
+def test_the_configuration_for_rviz_has_what_rviz_writes():
+    data = yaml.safe_load((CONFIG / 'dashcalib.rviz').read_text())
+    assert {'Panels', 'Visualization Manager', 'Window Geometry'} <= set(data)
+    manager = data['Visualization Manager']
+    assert {'Class', 'Displays', 'Global Options', 'Tools', 'Views'} <= set(manager)
+    for each in manager['Displays']:
+        assert each['Class'] == 'rviz_default_plugins/Image' and each['Enabled']
+        assert each['Topic']['Reliability Policy'] in ('Reliable', 'Best Effort')

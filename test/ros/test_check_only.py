@@ -1,0 +1,258 @@
+"""The node that only checks a driver's calibration, and the watch over one in use.
+
+The real node in this process, between real publishers; turns, and what they say, come by command.
+"""
+from __future__ import annotations
+
+import json
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from fakes import stands_in_for
+
+pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
+
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_desk import FIRST, SIGMA
+from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import Header, String
+
+from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.checking import Check, Reading, watch
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+from dashcalib_ros.ros import learner, node
+from dashcalib_ros.ros.messages import camera_info, given_camera
+from dashcalib_ros.ros.settings import NodeConfig
+from dashcalib_ros.ros.stream import LASTING
+from dashcalib_ros.turns import TurnId
+
+TOPIC = '/camera_info'
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+ZERO = np.zeros((6, 6))
+
+
+@stands_in_for(Calibrator)
+class Core:
+    """In the Calibrator's place: its turns are made by command, and show a focal length of 400."""
+
+    newest: ClassVar[Core]
+
+    def __init__(self, config=None, mask=None, verbose=False, live=False, use_stored=True,
+                 warn=None, inline=False, on_trouble=None):
+        self.ready, self.strangers = (), ()
+        Core.newest = self
+
+    def push(self, frame):
+        return self.status()
+
+    def status(self):
+        return Status(1, len(self.ready), len(self.ready), 60.0 * len(self.ready), 0.1, False,
+                      self.ready, 0, (60.0,) * len(self.ready), self.ready)
+
+    def calibrate(self, progress=None, final=True):
+        turns = tuple(TurnSummary(turn.number, 0, 0, 0.0, 0.1, 1, 1, True, misfit=1.0)
+                      for turn in self.ready)
+        return Calibration(Verdict('accepted'), (320, 240), FIRST, SIGMA, turns, 10, 0.3, {}, {},
+                           Config())
+
+    def check(self, given, calibration, progress=None):
+        right = given.fx == calibration.camera.fx
+        return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
+
+    def watch(self, camera, sigma=None):
+        return watch((Reading(turn, ZERO, ZERO[0], None, turn not in self.strangers)
+                      for turn in self.ready), camera, sigma or {}, Config().monitor)
+
+    def want(self, turns):
+        pass
+
+    def reject(self, turns):
+        pass
+
+    def close(self):
+        pass
+
+    def clear_store(self):
+        pass
+
+
+@pytest.fixture
+def desk(make_desk, monkeypatch):
+    """Make a node with such a core; with a driver and a reader of ~/check beside it."""
+    monkeypatch.setattr(learner, 'Calibrator', Core)
+    monkeypatch.setattr(learner, 'LOOK_S', 0.05)
+    monkeypatch.setattr(node, 'PERIOD_S', 0.1)
+
+    def make(**parameters):
+        desk = make_desk(**{'turns.wanted': 2, **parameters})
+        if parameters:
+            desk.driver = desk.bench.node.create_publisher(
+                CameraInfo, 'camera_info',
+                QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT))
+        return desk
+    return make
+
+
+def drive(desk, info, until):
+    """Publish a camera_info until something holds."""
+    def published():
+        desk.driver.publish(info)
+        return until()
+    desk.until(published)
+
+
+def turns(*centers):
+    return tuple(TurnId.at(center) for center in centers)
+
+
+def info_of(camera=FIRST, **changes):
+    message = camera_info(camera, Header(frame_id='camera'), 'same')
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def other(fx):
+    values = [*info_of().k]
+    values[0] = fx
+    return info_of(k=values)
+
+
+def answers(desk):
+    """Return what a reader that comes now hears on ~/check, decoded."""
+    heard = []
+    desk.bench.node.create_subscription(
+        String, 'calibrator/check', lambda message: heard.append(json.loads(message.data)),
+        LATCHED)
+    return heard
+
+
+def test_a_right_calibration_is_called_right_and_nothing_else_is_done(desk, capfd):
+    desk = desk(check_only='true')
+    Core.newest.ready = turns(10, 20)
+    desk.until(lambda: f'no camera_info on {TOPIC} yet' in desk.bench.status.message)
+    assert desk.bench.status.level == b'\x01' and desk.bench.values['state'] == 'checking'
+    assert not desk.call('calibrate').success and not desk.call('save').success
+    drive(desk, info_of(), lambda: desk.bench.values['check'] == 'right')
+    desk.until(lambda: desk.bench.status.level == b'\x00')
+    heard = answers(desk)
+    desk.until(lambda: heard)
+    assert heard[-1]['answer'] == 'right' and heard[-1]['changes'] == []
+    assert (heard[-1]['reasons'], heard[-1]['rms_px']) == (['fx 400'], 0.5)
+    assert f'the calibration on {TOPIC} is right: fx 400' in capfd.readouterr().err
+    published = {name for name, _ in desk.bench.node.get_publisher_names_and_types_by_node(
+        'calibrator', '/')}
+    assert '/calibrator/check' in published
+    assert not {TOPIC, '/calibrator/calibration'} & published
+    assert not desk.file.exists() and desk.bench.values['published'] == 'nothing'
+
+
+def test_a_wrong_one_warns_until_the_driver_has_another(desk, capfd):
+    desk = desk(check_only='true')
+    heard = answers(desk)
+    drive(desk, other(440.0), lambda: heard)
+    assert heard[-1]['answer'] == 'cannot tell' and 'not there yet' in heard[-1]['reasons'][0]
+    Core.newest.ready = turns(10, 20)
+    desk.until(lambda: desk.bench.values['check'] == 'wrong')
+    desk.until(lambda: heard[-1]['answer'] == 'wrong')
+    assert desk.bench.status.level == b'\x01'
+    assert 'the calibration is wrong: fx 440' in desk.bench.status.message
+    said = [line for line in capfd.readouterr().err.splitlines() if ' is wrong: ' in line]
+    assert len(said) == 1 and said[0].startswith('[WARN]')
+    # a single stray changes nothing; a lasting change is checked anew, with turns of its own
+    for _ in range(LASTING - 1):
+        desk.driver.publish(info_of())
+    desk.until(lambda: desk.bench.values['other_calibrations'] != '0')
+    assert heard[-1]['answer'] == 'wrong'
+    drive(desk, info_of(), lambda: heard[-1]['answer'] == 'cannot tell')
+    assert 'it is checked anew' in capfd.readouterr().err
+    Core.newest.ready = turns(30, 40)
+    desk.until(lambda: heard[-1]['answer'] == 'right')
+
+
+def test_a_calibration_for_other_images_is_told_and_checked(desk, capfd):
+    desk = desk(check_only='true')
+    drive(desk, info_of(width=640, height=480),
+          lambda: 'is for 640x480, and the images are 320x240' in desk.bench.status.message)
+    assert desk.bench.status.level == b'\x01' and '640x480' in capfd.readouterr().err
+    Core.newest.ready = turns(10, 20)
+    desk.until(lambda: desk.bench.values['check'] == 'right')
+    assert desk.bench.values['failed_watches'] == '0'
+
+
+def test_a_camera_that_is_exchanged_is_told(desk, capfd):
+    desk = desk(check_only='true', **{'turns.wanted': 5})
+    heard = answers(desk)
+    drive(desk, info_of(), lambda: heard)
+    core = Core.newest
+    core.strangers = turns(20, 30)
+    core.ready = turns(10, 20)
+    desk.until(lambda: 'does not explain' in desk.bench.values['suspected change'])
+    assert desk.bench.values['change'] == '' and heard[-1]['changes'] == []
+    assert 'does not explain' not in capfd.readouterr().err
+    core.ready = turns(10, 20, 30)
+    desk.until(lambda: heard[-1]['changes'])
+    text, = heard[-1]['changes']
+    assert 'does not explain the pictures since the turn at frame 20' in text
+    desk.until(lambda: desk.bench.values['change'] == text)
+    assert desk.bench.status.level == b'\x01' and desk.bench.status.message == text
+    assert capfd.readouterr().err.count(text) == 1
+    # after a reset, one turn is a suspicion again
+    assert desk.call('reset').success
+    desk.until(lambda: heard[-1]['changes'] == [])
+    Core.newest.ready = Core.newest.strangers = turns(50)
+    desk.until(lambda: 'frame 50' in desk.bench.values['suspected change'])
+    assert desk.bench.values['change'] == ''
+
+
+def test_a_change_of_an_own_calibration_is_told_until_another_is_adopted(desk, capfd):
+    desk = desk()
+    desk.give()
+    desk.until(lambda: desk.bench.values['state'] == 'calibrated')
+    core = Core.newest
+    core.ready = core.strangers = turns(10, 20)
+    desk.until(lambda: desk.bench.values['change'])
+    assert desk.bench.status.level == b'\x01' and desk.show() == 400.0
+    lines = [line for line in capfd.readouterr().err.splitlines() if 'does not explain' in line]
+    assert len(lines) == 1 and lines[0].startswith('[WARN]')
+    desk.give(sigma={**SIGMA, 'fx': 1.0})
+    desk.until(lambda: desk.bench.values['change'] == '')
+    assert desk.bench.status.level == b'\x00'
+
+
+@pytest.mark.parametrize(('changes', 'words'), [
+    ({'k': [0.0] * 9}, 'uncalibrated'),
+    ({'d': [float('nan')] * 5}, 'not finite'),
+    ({'binning_x': 2}, 'binning'),
+    ({'width': 0}, 'width'),
+    ({'distortion_model': 'rational_polynomial', 'd': [0.1] * 8}, 'rational_polynomial'),
+    ({'k': [400.0, 0.0, 160.0, 0.0, -1.0, 120.0, 0.0, 0.0, 1.0]}, 'focal length')])
+def test_a_calibration_that_cannot_be_used_is_refused_in_one_line(changes, words):
+    with pytest.raises(InputError, match=words) as raised:
+        given_camera(info_of(**changes), TOPIC)
+    assert TOPIC in str(raised.value) and '\n' not in str(raised.value)
+
+
+def test_an_uncalibrated_driver_is_told(desk):
+    desk = desk(check_only='true')
+    heard = answers(desk)
+    drive(desk, CameraInfo(), lambda: heard)
+    assert heard[-1]['answer'] == 'cannot tell' and 'uncalibrated' in heard[-1]['reasons'][0]
+    desk.until(lambda: 'uncalibrated' in desk.bench.status.message)
+    Core.newest.ready = turns(10, 20)
+    drive(desk, info_of(), lambda: heard[-1]['answer'] == 'right')
+
+
+def test_it_is_fixed_at_the_start_and_no_calibration_is_committed(desk):
+    with pytest.raises(ConfigError, match='commit'):
+        NodeConfig(check_only=True, commit=True)
+    desk = desk(check_only='true')
+    refused = desk.node.set_parameters_atomically([Parameter('commit', value=True)])
+    assert not refused.successful and 'check_only' in refused.reason
+    refused = desk.node.set_parameters_atomically([Parameter('check_only', value=False)])
+    assert not refused.successful and 'read-only' in refused.reason

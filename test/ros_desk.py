@@ -1,0 +1,84 @@
+"""The real node in the tests' own process, between real publishers."""
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from ros_bench import START, Bench, image_message
+from std_srvs.srv import Trigger
+
+from dashcalib_ros.camera import Radial
+from dashcalib_ros.config import Config
+from dashcalib_ros.judgement import Calibration, Verdict
+from dashcalib_ros.ros.news import Result
+from dashcalib_ros.ros.node import CalibratorNode
+
+FIRST = Radial((320, 240), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
+SIGMA = {'fx': 2.0, 'fy': 2.0, 'cx': 2.0, 'cy': 2.0, 'k1': 0.01, 'k2': 0.01}
+STAMPS = iter(range(START, START + 10**12, 10**8))
+
+
+class Desk:
+    """The node and a bench, spun in turns."""
+
+    def __init__(self, context, home, **parameters):
+        arguments = ['--ros-args', '-p', f'camera_info_url:={home}/camera.yaml']
+        for name, value in parameters.items():
+            arguments += ['-p', f'{name}:={value}']
+        rclpy.init(args=['calibrator', *arguments])
+        self.file = home / 'camera.yaml'
+        self.node = CalibratorNode()
+        self.spinner = SingleThreadedExecutor()
+        self.spinner.add_node(self.node)
+        self.bench = Bench(context)
+        self.until(lambda: self.bench.images.get_subscription_count() > 0
+                   and self.bench.values.get('reliability') == 'reliable')
+        self.show()
+
+    def until(self, condition):
+        def spun():
+            self.spinner.spin_once(timeout_sec=0.01)
+            return condition()
+        return self.bench.until(spun)
+
+    def give(self, level='accepted', complete=True, sigma=SIGMA, warnings=(), **changes):
+        """Let the learner's thread come up with a calibration."""
+        camera = dataclasses.replace(FIRST, **changes) if level != 'refused' else None
+        calibration = Calibration(
+            Verdict(level, () if level == 'accepted' else ('few turns',)), (320, 240), camera,
+            sigma if camera else None, (), 10, 0.3, {}, {}, Config(), warnings=warnings)
+        result = Result(calibration, complete, self.node._learner.bank)
+        done = []
+        self.node._later(lambda: self.node._on_result(result))
+        self.node._later(lambda: done.append(True))
+        self.until(lambda: done)
+
+    def show(self):
+        """Publish an image; return the fx of its camera_info, None if there is none."""
+        before, received = len(self.bench.infos), self.bench.count('received')
+        message = image_message(black(), next(STAMPS))
+        self.bench.images.publish(message)
+        self.until(lambda: self.bench.count('received') > received)
+        infos = self.bench.infos[before:]
+        return infos[0].k[0] if infos else None
+
+    def call(self, name):
+        """Call a service of the node."""
+        client = self.bench.node.create_client(Trigger, f'calibrator/{name}')
+        self.until(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
+        self.bench.node.destroy_client(client)
+        return future.result()
+
+    def close(self):
+        self.bench.close()
+        self.spinner.shutdown()
+        self.node.close()
+        rclpy.try_shutdown()
+
+
+def black():
+    return np.zeros((240, 320), np.uint8)

@@ -1,0 +1,86 @@
+"""docs/troubleshooting.md has every message of the code, and none that there is not."""
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from messages import PACKAGE, messages_in
+
+DOCUMENT = Path(__file__).parents[1] / 'docs' / 'troubleshooting.md'
+EXPLAINED = ('judgement', 'selection.py', 'inputs.py', 'frames', 'bags', 'motion', 'turns',
+             'turn_store.py', 'workers', 'cli/run.py')
+# texts that are no messages: parts of others that are shown with them, SQL, code
+PARTS = {
+    'judgement/calibration.py': {'Calibration(…, …, …)'},
+    'judgement/conclude.py': {'…, with … times the error of a camera of its own'},
+    'judgement/verdict.py': {'the turn… at frame …', '… turn… of earlier drives'},
+    'inputs.py': {' (and … more like it)'},
+    'frames/joined.py': {' (and … more like it)'},
+    'bags/camera_info.py': {
+        "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"},
+    'bags/salvage.py': {'… does not start like a bag', '… has a broken chunk (…)'},
+    'bags/source.py': {'… images; how many are lost is not known', '… (…, … images…)',
+                       '… of … images; … are lost', '… of … images; none is lost'},
+    'bags/storage.py': {
+        "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
+        'copy it again or record it again', 'the index does not lead to all messages'},
+    'bags/unpack.py': {'a part of the bag', 'a packed part is cut off'},
+    'bags/write.py': {'compressed must be jpeg, png or None, not …'},
+    'turns/turn.py': {'the turn at frame …'},
+    'turn_store.py': {
+        'it is too large when unpacked', 'it is no stored turn', 'it is too large',
+        'it has format …, this version has …', 'its numbers are no valid scene',
+        'it is no regular file', 'it is compressed in an unknown way',
+        'set turns.store to a folder you may write to', '… is smaller than its header says'},
+    'cli/run.py': {'written: … with … messages on …'},
+    'workers/child.py': {'used no processor time for … s'},
+    'workers/inline.py': {' in the environment before Python starts'},
+    'workers/pool.py': {'…; … is tried again'},
+}
+NO_MESSAGE = re.compile(r'\s*(SELECT|PRAGMA|import) ')
+MODULES = sorted(path for name in EXPLAINED for path in
+                 ([PACKAGE / name] if name.endswith('.py') else (PACKAGE / name).glob('*.py')))
+
+
+def document():
+    return DOCUMENT.read_text('utf-8')
+
+
+def entries():
+    """Return the beginnings of messages, from the first column of the tables."""
+    return re.findall(r'^\| `([^`]+)` \|', document(), re.MULTILINE)
+
+
+def is_explained(message):
+    """Tell whether a message begins like an entry, or is what the document says to do."""
+    return any(message.startswith(entry) for entry in entries()) or message in document()
+
+
+@pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_every_message_is_explained(path):
+    name = str(path.relative_to(PACKAGE))
+    missing = [text for text in messages_in(path)
+               if text not in PARTS.get(name, ()) and not NO_MESSAGE.match(text)
+               and not is_explained(text)]
+    assert missing == []
+
+
+def test_what_is_explained_is_in_the_code():
+    texts = [text for path in MODULES for text in messages_in(path)]
+    assert [entry for entry in entries()
+            if not any(text.startswith(entry) for text in texts)] == []
+
+
+def test_the_exceptions_are_in_the_code():
+    for name, parts in PARTS.items():
+        assert parts <= set(messages_in(PACKAGE / name)), name
+
+
+def test_a_message_without_an_entry_would_be_noticed(tmp_path):
+    module = tmp_path / 'module.py'
+    module.write_text('"""Not this docstring of several words."""\n'
+                      'x = f"the wheel number {n} has " f"come off: {why}"\ny = "a few words"\n')
+    assert messages_in(module) == ['the wheel number … has come off: …']
+    assert not is_explained('the wheel number … has come off: …')
+    assert is_explained('only … of at least … turns could be used')
