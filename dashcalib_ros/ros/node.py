@@ -68,7 +68,7 @@ class CalibratorNode(Node):
         self._magnitude = make_publisher(self, Float64, '~/turn_magnitude', QoSProfile(depth=10))
         self._preview = Preview(self, self._own, self._core.rectified,
                                 lambda error: self._later(
-                                    lambda: self._complaints.failure('preview', error)))
+                                    lambda: self._failed('preview', error)))
         self._intake = Intake(self._core.motion.rate, self._complaints, self._on_source)
         # not the ROS clock: diagnostics must also be published while a simulation is paused
         self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -110,8 +110,13 @@ class CalibratorNode(Node):
         self.destroy_node()
 
     def survive(self, error: Exception) -> None:
-        """Log and count what a callback raised."""
-        self._complaints.failure('failed_callbacks', error)
+        """Log and count what a callback raised, unless the context was shut down meanwhile."""
+        self._failed('failed_callbacks', error)
+
+    def _failed(self, kind: str, error: Exception) -> None:
+        # a callback that is at work while the node is stopped may raise nearly anything
+        if self.context.ok():
+            self._complaints.failure(kind, error)
 
     def blocked(self) -> bool:
         """Return whether rclpy calls no callback any more, after an exception of its own."""

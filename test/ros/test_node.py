@@ -385,7 +385,11 @@ def test_a_parameter_of_no_type_is_logged_once_and_the_node_goes_on(start_node, 
 
 # callbacks that fail, and an rclpy that is left in the middle of one
 FAILING = '''
+import os
+import signal
 import sys
+import time
+from std_msgs.msg import Float64
 from dashcalib_ros.ros import main, node
 kind = sys.argv.pop(1)
 class Node(node.CalibratorNode):
@@ -396,6 +400,13 @@ class Node(node.CalibratorNode):
         if kind == 'stuck':
             self._mail.wake.callback_group.ending_execution = lambda entity: None
             raise ZeroDivisionError('odd image')
+        if kind == 'stopped':
+            self._later(self.publish_while_stopped)
+    def publish_while_stopped(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        while self.context.ok():
+            time.sleep(0.01)
+        self._magnitude.publish(Float64())
     def _on_tick(self):
         if kind == 'timer' and self._intake.received == 2:
             raise ZeroDivisionError('odd tick')
@@ -418,6 +429,19 @@ def test_a_callback_that_fails_is_survived(ros_context, make_bench, tmp_path, ki
         camera.counted('received', 4, node)
         camera.counted('failed_callbacks', 1, node)
         assert node.text.count('Traceback') == 1 and node.stop() == 0
+    finally:
+        node.kill()
+
+
+def test_a_callback_at_work_while_the_node_is_stopped_is_no_failure(
+        ros_context, make_bench, tmp_path):
+    node = NodeProcess(tmp_path, command=[sys.executable, '-c', FAILING, 'stopped'])
+    try:
+        camera = make_bench()
+        camera.connect(node)
+        stream(camera, 1)
+        assert node.process.wait(SOON) == 0
+        assert 'Traceback' not in node.text and 'goes on' not in node.text
     finally:
         node.kill()
 
