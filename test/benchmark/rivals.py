@@ -199,7 +199,7 @@ def _colmap(task: Task, windows: Sequence[Turn]) -> dict[str, Any]:
         focal, cx, cy, k1, k2 = next(iter(model.cameras.values())).params
         # COLMAP has the first pixel's centre at (0.5, 0.5)
         estimate = {'fx': focal, 'fy': focal, 'cx': cx - 0.5, 'cy': cy - 0.5, 'k1': k1, 'k2': k2}
-        row['models'].append({'registered': model.num_reg_images(),
+        row['models'].append({'registered': model.num_reg_images(), 'camera': estimate,
                               **errors(estimate, task.truth)})
     if not row['models']:
         return {**row, 'registered': 0, 'reasons': ['no model']}
