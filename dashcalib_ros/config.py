@@ -267,6 +267,9 @@ class VerdictConfig:
     max_line_move: float = expert(
         0.001, 'of the width; only if that k1 moves the picture by more: less does no harm',
         0.0, 1.0)
+    max_model_sigmas: float = expert(
+        2.0, 'over the picture; a model asked for, but farther from what turns choose, is weak',
+        0.0, 1e6)
     max_misfit: float = expert(
         2.0, "times a turn's cost with a camera of its own; more is weak: another lens", 1.0, 1e4)
 

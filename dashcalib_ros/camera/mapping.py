@@ -99,10 +99,13 @@ def sensitivity(camera: Camera) -> tuple[Floats, Floats]:
     return (flat - by_rotation @ rotation).reshape(by_params.shape), pixels
 
 
-def as_model(camera: Camera, model: type[Camera]) -> Camera:
-    """Return the camera of another model that maps rays most alike; fitted, not exact."""
+def as_model(camera: Camera, model: type[Camera], pixels: Floats | None = None) -> Camera:
+    """Return the camera of another model that maps rays most alike; fitted, not exact.
+
+    pixels: (n, 2) where; None: all over the picture.
+    """
     from scipy.optimize import least_squares
-    pixels = grid_of(camera)
+    pixels = grid_of(camera) if pixels is None else pixels
     rays = camera.rays(pixels)
     known = np.isfinite(rays[:, 0])
     pixels, rays = pixels[known], rays[known]

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from dashcalib_ros.camera import MODELS
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.judgement.agreement import (
     focal_disagreement,
@@ -244,6 +245,25 @@ def _folds_over(solution: Solution, config: VerdictConfig) -> Finding | None:
                    'fisheye for a wide lens')
 
 
+def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Compare a model that was asked for with the one that the turns would have chosen.
+
+    Where nothing was seen, as near the corners, only the model says how the lens goes on there:
+    the sigma over the picture knows nothing of that.
+    """
+    own = next((each for each in solution.tried if each.model == solution.camera.model), None)
+    chosen = next((each for each in solution.tried if each.chosen), None)
+    # a model that has the chosen one in it is as right, and its sigma knows what it asks more
+    if own is None or chosen is None or isinstance(solution.camera, MODELS[chosen.model]):
+        return None
+    apart = own.apart_px
+    if apart is not None and apart <= config.max_model_sigmas * solution.picture.rms:
+        return None
+    far = f'{apart:.1f} px' if apart is not None else 'far'
+    return Finding('weak', f'the turns ask for a lens of the model {chosen.model}, not '
+                           f'{own.model}, and that one is {far} away', 'leave --model away')
+
+
 def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> Finding | None:
     """Poles and the edges of houses must be straight: nothing of this comes from motion."""
     moved = lines.picture_px / solution.camera.image_size[0]
@@ -271,5 +291,5 @@ ENOUGH: tuple[Rule, ...] = (
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
     _turns_disagree, _other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,
-    _folds_over)
+    _folds_over, _other_model)
 RULES = (*ENOUGH, *SOUND)

@@ -25,13 +25,14 @@ class Candidate:
 
     loses_by: how much worse than the chosen model it foretells the turns left out: the sum of the
     robust squared errors, in units of the noise of a track; 0 for the chosen one, negative for one
-    that does better, but not clearly. apart_px: how
-    far its camera is from the chosen one over the picture; None where they cannot be compared.
+    that does better, but not clearly. apart_px: how far its camera is from the chosen one over the
+    picture; None where they cannot be compared. chosen: it is the one that the turns choose.
     """
 
     model: str
     loses_by: float
     apart_px: float | None = None
+    chosen: bool = False
 
 
 def held_out_costs(scenes: Sequence[Scene], camera: Camera, parts: Sequence[Information],

@@ -15,7 +15,7 @@ from dashcalib_ros.solve.fitting import adapted_to
 from dashcalib_ros.solve.focal import kinds_of_lenses, nearest_start, profile_around, summed
 from dashcalib_ros.solve.information import covariance
 from dashcalib_ros.solve.misfit import misfits
-from dashcalib_ros.solve.model_choice import chosen_of, with_model_chosen
+from dashcalib_ros.solve.model_choice import chosen_of, compared_with_others, with_model_chosen
 from dashcalib_ros.solve.prior import (
     bounds_of,
     extra_sigma_of,
@@ -78,6 +78,9 @@ def solve(separate: Sequence[Scene], config: Config,
         progress('choosing the lens model', 0.0)
         result, others = with_model_chosen(result, full_scenes, config)
         tried = _merged(tried, others)
+    else:
+        progress('comparing the lens model with others', 0.0)
+        tried = compared_with_others(result, full_scenes, config)
     progress('trying other focal lengths', 0.0)
     around = profile_around(result.fit.scenes, result.fit.camera, start.profile, config)
     progress('estimating the uncertainty', 0.0)

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from dashcalib_ros.camera import Camera, larger_models
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera import MODELS, Camera, larger_models
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.config import Config
+from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.solve.choice import (
     Candidate,
     gain_of_wider_model,
@@ -24,6 +26,8 @@ from dashcalib_ros.solve.steps import ByTurn, Result, is_rolling, step2
 
 # a lens with p1, p2 of 0.003 looks like a shutter of 3 ms
 SHORT_READOUT_S = 0.008
+# of tracks, at least, where another model is made to map alike
+PLACES = 500
 
 
 def with_model_chosen(first: Result, full_scenes: ByTurn, config: Config
@@ -45,6 +49,31 @@ def with_model_chosen(first: Result, full_scenes: ByTurn, config: Config
     if model is type(camera):
         return first, tried
     return _without_shutter(first, model, full_scenes, config) or first, tried
+
+
+def compared_with_others(asked: Result, full_scenes: ByTurn, config: Config
+                         ) -> tuple[Candidate, ...]:
+    """Return how a model that was asked for compares with all others, with a part of the tracks.
+
+    Empty where one turn is all there is, or no other model explains the turns.
+    """
+    if len(asked.parts) < 2:
+        return ()
+    few, measured = _few(asked, full_scenes, config)
+    camera = asked.fit.camera
+    larger = larger_models(camera)
+    found = [_refitted(few, type(camera), measured, config)]
+    if found[0] is None:
+        return ()
+    for model in MODELS.values():
+        if model is not type(camera):
+            fitted = _without_shutter if model in larger else _refitted
+            found.append(fitted(few, model, measured, config))
+    chosen, tried = chosen_of([result for result in found if result is not None], config)
+    # the result is adjusted with all tracks
+    apart_px = mapping_error(camera, chosen.fit.camera)
+    return tuple(replace(each, apart_px=apart_px) if each.model == camera.model else each
+                 for each in tried)
 
 
 def chosen_of(results: Sequence[Result], config: Config) -> tuple[Result, tuple[Candidate, ...]]:
@@ -77,7 +106,7 @@ def chosen_of(results: Sequence[Result], config: Config) -> tuple[Result, tuple[
     chosen = results[best]
     return chosen, tuple(Candidate(
         result.fit.camera.model, sum(gains[best].values()) - sum(gains[n].values()),
-        mapping_error(result.fit.camera, chosen.fit.camera))
+        mapping_error(result.fit.camera, chosen.fit.camera), result is chosen)
         for n, result in enumerate(results))
 
 
@@ -126,10 +155,12 @@ def _refitted(first: Result, model: type[Camera], full_scenes: ByTurn, config: C
     """Return the result with another model, None where it does not explain all turns."""
     camera = first.fit.camera
     if type(camera) is not model:
-        camera = as_model(camera, model)
+        # where nothing was seen the first one may be far off, and must not draw the other there
+        camera = as_model(camera, model, _seen(first.fit.scenes))
     step1 = camera
     if model.ros_model == first.step1.ros_model:
-        step1 = model.centred(camera.image_size, first.step1.fx, *first.step1.params[4:])
+        distortion = first.step1.params[4:len(model.names())]
+        step1 = model.centred(camera.image_size, first.step1.fx, *distortion)
     scenes = retriangulate_all(first.fit.scenes, camera, config.scene)
     if len(scenes) < len(first.fit.scenes):
         return None
@@ -137,6 +168,12 @@ def _refitted(first: Result, model: type[Camera], full_scenes: ByTurn, config: C
     if len(fit.scenes) < len(first.fit.scenes):
         return None
     return Result(fit, step1, config.intrinsics)
+
+
+def _seen(scenes: Sequence[Scene]) -> Floats:
+    """Return (n, 2) where in the picture tracks are seen, some of them."""
+    places = np.concatenate([scene.tracks.xy[scene.structure.used] for scene in scenes])
+    return np.asarray(places[::max(1, len(places) // PLACES)])
 
 
 def _alike(larger: Result, simpler: Result, config: Config) -> bool:

@@ -10,6 +10,7 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model, mapping_error
+from dashcalib_ros.judgement.verdict import judge
 from dashcalib_ros.reconstruction.scene import Profile, Start
 from dashcalib_ros.solve.choice import gain_of_wider_model, is_clear
 from dashcalib_ros.solve.information import information
@@ -50,6 +51,35 @@ def test_a_model_that_is_asked_for_is_kept():
     brown = solved(scenes_of(3), CONFIG.replace({'model': 'brown'}))
     # all scenes came with a radial camera: the first step is the same
     assert mapping_error(brown.camera, LENS) < 1.0
+
+
+def test_a_model_that_was_asked_for_is_weak_where_the_turns_choose_one_far_from_it():
+    taken = as_model(LENS, Fisheye)
+    scenes = [synthetic_turn(LENS, yaw, world=world, tracks=140, keyframes=12).scene(taken, world)
+              for world, yaw in enumerate((80, -70))]
+    found = solved(scenes, CONFIG.replace({'model': 'fisheye'}))
+    assert type(found.camera) is Fisheye
+    tried = {each.model: each for each in found.tried}
+    assert [name for name, each in tried.items() if each.chosen] == ['radial']
+
+    def objections(apart_px):
+        own = replace(tried['fisheye'], apart_px=apart_px)
+        solution = replace(found, tried=tuple({**tried, 'fisheye': own}.values()))
+        return [reason for reason in judge(solution, CONFIG.verdict).reasons
+                if 'a lens of the model' in reason]
+
+    assert not objections(1.9 * found.picture.rms)
+    far = objections(2.1 * found.picture.rms)
+    assert len(far) == 1 and 'ask for a lens of the model radial, not fisheye' in far[0]
+    assert 'far away' in objections(None)[0]
+
+
+def test_a_model_that_has_the_chosen_one_in_it_is_as_right():
+    found = solved(scenes_of(2), CONFIG.replace({'model': 'brown'}))
+    far = tuple(replace(each, chosen=each.model == 'radial', apart_px=99.0)
+                for each in found.tried)
+    assert far and not any('a lens of the model' in reason for reason in judge(
+        replace(found, tried=far), CONFIG.verdict).reasons)
 
 
 def test_one_turn_chooses_no_larger_model():
