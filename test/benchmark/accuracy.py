@@ -3,6 +3,7 @@
 
     python test/benchmark/accuracy.py [SETTING ...] [--seeds 0 1 2] [--data DIR] [--cache DIR]
                                       [--out DIR] [--docs] [--again] [--list] [--summary]
+                                      [--solved]
 
 Runs every setting (or those named; part of a name will do) with every seed. Rows go to
 DIR/accuracy.json after each drive, and one that is there is not run again (--again: it is);
@@ -40,6 +41,7 @@ from measure import (
     summarised,
     table,
 )
+from solutions import solution_path, solved_drive
 from summary import settings_table, summary
 from views import BY_VIEW, INEXACT, SMALL, Viewed, inexact_view, recorded_view, small_view
 from wide import WIDE, wide_drive_of
@@ -126,6 +128,17 @@ def run_wide(name: str, seed: int, cache: Path) -> dict[str, Any]:
     return _finished(isolated(rendered, pictures, seed, drive.truth), about)
 
 
+def already_solved(name: str, seed: int, cache: Path) -> dict[str, Any] | None:
+    """Return the row of a rendered drive that check.py has calibrated; None if it has not."""
+    if name not in BY_NAME or not solution_path(name, seed, cache).exists():
+        return None
+    solved, setting = solved_drive(name, seed, cache), BY_NAME[name]
+    return {'setting': name, 'seed': seed, 'must': setting.must, 'counts': setting.counts,
+            'true_turns': list(drive_of(setting, seed).turn_centers),
+            **summarised(solved.calibration, solved.truth), 'truth': dict(solved.truth),
+            'seconds': {}, 'peak_mb': 0, 'commit': solved.commit}
+
+
 def drives_table(rows: Iterable[Mapping[str, Any]]) -> str:
     """Return a line for each drive."""
     head = ['drive', 'seed', 'verdict', 'turns', 'model', 'mapping px', 'fx %', 'fy %', 'cx %',
@@ -163,6 +176,8 @@ def main() -> None:
     parser = parser_with(__doc__, 'seeds', 'data', 'cache', 'out', 'docs', 'again')
     parser.add_argument('settings', nargs='*', help='default: all')
     parser.add_argument('--list', action='store_true', help='name the settings, and end')
+    parser.add_argument('--solved', action='store_true',
+                        help='take the solutions that check.py has in the cache, and run nothing')
     parser.add_argument('--summary', action='store_true', help='of the rows there are, and end')
     arguments = parser.parse_args()
     if arguments.list:
@@ -184,6 +199,10 @@ def main() -> None:
                 if done(rows.get(key)) and not arguments.again:
                     continue
                 cache = arguments.cache or Path(passing) / str(number)
+                if arguments.solved:
+                    if (row := already_solved(name, seed, cache)) is not None:
+                        rows[key] = row
+                    continue
                 row = (run_recorded(name, arguments.data) if _real(name)
                        else run_wide(name, seed, cache) if name in WIDE
                        else run_viewed(name, seed, cache) if name in INEXACT or name in SMALL
@@ -194,6 +213,7 @@ def main() -> None:
                 print(drives_table([row]).splitlines()[-1], '; '.join(row['reasons']), flush=True)
                 if not arguments.cache:
                     _forget(Path(passing) / str(number))
+    save(path, rows)
     text = f'{drives_table(_ordered(rows))}\n\n{summary(rows.values())}\n'
     (arguments.out / 'accuracy.md').write_text(
         f'Measured on {os.cpu_count()} cores at {", ".join(_commits(rows))}.\n\n{text}')

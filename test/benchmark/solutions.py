@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from drives import BY_NAME, drive_of, pictures_of
+from measure import commit
 from wide import WIDE, wide_drive_of
 
 from dashcalib_ros import Calibration, Calibrator, Config, open_frames
@@ -23,13 +24,14 @@ FPS = {'ntu_campus': 3.0}
 
 @dataclass(frozen=True)
 class Solved:
-    """A drive that was calibrated. solution: None where the drive gave none."""
+    """A drive that was calibrated. solution: None where it gave none; commit: of the code."""
 
     name: str
     seed: int
     calibration: Calibration
     solution: Solution | None
     truth: Mapping[str, Any]
+    commit: str = ''
 
 
 def solved_drive(name: str, seed: int, cache: Path, data: Path | None = None) -> Solved:
@@ -42,7 +44,7 @@ def solved_drive(name: str, seed: int, cache: Path, data: Path | None = None) ->
         for frame in frames:
             calibrator.push(frame)
         calibration = calibrator.calibrate()
-        found = Solved(name, seed, calibration, calibrator.solution, truth)
+        found = Solved(name, seed, calibration, calibrator.solution, truth, commit())
     path.parent.mkdir(parents=True, exist_ok=True)
     fresh = path.with_suffix('.new')
     # as a plain dictionary, which any script can read
