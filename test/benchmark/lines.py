@@ -3,7 +3,8 @@
     python test/benchmark/lines.py --seeds 0 1 --cache /tmp/cache --data ../shared/data
 
 Rendered: a picture each second through lenses that are known, seen by the true camera and by
-spoiled ones. Whole: rendered drives that are calibrated, too: how far lines and result are apart.
+spoiled ones. Whole: rendered drives whose solution check.py keeps in the cache: how far lines and
+result are apart.
 Real: KITTI odometry 03, with the dataset's own K and with ours; two drives with the cameras that
 others measured. Writes lines.json, and lines.md with the tables of docs/lines.md.
 """
@@ -18,8 +19,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from drives import BY_NAME, _key, drive_of, pictures_of
+from drives import BY_NAME, _key, drive_of
 from measure import commit, load, parser_with, save, table
+from solutions import solution_path, solved_drive
 from wide import WIDE, wide_drive_of
 
 from dashcalib_ros import Calibrator, Config, open_frames
@@ -71,8 +73,9 @@ def found_lines(frames: Iterable[Frame], config: Config) -> tuple[Lines, float]:
     return collector.lines(), seconds
 
 
-def rendered_row(drive: Drive, cache: Path, config: Config) -> dict[str, Any]:
+def rendered_row(name: str, seed: int, cache: Path) -> dict[str, Any]:
     """Return what lines say of the true camera of a drive, and of spoiled ones."""
+    drive, config = made(name, seed), Config()
     camera = true_camera(drive)
     scale = Scale.of(camera.image_size, config)
     lines, _ = found_lines(each_second(drive, cache), config)
@@ -83,12 +86,9 @@ def rendered_row(drive: Drive, cache: Path, config: Config) -> dict[str, Any]:
             for name, off in (('true', 0.0), ('more', SPOILED), ('less', -SPOILED))}
 
 
-def whole_row(drive: Drive, cache: Path, config: Config) -> dict[str, Any]:
-    """Return what lines say of the calibration of a drive."""
-    with Calibrator(config) as calibrator:
-        for frame in pictures_of(drive, cache):
-            calibrator.push(frame)
-        found = calibrator.calibrate()
+def whole_row(name: str, seed: int, cache: Path) -> dict[str, Any]:
+    """Return what lines say of the calibration of a drive that check.py has solved."""
+    found = solved_drive(name, seed, cache).calibration
     lines = found.straight_lines
     return {'verdict': found.verdict.level, 'reasons': found.verdict.reasons,
             'lines': _plain(lines), 'sigmas': None if lines is None else lines.sigmas}
@@ -203,21 +203,21 @@ def main() -> None:
     """Measure what is asked for; rows that are there are kept."""
     parser = parser_with(__doc__ or '', 'seeds', 'data', 'cache', 'out', 'again')
     parser.add_argument('--drives', nargs='*', help='names of drives.py and wide.py; default: all')
-    parser.add_argument('--whole', nargs='*', default=[], help='names of drives to calibrate')
     options = parser.parse_args()
     file, config = options.out / 'lines.json', Config()
     results = load(file)
     cache = options.cache or options.out / 'pictures'
     names = [name for name in (*BY_NAME, *WIDE) if name not in NOTHING_TO_SEE]
-    for kind, wanted, row_of in (
-            ('rendered', names if options.drives is None else options.drives, rendered_row),
-            ('whole', options.whole, whole_row)):
+    wanted = names if options.drives is None else options.drives
+    for kind, row_of in (('rendered', rendered_row), ('whole', whole_row)):
         rows = results.setdefault(kind, {})
         for seed in options.seeds:
             for name in wanted:
                 key = f'{name}, {seed}'
+                if kind == 'whole' and not solution_path(name, seed, cache).exists():
+                    continue
                 if options.again or key not in rows:
-                    rows[key] = row_of(made(name, seed), cache, config)
+                    rows[key] = row_of(name, seed, cache)
                     results[f'{kind}_commit'] = commit()
                     save(file, results)
                     print(kind, key, rows[key], flush=True)
