@@ -6,12 +6,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dashcalib_ros.calibrator import Calibrator, calibrate, check
+    from dashcalib_ros.calibrator import Calibrator
     from dashcalib_ros.camera import Camera
     from dashcalib_ros.config import Config
     from dashcalib_ros.frames import Frame
     from dashcalib_ros.inputs import open_frames
     from dashcalib_ros.judgement import Calibration
+    from dashcalib_ros.recorded import calibrate, check
 
 from dashcalib_ros.limits import PIXELS
 
@@ -22,8 +23,8 @@ __all__ = ['Calibration', 'Calibrator', 'Camera', 'Config', 'Frame', 'calibrate'
            'open_frames']
 
 _HOMES = {'Calibration': 'judgement', 'Calibrator': 'calibrator', 'Camera': 'camera',
-          'Config': 'config', 'Frame': 'frames', 'calibrate': 'calibrator',
-          'check': 'calibrator', 'open_frames': 'inputs'}
+          'Config': 'config', 'Frame': 'frames', 'calibrate': 'recorded',
+          'check': 'recorded', 'open_frames': 'inputs'}
 
 
 def __getattr__(name: str) -> Any:

@@ -7,9 +7,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from dashcalib_ros import stages
 from dashcalib_ros.arrays import Mask
@@ -17,52 +16,15 @@ from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.checking import Check, Monitor, Odometry, Poses, Reading, watch, with_lines
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames import Frame, FrameSource
+from dashcalib_ros.frames import Frame
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.judgement.agreement import evidence_of
 from dashcalib_ros.judgement.conclude import CONTRADICTS, Evidence, evidence_of_detection
-from dashcalib_ros.motion.motion import TrackedPoints
 from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.status import Status, View
 from dashcalib_ros.turns import Turn, TurnId
 from dashcalib_ros.turns.detection import Detection
-
-if TYPE_CHECKING:
-    from dashcalib_ros.inputs import Paths
-
-
-@dataclass(frozen=True)
-class Status:
-    """The calibrator's state after a frame.
-
-    frames: pushed so far. turns: in the bank and stored. built: how many scenes a calibration
-    would use now; ready: their turns; yaw_deg: the sum of their yaw. stored: how many turns are of
-    earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
-    yaws_deg: of the turns in ready, in their order. reconstructed: the turns of this drive that
-    watch() has scenes of, chosen or not.
-    """
-
-    frames: int
-    turns: int
-    built: int
-    yaw_deg: float
-    magnitude: float
-    standing: bool
-    ready: tuple[TurnId, ...] = ()
-    stored: int = 0
-    yaws_deg: tuple[float, ...] = ()
-    reconstructed: tuple[TurnId, ...] = ()
-
-
-@dataclass(frozen=True)
-class View:
-    """What is seen in the newest frame: for pictures that people look at.
-
-    valid: (h, w) of the frame, or of the frame resized; None: no ego vehicle is known.
-    """
-
-    points: TrackedPoints
-    valid: Mask | None
 
 
 @dataclass(frozen=True)
@@ -280,42 +242,3 @@ class Calibrator:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self.close()
-
-
-def calibrate(path: Paths, fps: float | None = None,
-              config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
-              duration_s: float | None = None) -> Calibration:
-    """Calibrate a recorded drive.
-
-    path, topic, fps, start_s, duration_s: as for open_frames(). Raises InputError for what cannot
-    be read; a drive that teaches too little gives a calibration that is weak or refused.
-    """
-    # the node has no use for the readers of files
-    from dashcalib_ros.inputs import open_frames
-    source = open_frames(path, topic, fps, start_s, duration_s)
-    with Calibrator(config) as calibrator:
-        for frame in source:
-            calibrator.push(frame)
-        return with_source(calibrator.calibrate(), source)
-
-
-def check(given: Camera, path: Paths, fps: float | None = None,
-          config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
-          duration_s: float | None = None) -> Check:
-    """Say whether a camera explains a recorded drive.
-
-    given: of the drive's pictures. All others are those of open_frames(). Raises InputError for
-    what cannot be read.
-    """
-    from dashcalib_ros.inputs import open_frames
-    with Calibrator(config) as calibrator:
-        for frame in open_frames(path, topic, fps, start_s, duration_s):
-            calibrator.push(frame)
-        return calibrator.check(given, calibrator.calibrate())
-
-
-def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
-    """Return the calibration with its input's name and warnings."""
-    new = tuple(line for line in source.warnings if line not in calibration.warnings)
-    return replace(calibration, input_name=calibration.input_name or source.name,
-                   warnings=(*new, *calibration.warnings))

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from synthetic import synthetic_turn
 
-from dashcalib_ros.calibrator import Calibrator, calibrate
+from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
@@ -26,6 +26,7 @@ from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.recorded import calibrate
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.turns import TurnId
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
@@ -169,7 +170,8 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way(frames, resul
 
 INLINE = """
 import pickle, sys
-from dashcalib_ros.calibrator import Calibrator, calibrate
+from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.recorded import calibrate
 frames, config = pickle.load(sys.stdin.buffer)
 with Calibrator(config, inline=True) as calibrator:
     for frame in frames:

@@ -13,7 +13,8 @@ PACKAGE = Path(__file__).parents[1] / 'dashcalib_ros'
 # in the order in which data flows: a room imports from those above it
 ROOMS = ('arrays', 'camera', 'frames', 'bags', 'inputs', 'motion', 'lines', 'turns',
          'reconstruction', 'solve', 'turn_store', 'judgement', 'checking', 'stages', 'workers',
-         'selection', 'calibrator', 'report', 'standard_streams', 'fleet', 'ros', 'demo', 'cli')
+         'selection', 'status', 'calibrator', 'recorded', 'report', 'standard_streams', 'fleet',
+         'ros', 'demo', 'cli')
 EVERYWHERE = {'config', 'errors', 'arrays', 'limits'}
 # what is not simply "all rooms above"
 ALLOWED: dict[str, set[str]] = {
@@ -21,7 +22,7 @@ ALLOWED: dict[str, set[str]] = {
     'errors': set(),
     'limits': {'errors'},
     'arrays': set(),
-    '__init__': {'calibrator', 'camera', 'frames', 'inputs', 'judgement'},
+    '__init__': {'calibrator', 'camera', 'frames', 'inputs', 'judgement', 'recorded'},
     'demo': {'camera', 'frames', 'bags', 'judgement'},
 }
 # rooms that nobody but these may import

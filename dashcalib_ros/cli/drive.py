@@ -9,13 +9,14 @@ from contextlib import contextmanager
 from typing import Any, Protocol
 
 from dashcalib_ros.arrays import Mask
-from dashcalib_ros.calibrator import Calibrator, with_source
+from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.frames import Frame, FrameSource
 from dashcalib_ros.frames.mask_file import check_mask
 from dashcalib_ros.inputs import open_frames
 from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.recorded import with_source
 from dashcalib_ros.turns import Turn
 
 

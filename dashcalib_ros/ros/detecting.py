@@ -1,12 +1,12 @@
 """One image of the camera: decoded, searched for turns, and handed on to who watches."""
 from __future__ import annotations
 
-from dashcalib_ros.calibrator import Status
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.frames.decode import decode
 from dashcalib_ros.ros.bank import Job
 from dashcalib_ros.ros.news import Listener, Picture, call, named
+from dashcalib_ros.status import Status
 
 
 def detect(job: Job, tell: Listener) -> Status | None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from dashcalib_ros.arrays import Mask
-from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.config import Config
 from dashcalib_ros.judgement.agreement import outdated, turns_of_another_camera
 from dashcalib_ros.report import NamedCamera
@@ -17,6 +17,7 @@ from dashcalib_ros.ros.bank import Bank, Job
 from dashcalib_ros.ros.detecting import detect
 from dashcalib_ros.ros.news import NOTHING, Activity, Listener, Result, call, named, new_turns
 from dashcalib_ros.ros.watch import Watch
+from dashcalib_ros.status import Status
 
 # s between two checks whether enough turns are built: scenes are finished without a push
 LOOK_S = 0.25

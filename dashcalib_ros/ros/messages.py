@@ -9,7 +9,6 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
-from dashcalib_ros.calibrator import Status
 from dashcalib_ros.camera import Camera, camera_from_ros, ros_camera
 from dashcalib_ros.checking import Check
 from dashcalib_ros.errors import InputError
@@ -17,6 +16,7 @@ from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.named_camera import check_focal, read_size
 from dashcalib_ros.ros.news import NOTHING
 from dashcalib_ros.ros.state import State, sigma_text
+from dashcalib_ros.status import Status
 
 OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR,
                           DiagnosticStatus.STALE)

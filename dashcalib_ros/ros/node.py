@@ -14,7 +14,6 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from dashcalib_ros.calibrator import Status
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.frames.mask_file import check_mask, read_mask
 from dashcalib_ros.report.camera_yaml import check_camera_name
@@ -42,6 +41,7 @@ from dashcalib_ros.ros.state import Rules
 from dashcalib_ros.ros.store import Store
 from dashcalib_ros.ros.stream import Source
 from dashcalib_ros.ros.wording import started_text, turn_text
+from dashcalib_ros.status import Status
 
 
 class SetupError(DashcalibError):

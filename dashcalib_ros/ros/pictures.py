@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import GreyImage, Mask
-from dashcalib_ros.calibrator import View
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.rectified import rectified_matrix
+from dashcalib_ros.status import View
 
 # blue, green, red
 TRACK, INK = (90, 230, 90), (255, 255, 255)

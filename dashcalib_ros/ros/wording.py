@@ -1,9 +1,9 @@
 """The lines that the node logs while it learns: one for each event."""
 from __future__ import annotations
 
-from dashcalib_ros.calibrator import Status
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.ros.news import NewTurn
+from dashcalib_ros.status import Status
 
 NEXT = {
     'weak': 'it is calculated again with each better turn',

@@ -22,7 +22,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.bags.write import BagWriter
-from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import AUTO, MODELS, ros_camera
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.terminal import Stages
@@ -32,6 +32,7 @@ from dashcalib_ros.demo.drive import Drive
 from dashcalib_ros.errors import ConfigError, WorkerError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.standard_streams import folded
+from dashcalib_ros.status import Status
 from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.turns.turn import Turn
 

@@ -19,7 +19,7 @@ from ros_desk import FIRST, SIGMA
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header, String
 
-from dashcalib_ros.calibrator import Calibrator, Status
+from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.checking import Check, Reading, watch
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError
@@ -28,6 +28,7 @@ from dashcalib_ros.ros import learner, node
 from dashcalib_ros.ros.messages import camera_info, given_camera
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.stream import LASTING
+from dashcalib_ros.status import Status
 from dashcalib_ros.turns import TurnId
 
 TOPIC = '/camera_info'

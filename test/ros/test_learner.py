@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fakes import image_message, stands_in_for
 
-from dashcalib_ros.calibrator import Calibrator, Status, View
+from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.checking import Check, Reading, watch
 from dashcalib_ros.config import Config
@@ -23,6 +23,7 @@ from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros import learner as room
 from dashcalib_ros.ros.learner import Learner
 from dashcalib_ros.ros.news import Listener
+from dashcalib_ros.status import Status, View
 from dashcalib_ros.turns import TurnId
 
 LIMIT = 20.0

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from dashcalib_ros.calibrator import View
 from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.camera.rectified import rectified_matrix
 from dashcalib_ros.config import Config
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.motion.motion import TrackedPoints
 from dashcalib_ros.ros.pictures import TRACK, Rectifier, overlay
+from dashcalib_ros.status import View
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 

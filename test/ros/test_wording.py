@@ -1,11 +1,11 @@
 """What the node says while it learns, one line for each event: no ROS needed."""
 from __future__ import annotations
 
-from dashcalib_ros.calibrator import Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
 from dashcalib_ros.ros.news import new_turns
 from dashcalib_ros.ros.wording import outcome_text, started_text, turn_text
+from dashcalib_ros.status import Status
 from dashcalib_ros.turns import TurnId
 
 
