@@ -293,9 +293,15 @@ class FleetConfig:
         0.01, 'of k1 and the like between units of a model: much less than of fx', 1e-5, 1.0)
     spread_units: float = expert(
         20.0, 'units that the two spreads count as, beside those of the fleet', 0.0, 1e6)
+    one_turn_excess: float = expert(
+        3.0, 'by which one turn varies more than its noise, as monitor.scatter; counts so, too',
+        1.0, 64.0)
     other_mode: float = expert(
         3.0, 'sigmas off the fx of its make; a unit farther off is in another sensor mode',
         1.0, 1e3)
+    least_odds: float = expert(
+        3.0, 'that a unit is in the mode of its make, by its own turns; with less: no prior',
+        0.0, 1e6)
 
 
 @dataclass(frozen=True)

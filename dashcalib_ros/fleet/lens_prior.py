@@ -5,8 +5,13 @@ own). Each unit is measured with its own covariance S; between units the lenses 
 covariance B, which is estimated by maximum likelihood (EM), so that S is not mistaken for B. The
 spreads of FleetConfig count as some more units. A unit with one turn has no scatter between turns
 in its S: by how much such S are too small is estimated, too. A unit that is several sigmas off is
-in another mode of its sensor: it is thrown out, and has no prior. A unit's prior is made without
-itself.
+in another mode of its sensor: it is thrown out, and has no prior. Nor has a unit that knows so
+little that it may well be in another mode. A unit's prior is made without itself.
+
+Focal lengths are compared by their curvature, -(w/f)^2 / 2. What a bend of the road shows beyond a
+shift of the picture is proportional to the square of x/f, so that this is what a bend measures
+with an error that does not depend on f. In f itself, or its logarithm, a unit whose error is
+negative would claim a smaller sigma, and the mean of many such units would be too small.
 """
 from __future__ import annotations
 
@@ -34,7 +39,7 @@ MOST_EXCESS = 64.0
 class Unit:
     """A camera's own estimate. make: with all that units must share, such as the image size.
 
-    lens: (d,) the logarithm of the focal length over the width, then the distortion coefficients.
+    lens: (d,) the curvature of the focal length, then the distortion coefficients.
     covariance: (d, d). one_turn: it is made from one turn only.
     """
 
@@ -93,15 +98,41 @@ def _priors_of_make(units: Sequence[Unit], config: FleetConfig) -> dict[str, Ver
     return found
 
 
+def curvature(focal: Floats) -> Floats:
+    """Return the curvature of focal lengths over the width."""
+    return np.asarray(-0.5 / np.square(focal))
+
+
+def focal_length(curvature: Floats) -> Floats:
+    """Return the focal lengths over the width that have these curvatures, all negative."""
+    return np.asarray(1 / np.sqrt(-2 * np.asarray(curvature)))
+
+
 def _verdict(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> Verdict:
     if prior is None:
         return Verdict(None, f'of its make there are {others} other usable cameras, '
                              f'{config.least_units} that agree are needed')
     if off_by(unit, prior) > config.other_mode:
-        percent = 100 * (np.exp(unit.lens[0] - prior.mean[0]) - 1)
+        percent = 100 * (focal_length(unit.lens[0]) / focal_length(prior.mean[0]) - 1)
         return Verdict(None, f'its fx is {percent:+.1f} % off that of its make, or its distortion '
                              f'is another: another mode of the sensor, or another device', True)
+    if odds_of_mode(unit, prior) < config.least_odds:
+        return Verdict(None, 'its own turns know too little to tell whether its sensor is in the '
+                             'mode of its make')
     return Verdict(prior)
+
+
+def odds_of_mode(unit: Unit, prior: LensPrior) -> float:
+    """Return how much likelier a unit's focal length is in the mode of its make than in another.
+
+    Another mode may have any focal length from half to twice that of the make.
+    """
+    # of the logarithm of the focal length
+    slope = -2 * prior.mean[0]
+    variance = (prior.excess_of(unit) * unit.covariance[0, 0] + prior.covariance[0, 0]) / slope**2
+    off = (unit.lens[0] - prior.mean[0]) / slope
+    density = np.exp(-off**2 / variance / 2) / np.sqrt(2 * np.pi * variance)
+    return float(density * 2 * np.log(2))
 
 
 def off_by(unit: Unit, prior: LensPrior) -> float:
@@ -131,10 +162,11 @@ def lens_prior(units: Sequence[Unit], config: FleetConfig) -> LensPrior | None:
 def _densest(focal: Floats, variance: Floats, config: FleetConfig) -> Mask:
     """Return (n,) the units around the value that most others agree with: the make's main mode.
 
-    focal: (n,) logarithms; variance: (n,) of each. A unit that knows little counts little.
+    focal: (n,) curvatures; variance: (n,) of each. A unit that knows little counts little.
     """
-    total = variance + config.focal_spread**2
-    weight = config.focal_spread**2 / total
+    spread = np.square(2 * focal * config.focal_spread)
+    total = variance + spread
+    weight = spread / total
     # the candidates are the best known units
     best = np.argsort(-weight, kind='stable')[:CANDIDATES]
     near = np.abs(focal[best, None] - focal) < config.other_mode / 2 * np.sqrt(total)
@@ -148,8 +180,9 @@ def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:
     own = np.array([unit.covariance for unit in units])
     vague = np.array([unit.one_turn for unit in units])
     count, size = lenses.shape
-    assumed = np.diag([config.focal_spread**2] + [config.distortion_spread**2] * (size - 1))
-    between, excess = assumed, 1.0
+    focal_spread = 2 * float(np.median(lenses[:, 0])) * config.focal_spread
+    assumed = np.diag([focal_spread**2] + [config.distortion_spread**2] * (size - 1))
+    between, excess = assumed, config.one_turn_excess if vague.any() else 1.0
     for _ in range(STEPS):
         noise = own * np.where(vague, excess, 1.0)[:, None, None]
         weights = np.linalg.inv(between + noise)
@@ -167,7 +200,8 @@ def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:
             # of fx: its sigma is what matters
             error = (lenses - mean - offset)[:, 0]
             ratios = (error**2 + rest[:, 0, 0]) / own[:, 0, 0]
-            now = min(max(float(ratios[vague].mean()), 1.0), MOST_EXCESS)
+            known = ratios[vague].sum() + config.spread_units * config.one_turn_excess
+            now = min(max(float(known / (vague.sum() + config.spread_units)), 1.0), MOST_EXCESS)
             change, excess = max(change, abs(now - excess)), now
         if change < SETTLED:
             break

@@ -1,7 +1,7 @@
 """A unit's own estimate and the prior of its make -> the final calibration, which tells both.
 
-Both are normal distributions, the estimate linearised at the unit's own solution, in the logarithm
-of the focal lengths: one step of conditioning.
+Both are normal distributions, the estimate linearised at the unit's own solution, in the curvature
+of the focal lengths (lens_prior.py): one step of conditioning.
 """
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.fleet.lens_prior import LensPrior, Unit
+from dashcalib_ros.fleet.lens_prior import LensPrior, Unit, curvature, focal_length
 from dashcalib_ros.fleet.lens_prior import Verdict as PriorVerdict
 from dashcalib_ros.fleet.solved import Estimate, Solved, sigmas
 from dashcalib_ros.judgement import Calibration, Verdict
@@ -125,16 +125,16 @@ def conditioned(camera: Camera, covariance: Floats, prior: LensPrior) -> tuple[C
     # Joseph's form stays positive
     spread = keep @ spread @ keep.T + gain @ prior.covariance @ gain.T
     params = values * _scales(camera)
-    params[:2] = np.exp(values[:2]) * camera.image_size[0]
+    params[:2] = focal_length(values[:2]) * camera.image_size[0]
     moved = camera.with_params(params)
     back = _slopes(moved)
     return moved, spread / np.outer(back, back)
 
 
 def _in_units_of_prior(camera: Camera, covariance: Floats) -> tuple[Floats, Floats]:
-    """Return log(fx/w), log(fy/w), cx/w, cy/w and the coefficients, and their covariance."""
+    """Return the curvatures, cx/w, cy/w and the coefficients, and their covariance."""
     values = camera.params / _scales(camera)
-    values[:2] = np.log(values[:2])
+    values[:2] = curvature(values[:2])
     slopes = _slopes(camera)
     return values, covariance * np.outer(slopes, slopes)
 
@@ -148,7 +148,7 @@ def _scales(camera: Camera) -> Floats:
 def _slopes(camera: Camera) -> Floats:
     """Return the derivatives (n,) of the prior's values by the camera's parameters."""
     slopes = 1 / _scales(camera)
-    slopes[:2] = 1 / camera.params[:2]
+    slopes[:2] = camera.image_size[0]**2 / camera.params[:2]**3
     return np.asarray(slopes)
 
 

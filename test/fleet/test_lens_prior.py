@@ -9,7 +9,15 @@ import pytest
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import FleetConfig
 from dashcalib_ros.fleet.clip_shares import ClipShare
-from dashcalib_ros.fleet.lens_prior import LensPrior, Unit, Verdict, lens_prior, priors
+from dashcalib_ros.fleet.lens_prior import (
+    LensPrior,
+    Unit,
+    Verdict,
+    curvature,
+    focal_length,
+    lens_prior,
+    priors,
+)
 from dashcalib_ros.fleet.posterior import conditioned, final_of, unit_of
 from dashcalib_ros.fleet.solved import Estimate, Solved
 from dashcalib_ros.judgement import Calibration
@@ -17,8 +25,10 @@ from dashcalib_ros.judgement import Verdict as OwnVerdict
 from dashcalib_ros.solve.picture import PictureSigma
 
 CONFIG = FleetConfig()
-MEAN = np.array([np.log(0.65), -0.28, 0.09])
-SPREAD = np.diag([0.01, 0.003, 0.003])**2
+MEAN = np.array([curvature(0.65), -0.28, 0.09])
+# of the curvature by the logarithm of the focal length
+SLOPE = 0.65**-2
+SPREAD = np.diag([0.01 * SLOPE, 0.003, 0.003])**2
 
 
 def fleet(seed, count=30, sigma=0.03, zooms=(), excess=1.0):
@@ -28,8 +38,8 @@ def fleet(seed, count=30, sigma=0.03, zooms=(), excess=1.0):
     for n in range(count + len(zooms)):
         truth = rng.multivariate_normal(MEAN, SPREAD)
         if n >= count:
-            truth[0] += np.log(zooms[n - count])
-        own = np.diag([sigma * rng.uniform(0.7, 1.4), 0.008, 0.01])**2
+            truth[0] /= zooms[n - count]**2
+        own = np.diag([sigma * SLOPE * rng.uniform(0.7, 1.4), 0.008, 0.01])**2
         # fx and k1 go together
         own[0, 1] = own[1, 0] = 0.6 * np.sqrt(own[0, 0] * own[1, 1])
         measured = rng.multivariate_normal(truth, excess * own)
@@ -51,12 +61,13 @@ def test_errors_are_halved_and_sigmas_hold(excess):
         units, truths = fleet(seed, excess=excess)
         found = priors(units, CONFIG)
         for unit, truth in zip(units, truths, strict=True):
+            alone.append(abs(unit.lens[0] - truth[0]))
+            errors.append(alone[-1])  # of a unit that knows too little for a prior
             if found[unit.name].prior is not None:
                 value, sigma = posterior(unit, found[unit.name].prior)
-                errors.append(abs(value - truth[0]))
-                alone.append(abs(unit.lens[0] - truth[0]))
+                errors[-1] = abs(value - truth[0])
                 inside.append(errors[-1] < 2 * sigma)
-    assert len(errors) > 0.97 * 12 * 30
+    assert len(inside) > 0.8 * 12 * 30
     assert np.median(errors) < 0.5 * np.median(alone)
     assert 0.94 < np.mean(inside) < 0.995
 
@@ -68,14 +79,36 @@ def test_units_in_another_mode_are_thrown_out_and_change_nothing():
         assert all(found[unit.name].other_mode for unit in units[30:])
         assert 'another mode' in found['u030'].why_not
         with_them, without = lens_prior(units, CONFIG), lens_prior(units[:30], CONFIG)
-        assert with_them.mean == pytest.approx(without.mean, abs=0.003)
+        assert with_them.mean == pytest.approx(without.mean, abs=0.003 * SLOPE)
         assert with_them.units <= 30
+
+
+def test_a_unit_that_knows_too_little_to_tell_its_mode_has_no_prior():
+    units, _ = fleet(7)
+    vague = replace(units[0], covariance=units[0].covariance * np.diag([100.0, 1.0, 1.0]))
+    found = priors([vague, *units[1:]], CONFIG)
+    assert found['u000'].prior is None and not found['u000'].other_mode
+    assert 'too little to tell' in found['u000'].why_not
+
+
+def test_errors_that_a_bend_makes_do_not_bias_the_mean():
+    """A focal length that comes out too short claims a smaller sigma of its logarithm."""
+    means = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        units, _ = fleet(seed, 40, sigma=0.04)
+        focal = focal_length(MEAN[0] + 0.04 * SLOPE * rng.standard_normal(40))
+        # as a unit tells it: sigma of f at its own f
+        units = [replace(unit, lens=np.array([curvature(own), *MEAN[1:]]), covariance=np.diag(
+            [0.04 * SLOPE, 0.008, 0.01])**2) for unit, own in zip(units, focal, strict=True)]
+        means.append(focal_length(lens_prior(units, CONFIG).mean[0]) / 0.65 - 1)
+    assert abs(np.mean(means)) < 2.5 * 0.04 / np.sqrt(20 * 40)
 
 
 def test_the_larger_mode_wins_whatever_the_order():
     units, _ = fleet(1, 20, 0.01, zooms=[1.3] * 12)
     for order in (units, units[::-1]):
-        assert lens_prior(order, CONFIG).mean[0] == pytest.approx(MEAN[0], abs=0.02)
+        assert focal_length(lens_prior(order, CONFIG).mean[0]) == pytest.approx(0.65, rel=0.02)
     one, two = priors(units, CONFIG), priors(units[::-1], CONFIG)
     assert all(np.array_equal(one[name].prior.mean, two[name].prior.mean)
                for name in one if one[name].prior)
@@ -83,17 +116,20 @@ def test_the_larger_mode_wins_whatever_the_order():
 
 def test_the_spread_between_units_is_not_their_noise():
     wide, _ = fleet(3, 200, 0.03)
-    assert np.sqrt(lens_prior(wide, CONFIG).covariance[0, 0]) < 0.016
+    assert np.sqrt(lens_prior(wide, CONFIG).covariance[0, 0]) < 0.016 * SLOPE
     exact, _ = fleet(3, 200, 0.001)
-    assert np.sqrt(lens_prior(exact, CONFIG).covariance[0, 0]) == pytest.approx(0.01, rel=0.15)
+    assert np.sqrt(lens_prior(exact, CONFIG).covariance[0, 0]) == pytest.approx(
+        0.01 * SLOPE, rel=0.15)
 
 
 def test_a_units_own_data_are_not_used_twice():
     units, _ = fleet(4, 12)
-    moved = [replace(units[0], lens=units[0].lens + [0.03, 0.0, 0.0]), *units[1:]]
+    moved = [replace(units[0], lens=units[0].lens + [0.02 * SLOPE, 0.0, 0.0]), *units[1:]]
     before, after = (priors(each, CONFIG) for each in (units, moved))
     np.testing.assert_array_equal(before['u000'].prior.mean, after['u000'].prior.mean)
-    assert not np.array_equal(before['u001'].prior.mean, after['u001'].prior.mean)
+    others = [name for name in before if before[name].prior and after[name].prior]
+    assert len(others) > 6 and not any(np.array_equal(
+        before[name].prior.mean, after[name].prior.mean) for name in others if name != 'u000')
 
 
 def test_few_units_give_no_prior():
@@ -120,8 +156,8 @@ def _config():
     return Config()
 
 
-PRIOR = LensPrior(np.array([np.log(520 / 800), -0.28, 0.09]),
-                  np.diag([0.01, 0.005, 0.01])**2, 20)
+PRIOR = LensPrior(np.array([curvature(520 / 800), -0.28, 0.09]),
+                  np.diag([0.01 * SLOPE, 0.005, 0.01])**2, 20)
 
 
 @pytest.mark.parametrize('level', ['weak', 'refused'])
@@ -160,10 +196,10 @@ def test_conditioning_agrees_with_the_sum_of_informations():
     covariance = root @ root.T
     moved, after = conditioned(camera, covariance, PRIOR)
     slope = np.zeros((3, 6))
-    slope[0, 0], slope[1, 4], slope[2, 5] = 1 / camera.fx, 1, 1
+    slope[0, 0], slope[1, 4], slope[2, 5] = 800**2 / camera.fx**3, 1, 1
     expected = np.linalg.inv(np.linalg.inv(covariance)
                              + slope.T @ np.linalg.inv(PRIOR.covariance) @ slope)
     step = expected @ slope.T @ np.linalg.inv(PRIOR.covariance) @ (
-        PRIOR.mean - [np.log(camera.fx / 800), camera.k1, camera.k2])
+        PRIOR.mean - [curvature(camera.fx / 800), camera.k1, camera.k2])
     np.testing.assert_allclose(moved.params, camera.params + step, rtol=1e-3)
     np.testing.assert_allclose(after, expected, rtol=0.02, atol=1e-6)
