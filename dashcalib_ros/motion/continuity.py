@@ -5,10 +5,12 @@ camera's angles, on a bumpy road. Let u be a point's step between the two images
 step to the image in question. Small changes of yaw and pitch shift the whole picture, those of
 roll turn it:
 
-    v = (1 + change) u + shift + roll
+    v = ratio u + shift + roll
 
-Nothing is lost where most points can be followed and agree with this, and change is about 0. One
-lost image makes it about 1, and more of them make it larger; a repeated image makes it -1.
+Nothing is lost where most points can be followed and agree with this, and the ratio is about 1.
+It is a little larger, as what comes nearer moves faster; in a sharp turn it is up to 1.5, as the
+picture turns about a vertical axis, which is not quite a shift. One lost image makes it more than
+2, and more of them make it larger; a repeated image makes it 0.
 """
 from __future__ import annotations
 
@@ -22,8 +24,8 @@ MIN_POINTS = 30
 MIN_SHARE = 0.25
 # of the smallest share in the images before; without a loss it is 0.65 and more
 SHARE_KEPT = 0.5
-# of the speed; from -0.2 to 0.35 without a loss, 0.5 and more with a fifth of a second lost
-MAX_CHANGE = 0.4
+# of a point's step to the one before, up or down: about the root of 3, two lost images' ratio
+MAX_RATIO = 1.7
 # a point agrees when it is this far, px, and this share of its step, from where it should be
 AGREES_PX, AGREES_SHARE = 1.0, 0.15
 # px; a standing car's points move so much by noise, which does not tell its speed
@@ -45,14 +47,15 @@ def goes_on(first: Floats32, middle: Floats32, last: Floats32, followed: float, 
     if len(last) < MIN_POINTS:
         return False
     before, now = (np.asarray(step, np.float64) for step in (middle - first, last - middle))
-    change, off = _change(before, now, np.asarray(middle, np.float64))
+    ratio, off = _ratio(before, now, np.asarray(middle, np.float64))
     agree = off < AGREES_PX + AGREES_SHARE * np.linalg.norm(now, axis=1)
     share = followed * float(agree.mean())
-    return abs(change) < MAX_CHANGE and share > max(MIN_SHARE, SHARE_KEPT * usual)
+    return (1 / MAX_RATIO < ratio < MAX_RATIO
+            and share > max(MIN_SHARE, SHARE_KEPT * usual))
 
 
-def _change(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
-    """Return the relative change of speed, and (n,) how far each point is off, px.
+def _ratio(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
+    """Return how much longer the steps have become, and (n,) how far each point is off, px.
 
     before, now: (n, 2) px, two steps of the points; xy: (n, 2) px, where they are.
     """
@@ -61,6 +64,7 @@ def _change(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
     one, none = np.ones(len(xy)), np.zeros(len(xy))
     design = np.stack([before, np.stack([one, none], 1), np.stack([none, one], 1),
                        np.stack([-around[:, 1], around[:, 0]], 1)], axis=2)
+    # the first parameter is the ratio less 1: 0 where nothing tells it
     wanted = now - before
     params = np.array([0.0, *np.median(wanted, axis=0), 0.0])
     for _ in range(ROUNDS):
@@ -71,4 +75,4 @@ def _change(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
         # as if each point had moved that much more; and equal points determine no roll
         normal += np.diag([weights.sum() * STILL_PX ** 2, 0.0, 0.0, 1e-6])
         params = np.linalg.solve(normal, np.einsum('nik,n,ni->k', design, weights, wanted))
-    return float(params[0]), np.linalg.norm(wanted - design @ params, axis=1)
+    return 1.0 + float(params[0]), np.linalg.norm(wanted - design @ params, axis=1)
