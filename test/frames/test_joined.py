@@ -99,6 +99,16 @@ def test_bags_that_do_not_go_on(tmp_path):
     assert found[10].stamp_ns - found[9].stamp_ns == STEP
 
 
+def test_a_bag_after_a_video(tmp_path):
+    video = write_video(tmp_path / '1.avi', smooth(), fps=25)
+    bag = write_bag(tmp_path / '2', images(drive(5)))
+    found = list(open_frames([video, bag, video]))
+    assert [frame.index for frame in found if frame.perhaps_after_gap] == [12, 17]
+    assert not any(frame.after_gap for frame in found)
+    steps = np.diff([frame.stamp_ns for frame in found])
+    assert set(steps[:12]) == {40_000_000} and set(steps[12:17]) == {STEP}
+
+
 def test_one_that_cannot_be_read_is_left_out(tmp_path):
     paths = videos(tmp_path / 'clips')
     paths[0].write_bytes(b'junk' * 999)
@@ -145,6 +155,14 @@ def test_undecodable_images_are_told_by_their_file(tmp_path):
     source = open_frames(folders, fps=10)
     assert [frame.index for frame in source] == [0, 1, 2, 3, 5]
     assert f'1 undecodable images were skipped ({folders[1]}: image 4: ' in source.warnings[0]
+
+
+def test_an_undecodable_first_image_leaves_the_question_to_the_next(tmp_path):
+    folders = [write_folder(tmp_path / name, drive(3)) for name in 'ab']
+    (folders[1] / '0000.png').write_bytes(b'junk')
+    found = list(open_frames(folders, fps=10))
+    assert [frame.index for frame in found] == [0, 1, 2, 4, 5]
+    assert [frame.index for frame in found if frame.perhaps_after_gap] == [4]
 
 
 def test_what_all_files_say_is_said_once(tmp_path):
