@@ -22,8 +22,8 @@ from dashcalib_ros.arrays import Floats, Floats32
 MIN_POINTS = 30
 # of the points; in slow series that lose more from image to image, chance may look alike
 MIN_SHARE = 0.25
-# of the smallest share in the images before; without a loss it is 0.65 and more
-SHARE_KEPT = 0.5
+# of the smallest share in the images before; at 10 images a second it is more without a loss
+SHARE_KEPT = 0.6
 # of a point's step to the one before, up or down: about the root of 3, two lost images' ratio
 MAX_RATIO = 1.7
 # a point agrees when it is this far, px, and this share of its step, from where it should be

@@ -42,9 +42,8 @@ from dashcalib_ros.motion import MotionEstimator
 FILES = 5
 # where it is cut, s lost at each cut, and whether the files tell that something may be missing
 CASES = (('between', 0.0, True), ('inside', 0.0, True), ('between', 0.5, True),
-         ('inside', 0.1, True), ('inside', 0.2, True), ('inside', 0.5, True),
-         ('inside', 2.0, True), ('inside', 0.1, False), ('inside', 0.2, False),
-         ('inside', 0.5, False))
+         ('inside', 0.2, True), ('inside', 0.5, True), ('inside', 0.1, False),
+         ('inside', 0.2, False))
 DRIVES = ('kitti03', 'dashcam: bonnet, text', 'rolling shutter 20 ms')
 
 

@@ -75,7 +75,7 @@ def test_other_cars_do_not_decide():
 
 def test_too_little_is_seen():
     points = seen([1.0, 1.0])
-    assert goes_on(*points, 0.4, 0.7) and not goes_on(*points, 0.3, 0.7)
+    assert goes_on(*points, 0.5, 0.7) and not goes_on(*points, 0.4, 0.7)
     assert goes_on(*points, 0.3, 0.3) and not goes_on(*points, 0.2, 0.2)
     assert not goes_on(*points[:, :29], *ALL) and not goes_on(*points[:, :0], *ALL)
     rng = np.random.default_rng(3)
