@@ -29,6 +29,7 @@ from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.recorded import calibrate
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.turns import TurnId
+from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 LENS = Lens.of(640, 360, 80.0, -0.25, 0.06, offset=(6.0, -4.0))
@@ -410,6 +411,25 @@ def test_a_drive_in_two_files_gives_what_the_whole_gives(drive, frames, result):
     for name, sigma in result.sigma.items():
         off = abs(found.intrinsics[name] - result.intrinsics[name])
         assert off < (0.5 if name in ('fx', 'fy', 'cx', 'cy') else 1.0) * sigma, name
+
+
+def test_a_turn_that_the_end_of_a_file_cuts_is_whole_unless_images_are_lost(drive, frames, result):
+    cut = round(drive.turn_centers[0])
+
+    def turns(lost: int, end: int) -> list[tuple[int, int, int]]:
+        detection = Detection(QUICK)
+        for frame in frames[:cut]:
+            detection.push(frame)
+        # the files' stamps go on whatever is lost
+        for frame, place in zip(frames[cut + lost:end], frames[cut:], strict=False):
+            detection.push(dataclasses.replace(
+                place, image=frame.image, perhaps_after_gap=place.index == cut))
+        detection.finish()
+        return sorted((turn.center, turn.first, turn.last) for turn in detection.turns())
+
+    whole = sorted((turn.center, turn.first, turn.last) for turn in result.turns)
+    assert whole[0][1] < cut < whole[0][2] and turns(0, len(frames)) == whole
+    assert not any(first < cut <= last for _, first, last in turns(5, cut + 45))
 
 
 def test_a_folder_is_calibrated_in_one_call(tmp_path):

@@ -14,7 +14,9 @@ class Frame:
     stamp_ns: time of exposure in nanoseconds (the message header's stamp, or index / rate).
     image: (height, width) uint8, grey. Never written to after the Frame is made.
     frame_id: the message header's; empty where there is none.
-    after_gap: it does not continue the one before, as the first of another video file.
+    after_gap: images are missing before it, or it is of another drive.
+    perhaps_after_gap: the first of another file that may or may not go on where the one before
+    ended, as the next video of a dashcam; how the picture moves tells (motion/continuity.py).
     """
 
     index: int
@@ -22,6 +24,7 @@ class Frame:
     image: GreyImage
     frame_id: str = ''
     after_gap: bool = False
+    perhaps_after_gap: bool = False
 
     @property
     def size(self) -> tuple[int, int]:

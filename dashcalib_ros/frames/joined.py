@@ -4,7 +4,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Generator, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.source import FrameSource, Picture, Reading
@@ -18,9 +18,9 @@ STEP_NS = 100_000_000
 class JoinedSource(FrameSource):
     """The images of several sources, one after the other; index and stamps go on.
 
-    Nothing tells whether one video or folder follows the other without a gap, so each of them
-    begins after one (Frame.after_gap), but its stamps go on as if there was none. A bag's stamps
-    are kept where they are later than those before; they tell where there is a gap.
+    No video or folder tells whether it follows the one before without a loss: each begins perhaps
+    after a gap (Frame.perhaps_after_gap), and its stamps go on as if there was none. A bag's
+    stamps are kept where they are later than those before; they tell where there is a gap.
 
     A source that cannot be read is left out, with a warning. Raises InputError where two that
     tell their size have different ones.
@@ -60,6 +60,15 @@ class JoinedSource(FrameSource):
         reading.warnings += _together(told)
 
 
+@dataclass(frozen=True)
+class _Joint:
+    """How a source follows the one before. shift_ns: what is added to its stamps."""
+
+    shift_ns: int
+    gap: bool = False
+    perhaps_gap: bool = False
+
+
 class _Place:
     """Where the next source begins in the drive: index of its first image, and its time in ns.
 
@@ -84,9 +93,9 @@ class _Place:
         with closing(part._pictures(reading, left)) as pictures:
             for picture in pictures:
                 if before is None:
-                    shift, after_gap = self._joint(part, picture.stamp_ns)
+                    joint = self._joint(part, picture.stamp_ns)
                     before = picture.stamp_ns - STEP_NS
-                stamp_ns = picture.stamp_ns + shift
+                stamp_ns = picture.stamp_ns + joint.shift_ns
                 if self._first_ns is None:
                     self._first_ns = stamp_ns
                 self._last_ns = stamp_ns
@@ -95,8 +104,9 @@ class _Place:
                 # what a bag has before the start is left out here; it is not decoded yet
                 if stamp_ns - self._first_ns >= self._start_ns:
                     yield replace(picture, index=self.index + picture.index, stamp_ns=stamp_ns,
-                                  file=part.name, after_gap=after_gap)
-                    after_gap = False
+                                  file=part.name, after_gap=joint.gap,
+                                  perhaps_after_gap=joint.perhaps_gap)
+                    joint = _Joint(joint.shift_ns)
         if before is None:
             self._next_ns += part.length_ns or 0  # all of it was before the excerpt
         self._recorded = part.recorded
@@ -107,17 +117,18 @@ class _Place:
             self._first_ns = self._next_ns
         return max(0, self._start_ns - (self._next_ns - self._first_ns))
 
-    def _joint(self, part: FrameSource, stamp_ns: int) -> tuple[int, bool]:
-        """Return what a source's stamps are shifted by, and whether it begins after a gap.
-
-        stamp_ns: its first one.
-        """
+    def _joint(self, part: FrameSource, stamp_ns: int) -> _Joint:
+        """Return how a source follows the one before. stamp_ns: its first one."""
         if not part.recorded:
-            return self._next_ns, self.index > 0
+            return _Joint(self._next_ns, perhaps_gap=self.index > 0)
+        if self.index == 0:
+            return _Joint(0)
+        if not self._recorded:
+            return _Joint(self._next_ns - stamp_ns, perhaps_gap=True)
         step = stamp_ns - self._last_ns
-        if self.index == 0 or (self._recorded and step > 0):
-            return 0, self.index > 0 and step > CONTINUES_NS
-        return self._next_ns - stamp_ns, True
+        if step > 0:
+            return _Joint(0, gap=step > CONTINUES_NS)
+        return _Joint(self._next_ns - stamp_ns, gap=True)
 
 
 def _by(part: FrameSource) -> str:

@@ -46,6 +46,7 @@ class Picture:
     decode: Callable[[], GreyImage]
     frame_id: str = ''
     after_gap: bool = False
+    perhaps_after_gap: bool = False
     file: str = ''
 
 
@@ -140,16 +141,18 @@ class FrameSource(ABC):
 
     def _frames(self, reading: Reading) -> Iterator[Frame]:
         size: tuple[int, int] | None = None
-        after_gap = False
+        after_gap = perhaps = False
         with closing(self._excerpted(reading)) as pictures:
             for picture in pictures:
                 after_gap |= picture.after_gap
+                perhaps |= picture.perhaps_after_gap
                 try:
                     image = picture.decode()
                 except InputError as error:
                     reading.failed(picture.index, error, picture.file)
                     continue
-                frame = Frame(picture.index, picture.stamp_ns, image, picture.frame_id, after_gap)
+                frame = Frame(picture.index, picture.stamp_ns, image, picture.frame_id, after_gap,
+                              perhaps)
                 size = size or frame.size
                 if frame.size != size:
                     raise InputError(
@@ -157,7 +160,7 @@ class FrameSource(ABC):
                         f'those before are {_by(size)}: a calibration holds for one size; '
                         f'split the drive there')
                 reading.decoded += 1
-                after_gap = False
+                after_gap = perhaps = False
                 yield frame
         if not reading.decoded:
             raise InputError(self._no_image(reading))

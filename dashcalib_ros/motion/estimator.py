@@ -14,6 +14,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.frame import Frame
 from dashcalib_ros.frames.shrink import shrink_image
 from dashcalib_ros.frames.stamps import EARLY, least_step_ns
+from dashcalib_ros.motion.continuity import goes_on
 from dashcalib_ros.motion.epipoles import epipoles_of, turning
 from dashcalib_ros.motion.mask import EgoMask
 from dashcalib_ros.motion.motion import Motion, TrackedPoints
@@ -30,12 +31,16 @@ JITTER_GROWTH = 1.5
 
 @dataclass(frozen=True)
 class _Seen:
-    """The points in one processed image: ids (n,) ascending, xy (n, 2) px."""
+    """The points in one processed image: ids (n,) ascending, xy (n, 2) px.
+
+    followed: the share of the last image's points that were found; NaN where there were none.
+    """
 
     index: int
     stamp_ns: int
     ids: Ints
     xy: Floats32
+    followed: float
 
 
 class MotionEstimator:
@@ -50,6 +55,7 @@ class MotionEstimator:
     _segmented: SegmentationMask | None = None
     _valid: Mask | None = None
     _factor: int = 1
+    _perhaps_gap: bool = False
 
     def __init__(self, config: MotionConfig, mask: MaskConfig | None = None,
                  valid: Mask | None = None) -> None:
@@ -73,16 +79,24 @@ class MotionEstimator:
         """Take the next image; None if it is skipped, as the camera is faster than config.rate."""
         if frame.image.shape != self._shape:
             self._start(frame.image.shape)
+        # a skipped image leaves the question to the next one
+        self._perhaps_gap |= frame.perhaps_after_gap
+        after_gap = False
         if self._seen:
-            gap = frame.stamp_ns - self._seen[-1].stamp_ns
-            if gap < 0 or frame.after_gap:
+            step = frame.stamp_ns - self._seen[-1].stamp_ns
+            after_gap = step < 0 or frame.after_gap
+            if after_gap:
                 self._reset()
-            elif gap < least_step_ns(self.config.rate):
+            elif step < least_step_ns(self.config.rate):
                 return None
         image = shrink_image(frame.image, self._factor)
+        followed = self._follow(image)
+        if self._perhaps_gap and self._seen and not self._goes_on(followed):
+            after_gap, followed = True, math.nan
+            self._reset()
+        self._perhaps_gap = False
         before = self._seen[-1] if self._seen else None
-        self._follow(image)
-        now = _Seen(frame.index, frame.stamp_ns, self._ids, self._xy)
+        now = _Seen(frame.index, frame.stamp_ns, self._ids, self._xy, followed)
         moved = math.nan if before is None else _median_shift(*_common(before, now))
         self._seen.append(now)
         first, middle = self._triplet()
@@ -101,7 +115,7 @@ class MotionEstimator:
         return Motion(
             frame.index, frame.stamp_ns, magnitude, standing,
             moved * self._factor, len(now.ids), middle.index if middle else None,
-            middle.stamp_ns if middle else None)
+            middle.stamp_ns if middle else None, after_gap)
 
     def valid(self) -> Mask | None:
         """Return (height, width) of the full image: False on the ego vehicle and the user's mask.
@@ -145,6 +159,7 @@ class MotionEstimator:
         self._ids = np.zeros(0, np.int64)
         self._xy = np.zeros((0, 2), np.float32)
         self._born = 0
+        self._perhaps_gap = False
 
     def _start(self, shape: tuple[int, ...]) -> None:
         """Begin with images of this shape."""
@@ -186,10 +201,13 @@ class MotionEstimator:
         assert self._shape is not None
         return max(1, self._shape[1] // self._factor), max(1, self._shape[0] // self._factor)
 
-    def _follow(self, image: GreyImage) -> None:
-        """Move the points on to this image; drop those that do not track back."""
+    def _follow(self, image: GreyImage) -> float:
+        """Move the points on to this image; drop those that do not track back.
+
+        Returns the share of them that is left, NaN if there were none.
+        """
         if self._last is None or len(self._ids) == 0:
-            return
+            return math.nan
         moved, trusted = follow_points(self._last, image, self._xy, self._tracking)
         if self._valid is not None:
             height, width = image.shape
@@ -197,6 +215,21 @@ class MotionEstimator:
             row = np.clip(np.rint(moved[:, 1]), 0, height - 1).astype(int)
             trusted &= self._valid[row, column]
         self._ids, self._xy = self._ids[trusted], moved[trusted]
+        return float(np.mean(trusted))
+
+    def _goes_on(self, followed: float) -> bool:
+        """Return whether the points tell that the image they are in now follows the last one.
+
+        followed: the share of the last image's points that is left.
+        """
+        usual = [seen.followed for seen in self._seen if not math.isnan(seen.followed)]
+        if not usual:
+            return False
+        before, last = self._seen[-2], self._seen[-1]
+        ids = np.intersect1d(before.ids, self._ids, assume_unique=True)
+        first, middle, now = (xy[np.searchsorted(own, ids)] for own, xy in (
+            (before.ids, before.xy), (last.ids, last.xy), (self._ids, self._xy)))
+        return goes_on(first, middle, now, followed, min(usual))
 
     def _replenish(self, image: GreyImage) -> None:
         """Add points where there are few; they are found at half resolution, which is enough."""

@@ -15,6 +15,7 @@ class Motion:
     magnitude: turning magnitude, of the image width (see epipoles.py); 0 when standing, NaN when
     no epipole is found. standing: the picture does not move. moved_px: how far the median point
     moved since the last processed image, at full resolution. points: how many were tracked.
+    after_gap: the tracking began anew: nothing from here on belongs to what was before.
     """
 
     index: int
@@ -25,6 +26,7 @@ class Motion:
     points: int = 0
     center: int | None = None
     center_ns: int | None = None
+    after_gap: bool = False
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,8 @@ class TurnDetector:
         changed: list[Turn] = []
         if self._last_ns is not None:
             step = frame.stamp_ns - self._last_ns
-            # no turn extends over a gap, or over a clock that was set back
-            if frame.after_gap or step < 0 or step > self.config.half_width * 1e9:
+            # no turn extends over a gap, or over a long pause of the camera
+            if motion.after_gap or step > self.config.half_width * 1e9:
                 changed += self._end()
         self._last_ns = frame.stamp_ns
         self.bank.collect(frame, self._needed_ns(frame))

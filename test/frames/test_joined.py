@@ -48,7 +48,8 @@ def test_videos_are_one_drive(tmp_path, how):
         assert [frame.index for frame in found] == list(range(36))
         assert [frame.stamp_ns for frame in found] == [index * 40_000_000 for index in range(36)]
         # whether they follow each other directly is not known
-        assert [frame.index for frame in found if frame.after_gap] == [12, 24]
+        assert [frame.index for frame in found if frame.perhaps_after_gap] == [12, 24]
+        assert not any(frame.after_gap for frame in found)
         assert np.allclose(brightness(found),
                            [20 + 15 * (n % 12) + n // 12 for n in range(36)], atol=1)
     assert source.warnings == ()
@@ -98,13 +99,23 @@ def test_bags_that_do_not_go_on(tmp_path):
     assert found[10].stamp_ns - found[9].stamp_ns == STEP
 
 
+def test_a_bag_after_a_video(tmp_path):
+    video = write_video(tmp_path / '1.avi', smooth(), fps=25)
+    bag = write_bag(tmp_path / '2', images(drive(5)))
+    found = list(open_frames([video, bag, video]))
+    assert [frame.index for frame in found if frame.perhaps_after_gap] == [12, 17]
+    assert not any(frame.after_gap for frame in found)
+    steps = np.diff([frame.stamp_ns for frame in found])
+    assert set(steps[:12]) == {40_000_000} and set(steps[12:17]) == {STEP}
+
+
 def test_one_that_cannot_be_read_is_left_out(tmp_path):
     paths = videos(tmp_path / 'clips')
     paths[0].write_bytes(b'junk' * 999)
     (tmp_path / 'clips' / 'clip99.mp4').touch()
     source = open_frames(tmp_path / 'clips')
     assert [frame.index for frame in source] == list(range(24))
-    assert [frame.after_gap for frame in source].index(True) == 12
+    assert [frame.perhaps_after_gap for frame in source].index(True) == 12
     assert len(source.warnings) == 2
     assert str(paths[0]) in source.warnings[0] and 'clip99.mp4 is empty' in source.warnings[1]
     source = open_frames([tmp_path / 'missing.mp4', paths[1]])
@@ -144,6 +155,14 @@ def test_undecodable_images_are_told_by_their_file(tmp_path):
     source = open_frames(folders, fps=10)
     assert [frame.index for frame in source] == [0, 1, 2, 3, 5]
     assert f'1 undecodable images were skipped ({folders[1]}: image 4: ' in source.warnings[0]
+
+
+def test_an_undecodable_first_image_leaves_the_question_to_the_next(tmp_path):
+    folders = [write_folder(tmp_path / name, drive(3)) for name in 'ab']
+    (folders[1] / '0000.png').write_bytes(b'junk')
+    found = list(open_frames(folders, fps=10))
+    assert [frame.index for frame in found] == [0, 1, 2, 4, 5]
+    assert [frame.index for frame in found if frame.perhaps_after_gap] == [4]
 
 
 def test_what_all_files_say_is_said_once(tmp_path):
