@@ -28,11 +28,12 @@ Kind = Literal['lens', 'mount']
 LEAST_DISTORTION_SIGMA = 0.002
 # times the least sigmas: the error of a camera of which nothing is known
 UNKNOWN = 100.0
-# a size that one linear step finds is up to so many times too large, the more the larger it is
-OVERSHOOT = 2.5
+# times the zoom that is found, between which the true one is: the linear step overshoots by half
+# and more, and noise adds to it
+TRUE_ZOOM = (0.4, 1.3)
 # of the evidence; parts of the camera that leave less are the explanation: a turn's cost is not
 # exactly quadratic, so that the others gain some evidence from a change they have no part in
-UNEXPLAINED = 0.1
+UNEXPLAINED = 0.2
 
 
 @dataclass(frozen=True)
@@ -229,10 +230,11 @@ class Monitor:
 
     def _in_words(self, ways: Sequence[Way], offsets: Floats) -> str:
         zoom = 100 * offsets[0] / self.camera.fx
+        least, most = (share * abs(zoom) for share in TRUE_ZOOM)
         shift = 100 * np.abs(offsets[2:4]).max() / self.camera.image_size[0]
         texts: dict[Way, str] = {
-            'focal length': f'its focal length were about {abs(zoom) / OVERSHOOT:.1f} to '
-                            f'{abs(zoom):.1f} % too {"short" if zoom > 0 else "long"}',
+            'focal length': f'its focal length were {least:.1f} to {most:.1f} % too '
+                            f'{"short" if zoom > 0 else "long"}',
             'centre': f'its centre were up to {shift:.1f} % of the width off',
             'distortion': 'its distortion were another'}
         return ' and '.join(texts[way] for way in ways)

@@ -13,6 +13,7 @@ it knows in the node: the sigma of each parameter.
 from __future__ import annotations
 
 import pickle
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -257,19 +258,28 @@ def words_table(simulation: Simulation) -> str:
     rows = []
     for name in OF_LENS:
         kinds: Counter[str] = Counter()
-        ratios = []
+        in_range = []
         for each in simulation.of(Row(name)):
             if each.change is not None:
                 kinds[_kind_of(each.change, EVENTS[name].parts)] += 1
-                if name.startswith('zoom') and each.change.looks_like:
-                    true = EVENTS[name].camera(Radial((2, 2), 1.0, 1.0, 0.5, 0.5, 0.0, 0.0)).fx - 1
-                    ratios.append(each.change.zoom / true)
+                in_range += _told_rightly(each.change, EVENTS[name])
         count = sum(kinds.values())
         rows.append((name, *(f'{100 * kinds[kind] / count:.1f} %' for kind in KINDS),
-                     f'{min(ratios):.1f} to {max(ratios):.1f}' if ratios else ''))
-    return table(('change', *KINDS, 'zoom told / true'), rows)
+                     f'{100 * np.mean(in_range):.1f} %' if in_range else ''))
+    return table(('change', *KINDS, 'true zoom is in the range told'), rows)
 
 
+def _told_rightly(change: Change, event: Event) -> list[bool]:
+    """Return for each text of a focal length alone whether its range holds a zoom's size."""
+    true = 100 * (event.camera(Radial((2, 2), 1.0, 1.0, 0.5, 0.5, 0.0, 0.0)).fx - 1)
+    if event.parts != PARTS[:1]:
+        return []
+    return [(side == 'short') == (true > 0) and float(low) <= abs(true) <= float(high)
+            for text in change.looks_like
+            for low, high, side in RANGE.findall(text)]
+
+
+RANGE = re.compile(r'^its focal length were (\S+) to (\S+) % too (\w+)$')
 KINDS = ('these parts', 'these or others', 'others', 'another camera')
 
 

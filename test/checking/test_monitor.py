@@ -70,7 +70,7 @@ def test_turns_that_cannot_tell_focal_length_from_distortion_leave_it_open(readi
     after = [replace(each, score=0.02 * hessian @ zoom_and_k1 / (zoom_and_k1 @ zoom_and_k1))
              for each in before[:2]]
     [change] = watched(driven(*before, *after)).changes
-    assert change.looks_like == ('its focal length were about 0.8 to 2.0 % too short',
+    assert change.looks_like == ('its focal length were 0.8 to 2.6 % too short',
                                  'its distortion were another')
 
 
