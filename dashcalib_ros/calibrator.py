@@ -157,9 +157,11 @@ class Calibrator:
               progress: Progress | None = None) -> Monitor:
         """Return whether the turns so far show that a camera in use has changed.
 
-        camera: of the full-size pictures; sigma: of its parameters, None where not known. Turns
-        that were read with the same camera before are not read again. progress: as for
-        calibrate(). Raises InputError where the camera is for pictures of another size.
+        camera: of the full-size pictures. sigma: of its parameters; None for a camera that is not
+        known to have fitted any turns before these: then only turns behind one that it explains
+        can show a change. Turns that were read with the same camera before are not read again.
+        progress: as for calibrate(). Raises InputError where the camera is for pictures of
+        another size.
         """
         with self._lock:
             size, scale = self._detection.size, self._detection.scale
@@ -178,8 +180,9 @@ class Calibrator:
                 progress=progress or (lambda stage, done: None))
             turns |= {reading.turn: reading for reading in readings}
         # fx, fy, cx and cy are pixels
-        scaled = {name: value / scale.px if name in small.names()[:4] else value
-                  for name, value in (sigma or {}).items()}
+        scaled = None if sigma is None else {
+            name: value / scale.px if name in small.names()[:4] else value
+            for name, value in sigma.items()}
         return watch((turns[turn] for turn in sorted(turns)), small, scaled, self._config.monitor)
 
     @property

@@ -1,17 +1,20 @@
 #!/usr/bin/env python3
 """After how many turns the monitor notices a change of the camera, and how often for nothing.
 
-    python test/benchmark/monitor.py --cache DIR [--drives N] [--out DIR]
+    python test/benchmark/monitor.py --cache DIR [--drives N] [--seed N] [--out DIR]
 
 Reads the solutions that check.py keeps in the cache. Each turn's tracks are mapped to what a
 zoomed, cropped, exchanged or turned camera would have seen of them, and explained with the
 calibration in use; these readings are kept in the cache, too. A simulated drive is a row of turns
 of one lens, drawn at random, with a change after some of them. Its calibration in use is the
-solution, moved by an error drawn from the solution's own covariance.
+solution, moved by an error drawn from the solution's own covariance; the monitor knows of it what
+it knows in the node: the sigma of each parameter.
 """
 from __future__ import annotations
 
 import pickle
+import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,8 +26,8 @@ from scipy.spatial.transform import Rotation
 from solutions import Solved
 
 from dashcalib_ros import Config, stages
-from dashcalib_ros.camera import Camera
-from dashcalib_ros.checking import Monitor, Reading
+from dashcalib_ros.camera import Camera, Radial
+from dashcalib_ros.checking import Change, Reading, watch
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.solve.opinions import covariance_of
 from dashcalib_ros.turns.turn import TurnId
@@ -52,9 +55,13 @@ def exchanged(camera: Camera) -> Camera:
 
 @dataclass(frozen=True)
 class Event:
-    """A change: the camera that takes the pictures afterwards, and how it is turned, degrees."""
+    """A change: the camera that takes the pictures afterwards, and how it is turned, degrees.
+
+    parts: of the camera that are others then, as the monitor names them.
+    """
 
     camera: Callable[[Camera], Camera] = lambda camera: camera
+    parts: tuple[str, ...] = ()
     yaw_deg: float = 0.0
     pitch_deg: float = 0.0
 
@@ -64,19 +71,23 @@ class Event:
         return 'mount' if self.yaw_deg or self.pitch_deg else 'lens'
 
 
+PARTS = ('focal length', 'centre', 'distortion')
 EVENTS: Mapping[str, Event] = {
     'none': Event(),
-    'zoom +1 %': Event(lambda camera: zoomed(camera, 1.01)),
-    'zoom +2 %': Event(lambda camera: zoomed(camera, 1.02)),
-    'zoom -2 %': Event(lambda camera: zoomed(camera, 1 / 1.02)),
-    'zoom +5 %': Event(lambda camera: zoomed(camera, 1.05)),
-    'crop of 95 % at a corner': Event(lambda camera: zoomed(camera, 1 / 0.95, (0.0, 1.0))),
-    'exchanged': Event(exchanged),
+    'zoom +1 %': Event(lambda camera: zoomed(camera, 1.01), PARTS[:1]),
+    'zoom +2 %': Event(lambda camera: zoomed(camera, 1.02), PARTS[:1]),
+    'zoom -2 %': Event(lambda camera: zoomed(camera, 1 / 1.02), PARTS[:1]),
+    'zoom +5 %': Event(lambda camera: zoomed(camera, 1.05), PARTS[:1]),
+    'crop of 95 % at a corner': Event(lambda camera: zoomed(camera, 1 / 0.95, (0.0, 1.0)),
+                                      PARTS[:2]),
+    'exchanged': Event(exchanged, PARTS),
+    'k1 0.02 higher': Event(lambda camera: replace(camera, k1=camera.k1 + 0.02), PARTS[2:]),
     'turned 1° to a side': Event(yaw_deg=1.0),
     'tilted by 1°': Event(pitch_deg=1.0),
     'turned 3° to a side': Event(yaw_deg=-3.0),
     'tilted by 3°': Event(pitch_deg=-3.0),
 }
+OF_LENS = [name for name, event in EVENTS.items() if event.parts]
 
 
 def seen_after(scene: Scene, camera: Camera, event: Event) -> Scene:
@@ -97,95 +108,195 @@ def seen_after(scene: Scene, camera: Camera, event: Event) -> Scene:
 
 @dataclass(frozen=True)
 class Library:
-    """The readings of one lens, by event; covariance: (n, n) of its calibration."""
+    """The readings of one lens, by event.
+
+    covariance: (n, n) of its calibration; sigma: as it is stated, of the solution's pictures.
+    """
 
     name: str
     camera: Camera
     covariance: np.ndarray
+    sigma: Mapping[str, float]
     readings: Mapping[str, Sequence[Reading]]
 
 
 def library_of(drive: Solved, cache: Path) -> Library:
-    """Return a drive's readings from the cache, or make them."""
-    assert drive.solution is not None
-    path = cache / 'readings' / f'{drive.name}, seed {drive.seed}.pickle'.replace('/', ' ')
-    if path.exists():
-        found: Library = pickle.loads(path.read_bytes())
-        return found
-    camera = drive.solution.camera
-    found = Library(
-        f'{drive.name}, seed {drive.seed}', camera,
-        covariance_of(drive.solution, CONFIG.intrinsics),
-        {name: stages.read([seen_after(scene, camera, event) for scene in drive.solution.scenes],
-                           camera, CONFIG) for name, event in EVENTS.items()})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_suffix('.new')
-    fresh.write_bytes(pickle.dumps(found))
-    fresh.replace(path)
-    return found
+    """Return a drive with its readings, which come from the cache or are made."""
+    assert drive.solution is not None and drive.calibration.sigma is not None
+    camera, name = drive.solution.camera, f'{drive.name}, seed {drive.seed}'
+    path = cache / 'readings' / f'{name}.pickle'.replace('/', ' ')
+    readings = pickle.loads(path.read_bytes()) if path.exists() else {}
+    missing = [event for event in EVENTS if event not in readings]
+    if missing:
+        readings |= {event: stages.read([seen_after(scene, camera, EVENTS[event])
+                                         for scene in drive.solution.scenes], camera, CONFIG)
+                     for event in missing}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = path.with_suffix('.new')
+        fresh.write_bytes(pickle.dumps(readings))
+        fresh.replace(path)
+    px = drive.calibration.image_size[0] / camera.image_size[0]
+    # fx, fy, cx and cy are pixels
+    sigma = {key: value / px if key in camera.names()[:4] else value
+             for key, value in drive.calibration.sigma.items()}
+    return Library(name, camera, covariance_of(drive.solution, CONFIG.intrinsics), sigma, readings)
 
 
-def noticed(library: Library, name: str, factor: float, seed: int) -> tuple[int | None, bool]:
-    """Return after how many turns a change was told (None: not), and whether one was for nothing.
+@dataclass(frozen=True)
+class Row:
+    """A row of simulated drives: turns of one event, then of another.
 
-    factor: of the monitor's limits.
+    proven: the calibration in use is known to have fitted before. factor: of the limits.
     """
+
+    after: str
+    before: str = 'none'
+    proven: bool = True
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Told:
+    """What was told of a drive: a change, after how many of its turns; one for nothing."""
+
+    change: Change | None = None
+    turns: int = 0
+    for_nothing: Change | None = None
+
+
+def told(library: Library, row: Row, seed: int) -> Told:
+    """Simulate a drive until something is told."""
     rng = np.random.default_rng([seed, 17])
     settings = CONFIG.monitor
-    settings = replace(settings, limit=factor * settings.limit,
-                       turn_limit=factor * settings.turn_limit,
-                       heading_limit=np.sqrt(factor) * settings.heading_limit)
+    settings = replace(settings, limit=row.factor * settings.limit,
+                       turn_limit=row.factor * settings.turn_limit,
+                       heading_limit=np.sqrt(row.factor) * settings.heading_limit)
     # the calibration in use is off by this much
     off = rng.multivariate_normal(np.zeros(len(library.covariance)), library.covariance)
-    monitor = Monitor(library.camera, library.covariance, settings)
-    event = EVENTS[name]
-    before = int(rng.integers(3, 7)) if name != 'none' else UNCHANGED
-    for turn in range(before + (AFTER if name != 'none' else 0)):
-        rows = library.readings['none' if turn < before else name]
+    monitor = watch((), library.camera, library.sigma if row.proven else None, settings)
+    event, changes = EVENTS[row.after], row.after != row.before
+    before = int(rng.integers(3, 7)) if changes else UNCHANGED
+    for turn in range(before + (AFTER if changes else 0)):
+        rows = library.readings[row.before if turn < before else row.after]
         reading = rows[rng.integers(len(rows))]
         monitor = monitor.after(replace(reading, turn=TurnId.at(turn),
                                         score=reading.score - reading.hessian @ off))
         if turn < before and monitor.changes:
-            return None, True
-        if any(change.kind == event.kind for change in monitor.changes):
-            return turn - before + 1, False
-    return None, False
+            return Told(for_nothing=monitor.changes[0])
+        found = [change for change in monitor.changes if change.kind == event.kind]
+        if found:
+            return Told(found[0], turn - before + 1)
+    return Told()
 
 
-def events_table(libraries: Sequence[Library], drives: int) -> str:
-    """Return a line for each event."""
-    rows = []
-    for name in EVENTS:
-        found = [noticed(libraries[n % len(libraries)], name, 1.0, n) for n in range(drives)]
-        turns = [after for after, _ in found if after is not None]
-        within = [sum(each <= most for each in turns) for most in (2, 3, AFTER)]
-        false = sum(each for _, each in found)
-        rows.append((name, *('' if name == 'none' else f'{100 * count / drives:.1f} %'
-                             for count in within), f'{false} of {drives}'))
+class Simulation:
+    """Simulated drives of all lenses in turn, numbered from seed on."""
+
+    def __init__(self, libraries: Sequence[Library], drives: int, seed: int) -> None:
+        self.libraries, self.drives, self.seed = libraries, drives, seed
+
+    def of(self, row: Row, times: int = 1) -> list[Told]:
+        """Return what was told of each drive."""
+        return [told(self.libraries[n % len(self.libraries)], row, self.seed + n)
+                for n in range(times * self.drives)]
+
+    def within(self, row: Row) -> tuple[str, str, str, str]:
+        """Return the shares that are told within 2, 3 and AFTER turns, and those for nothing."""
+        found = self.of(row)
+        counts = [sum(each.change is not None and each.turns <= most for each in found)
+                  for most in (2, 3, AFTER)]
+        two, three, all_turns = (f'{100 * count / self.drives:.1f} %' for count in counts)
+        return two, three, all_turns, _for_nothing(found)
+
+
+def _for_nothing(found: Sequence[Told]) -> str:
+    return f'{sum(each.for_nothing is not None for each in found)} of {len(found)}'
+
+
+def events_table(simulation: Simulation) -> str:
+    """Return a line for each event; ten times as many drives without one."""
+    rows = [(name, *simulation.within(Row(name))) for name in EVENTS if name != 'none']
+    rows.insert(0, ('none', '', '', '', _for_nothing(simulation.of(Row('none'), 10))))
     return table(('change', 'told within 2 turns', '3', f'{AFTER}', 'for nothing'), rows)
 
 
-def trade_table(libraries: Sequence[Library], drives: int) -> str:
+def trade_table(simulation: Simulation) -> str:
     """Return what other limits would tell: the curve of alarms that are true and false."""
     names = ('zoom +1 %', 'zoom +2 %', 'zoom -2 %', 'turned 1° to a side', 'tilted by 1°')
     rows = []
     for factor in FACTORS:
-        shares = []
-        for name in names:
-            found = [noticed(libraries[n % len(libraries)], name, factor, n)[0]
-                     for n in range(drives)]
-            told = sum(each is not None and each <= 3 for each in found)
-            shares.append(f'{100 * told / drives:.1f} %')
-        false = sum(noticed(libraries[n % len(libraries)], 'none', factor, n)[1]
-                    for n in range(drives))
-        rows.append((f'{factor:g}', *shares, f'{false} of {drives}'))
+        shares = [simulation.within(Row(name, factor=factor))[1] for name in names]
+        rows.append((f'{factor:g}', *shares,
+                     _for_nothing(simulation.of(Row('none', factor=factor)))))
     return table(('limits, times ours', *names, 'for nothing'), rows)
+
+
+def lenses_table(simulation: Simulation) -> str:
+    """Return the lenses on which a zoom of 2 % is not always told within three turns."""
+    rows = []
+    for library in simulation.libraries:
+        own = Simulation([library], simulation.drives, simulation.seed)
+        shares = [own.within(Row(name))[1] for name in ('zoom +2 %', 'zoom -2 %')]
+        if set(shares) != {'100.0 %'}:
+            rows.append((library.name, *shares, _for_nothing(own.of(Row('none')))))
+    return table(('lens', 'zoom +2 %', 'zoom -2 %', 'for nothing'), rows)
+
+
+def unproven_table(simulation: Simulation) -> str:
+    """Return what is told of a calibration that is not known to have fitted before.
+
+    One that never fits has not changed; one that fits at first has.
+    """
+    rows = [(name, _for_nothing(simulation.of(Row(name, name, proven=False))),
+             simulation.within(Row(name, proven=False))[1]) for name in OF_LENS]
+    return table(('the calibration is off by', 'told, though it never fitted',
+                  'told, within 3 turns after it fitted'), rows)
+
+
+def words_table(simulation: Simulation) -> str:
+    """Return which parts of the camera a change is told to be of, and the size of a zoom."""
+    rows = []
+    for name in OF_LENS:
+        kinds: Counter[str] = Counter()
+        in_range = []
+        for each in simulation.of(Row(name)):
+            if each.change is not None:
+                kinds[_kind_of(each.change, EVENTS[name].parts)] += 1
+                in_range += _told_rightly(each.change, EVENTS[name])
+        count = sum(kinds.values())
+        rows.append((name, *(f'{100 * kinds[kind] / count:.1f} %' for kind in KINDS),
+                     f'{100 * np.mean(in_range):.1f} %' if in_range else ''))
+    return table(('change', *KINDS, 'true zoom is in the range told'), rows)
+
+
+def _told_rightly(change: Change, event: Event) -> list[bool]:
+    """Return for each text of a focal length alone whether its range holds a zoom's size."""
+    true = 100 * (event.camera(Radial((2, 2), 1.0, 1.0, 0.5, 0.5, 0.0, 0.0)).fx - 1)
+    if event.parts != PARTS[:1]:
+        return []
+    return [(side == 'short') == (true > 0) and float(low) <= abs(true) <= float(high)
+            for text in change.looks_like
+            for low, high, side in RANGE.findall(text)]
+
+
+RANGE = re.compile(r'^its focal length were (\S+) to (\S+) % too (\w+)$')
+KINDS = ('these parts', 'these or others', 'others', 'another camera')
+
+
+def _kind_of(change: Change, parts: Sequence[str]) -> str:
+    named = [{part for part in PARTS if part in text} for text in change.looks_like]
+    if not named:
+        return 'another camera'
+    if set(parts) not in named:
+        return 'others'
+    return 'these parts' if len(named) == 1 else 'these or others'
 
 
 def main() -> None:
     """Parse the arguments, print the tables."""
     parser = parser_with(__doc__, 'cache', 'out')
     parser.add_argument('--drives', type=int, default=200, help='simulated, for each change')
+    parser.add_argument('--seed', type=int, default=0, help='number of the first drive')
     arguments = parser.parse_args()
     libraries = []
     for drive in solved_drives(arguments.cache):
@@ -196,9 +307,10 @@ def main() -> None:
         libraries.append(library_of(drive, arguments.cache))
         complain(libraries[-1].name)
     turns = sum(len(each.readings['none']) for each in libraries)
-    text = (f'{len(libraries)} lenses, {turns} turns\n\n'
-            f'{events_table(libraries, arguments.drives)}\n\n'
-            f'{trade_table(libraries, arguments.drives)}')
+    simulation = Simulation(libraries, arguments.drives, arguments.seed)
+    text = '\n\n'.join((f'{len(libraries)} lenses, {turns} turns', *(
+        made(simulation) for made in (events_table, lenses_table, unproven_table, words_table,
+                                      trade_table))))
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / 'monitor.md').write_text(text + '\n')
     print(text)

@@ -35,8 +35,8 @@ def driven(*turns):
     return [replace(reading, turn=TurnId.at(n), heading=None) for n, reading in enumerate(turns)]
 
 
-def watched(turns):
-    return watch(turns, LENS, SIGMA, CONFIG.monitor)
+def watched(turns, sigma=SIGMA):
+    return watch(turns, LENS, sigma, CONFIG.monitor)
 
 
 def test_the_same_camera_has_not_changed(readings):
@@ -50,7 +50,59 @@ def test_a_zoom_is_suspected_after_one_turn_and_told_after_two(readings):
     [change] = watched(driven(*readings['same'], *readings['zoomed'][:2])).changes
     assert change.kind == 'lens' and change.since == TurnId.at(3)
     assert 0.015 < change.zoom < 0.06 and max(map(abs, change.shift)) < 0.01
-    assert 'since the turn at frame 3' in str(change) and 'focal length' in str(change)
+    assert 'since the turn at frame 3' in str(change)
+    text, = change.looks_like
+    assert 'focal length' in text and 'short' in text and 'and' not in text
+
+
+def test_another_distortion_is_not_told_as_a_focal_length(readings):
+    bent = [replace(each, score=each.hessian @ (0, 0, 0, 0, 0.03, 0))
+            for each in readings['same'][:2]]
+    [change] = watched(driven(*readings['same'], *bent)).changes
+    assert change.looks_like == ('its distortion were another',)
+
+
+def test_turns_that_cannot_tell_focal_length_from_distortion_leave_it_open(readings):
+    """They know the centre, and of the others only the sum of zoom and k1."""
+    zoom_and_k1 = np.array([0.5 / LENS.fx, 0.5 / LENS.fy, 0.0, 0.0, 1.0, 0.0])
+    hessian = 1e6 * np.outer(zoom_and_k1, zoom_and_k1) + np.diag([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+    before = [replace(each, hessian=hessian, score=np.zeros(6)) for each in readings['same']]
+    after = [replace(each, score=0.02 * hessian @ zoom_and_k1 / (zoom_and_k1 @ zoom_and_k1))
+             for each in before[:2]]
+    [change] = watched(driven(*before, *after)).changes
+    assert change.looks_like == ('its focal length were 0.8 to 2.6 % too short',
+                                 'its distortion were another')
+
+
+def test_turns_before_a_change_make_up_for_a_calibration_that_is_known_badly(readings):
+    badly = {**SIGMA, 'fx': 0.03 * LENS.fx, 'fy': 0.03 * LENS.fy, 'k1': 0.02}
+    assert not watched(driven(*readings['zoomed']), badly).changes
+    [change] = watched(driven(*readings['same'], *readings['zoomed'][:2]), badly).changes
+    assert change.since == TurnId.at(3)
+
+
+def test_a_calibration_that_fits_no_turn_has_changed_only_if_it_fitted_others_before(readings):
+    for name in ('zoomed', 'exchanged'):
+        turns = driven(*readings[name])
+        [change] = watched(turns).changes
+        assert change.since == TurnId.at(0)
+        assert watched(turns, None).changes == ()
+
+
+def test_a_turn_that_the_calibration_explains_shows_that_it_changed(readings):
+    for name in ('zoomed', 'exchanged'):
+        [change] = watched(driven(readings['same'][0], *readings[name]), None).changes
+        assert change.since == TurnId.at(1)
+        # not one that any camera would explain
+        nothing = replace(readings['same'][0], hessian=np.zeros((6, 6)), score=np.zeros(6))
+        assert watched(driven(nothing, *readings[name]), None).changes == ()
+
+
+def test_the_first_turn_that_showed_a_change_is_kept(readings):
+    turns = driven(*readings['same'], *readings['zoomed'] * 4)
+    assert len(turns) > CONFIG.monitor.turns + 3
+    [change] = watched(turns).changes
+    assert change.since == TurnId.at(3)
 
 
 def test_one_odd_turn_is_no_change(readings):
@@ -73,6 +125,14 @@ def test_another_camera_is_told_although_no_size_can_be(readings):
 def test_turns_that_know_nothing_say_nothing(readings):
     nothing = replace(readings['same'][0], hessian=np.zeros((6, 6)), score=np.zeros(6))
     assert watched(driven(*[nothing] * 5)).changes == ()
+
+
+def test_turns_that_the_camera_does_not_explain_do_not_show_where_it_points(readings):
+    turned = Heading(2.0, 0.0, 0.1, 0.1)
+    before = [looking(0.0, 0.0, n) for n in range(4)]
+    for name, kind in (('same', 'mount'), ('zoomed', 'lens')):
+        after = [replace(readings[name][0], turn=TurnId.at(n), heading=turned) for n in (4, 5)]
+        assert [each.kind for each in watched([*before, *after]).changes] == [kind]
 
 
 def looking(yaw_deg, pitch_deg, number, sigma_deg=0.1):

@@ -24,7 +24,7 @@ class FakeCalibrator:
 
     answer = 'right'
     asked: object = None
-    zooms = False
+    fits = 5
 
     def __init__(self, config=None, mask=None, verbose=False):
         pass
@@ -51,9 +51,9 @@ class FakeCalibrator:
         return Odometry(('given', 'ours', 'guess'), (turn,))
 
     def watch(self, camera, sigma=None, progress=None):
-        seen = [Reading(TurnId.at(n), np.zeros((6, 6)), np.zeros(6), None, n < 3)
-                for n in range(5 if self.zooms else 3)]
-        return watch(seen, camera, {}, Config().monitor)
+        seen = [Reading(TurnId.at(n), 100 * np.eye(6), np.zeros(6), None, n < self.fits)
+                for n in range(5)]
+        return watch(seen, camera, sigma, Config().monitor)
 
     def close(self):
         pass
@@ -92,9 +92,15 @@ def test_json_has_what_programs_need(files, capfd):
 
 
 def test_a_change_during_the_drive_is_told(files, monkeypatch, capfd):
-    monkeypatch.setattr(FakeCalibrator, 'zooms', True)
+    monkeypatch.setattr(FakeCalibrator, 'fits', 3)
     assert main(files) == 0
     assert 'since the turn at frame 3' in capfd.readouterr().out
+
+
+def test_a_calibration_that_never_fitted_has_not_changed(files, monkeypatch, capfd):
+    monkeypatch.setattr(FakeCalibrator, 'fits', 0)
+    assert main(files) == 0
+    assert 'since' not in capfd.readouterr().out
 
 
 def test_poses_are_compared_and_paths_are_written(files, tmp_path, capfd):

@@ -34,7 +34,9 @@ from dashcalib_ros.turns import TurnId
 TOPIC = '/camera_info'
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
-ZERO = np.zeros((6, 6))
+ZERO = np.zeros(6)
+# of a turn that knows each parameter to 0.1
+KNOWS = 100 * np.eye(6)
 
 
 @stands_in_for(Calibrator)
@@ -66,8 +68,8 @@ class Core:
         return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
 
     def watch(self, camera, sigma=None):
-        return watch((Reading(turn, ZERO, ZERO[0], None, turn not in self.strangers)
-                      for turn in self.ready), camera, sigma or {}, Config().monitor)
+        return watch((Reading(turn, KNOWS, ZERO, None, turn not in self.strangers)
+                      for turn in self.ready), camera, sigma, Config().monitor)
 
     def want(self, turns):
         pass
@@ -206,7 +208,8 @@ def test_a_camera_that_is_exchanged_is_told(desk, capfd):
     # after a reset, one turn is a suspicion again
     assert desk.call('reset').success
     desk.until(lambda: heard[-1]['changes'] == [])
-    Core.newest.ready = Core.newest.strangers = turns(50)
+    Core.newest.strangers = turns(50)
+    Core.newest.ready = turns(40, 50)
     desk.until(lambda: 'frame 50' in desk.bench.values['suspected change'])
     assert desk.bench.values['change'] == ''
 

@@ -28,7 +28,8 @@ from dashcalib_ros.turns import TurnId
 
 LIMIT = 20.0
 CONFIG = Config().replace({'turns.wanted': 2})
-CAMERA = NamedCamera('in use', Radial((64, 48), 60.0, 60.0, 31.5, 23.5, -0.1, 0.01))
+CAMERA = NamedCamera('in use', Radial((64, 48), 60.0, 60.0, 31.5, 23.5, -0.1, 0.01),
+                     dict.fromkeys(('fx', 'fy', 'cx', 'cy', 'k1', 'k2'), 0.1))
 ZERO = np.zeros((6, 6))
 
 
@@ -84,7 +85,7 @@ class Core:
         if Core.failures:
             raise Core.failures.pop()
         return watch((Reading(turn, ZERO, ZERO[0], None, explained=turn not in self.strangers)
-                      for turn in self.ready), camera, sigma or {}, CONFIG.monitor)
+                      for turn in self.ready), camera, sigma, CONFIG.monitor)
 
     def check(self, given, calibration, progress=None):
         self.checked.append(given)
