@@ -46,11 +46,11 @@ def ros_context(tmp_path_factory):
 @pytest.fixture
 def start_node(tmp_path, ros_context):
     """Start nodes that are gone after the test, whatever happens."""
-    from ros_bench import NodeProcess
+    from ros_bench import QUICK_COMMAND, NodeProcess
     nodes = []
 
-    def start(*arguments, **parameters):
-        nodes.append(NodeProcess(tmp_path, *arguments, **parameters))
+    def start(*arguments, command=QUICK_COMMAND, **parameters):
+        nodes.append(NodeProcess(tmp_path, *arguments, command=command, **parameters))
         return nodes[-1]
 
     yield start

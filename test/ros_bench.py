@@ -27,6 +27,13 @@ SECOND = 10**9
 # ns; stamp of the first image
 START = 1_767_614_400 * SECOND
 COMMAND = [sys.executable, '-m', 'dashcalib_ros.ros']
+# the same with diagnostics ten times a second, which tests wait for again and again
+QUICK_COMMAND = [sys.executable, '-c', """
+import sys
+from dashcalib_ros.ros import diagnosis, main
+diagnosis.PERIOD_S = 0.1
+sys.exit(main())
+"""]
 
 
 def ros_environment(home):

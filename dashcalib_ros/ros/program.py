@@ -4,6 +4,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import rclpy
 import rclpy.utilities
@@ -32,7 +33,7 @@ def run(argv: Sequence[str], lifecycle: bool, stopping: Stopping) -> int:
         start_ros(argv)
         if not stopping.requested:
             node = make_node(lifecycle)
-            spin(node)
+            spin(node, stopping)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception as error:
@@ -71,17 +72,27 @@ def start_ros(argv: Sequence[str]) -> None:
                           f'files --params-file FILE') from error
 
 
-def spin(node: CalibratorNode) -> None:
-    """Run the node's callbacks until the context is shut down.
+class Executor(SingleThreadedExecutor):
+    """One that tells nothing where it cannot be made, as in a context that is shut down."""
+
+    # rclpy reads it in __del__, also where __init__ failed before it was set
+    _sigint_gc: Any = None
+
+
+def spin(node: CalibratorNode, stopping: Stopping) -> None:
+    """Run the node's callbacks until the context is shut down, or a signal asked for the end.
+
+    A signal that comes while rclpy installs its own handlers does not shut the context down; the
+    next timer of the node then ends the wait.
 
     Exceptions of callbacks, and of rclpy itself, are logged and counted, and the node goes on.
     Raises SetupError, and exceptions after which rclpy calls no callback any more: the node must
     then be started again, as the launch files do.
     """
-    with SingleThreadedExecutor() as executor:
+    with Executor() as executor:
         executor.add_node(node)
         wait_s = FIRST_WAIT_S
-        while executor.context.ok():
+        while executor.context.ok() and not stopping.requested:
             try:
                 executor.spin_once()
                 wait_s = FIRST_WAIT_S

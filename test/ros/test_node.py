@@ -43,7 +43,7 @@ from dashcalib_ros.report import load_calibration_yaml
     (signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT),
     (signal.SIGTERM, signal.SIGINT)], ids=['SIGINT', 'SIGTERM', 'two SIGINT', 'both'])
 def test_it_ends_cleanly_while_it_collects(start_node, make_bench, signals):
-    node, camera = start_node(), make_bench()
+    node, camera = start_node(command=COMMAND), make_bench()
     camera.connect(node)
     stream(camera, 5)
     assert node.stop(*signals) == 0, node.text
@@ -54,7 +54,7 @@ def test_it_ends_cleanly_while_it_collects(start_node, make_bench, signals):
 @pytest.mark.parametrize('delay', [0.0, 0.2, 0.4])
 def test_it_ends_cleanly_while_it_starts(start_node, number, delay):
     """From the node's own first line on: before that it is Python that starts."""
-    node = start_node()
+    node = start_node(command=COMMAND)
     end = time.monotonic() + SOON
     while not node.catches(signal.SIGTERM):
         assert time.monotonic() < end and node.process.poll() is None, node.text
