@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,12 @@ from dashcalib_ros.solve.fitting import adapted_to
 from dashcalib_ros.solve.focal import kinds_of_lenses, nearest_start, profile_around, summed
 from dashcalib_ros.solve.information import covariance
 from dashcalib_ros.solve.misfit import misfits
-from dashcalib_ros.solve.model_choice import chosen_of, compared_with_others, with_model_chosen
+from dashcalib_ros.solve.model_choice import (
+    chosen_of,
+    compared_with_others,
+    with_model_chosen,
+    with_poses_of_rival,
+)
 from dashcalib_ros.solve.prior import (
     bounds_of,
     extra_sigma_of,
@@ -60,8 +65,8 @@ def solve(separate: Sequence[Scene], config: Config,
              if (found := _begun(kind, separate, config, progress)) is not None]
     if not begun:
         return None
-    roughly, tried = chosen_of([each.result for each in begun], config)
-    start = next(each for each in begun if each.result is roughly)
+    start, tried = _best_of(begun, config)
+    roughly = start.result
     roughly = _steadied(roughly, config)
     crops, full_scenes = roughly.fit.crops, start.full_scenes
     if crops:
@@ -97,6 +102,26 @@ def _steadied(first: Result, config: Config) -> Result:
     if not rounds or not moves(first.departures(bent=False)) or not moves(first.departures()):
         return first
     return without_stabiliser(first, config, rounds)
+
+
+def _best_of(begun: Sequence[_Begun], config: Config) -> tuple[_Begun, tuple[Candidate, ...]]:
+    """Return the kind of lens that explains the turns best, and how the kinds compare.
+
+    Each of the others is also tried from the best one's poses.
+    """
+    def chosen(found: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
+        result, tried = chosen_of([each.result for each in found], config)
+        return next(each for each in found if each.result is result), tried
+
+    best, tried = chosen(begun)
+    again = []
+    for other in begun:
+        if other is not best and len(best.result.parts) > 1:
+            model = type(other.result.fit.camera)
+            result = with_poses_of_rival(best.result, model, best.full_scenes, config)
+            if result is not None:
+                again.append(replace(other, result=result))
+    return chosen([best, *again]) if again else (best, tried)
 
 
 def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progress

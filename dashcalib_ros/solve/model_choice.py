@@ -51,6 +51,16 @@ def with_model_chosen(first: Result, full_scenes: ByTurn, config: Config
     return _without_shutter(first, model, full_scenes, config) or first, tried
 
 
+def with_poses_of_rival(result: Result, model: type[Camera], full_scenes: ByTurn, config: Config
+                        ) -> Result | None:
+    """Return a result's turns explained with another kind of lens, from the poses they have now.
+
+    A kind that loses may have lost by the bad poses of one turn only.
+    """
+    few, measured = _few(result, full_scenes, config)
+    return _refitted(few, model, measured, config)
+
+
 def compared_with_others(asked: Result, full_scenes: ByTurn, config: Config
                          ) -> tuple[Candidate, ...]:
     """Return how a model that was asked for compares with all others, with a part of the tracks.
