@@ -27,12 +27,14 @@ class Candidate:
     robust squared errors, in units of the noise of a track; 0 for the chosen one, negative for one
     that does better, but not clearly. apart_px: how far its camera is from the chosen one over the
     picture; None where they cannot be compared. chosen: it is the one that the turns choose.
+    cost_ratio: its cost of the turns left out over that of the chosen one.
     """
 
     model: str
     loses_by: float
     apart_px: float | None = None
     chosen: bool = False
+    cost_ratio: float = 1.0
 
 
 def held_out_costs(scenes: Sequence[Scene], camera: Camera, parts: Sequence[Information],

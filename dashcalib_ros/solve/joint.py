@@ -18,8 +18,8 @@ from dashcalib_ros.solve.misfit import misfits
 from dashcalib_ros.solve.model_choice import (
     chosen_of,
     compared_with_others,
+    refitted,
     with_model_chosen,
-    with_poses_of_rival,
 )
 from dashcalib_ros.solve.prior import (
     bounds_of,
@@ -107,21 +107,19 @@ def _steadied(first: Result, config: Config) -> Result:
 def _best_of(begun: Sequence[_Begun], config: Config) -> tuple[_Begun, tuple[Candidate, ...]]:
     """Return the kind of lens that explains the turns best, and how the kinds compare.
 
-    Each of the others is also tried from the best one's poses.
+    A kind may lose by the bad poses of one turn only. So all are tried again from those of the
+    best one, that one too: it must not win or lose by fewer steps of adjustment.
     """
     def chosen(found: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
         result, tried = chosen_of([each.result for each in found], config)
         return next(each for each in found if each.result is result), tried
 
     best, tried = chosen(begun)
-    again = []
-    for other in begun:
-        if other is not best and len(best.result.parts) > 1:
-            model = type(other.result.fit.camera)
-            result = with_poses_of_rival(best.result, model, best.full_scenes, config)
-            if result is not None:
-                again.append(replace(other, result=result))
-    return chosen([best, *again]) if again else (best, tried)
+    if len(begun) == 1 or len(best.result.parts) < 2:
+        return best, tried
+    again = [replace(each, result=result) for each in begun if (result := refitted(
+        best.result, type(each.result.fit.camera), best.full_scenes, config)) is not None]
+    return chosen(again) if again else (best, tried)
 
 
 def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progress

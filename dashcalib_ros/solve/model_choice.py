@@ -51,11 +51,11 @@ def with_model_chosen(first: Result, full_scenes: ByTurn, config: Config
     return _without_shutter(first, model, full_scenes, config) or first, tried
 
 
-def with_poses_of_rival(result: Result, model: type[Camera], full_scenes: ByTurn, config: Config
-                        ) -> Result | None:
-    """Return a result's turns explained with another kind of lens, from the poses they have now.
+def refitted(result: Result, model: type[Camera], full_scenes: ByTurn, config: Config
+             ) -> Result | None:
+    """Return a result's turns explained with a model, from the poses that they have now.
 
-    A kind that loses may have lost by the bad poses of one turn only.
+    None where it does not explain all of them.
     """
     few, measured = _few(result, full_scenes, config)
     return _refitted(few, model, measured, config)
@@ -114,9 +114,11 @@ def chosen_of(results: Sequence[Result], config: Config) -> tuple[Result, tuple[
         if clear and not _alike(results[n], results[best], config):
             best = n
     chosen = results[best]
+    totals = [sum(cost.get(turn, 2 * worst[turn]) for turn in worst) for cost in costs]
     return chosen, tuple(Candidate(
         result.fit.camera.model, sum(gains[best].values()) - sum(gains[n].values()),
-        mapping_error(result.fit.camera, chosen.fit.camera), result is chosen)
+        mapping_error(result.fit.camera, chosen.fit.camera), result is chosen,
+        totals[n] / totals[best])
         for n, result in enumerate(results))
 
 
