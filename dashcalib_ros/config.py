@@ -270,6 +270,10 @@ class VerdictConfig:
     max_model_sigmas: float = expert(
         2.0, 'over the picture; a model asked for, but farther from what turns choose, is weak',
         0.0, 1e6)
+    min_kind_ratio: float = expert(
+        1.5, "of the turns' costs, pinhole to fisheye; true fisheyes have 2.7 and more", 1.0, 1e6)
+    max_kind_sigmas: float = expert(
+        10.0, 'over the picture; kinds of lenses that differ by less may be mistaken', 0.0, 1e6)
     max_misfit: float = expert(
         2.0, "times a turn's cost with a camera of its own; more is weak: another lens", 1.0, 1e4)
 

@@ -264,6 +264,22 @@ def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
                            f'{own.model}, and that one is {far} away', 'leave --model away')
 
 
+def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Doubt a fisheye that explains the turns hardly better than a pinhole far from it."""
+    camera = solution.camera
+    for each in solution.tried:
+        model = MODELS[each.model]
+        if model.ros_model == camera.ros_model or len(model.names()) >= len(camera.names()):
+            continue
+        alike_px = config.max_kind_sigmas * solution.picture.rms
+        far = each.apart_px is None or each.apart_px > alike_px
+        if far and each.cost_ratio < config.min_kind_ratio:
+            return Finding('weak', f'the turns do not tell whether the lens is {camera.model} or '
+                                   f'{each.model}, and near the corners these differ',
+                           'drive where there is something to see up to the corners')
+    return None
+
+
 def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> Finding | None:
     """Poles and the edges of houses must be straight: nothing of this comes from motion."""
     moved = lines.picture_px / solution.camera.image_size[0]
@@ -291,5 +307,5 @@ ENOUGH: tuple[Rule, ...] = (
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
     _turns_disagree, _other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,
-    _folds_over, _other_model)
+    _folds_over, _other_model, _other_kind)
 RULES = (*ENOUGH, *SOUND)

@@ -12,7 +12,7 @@ from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.judgement.verdict import judge
 from dashcalib_ros.reconstruction.scene import Profile, Start
-from dashcalib_ros.solve.choice import gain_of_wider_model, is_clear
+from dashcalib_ros.solve.choice import Candidate, gain_of_wider_model, is_clear
 from dashcalib_ros.solve.information import information
 from dashcalib_ros.solve.picture import scatter_between_turns
 
@@ -115,6 +115,17 @@ def test_turns_that_may_be_of_two_kinds_are_tried_with_both():
     assert type(found.camera) is Fisheye
     radial = next(each for each in found.tried if each.model == 'radial')
     assert radial.loses_by > 30
+
+
+@pytest.mark.parametrize(('ratio', 'sigmas', 'doubted'), [
+    (1.4, 11.0, True), (1.4, None, True), (1.6, 11.0, False), (1.4, 9.0, False)])
+def test_a_fisheye_is_doubted_where_a_pinhole_far_from_it_is_nearly_as_good(
+        brown, ratio, sigmas, doubted):
+    pinhole = Candidate('radial', 500.0, sigmas and sigmas * brown.picture.rms, False, ratio)
+    fisheye = replace(brown, camera=WIDE, bounds=np.array([WIDE.params - 1, WIDE.params + 1]),
+                      tried=(pinhole, Candidate('fisheye', 0.0, 0.0, True)))
+    reasons = judge(fisheye, CONFIG.verdict).reasons
+    assert any('do not tell whether' in reason for reason in reasons) == doubted
 
 
 def test_a_pinhole_that_all_turns_were_taken_for_a_fisheye_is_one():
