@@ -64,8 +64,7 @@ def test_the_commits_of_figures_are_in_the_history():
                              capture_output=True, text=True)
     if shallow.stdout.strip() != 'false':
         pytest.skip('no complete git history here')
-    texts = ''.join((ROOT / name).read_text() for name in (
-        'README.md', 'docs/accuracy.md', 'docs/speed.md'))
+    texts = ''.join(path.read_text() for path in (ROOT / 'README.md', *ROOT.glob('docs/*.md')))
     named = sorted(set(re.findall(r'(?<![\w.])[0-9a-f]{7}(?![\w.])', texts)) - {'accepted'})
     named = [name for name in named if re.search('[0-9]', name) and re.search('[a-f]', name)]
     known = subprocess.run(['git', 'cat-file', '--batch-check=%(objecttype)'], cwd=ROOT, text=True,
