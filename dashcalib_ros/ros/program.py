@@ -73,9 +73,9 @@ def start_ros(argv: Sequence[str]) -> None:
 
 
 class Executor(SingleThreadedExecutor):
-    """One that tells nothing where it cannot be made, as in a context that is shut down."""
+    """rclpy's, without the traceback that it prints where the context is shut down already."""
 
-    # rclpy reads it in __del__, also where __init__ failed before it was set
+    # its __del__ reads this, also where __init__ failed before setting it
     _sigint_gc: Any = None
 
 

@@ -108,7 +108,8 @@ def _best_of(begun: Sequence[_Begun], config: Config) -> tuple[_Begun, tuple[Can
     """Return the kind of lens that explains the turns best, and how the kinds compare.
 
     A kind may lose by the bad poses of one turn only. So all are tried again from those of the
-    best one, that one too: it must not win or lose by fewer steps of adjustment.
+    best one, that one too: it must not win or lose by fewer steps of adjustment. Where that one
+    then explains a turn no more, there is nothing to compare the others with, and it stays.
     """
     def chosen(found: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
         result, tried = chosen_of([each.result for each in found], config)
@@ -119,7 +120,9 @@ def _best_of(begun: Sequence[_Begun], config: Config) -> tuple[_Begun, tuple[Can
         return best, tried
     again = [replace(each, result=result) for each in begun if (result := refitted(
         best.result, type(each.result.fit.camera), best.full_scenes, config)) is not None]
-    return chosen(again) if again else (best, tried)
+    best_again = any(type(each.result.fit.camera) is type(best.result.fit.camera)
+                     for each in again)
+    return chosen(again) if best_again else (best, tried)
 
 
 def _begun(kind: str, separate: Sequence[Scene], config: Config, progress: Progress
