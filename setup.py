@@ -46,6 +46,7 @@ setup(
         'zstandard>=0.22',
         'lz4>=4',
         'PyYAML>=6',
+        'av>=17',
         'rich>=13',
         'jinja2>=3.0',
     ],

@@ -7,24 +7,30 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dashcalib_ros.calibrator import Calibrator
-    from dashcalib_ros.camera import Camera
+    from dashcalib_ros.camera import Brown, Camera, Fisheye, Radial, Rational
     from dashcalib_ros.config import Config
     from dashcalib_ros.frames import Frame
     from dashcalib_ros.inputs import open_frames
     from dashcalib_ros.judgement import Calibration
     from dashcalib_ros.recorded import calibrate, check
+    from dashcalib_ros.report import load_camera
 
 from dashcalib_ros.limits import PIXELS
 
 # OpenCV reads it when it is loaded; image headers are checked before decoding, too
 os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(PIXELS))
 
-__all__ = ['Calibration', 'Calibrator', 'Camera', 'Config', 'Frame', 'calibrate', 'check',
-           'open_frames']
+__all__ = ['Brown', 'Calibration', 'Calibrator', 'Camera', 'Config', 'Fisheye', 'Frame', 'Radial',
+           'Rational', 'calibrate', 'check', 'load_camera', 'open_frames']
 
-_HOMES = {'Calibration': 'judgement', 'Calibrator': 'calibrator', 'Camera': 'camera',
-          'Config': 'config', 'Frame': 'frames', 'calibrate': 'recorded',
-          'check': 'recorded', 'open_frames': 'inputs'}
+_HOMES = {'Calibration': 'judgement', 'Calibrator': 'calibrator', 'Config': 'config',
+          'Frame': 'frames', 'calibrate': 'recorded', 'check': 'recorded',
+          'load_camera': 'report', 'open_frames': 'inputs',
+          **dict.fromkeys(('Brown', 'Camera', 'Fisheye', 'Radial', 'Rational'), 'camera')}
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
 
 
 def __getattr__(name: str) -> Any:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -165,7 +165,7 @@ class Calibrator:
         """
         with self._lock:
             size, scale = self._detection.size, self._detection.scale
-            scenes = {scene.turn: scene for scene in self._scenes.built() if scene is not None}
+            scenes = self._scenes.all_scenes()
         if camera.image_size != size:
             raise InputError(f'the camera in use is for pictures of another size: '
                              f'{camera.image_size[0]}x{camera.image_size[1]}')
@@ -183,7 +183,10 @@ class Calibrator:
         scaled = None if sigma is None else {
             name: value / scale.px if name in small.names()[:4] else value
             for name, value in sigma.items()}
-        return watch((turns[turn] for turn in sorted(turns)), small, scaled, self._config.monitor)
+        # a stored turn that was driven again counts once
+        return watch((turns[turn] for turn in sorted(turns)
+                      if turn.of_this_drive or turn in scenes), small, scaled,
+                     self._config.monitor)
 
     @property
     def solution(self) -> Solution | None:
@@ -204,17 +207,20 @@ class Calibrator:
                           sum(scene.yaw_deg for scene in chosen), found.magnitude,
                           found.standing, tuple(scene.turn for scene in chosen), stored,
                           tuple(scene.yaw_deg for scene in chosen),
-                          tuple(scene.turn for scene in self._scenes.built()
-                                if scene is not None))
+                          tuple(self._scenes.all_scenes()))
 
     def view(self) -> View:
         """Return what is tracked and masked in the newest frame."""
         with self._lock:
             return View(self._detection.points(), self._detection.valid())
 
-    def want(self, turns: int) -> None:
-        """Use so many turns from the next calibration on, turns.capacity at the most."""
+    def want(self, turns: int, more: int = 0) -> None:
+        """Use so many turns from the next calibration on, turns.capacity at the most.
+
+        more: turns of this drive are used beyond those.
+        """
         with self._lock:
+            self._scenes.more = more
             if turns != self._config.turns.wanted:
                 self._config = self._config.replace({'turns.wanted': turns})
                 self._scenes.want(turns)
@@ -223,9 +229,9 @@ class Calibrator:
         """Take turns out that are not of the present camera."""
         self._scenes.reject(dict.fromkeys(turns, CONTRADICTS))
 
-    def forget_stored(self) -> None:
-        """Drop the turns of earlier drives, also on disk: for a camera that has changed since."""
-        self._scenes.forget_stored()
+    def forget_stored(self, but: Set[TurnId] = frozenset()) -> None:
+        """Drop the turns of earlier drives but these, also on disk: for a camera that changed."""
+        self._scenes.forget_stored(but)
 
     def clear_store(self) -> None:
         """Remove all turns of this calibrator from turns.store; it stores no others."""

@@ -212,6 +212,17 @@ class IntrinsicsConfig:
     focal_floor: float = expert(
         0.0005, 'of fx, added to the sigma of fx and fy: systematic errors of the tracking',
         0.0, 0.1)
+    one_turn_sigma: float = expert(
+        0.012, 'of fx, added where one turn is all: those of real drives differ by 0.6 to 2 %',
+        0.0, 0.1)
+    least_field_nats: float = expert(
+        10.0, 'of evidence for a field that no lens model has: sound lenses 0, KITTI 60 to 400',
+        0.0, 1e6)
+    field_floor: float = expert(
+        0.0025, 'of fx, the same behind a field: KITTI 03 and 07 are so far from true rotations',
+        0.0, 0.1)
+    whole_field_px: float = expert(
+        0.1, 'px; behind a smaller field, the floor is smaller', 1e-3, 100.0)
     centre_floor: float = expert(
         0.0003, 'of the width, the same for cx and cy', 0.0, 0.1)
     centre_sigma: float = expert(
@@ -250,6 +261,8 @@ class VerdictConfig:
     refused_contrast: float = expert(
         0.01, 'the same; less is refused', 0.0, 10.0)
     refused_sigma: float = expert(0.1, 'sigma of fx, of fx; more is refused', 0.0, 1.0)
+    max_roll_deg: float = expert(
+        45.0, 'degrees; pictures turned more are weak; 180 for a camera mounted so', 0.0, 180.0)
     max_aspect: float = expert(
         0.015, 'fy / fx farther from 1 is weak; a rolling shutter of 20 ms made it 0.04', 0.0, 1.0)
     max_readout_ms: float = expert(
@@ -261,6 +274,9 @@ class VerdictConfig:
         0.0, 1.0)
     max_untold_model_error: float = expert(
         0.005, 'of fx or the width; a warning comes if p1, p2 and k3 would change more', 0.0, 1.0)
+    told_field_px: float = expert(
+        0.5, 'px RMS; a warning tells of a field that no lens model has, if it is larger',
+        0.0, 1e6)
     max_line_sigmas: float = expert(
         4.0, 'of both; where straight lines ask for another k1 by more, the result is weak',
         1.0, 1e6)
@@ -276,6 +292,8 @@ class VerdictConfig:
         10.0, 'over the picture; kinds of lenses that differ by less may be mistaken', 0.0, 1e6)
     max_misfit: float = expert(
         2.0, "times a turn's cost with a camera of its own; more is weak: another lens", 1.0, 1e4)
+    max_crop_sigmas: float = expert(
+        2.0, 'over the picture; a picture that a stabiliser moves farther is weak', 0.0, 1e6)
 
 
 @dataclass(frozen=True)
@@ -342,7 +360,11 @@ class MonitorConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """All settings. Raises ConfigError for a value of the wrong type, NaN or out of range."""
+    """All settings; frozen. Config().replace({'turns.wanted': 8}) returns a copy with changes.
+
+    Config.from_mapping() takes what a YAML file has, flat() gives every setting by its full name.
+    Raises ConfigError for a value of the wrong type, NaN or out of range.
+    """
 
     seed: int = setting(0, 'same input and seed: same result', 0, 2**31 - 1)
     threads: int = setting(

@@ -14,6 +14,11 @@ def shortened(text: str, limit: int = 160) -> str:
     return text if len(text) <= limit else text[:limit - 1] + '…'
 
 
+def counted(count: int, what: str) -> str:
+    """Return a number of things in words: 1 turn, 2 turns."""
+    return f'{count} {what}{"" if count == 1 else "s"}'
+
+
 class DashcalibError(Exception):
     """Root of all errors that this package raises on purpose."""
 

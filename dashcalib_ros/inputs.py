@@ -8,7 +8,7 @@ import glob
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,18 @@ VIDEO_SUFFIXES = frozenset(
     ('.mp4', '.m4v', '.mov', '.avi', '.mkv', '.webm', '.ts', '.mts', '.m2ts', '.mpg', '.mpeg',
      '.wmv', '.flv', '.3gp', '.ogv', '.mjpg', '.mjpeg', '.h264', '.264', '.h265', '.265', '.hevc'))
 
+# how makers name what one camera records, without the ending: t is the time or the number of a
+# recording, n of its part, c which camera of several it is; GX010001, GX020001, GX010002
+MAKERS = {maker: re.compile(name, re.IGNORECASE) for maker, name in (
+    ('GoPro names', r'G(?:OPR|[HXSP](?P<n>\d\d))(?P<t>\d{4})(?P<c>)'),
+    ('DJI names', r'DJI_(?P<t>(?:\d{14})?)_?(?P<n>\d{4})(?P<c>).*'),
+    ('Garmin names', r'GRMN(?P<t>)(?P<n>\d+)(?P<c>)'),
+    ('Viofo names', r'(?P<t>\d{4}_?\d{4}_?\d{6})_(?P<n>\d{3,6})P?(?P<c>[A-Z]?)'),
+    ('BlackVue names', r'(?P<t>\d{8}_\d{6})(?P<n>)_[A-Z](?P<c>[A-Z])[LS]?'),
+    ('Insta360 names', r'(?:PRO_)?VID_(?P<t>\d{8}_\d{6})_(?P<c>\d\d)_(?P<n>\d+)(?:_\d+)?'))}
+# names of files in a message; of more only the first and the last are told
+TOLD = 12
+
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -33,8 +45,9 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     path: a ROS 2 bag (folder, .mcap, .db3, zstd or not), a ROS 1 .bag, a video file, or a folder
     of images, which are taken in the order of their names (2.png before 10.png). Also several of
     these, of one camera: a sequence, taken in its order; a folder of videos or bags, or a pattern
-    (drives/*.mp4): bags by their time, all else by name. No turn spans two of them unless their
-    stamps go on; one that cannot be read is left out, with a warning.
+    (drives/*.mp4): in the order that the camera's maker gives their names, else of the times at
+    which they were recorded, else of their names; a warning says which. No turn spans two of them
+    unless they go on; one that cannot be read is left out, with a warning.
     topic: the image topic of a bag; needed only when it has several.
     fps: images per second of a folder (default 10), or instead of what a video says (Hz).
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
@@ -64,8 +77,9 @@ def _check_numbers(fps: float | None, start_s: float, duration_s: float | None) 
 
 @dataclass(frozen=True)
 class _Group:
-    """The recordings that one argument names, by name."""
+    """The recordings that one argument names, by name. where: the argument."""
 
+    where: str
     paths: tuple[Path, ...]
     warnings: tuple[str, ...] = ()
 
@@ -80,27 +94,42 @@ def _expanded(text: str) -> _Group:
     except OSError as error:
         raise InputError(os_error(path, error)) from error
     if path.exists() or not glob.has_magic(text):
-        return _Group((path,))
-    found = sorted(map(Path, glob.glob(text, recursive=True)), key=lambda each: by_name(str(each)))
+        return _Group(text, (path,))
+    found = sorted(named_like(text), key=lambda each: by_name(str(each)))
     known = tuple(each for each in found if _kind_of(each) is not None)
     if not known:
         raise InputError(_unknown(found[0]) if found else
                          f'no file is named like {text}: check the pattern')
-    return _Group(known, _left_out(text, len(found) - len(known)))
+    return _Group(text, known, _left_out(text, len(found) - len(known)))
+
+
+def named_like(pattern: str) -> Iterator[Path]:
+    """Yield what a pattern names, nothing hidden. ** follows no links: some lead upwards."""
+    path = Path(pattern)
+    try:
+        for found in Path(path.anchor or '.').glob(str(path.relative_to(path.anchor))):
+            if not any(map(_is_hidden, found.parts)) or any(map(_is_hidden, path.parts)):
+                yield found
+    except ValueError as error:
+        raise InputError(f'{pattern} is no pattern ({error})') from error
+
+
+def _is_hidden(part: str) -> bool:
+    return part.startswith('.') and part not in ('.', '..')
 
 
 def _in_folder(folder: Path) -> _Group:
     """Return a bag or a folder of images itself, or else the videos and bags that are in it."""
-    if _fits_bag(folder):
-        return _Group((folder,))
+    if fits_bag(folder):
+        return _Group(str(folder), (folder,))
     entries = sorted(folder.iterdir(), key=lambda each: by_name(each.name))
     found = tuple(each for each in entries if not each.name.startswith('.')
-                  and (_is_video(each) or (each.is_dir() and _fits_bag(each))))
+                  and (_is_video(each) or (each.is_dir() and fits_bag(each))))
     images = sum(each.suffix.lower() in IMAGE_SUFFIXES for each in entries)
     # cameras leave thumbnails beside their videos
     if not found or images > len(found):
-        return _Group((folder,))
-    return _Group(found, _left_out(str(folder), images))
+        return _Group(str(folder), (folder,))
+    return _Group(str(folder), found, _left_out(str(folder), images))
 
 
 def _left_out(where: str, count: int) -> tuple[str, ...]:
@@ -120,16 +149,47 @@ def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> F
                 opened.append(_open_one(path, topic, fps))
             except InputError as error:
                 failures.append(str(error))
-        begins = [source.begin_ns for source in opened]
-        if None not in begins:
-            opened = [source for _, source in sorted(
-                zip(begins, opened, strict=True), key=lambda pair: pair[0] or 0)]
+        if len(opened) > 1:
+            opened, by = _ordered(opened)
+            if len(cameras := {camera for *_, camera in map(_numbered, opened)}) > 1:
+                raise InputError(f'{group.where} has recordings of {len(cameras)} cameras '
+                                 f'({_listed(opened)}): give a pattern that names one')
+            warnings.append(f'{group.where}: {len(opened)} files by {by}: {_listed(opened)}')
         parts += opened
+    if len(parts) == len(groups):
+        ordered, by = _ordered(parts)
+        if by in MAKERS and ordered != parts:
+            warnings.append(f'the files are taken in the order in which they were given; by {by} '
+                            f'it is {_listed(ordered)}: give their folder for that')
     if not parts:
         more = f' (and {len(failures) - 1} more like it)' if len(failures) > 1 else ''
         raise InputError(f'none of the files can be read: {failures[0]}{more}')
     return JoinedSource(parts, (*warnings, *(f'one of the files is left out: {each}'
                                              for each in failures)))
+
+
+def _ordered(sources: list[FrameSource]) -> tuple[list[FrameSource], str]:
+    """Return recordings, which come by name, in their order, and what tells it."""
+    maker, *others = {_numbered(source)[0] for source in sources}
+    if maker and not others:
+        return sorted(sources, key=_numbered), maker
+    begins = {source.name: source.begin_ns or 0 for source in sources}
+    if 0 not in begins.values() and len(set(begins.values())) == len(sources):
+        return sorted(sources, key=lambda each: begins[each.name]), 'the time of recording'
+    return sources, 'name'
+
+
+def _numbered(source: FrameSource) -> tuple[str, str, int, str]:
+    """Return the maker by whose rule a recording is named, and its t, n and c."""
+    for maker, name in MAKERS.items():
+        if found := name.fullmatch(Path(source.name).stem):
+            return (maker, found['t'].replace('_', ''), int(found['n'] or 0), found['c'].upper())
+    return '', '', 0, ''
+
+
+def _listed(sources: Sequence[FrameSource]) -> str:
+    names = [Path(source.name).name for source in sources]
+    return ', '.join(names if len(names) <= TOLD else [*names[:TOLD - 2], '...', names[-1]])
 
 
 def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
@@ -156,7 +216,8 @@ class InputKind:
     open: Callable[[Path, str | None, float | None], FrameSource]
 
 
-def _fits_bag(path: Path) -> bool:
+def fits_bag(path: Path) -> bool:
+    """Return whether a path is a bag, by its name or by what is in the folder."""
     if path.is_dir():
         return any(entry.name == METADATA
                    or (is_bag_file(entry.name) and not irregular_entry(entry))
@@ -185,7 +246,7 @@ def _is_video(path: Path) -> bool:
 
 #: the first that fits is taken: a folder with a bag in it is no folder of images
 KINDS = (
-    InputKind('bag', _fits_bag, _open_bag),
+    InputKind('bag', fits_bag, _open_bag),
     InputKind('video', _is_video, _open_video),
     InputKind('folder of images', Path.is_dir, _open_folder),
 )

@@ -33,6 +33,8 @@ MODEL_BYTES = 2**31
 YAML_VALUES = 300_000
 # levels of a YAML text: a metadata.yaml has 6
 YAML_DEPTH = 30
+# of a clip of a fleet, in so many files: a day of 4K video, or of images at 10 Hz
+CLIP_BYTES, CLIP_FILES = 2**38, 1_000_000
 # digits of a number in a text: a float has 17 digits and at most 308 zeros
 DIGITS = 300
 # text in YAML that may be a number; 1:20:30 is one, too

@@ -1,48 +1,128 @@
 """Recorded drives in one call: files in, a Calibration or an answer out."""
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.checking import Check
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames import FrameSource
+from dashcalib_ros.frames.mask_file import check_mask, read_mask
 from dashcalib_ros.inputs import Paths, open_frames
 from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.selection import Progress
+
+MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
 
 
 def calibrate(path: Paths, fps: float | None = None,
               config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
-              duration_s: float | None = None) -> Calibration:
+              duration_s: float | None = None, mask: MaskOrPath = None,
+              progress: Progress | None = None) -> Calibration:
     """Calibrate a recorded drive.
 
-    path, topic, fps, start_s, duration_s: as for open_frames(). Raises InputError for what cannot
-    be read; a drive that teaches too little gives a calibration that is weak or refused.
+    path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
+    of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
+    fps: images per second of a folder (default 10), or instead of what a video says.
+    config: the settings; None: Config().
+    topic: the image topic of a bag; needed only when it has several.
+    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
+    mask: what is not to be used (bonnet, burnt-in text): a picture's path, black there, or an
+    array (height, width), 0 or False there; in addition to what is found by itself.
+    progress: called with the stage's name and the share done, 0 to 1.
+
+    Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and where it is
+    refused its camera is None. Raises InputError for what cannot be read, ConfigError for a bad
+    setting, WorkerError where a child process cannot run.
     """
-    source = open_frames(path, topic, fps, start_s, duration_s)
-    with Calibrator(config) as calibrator:
-        for frame in source:
-            calibrator.push(frame)
-        return with_source(calibrator.calibrate(), source)
+    source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
+    with _fed(source, config, mask, tell) as calibrator:
+        return with_source(calibrator.calibrate(tell), source)
 
 
 def check(given: Camera, path: Paths, fps: float | None = None,
           config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
-          duration_s: float | None = None) -> Check:
+          duration_s: float | None = None, mask: MaskOrPath = None,
+          progress: Progress | None = None) -> Check:
     """Say whether a camera explains a recorded drive.
 
-    given: of the drive's pictures. All others are those of open_frames(). Raises InputError for
-    what cannot be read.
+    given: a Radial, Brown, Rational or Fisheye of the drive's pictures, such as
+    load_camera('camera.yaml').camera.
+    path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
+    of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
+    fps: images per second of a folder (default 10), or instead of what a video says.
+    config: the settings; None: Config().
+    topic: the image topic of a bag; needed only when it has several.
+    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
+    mask: what is not to be used: a picture's path, black there, or an array (height, width), 0 or
+    False there.
+    progress: called with the stage's name and the share done, 0 to 1.
+
+    Returns a Check: its answer is 'right', 'wrong' or 'cannot tell', with reasons. Raises
+    InputError for what cannot be read, ConfigError for a bad setting, WorkerError where a child
+    process cannot run.
     """
-    with Calibrator(config) as calibrator:
-        for frame in open_frames(path, topic, fps, start_s, duration_s):
+    source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
+    with _fed(source, config, mask, tell) as calibrator:
+        return calibrator.check(given, calibrator.calibrate(tell), tell)
+
+
+@contextmanager
+def _fed(source: FrameSource, config: Config | None, mask: MaskOrPath, tell: Progress
+         ) -> Iterator[Calibrator]:
+    """Give a calibrator that has taken every frame of the drive."""
+    valid = _valid(mask)
+    with Calibrator(config, valid) as calibrator:
+        for number, frame in enumerate(source, 1):
+            if number == 1:
+                check_mask(valid, frame.size)
             calibrator.push(frame)
-        return calibrator.check(given, calibrator.calibrate())
+            tell('reading', min(number / source.count, 1.0) if source.count else 0.0)
+        yield calibrator
+
+
+def _valid(mask: MaskOrPath) -> Mask | None:
+    if mask is None or isinstance(mask, (str, os.PathLike)):
+        return None if mask is None else read_mask(Path(mask))
+    if mask.ndim != 2:
+        raise InputError(f'the mask has the shape {mask.shape}: give (height, width)')
+    return np.asarray(mask) > 0
+
+
+def _silent(stage: str, done: float) -> None:
+    """Tell nobody."""
 
 
 def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
-    """Return the calibration with its input's name and warnings."""
-    new = tuple(line for line in source.warnings if line not in calibration.warnings)
-    return replace(calibration, input_name=calibration.input_name or source.name,
+    """Return the calibration with its input's name and warnings, its pictures in colour.
+
+    What the input contradicts is the first reason of one that is not accepted: it may be why.
+    """
+    verdict, material = calibration.verdict, calibration.material
+    doubts = source.contradictions if verdict.level != 'accepted' else ()
+    new = tuple(line for line in source.warnings
+                if line not in (*doubts, *calibration.warnings))
+    if doubts:
+        cures = (line.rpartition(': ')[2] for line in doubts)
+        verdict = replace(verdict, reasons=(*doubts, *verdict.reasons),
+                          cures=(*cures, *verdict.cures))
+    if material is not None:
+        shown = material.pictures
+        images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})
+        material = replace(material, pictures={
+            turn: each.coloured(images[each.frame]) if each.frame in images else each
+            for turn, each in shown.items()})
+    return replace(calibration, verdict=verdict, material=material,
+                   input_name=calibration.input_name or source.name,
                    warnings=(*new, *calibration.warnings))

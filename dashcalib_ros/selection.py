@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Set
 from typing import Any
 
 from dashcalib_ros.config import Config
@@ -10,7 +10,8 @@ from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.reconstruction.picture import TurnPicture
 from dashcalib_ros.reconstruction.repeated import without_repeated
 from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
+from dashcalib_ros.scene_file import Origin, StoredTurn
+from dashcalib_ros.turn_store import TurnStore
 from dashcalib_ros.turns import TurnId
 from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.workers.child import ChildWorker
@@ -23,6 +24,7 @@ Progress = Callable[[str, float], None]
 # why a turn is not used, in words
 NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow enough points, or '
             'the car hardly moved')
+ALONE = 'this drive has no turn that could agree with it'
 
 
 class SceneSelection:
@@ -32,11 +34,11 @@ class SceneSelection:
 
     Threads: the Calibrator's lock guards the detection, the places and the stored turns. It is
     held only briefly, as push() needs it for each frame: no thread that holds it waits for a
-    worker or for a file (except in load(), once). load(), want(), submit(), chosen(), built(),
-    stored(), pictures(), left_out() and stored_before() must be called with the lock held; all
-    other methods without it, as they take it themselves. Locks are taken in this order: the
-    store's (of its files), this one, the pool's. The pool's threads call _store() without any
-    lock.
+    worker or for a file (except in load(), once). load(), want(), submit(), chosen(),
+    all_scenes(), built(), stored(), pictures(), left_out() and stored_before() must be called
+    with the lock held; all other methods without it, as they take it themselves. Locks are taken
+    in this order: the store's (of its files), this one, the pool's. The pool's threads call
+    _store() without any lock.
     """
 
     def __init__(self, config: Config, detection: Detection, lock: threading.Lock,
@@ -47,6 +49,8 @@ class SceneSelection:
         self.warnings: list[str] = []
         # how many turns are used: more than wanted once these have left a result weak
         self._places = config.turns.wanted
+        # turns of this drive that are used beyond that
+        self.more = 0
         self._config = config
         self._detection = detection
         self._lock = lock
@@ -95,7 +99,7 @@ class SceneSelection:
         built = self._pool.scenes()
         self._pool.keep_only(set(turns))
         self._rejected = {key: why for key, why in self._rejected.items() if key in turns}
-        places = self._places
+        places = self._places + self.more
         for key in self._ranked():
             turn = turns.get(key)
             if turn is not None and (places > 0 or self._live) and turn.frames:
@@ -106,7 +110,13 @@ class SceneSelection:
 
     def chosen(self) -> list[Scene]:
         """Return the scenes that a calibration would use now, best first."""
-        return self._built()[:self._places]
+        scenes = self.all_scenes()
+        return [scenes[key] for key in self._best(scenes)]
+
+    def all_scenes(self) -> dict[TurnId, Scene]:
+        """Return all scenes, those of earlier drives too."""
+        own = {key: scene for key, scene in self._pool.scenes().items() if scene is not None}
+        return {**own, **{key: turn.scene for key, turn in self._kept.turns.items()}}
 
     def built(self) -> Collection[Scene | None]:
         """Return the results of this drive's turns: scenes, None for a turn that gave none."""
@@ -118,8 +128,10 @@ class SceneSelection:
 
     def left_out(self) -> dict[TurnId, str]:
         """Return why turns that were tried are without a scene now, in words."""
-        failed = {turn for turn, scene in self._pool.scenes().items() if scene is None}
-        return {turn: NO_SCENE for turn in failed} | self._rejected
+        built = self._pool.scenes()
+        failed = {turn: NO_SCENE for turn, scene in built.items() if scene is None}
+        alone = {} if len(failed) < len(built) else dict.fromkeys(self._kept.turns, ALONE)
+        return failed | alone | self._rejected
 
     def stored_before(self) -> tuple[StoredTurn, ...]:
         """Return the turns of earlier drives that the last wanted() had to choose from."""
@@ -130,23 +142,24 @@ class SceneSelection:
         return tuple(self._kept.turns.values())
 
     def _ranked(self) -> list[TurnId]:
-        """Return all turns, the most prominent first."""
-        found = [(-turn.prominence, turn.id) for turn in self._detection.turns()]
-        found += [(-turn.prominence, key) for key, turn in self._kept.turns.items()]
-        return [key for _, key in sorted(found)]
+        """Return all turns, the most prominent first; those of earlier drives behind.
 
-    def _built(self) -> list[Scene]:
-        """Return all scenes, best first; turns without a scene are left out."""
-        scenes = {**self._pool.scenes(),
-                  **{key: turn.scene for key, turn in self._kept.turns.items()}}
-        return [scene for key in self._ranked() if (scene := scenes.get(key)) is not None]
+        These may be another camera's, and must not crowd out those that tell.
+        """
+        found = [(False, -turn.prominence, turn.id) for turn in self._detection.turns()]
+        found += [(True, -turn.prominence, key) for key, turn in self._kept.turns.items()]
+        return [key for *_, key in sorted(found)]
+
+    def _best(self, among: Collection[TurnId]) -> list[TurnId]:
+        """Return the turns to use, best first; none where none is of this drive."""
+        ranked = [key for key in self._ranked() if key in among]
+        own = [key for key in ranked if key.of_this_drive][:self._places + self.more]
+        return own + ranked[len(own):self._places] if own else []
 
     def _undecided(self) -> bool:
         """Return whether a turn that is not built yet may be among the best."""
         unbuilt = self._pool.unbuilt()
-        built = {scene.turn for scene in self._built()}
-        candidates = [key for key in self._ranked() if key in unbuilt or key in built]
-        return any(key in unbuilt for key in candidates[:self._places])
+        return any(key in unbuilt for key in self._best({*unbuilt, *self.all_scenes()}))
 
     # without the lock
 
@@ -238,10 +251,11 @@ class SceneSelection:
 
         self._kept.mirror(snapshot)
 
-    def forget_stored(self) -> None:
-        """Drop the turns of earlier drives, on disk too."""
+    def forget_stored(self, but: Set[TurnId]) -> None:
+        """Drop the turns of earlier drives but these, on disk too."""
         with self._lock:
-            self._kept.turns.clear()
+            for key in self._kept.turns.keys() - but:
+                del self._kept.turns[key]
         self._store()
 
     def clear_store(self) -> None:

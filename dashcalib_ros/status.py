@@ -15,8 +15,8 @@ class Status:
     frames: pushed so far. turns: in the bank and stored. built: how many scenes a calibration
     would use now; ready: their turns; yaw_deg: the sum of their yaw. stored: how many turns are of
     earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
-    yaws_deg: of the turns in ready, in their order. reconstructed: the turns of this drive that
-    watch() has scenes of, chosen or not.
+    yaws_deg: of the turns in ready, in their order. reconstructed: the turns that watch() has
+    scenes of, chosen or not.
     """
 
     frames: int

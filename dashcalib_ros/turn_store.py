@@ -7,83 +7,32 @@ and not changed.
 from __future__ import annotations
 
 import errno
-import io
-import math
 import os
 import secrets
-import stat
 import threading
 import time
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-from numpy.lib import format as npy
-
-from dashcalib_ros.camera import MODELS, camera_of
 from dashcalib_ros.errors import InputError, one_line
-from dashcalib_ros.frames.scale import FULL_SIZE, Scale
-from dashcalib_ros.reconstruction.scene import Profile, Scene
-from dashcalib_ros.reconstruction.structure import Structure
-from dashcalib_ros.reconstruction.tracks import Tracks
+from dashcalib_ros.limits import read_file
+from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.scene_file import (
+    LARGEST,
+    SUFFIX,
+    Origin,
+    SceneFile,
+    StoredTurn,
+    decoded,
+    encoded,
+)
 from dashcalib_ros.turns.turn import TurnId
 
-# of the files; a changed layout needs a new number
-FORMAT = 3
-# bytes of a file; a turn has a few hundred thousand
-LARGEST = 16_000_000
-# bytes that a file's arrays may take in memory; a turn's take a few million
-LARGEST_UNPACKED = 64_000_000
-# with other kinds the unpacker may take any amount of memory
-COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-# s; later stamps (this is in 2001) are dates, so that equal stamps mean the same moment
-DATES_S = 1e9
 # s; temporary files older than this are left over from a killed process
 ABANDONED_S = 3600.0
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Where a turn is from: image size (width, height) of the input, and how it was resized.
-
-    frame_id: of the image headers; an empty one, of inputs without, fits any.
-    """
-
-    image_size: tuple[int, int]
-    scale: Scale = FULL_SIZE
-    frame_id: str = ''
-
-    def fits(self, other: Origin) -> bool:
-        """Return whether both may be of one camera."""
-        frames = {self.frame_id, other.frame_id} - {''}
-        return (self.image_size, self.scale) == (other.image_size, other.scale) and (
-            len(frames) < 2)
-
-    def __str__(self) -> str:
-        frame = f' in frame {self.frame_id!r}' if self.frame_id else ''
-        return f'{self.image_size[0]}x{self.image_size[1]} {self.scale}{frame}'
-
-
-@dataclass(frozen=True)
-class StoredTurn:
-    """A scene with its turn's time (stamp of the centre in s) and prominence."""
-
-    scene: Scene
-    stamp_s: float
-    prominence: float
-
-    def repeats(self, scene: Scene) -> bool:
-        """Return whether a scene is of the same pictures."""
-        return np.array_equal(self.scene.tracks.xy, scene.tracks.xy, equal_nan=True)
-
-    def happened(self, stamp_s: float, half_width_s: float) -> bool:
-        """Return whether the turn was at this time; False if a stamp is no date."""
-        return min(self.stamp_s, stamp_s) > DATES_S and abs(self.stamp_s - stamp_s) < half_width_s
 
 
 class TurnStore:
@@ -138,12 +87,11 @@ class TurnStore:
         others: list[Origin] = []
         for name in self._listed():
             try:
-                of, turn = _read(self._folder / name)
-            except FileNotFoundError:
-                continue  # another process removed it
+                of, turn = self._read(name)
             except InputError as error:
-                bad.append(str(error))
-                self._known[name] = None
+                if os.path.lexists(self._folder / name):  # or another process removed it
+                    bad.append(str(error))
+                    self._known[name] = None
                 continue
             self._known[name] = of, turn.prominence
             if of.fits(origin):
@@ -196,7 +144,7 @@ class TurnStore:
         with self._writing:
             if self._origin is None:
                 self._own = {TurnId.stored(n): (name, 0.0) for n, name in enumerate(self._listed())
-                             if _heading(self._folder / name) is not None}
+                             if self._about(name) is not None}
             self._write_all({})
             self._off = True
 
@@ -228,7 +176,7 @@ class TurnStore:
         except OSError:
             pass  # of another process, or without the permission to remove it
         try:
-            return sorted(path.name for path in self._folder.iterdir() if path.suffix == '.npz')
+            return sorted(path.name for path in self._folder.iterdir() if path.suffix == SUFFIX)
         except FileNotFoundError:
             return []
         except OSError as error:
@@ -244,16 +192,33 @@ class TurnStore:
             self._warn(f'{_count(others)} in {self._folder} left out: of images {others[0]}, '
                        f'these are {origin}; give each camera a folder of its own in turns.store')
 
+    def _read(self, name: str) -> tuple[Origin, StoredTurn]:
+        """Return a file's origin and turn; raises InputError if it is no stored turn."""
+        data = read_file(self._folder / name, LARGEST, name)
+        try:
+            file = decoded(data)
+            [turn] = file.turns
+        except ValueError as error:
+            raise InputError(f'{name} cannot be used ({one_line(error)})') from error
+        return file.origin, turn
+
+    def _about(self, name: str) -> tuple[Origin, float] | None:
+        """Return a file's origin and prominence, None if it is no stored turn."""
+        try:
+            origin, turn = self._read(name)
+        except InputError:
+            return None
+        return origin, turn.prominence
+
     def _write(self, turn: StoredTurn) -> str:
         assert self._origin is not None
-        name = f'turn-{secrets.token_hex(8)}.npz'
-        data = io.BytesIO()
-        np.savez_compressed(data, **_arrays(turn, self._origin))
+        name = f'turn-{secrets.token_hex(8)}{SUFFIX}'
+        data = encoded(SceneFile(self._origin, (turn,), 1))
         self._folder.mkdir(parents=True, exist_ok=True)
         temporary = self._folder / f'.{name}.tmp'
         try:
             with temporary.open('xb') as stream:
-                stream.write(data.getbuffer())
+                stream.write(data)
                 stream.flush()
                 os.fsync(stream.fileno())
             temporary.replace(self._folder / name)
@@ -269,7 +234,7 @@ class TurnStore:
         ranked: list[tuple[float, str]] = []
         for name in self._listed():
             if name not in self._known:
-                self._known[name] = _heading(self._folder / name)
+                self._known[name] = self._about(name)
             about = self._known[name]
             if about is not None and about[0].fits(self._origin):
                 ranked.append((-about[1], name))
@@ -301,150 +266,3 @@ class TurnStore:
 
 def _count(files: list[Any]) -> str:
     return '1 file is' if len(files) == 1 else f'{len(files)} files are'
-
-
-def _arrays(turn: StoredTurn, origin: Origin) -> dict[str, Any]:
-    values = {
-        'format': FORMAT, 'image_size': origin.image_size, 'shrink': origin.scale.shrink,
-        'enlarge': origin.scale.enlarge, 'frame_id': origin.frame_id}
-    return {**{name: np.asarray(value) for name, value in values.items()}, **turn_arrays(turn)}
-
-
-def turn_arrays(turn: StoredTurn) -> dict[str, npt.NDArray[Any]]:
-    """Return a turn as plain arrays by name; turn_of() is the inverse."""
-    scene = turn.scene
-    values = {
-        'stamp_s': turn.stamp_s, 'prominence': turn.prominence,
-        'frames': scene.tracks.frames, 'xy': scene.tracks.xy, 'size': scene.tracks.image_size,
-        'stamps_ns': scene.tracks.stamps_ns,
-        'rotations': scene.structure.rotations, 'translations': scene.structure.translations,
-        'points': scene.structure.points, 'registered': scene.structure.registered,
-        'used': scene.structure.used, 'camera': scene.camera.params,
-        'camera_model': scene.camera.model,
-        'ratios': scene.profile.ratios, 'costs': scene.profile.costs,
-        'observations': scene.profile.observations}
-    return {name: np.asarray(value) for name, value in values.items()}
-
-
-def _heading(path: Path) -> tuple[Origin, float] | None:
-    """Return a file's origin and prominence, None if it is no stored turn."""
-    try:
-        data = _loaded(path)
-        return _origin(data), float(_array(data, 'prominence', float, ()))
-    except Exception:  # as in _read
-        return None
-
-
-def _read(path: Path) -> tuple[Origin, StoredTurn]:
-    """Return a file's origin and turn; the turn's identity is that of stored turn 0.
-
-    Raises InputError if it is no stored turn, FileNotFoundError if it was removed.
-    """
-    try:
-        data = _loaded(path)
-        origin, turn = _origin(data), turn_of(data)
-        if turn.scene.tracks.image_size != origin.scale.size(origin.image_size):
-            raise ValueError('its numbers are no valid scene')
-        return origin, turn
-    except Exception as error:
-        if isinstance(error, FileNotFoundError) and not path.is_symlink():
-            raise
-        # for a damaged file numpy, zipfile and zlib raise errors of all kinds
-        what = error.strerror if isinstance(error, OSError) else None
-        raise InputError(f'{path.name} cannot be used ({what or one_line(error, 120)})') from error
-
-
-def _loaded(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Return a file's arrays; raises ValueError, among others, before it takes much memory."""
-    # not blocking: opening a FIFO would wait for its writer
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), 'rb') as stream:
-        about = os.fstat(stream.fileno())
-        if not stat.S_ISREG(about.st_mode):
-            raise ValueError('it is no regular file')
-        return arrays_in(stream, about.st_size)
-
-
-def arrays_in(stream: BinaryIO, size: int, largest: int = LARGEST,
-              largest_unpacked: int = LARGEST_UNPACKED) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of an npz file of this size in bytes, without pickle.
-
-    Raises ValueError, among others, before it takes more memory than largest_unpacked.
-    """
-    if size > largest:
-        raise ValueError('it is too large')
-    with zipfile.ZipFile(stream) as members:
-        _check_sizes(members, largest_unpacked)
-    stream.seek(0)
-    with np.load(stream, allow_pickle=False) as data:
-        return dict(data)
-
-
-def _check_sizes(members: zipfile.ZipFile, largest_unpacked: int) -> None:
-    """Raise ValueError when the arrays would take too much memory, or more than they fill."""
-    found = members.infolist()
-    if sum(member.file_size for member in found) > largest_unpacked:
-        raise ValueError('it is too large when unpacked')
-    for member in found:
-        if member.compress_type not in COMPRESSIONS:
-            raise ValueError('it is compressed in an unknown way')
-        with members.open(member) as stream:
-            version = npy.read_magic(stream)
-            read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-            shape, _, dtype = read(stream)
-            # numpy allocates the size in the header before it reads
-            if math.prod(shape) * dtype.itemsize > member.file_size:
-                raise ValueError(f'{member.filename} is smaller than its header says')
-
-
-def _origin(data: Mapping[str, npt.NDArray[Any]]) -> Origin:
-    if 'format' not in data:
-        raise ValueError('it is no stored turn')
-    if (number := int(_array(data, 'format', int, ()))) != FORMAT:
-        raise ValueError(f'it has format {number}, this version has {FORMAT}')
-    width, height = (int(side) for side in _array(data, 'image_size', int, (2,)))
-    # older files do not have it: nothing was enlarged
-    enlarge = int(_array(data, 'enlarge', int, ())) if 'enlarge' in data else 1
-    scale = Scale(int(_array(data, 'shrink', int, ())), enlarge)
-    if min(scale.shrink, scale.enlarge) < 1:
-        raise ValueError('its numbers are no valid scene')
-    return Origin((width, height), scale, str(_array(data, 'frame_id', str, ())))
-
-
-def turn_of(data: Mapping[str, npt.NDArray[Any]]) -> StoredTurn:
-    """Return the turn; raises ValueError, or KeyError, unless it is valid for the core."""
-    xy = np.asarray(data['xy'])
-    k, t = xy.shape[:2] if xy.ndim == 3 else (0, 0)
-    tracks = Tracks(
-        _array(data, 'frames', np.int64, (k,)), _array(data, 'xy', float, (k, t, 2), nan=True),
-        (int(data['size'][0]), int(data['size'][1])),
-        _array(data, 'stamps_ns', np.int64, (k,)))
-    structure = Structure(
-        _array(data, 'rotations', float, (k, 3, 3)), _array(data, 'translations', float, (k, 3)),
-        _array(data, 'points', float, (t, 3), nan=True), _array(data, 'registered', bool, (k,)),
-        _array(data, 'used', bool, (k, t)))
-    ratios = _array(data, 'ratios', float, (np.size(data['ratios']),))
-    profile = Profile(ratios, _array(data, 'costs', float, ratios.shape),
-                      int(_array(data, 'observations', int, ())))
-    name = str(_array(data, 'camera_model', str, ()))
-    count = len(MODELS[name].names()) if name in MODELS else 0
-    camera = camera_of(name, tracks.image_size, _array(data, 'camera', float, (count,)))
-    prominence = float(_array(data, 'prominence', float, ()))
-    seen = structure.used.any() and tracks.seen[structure.used].all()
-    points = np.isfinite(structure.points[structure.used.any(axis=0)]).all()
-    if not (min(camera.fx, camera.fy, prominence) > 0 and ratios.size and ratios.min() > 0
-            and (np.diff(ratios) > 0).all() and seen and points):
-        raise ValueError('its numbers are no valid scene')
-    scene = Scene(TurnId.stored(0), tracks, structure, camera, profile)
-    return StoredTurn(scene, float(_array(data, 'stamp_s', float, ())), prominence)
-
-
-def _array(data: Mapping[str, npt.NDArray[Any]], name: str, kind: Any, shape: tuple[int, ...],
-           nan: bool = False) -> npt.NDArray[Any]:
-    """Return an array of this kind and shape, finite unless nan is allowed; or ValueError."""
-    array = np.asarray(data[name])
-    same = np.dtype(kind).kind
-    if array.dtype.kind != same or array.shape != shape:
-        raise ValueError(f'{name} is {array.dtype} of {array.shape}')
-    if same == 'f' and not nan and not np.isfinite(array).all():
-        raise ValueError(f'{name} is not finite')
-    return array if same == 'U' else array.astype(kind)

@@ -1,11 +1,16 @@
 #!/usr/bin/env python3
 """Draw the pictures of README.md and docs/ from the demo drive: python docs/pictures.py.
 
-Needs matplotlib; takes about a minute on two idle cores.
+`python docs/pictures.py report` takes only the picture of its report, for which all of them need
+Chromium. Needs matplotlib; takes about two minutes on two idle cores.
 """
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
+import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +43,11 @@ PLOTS = HERE / 'plots'
 FRAME, ENDS, SHOWN = 314, ((14.0, 466.0), (944.0, 428.0)), (slice(62, 500), slice(5, 955))
 # images between the two of a pair whose epipoles are drawn: 0.3 s
 SPACING = 3
+# the window in which the report is shown, px
+WINDOW = (1040, 1080)
+BROWSER = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
+           '--disable-background-networking', '--disable-component-update', '--disable-sync',
+           '--hide-scrollbars', f'--window-size={WINDOW[0]},{WINDOW[1]}')
 
 
 @dataclass(frozen=True)
@@ -107,9 +117,26 @@ def pair(seen: Measured) -> None:
     panels[0].set(xlim=(0, before.shape[1]), ylim=(before.shape[0] - 20, 78))
     figure.savefig(HERE / 'picture.png', dpi=80)
     plt.close(figure)
-    # smaller: the picture is in every clone
-    grey = cv2.imread(str(HERE / 'picture.png'))
-    cv2.imwrite(str(HERE / 'picture.png'), grey, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    _shrink(HERE / 'picture.png')
+
+
+def _shrink(path: Path) -> None:
+    """Write a picture anew, as small as it can be: it is in every clone."""
+    cv2.imwrite(str(path), cv2.imread(str(path)), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def report() -> None:
+    """Take the picture of the page that `dashcalib demo` writes."""
+    browser = shutil.which('chromium') or shutil.which('google-chrome')
+    if browser is None:
+        sys.exit('the picture of the report needs Chromium; install it')
+    with tempfile.TemporaryDirectory() as folder:
+        page = Path(folder) / 'demo' / 'report.html'
+        subprocess.run([sys.executable, '-m', 'dashcalib_ros.cli', 'demo', '--quiet', '--out',
+                        str(page.parent)], check=True)
+        subprocess.run([browser, *BROWSER, f'--user-data-dir={folder}/profile',
+                        f'--screenshot={HERE / "report.png"}', page.as_uri()], check=True)
+    _shrink(HERE / 'report.png')
 
 
 def turns(seen: Measured) -> None:
@@ -212,6 +239,9 @@ def _save(figure: plt.Figure, name: str) -> None:
 
 def main() -> None:
     """Measure and draw."""
+    report()
+    if sys.argv[1:] == ['report']:
+        return
     seen = measure()
     PLOTS.mkdir(exist_ok=True)
     for draw in (pair, turns, profile, steps, sigma):

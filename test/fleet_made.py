@@ -11,9 +11,7 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.config import Config
-from dashcalib_ros.fleet import gathered
-from dashcalib_ros.fleet.gathered import Gathered, GatheredTurn
-from dashcalib_ros.frames.scale import FULL_SIZE
+from dashcalib_ros.scene_file import Origin, SceneFile, StoredTurn, encoded
 
 CONFIG = Config().replace({'intrinsics.profile_tracks': 60})
 FEW = {'tracks': 110, 'keyframes': 9, 'noise_px': 0.25}
@@ -37,25 +35,23 @@ def lens_of(focal_factor: float = 1.0, lens: Radial = LENS) -> Radial:
 
 
 def clip_of(lens: Radial = LENS, yaws: Sequence[float] = YAWS[:1], world: int = 0,
-            start_s: float = 0.0, start: Camera | None = None, **options: Any) -> Gathered:
+            start_s: float = 0.0, start: Camera | None = None, **options: Any) -> SceneFile:
     """Return a clip with these turns. world: of its first one; each has a world of its own."""
     # as a turn's own adjustment leaves it
     start = start or Radial.centred(SIZE, lens.fx, lens.k1, lens.k2)
-    turns, scenes = [], {}
+    turns = []
     for n, yaw in enumerate(yaws):
         scene = synthetic_turn(lens, yaw, seed=world + n, world=world + n,
                                **{**FEW, **options}).scene(start, 100 * n)
         # as in a file, so that what is read equals what is made
         scene = replace(scene, tracks=replace(
             scene.tracks, xy=scene.tracks.xy.astype(np.float32).astype(float)))
-        scenes[100 * n] = scene
-        turns.append(GatheredTurn(100 * n, start_s + 10.0 * n, 0.05 - 0.001 * n, True,
-                                  scene.yaw_deg))
-    return Gathered(f'{world:032x}', 'made', lens.image_size, FULL_SIZE, 100 * len(yaws) + 50,
-                    10.0 * len(yaws) + 5.0, tuple(turns), scenes)
+        turns.append(StoredTurn(scene, start_s + 10.0 * n, 0.05 - 0.001 * n))
+    return SceneFile(Origin(lens.image_size), tuple(turns), len(turns), f'{world:032x}', 'abc',
+                     100 * len(yaws) + 50, 10.0 * len(yaws) + 5.0)
 
 
-def written(clip: Gathered, path: Path) -> Path:
+def written(clip: SceneFile, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(gathered.encoded(clip))
+    path.write_bytes(encoded(clip))
     return path

@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 
-from dashcalib_ros.camera import Brown, Fisheye, Radial
+from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
 from dashcalib_ros.config import Config
 from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
 
@@ -15,13 +15,16 @@ SIGMA = dict(zip(TRUTH.names(), (3.5, 3.75, 2.0, 2.25, 0.004, 0.003), strict=Tru
 # one camera of each model
 EACH_MODEL = {
     'radial': TRUTH,
-    'brown': Brown.of(SIZE, [*TRUTH.params, 0.00034, -0.0012, -0.04]),
+    'brown': Brown.of(SIZE, [*TRUTH.params, 0.00034, -0.0012, -0.004]),
+    'rational_polynomial': Rational.of(
+        SIZE, [*TRUTH.params, 0.00034, -0.0012, -0.004, 0.02, -0.003, 0.0011]),
     'fisheye': Fisheye(SIZE, 420.0, 421.5, 615.0, 180.0, -0.021, 0.0043, -0.0021, 0.00034)}
 
 
 def calibration_of(camera, level='accepted', **changes):
     """Make a calibration of any camera, with sigmas for all its parameters."""
-    sigma = dict(zip(camera.names(), (3.5, 3.75, 2.0, 2.25, 0.004, 0.003, 0.0002, 0.00005, 0.001),
+    sigma = dict(zip(camera.names(), (3.5, 3.75, 2.0, 2.25, 0.004, 0.003, 0.0002, 0.00005, 0.001,
+                                      0.002, 0.003, 0.004),
                      strict=False))
     return make_calibration(level, camera=camera, sigma=sigma, **changes)
 

@@ -1,6 +1,9 @@
 """Drives of every kind, written for the tests of what reads them."""
 from __future__ import annotations
 
+from fractions import Fraction
+
+import av
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-import dashcalib_ros.frames.quiet  # noqa: F401 (before our VideoWriter wakes FFmpeg)
+from dashcalib_ros.camera import ros_camera
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames import Frame
 from dashcalib_ros.inputs import open_frames
@@ -49,6 +52,19 @@ def head(stamp_ns, store=ROS2):
     stamp = store.types['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds)
     more = {'seq': 0} if store is ROS1 else {}
     return store.types['std_msgs/msg/Header'](stamp=stamp, frame_id='camera', **more)
+
+
+def info_of(camera, store=ROS2, **changes):
+    """Make a CameraInfo as a driver does, for ROS 2 or 1."""
+    kind = store.types['sensor_msgs/msg/CameraInfo']
+    values = {'k': camera.matrix.ravel(), 'd': np.array(camera.ros_distortion()),
+              'r': np.eye(3).ravel(), 'p': np.array(ros_camera(camera).p)}
+    roi = store.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
+    return kind(**{
+        'header': head(START, store), 'width': camera.image_size[0],
+        'height': camera.image_size[1], 'distortion_model': camera.ros_model,
+        **(values if store is ROS2 else {key.upper(): value for key, value in values.items()}),
+        'binning_x': 0, 'binning_y': 0, 'roi': roi, **changes})
 
 
 def text(content):
@@ -121,6 +137,46 @@ def write_video(path, frames, codec='MJPG', fps=25.0):
     for frame in frames:
         writer.write(cv2.cvtColor(frame.image, cv2.COLOR_GRAY2BGR))
     writer.release()
+    return path
+
+
+# s; no rate: 20, 33 and 66 ms apart, and a stretch at 8 Hz
+STEPS = np.tile([0.033, 0.066, 0.020], 30)
+STEPS[40:50] = 0.120
+TIMES = np.concatenate([[0.0], np.cumsum(STEPS)[:-1]])
+
+
+def numbered(index):
+    """Make a picture that tells its index."""
+    image = np.full((64, 160), 60, np.uint8)
+    for bit in range(8):
+        image[8:56, 8 + 18 * bit:22 + 18 * bit] = 220 if index >> bit & 1 else 20
+    return image
+
+
+def number(image):
+    return sum(1 << bit for bit in range(8)
+               if image[20:44, 11 + 18 * bit:19 + 18 * bit].mean() > 120)
+
+
+def write_timed(path, times=TIMES, start=0.0, between=3, turn=0, created=None, **options):
+    """Write a video of numbered pictures at these times. between: B-frames; turn: degrees."""
+    tick = Fraction(1, 90000)
+    with av.open(str(path), 'w', options=options) as container:
+        if created:
+            container.metadata['creation_time'] = created
+        stream = container.add_stream('libx264', rate=30)
+        stream.width, stream.height, stream.pix_fmt = 160, 64, 'yuv420p'
+        stream.time_base = stream.codec_context.time_base = tick
+        stream.codec_context.gop_size, stream.codec_context.max_b_frames = 30, between
+        if turn:
+            stream.set_display_rotation(turn)
+        for index, time in enumerate(times):
+            frame = av.VideoFrame.from_ndarray(numbered(index), format='gray8')
+            frame = frame.reformat(format='yuv420p')
+            frame.pts, frame.time_base = round((time + start) / tick), tick
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
     return path
 
 

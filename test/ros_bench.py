@@ -231,7 +231,7 @@ def keep_file(home, text, name='dashcam'):
     """Leave a calibration where the node looks for it."""
     path = home / '.ros' / 'camera_info' / f'{name}.yaml'
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    path.write_text(text.replace('camera_name: dashcam', f'camera_name: {name}'))
     return path
 
 

@@ -32,7 +32,7 @@ class Desk:
         for name, value in parameters.items():
             arguments += ['-p', f'{name}:={value}']
         rclpy.init(args=['calibrator', *arguments])
-        self.file = home / 'camera.yaml'
+        self.file, self.closed = home / 'camera.yaml', False
         self.node = CalibratorNode()
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self.node)
@@ -47,12 +47,13 @@ class Desk:
             return condition()
         return self.bench.until(spun)
 
-    def give(self, level='accepted', complete=True, sigma=SIGMA, warnings=(), **changes):
+    def give(self, level='accepted', complete=True, sigma=SIGMA, warnings=(), turns=(),
+             **changes):
         """Let the learner's thread come up with a calibration."""
         camera = dataclasses.replace(FIRST, **changes) if level != 'refused' else None
         calibration = Calibration(
             Verdict(level, () if level == 'accepted' else ('few turns',)), (320, 240), camera,
-            sigma if camera else None, (), 10, 0.3, {}, {}, Config(), warnings=warnings)
+            sigma if camera else None, turns, 10, 0.3, {}, {}, Config(), warnings=warnings)
         result = Result(calibration, complete, self.node._learner.bank)
         done = []
         self.node._later(lambda: self.node._on_result(result))
@@ -78,10 +79,13 @@ class Desk:
         return future.result()
 
     def close(self):
-        self.bench.close()
-        self.spinner.shutdown()
-        self.node.close()
-        rclpy.try_shutdown()
+        """Close all; closing it again does nothing."""
+        if not self.closed:
+            self.closed = True
+            self.bench.close()
+            self.spinner.shutdown()
+            self.node.close()
+            rclpy.try_shutdown()
 
 
 def black():

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
@@ -27,6 +28,7 @@ from dashcalib_ros.frames import Frame
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.recorded import calibrate
+from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.turns import TurnId
 from dashcalib_ros.turns.detection import Detection
@@ -338,11 +340,51 @@ def test_stored_turns_of_another_size_are_left_out_and_told(tmp_path):
     # of this size they count as turns, until they are forgotten
     with Calibrator(config, live=True) as calibrator:
         status = calibrator.push(pictures(1, 640, 360)[0])
-        assert (status.turns, status.built, status.stored) == (1, 1, 1)
-        assert status.ready == (TurnId.stored(0),)
-        assert status.yaw_deg == pytest.approx(80.0, abs=8.0)
+        assert (status.turns, status.built, status.stored) == (1, 0, 1)
+        assert status.reconstructed == (TurnId.stored(0),)
+        # but alone they give nothing: they may be another camera's
+        result = calibrator.calibrate()
+        assert result.verdict.level == 'refused'
+        assert 'could agree' in result.stored_turns[0].unused_because
         calibrator.forget_stored()
         assert calibrator.status().turns == 0 and list(tmp_path.iterdir()) == []
+
+
+def test_a_camera_in_use_is_compared_with_stored_turns(tmp_path):
+    store = TurnStore(str(tmp_path), 10, 3.0, pytest.fail)
+    store.load(Origin((640, 360)))
+    lens = Radial((640, 360), 390.0, 390.0, 319.5, 179.5, -0.2, 0.03)
+    scenes = [synthetic_turn(lens, keyframes=10, tracks=100, world=n).scene(lens, n)
+              for n in range(2)]
+    store.mirror(lambda: {scene.turn: StoredTurn(scene, 50.0 * n, 0.8 - n / 10)
+                          for n, scene in enumerate(scenes)})
+    sigma = dict.fromkeys(lens.names(), 0.1)
+    with Calibrator(QUICK.replace({'turns.store': str(tmp_path)})) as calibrator:
+        calibrator.push(pictures(1, 640, 360)[0])
+        assert calibrator.watch(lens, sigma).lens is None
+        change, = calibrator.watch(replace(lens, fx=10 * lens.fx), sigma).changes
+        assert change.kind == 'lens' and change.since == TurnId.stored(0)
+        # of other turns than these it knows nothing
+        assert not calibrator.watch(lens, sigma).agrees
+        calibrator.forget_stored({TurnId.stored(1)})
+        assert calibrator.status().reconstructed == (TurnId.stored(1),)
+        assert len(calibrator.watch(lens, sigma).readings) == len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(('own', 'more', 'used'), [
+    (0, 0, ''), (1, 0, 'oss'), (2, 0, 'oos'), (4, 0, 'ooo'), (4, 1, 'oooo'), (2, 1, 'oos')])
+def test_turns_of_this_drive_come_before_more_prominent_ones_of_earlier_drives(own, more, used):
+    scene = garbage()
+    turns = tuple(types.SimpleNamespace(id=TurnId.at(n), prominence=0.01) for n in range(own))
+    selection = SceneSelection(QUICK.replace({'turns.wanted': 3}),
+                               types.SimpleNamespace(turns=lambda: turns), threading.Lock())
+    selection.more = more
+    selection._pool._scenes = {turn.id: replace(scene, turn=turn.id) for turn in turns}
+    selection._kept.turns = {key: StoredTurn(replace(scene, turn=key), 0.0, 0.9)
+                             for key in map(TurnId.stored, range(5))}
+    chosen = [scene.turn for scene in selection.chosen()]
+    assert ''.join('o' if turn.of_this_drive else 's' for turn in chosen) == used
+    selection.close()
 
 
 def test_turns_that_are_rejected_leave_the_store(tmp_path):
@@ -353,12 +395,12 @@ def test_turns_that_are_rejected_leave_the_store(tmp_path):
     store.mirror(lambda: {TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9),
                           TurnId.at(9): StoredTurn(other, 50.0, 0.8)})
     with Calibrator(QUICK.replace({'turns.store': str(tmp_path)}), live=True) as calibrator:
-        first, second = calibrator.push(pictures(1, 640, 360)[0]).ready
+        first, second = calibrator.push(pictures(1, 640, 360)[0]).reconstructed
         calibrator.reject([first])
-        assert calibrator.status().ready == (second,) and calibrator.status().turns == 1
+        assert calibrator.status().reconstructed == (second,) and calibrator.status().turns == 1
         assert len(list(tmp_path.iterdir())) == 1
         calibrator.reject([first, TurnId.at(77)])  # gone, and never there
-        assert calibrator.status().ready == (second,)
+        assert calibrator.status().reconstructed == (second,)
 
 
 # drives that cannot calibrate

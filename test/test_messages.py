@@ -9,13 +9,16 @@ from messages import PACKAGE, messages_in
 
 DOCUMENT = Path(__file__).parents[1] / 'docs' / 'troubleshooting.md'
 EXPLAINED = ('judgement', 'selection.py', 'inputs.py', 'frames', 'bags', 'motion', 'turns',
-             'turn_store.py', 'workers', 'cli/run.py')
+             'scene_file.py', 'turn_store.py', 'workers', 'cli/run.py')
 # texts that are no messages: parts of others that are shown with them, SQL, code
 PARTS = {
-    'judgement/calibration.py': {'Calibration(…, …, …)'},
+    'judgement/calibration.py': {'from one turn alone, which nothing confirms'},
     'judgement/conclude.py': {'…, with … times the error of a camera of its own'},
-    'judgement/verdict.py': {'the turn… at frame …', '… turn… of earlier drives'},
-    'inputs.py': {' (and … more like it)'},
+    'judgement/next_turn.py': {'…: fx to about … %'},
+    'judgement/verdict.py': {
+        'the turn… at frame …', '… turn… of earlier drives',
+        ', so that nothing confirms the numbers and their sigma'},
+    'inputs.py': {' (and … more like it)', 'the time of recording'},
     'frames/joined.py': {' (and … more like it)'},
     'bags/camera_info.py': {
         "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"},
@@ -28,11 +31,12 @@ PARTS = {
     'bags/unpack.py': {'a part of the bag', 'a packed part is cut off'},
     'bags/write.py': {'compressed must be jpeg, png or None, not …'},
     'turns/turn.py': {'the turn at frame …'},
-    'turn_store.py': {
-        'it is too large when unpacked', 'it is no stored turn', 'it is too large',
+    'scene_file.py': {
+        'it is too large when unpacked', 'it is too large', 'it has too many parts',
         'it has format …, this version has …', 'its numbers are no valid scene',
-        'it is no regular file', 'it is compressed in an unknown way',
-        'set turns.store to a folder you may write to', '… is smaller than its header says'},
+        'it is no file of turns, or one of an older version', '… is not finite, or too large',
+        'it is compressed in an unknown way', '… is smaller than its header says'},
+    'turn_store.py': {'set turns.store to a folder you may write to'},
     'cli/run.py': {'written: … with … messages on …'},
     'workers/child.py': {'used no processor time for … s'},
     'workers/inline.py': {' in the environment before Python starts'},

@@ -9,12 +9,19 @@ import pytest
 
 from dashcalib_ros import Calibrator, Config, stages
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import MODELS, Camera, Radial, camera_from_ros, ros_camera
+from dashcalib_ros.camera import (
+    MODELS,
+    PINHOLE,
+    Camera,
+    Radial,
+    camera_from_ros,
+    ros_camera,
+)
 from dashcalib_ros.camera.camera import ColmapModel
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.judgement.conclude import evidence_of_detection
-from dashcalib_ros.report import calibration_yaml, load_calibration_yaml, result_dict
+from dashcalib_ros.report import calibration_yaml, load_camera, result_dict
 from dashcalib_ros.turns.detection import Detection
 
 # one term is all that this lens has
@@ -35,6 +42,7 @@ class OneTerm(Camera):
 
     model: ClassVar[str] = 'one_term'
     ros_model: ClassVar[str] = 'plumb_bob'
+    family: ClassVar[str] = PINHOLE
     step1: ClassVar[ColmapModel] = ColmapModel('SIMPLE_RADIAL', 4, (0, 0, 1, 2, 3))
     step2: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4))
     spread: ClassVar[tuple[float, ...]] = (1.0,)
@@ -99,7 +107,7 @@ def test_a_model_that_registers_itself_calibrates_a_rendered_drive(found):
 
 def test_its_file_is_read_back(found, tmp_path):
     (tmp_path / 'calibration.yaml').write_text(calibration_yaml(found))
-    read = load_calibration_yaml(tmp_path / 'calibration.yaml').camera
+    read = load_camera(tmp_path / 'calibration.yaml').camera
     points = np.random.default_rng(1).uniform([-2, -1, 4], [2, 1, 9], (20, 3))
     np.testing.assert_allclose(read.project(points), found.camera.project(points), atol=1e-9)
 

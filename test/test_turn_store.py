@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import threading
 import tracemalloc
@@ -13,11 +14,14 @@ import numpy as np
 import pytest
 from synthetic import LENS, synthetic_turn
 
+from dashcalib_ros import scene_file
 from dashcalib_ros import turn_store as room
 from dashcalib_ros.camera import Fisheye
 from dashcalib_ros.frames.scale import Scale
-from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
+from dashcalib_ros.reconstruction.scene import Scene, Start
+from dashcalib_ros.scene_file import Origin, StoredTurn
+from dashcalib_ros.solve.focal import kinds_of_lenses
+from dashcalib_ros.turn_store import TurnStore
 from dashcalib_ros.turns import TurnId
 
 HALF_WIDTH_S = 3.0
@@ -27,7 +31,10 @@ CAMERA = Origin((800, 450), Scale(), 'camera')
 
 @cache
 def scene(seed: int = 0, center: int = 30) -> Scene:
-    return synthetic_turn(keyframes=8, tracks=60, world=seed, seed=seed).scene(LENS, center)
+    made = synthetic_turn(keyframes=8, tracks=60, world=seed, seed=seed).scene(LENS, center)
+    # as in a file
+    xy = made.tracks.xy.astype(np.float32).astype(float)
+    return replace(made, tracks=replace(made.tracks, xy=xy))
 
 
 def stored(seed: int = 0, prominence: float = 0.05) -> StoredTurn:
@@ -64,9 +71,12 @@ def same(a: Scene, b: Scene) -> bool:
              (a.profile.ratios, b.profile.ratios), (a.profile.costs, b.profile.costs)]
     pairs += [(getattr(a.structure, name), getattr(b.structure, name)) for name in (
         'rotations', 'translations', 'points', 'registered', 'used')]
+    for one, other in zip(a.rivals, b.rivals, strict=True):
+        pairs += [(one.profile.ratios, other.profile.ratios),
+                  (one.profile.costs, other.profile.costs)]
     return all(x.dtype == y.dtype and np.array_equal(x, y, equal_nan=True) for x, y in pairs) and (
-        (a.camera, a.tracks.image_size, a.profile.observations)
-        == (b.camera, b.tracks.image_size, b.profile.observations))
+        (a.camera, a.tracks.image_size, a.profile.observations, [r.camera for r in a.rivals])
+        == (b.camera, b.tracks.image_size, b.profile.observations, [r.camera for r in b.rivals]))
 
 
 def test_a_turn_through_a_fisheye_comes_back(make):
@@ -75,6 +85,16 @@ def test_a_turn_through_a_fisheye_comes_back(make):
     hold(make(), StoredTurn(wide, DATE_S, 0.05))
     [found] = make().turns.values()
     assert same(found.scene, wide)
+
+
+def test_stored_turns_vote_for_each_kind_of_lens_that_was_tried(make):
+    """Half of the turns must have tried a kind: without it, a fisheye's bank is a pinhole's."""
+    wide = Fisheye.centred(scene(0).tracks.image_size, 400.0)
+    both = replace(scene(0), rivals=(Start(scene(0).profile, wide),))
+    hold(make(), StoredTurn(both, DATE_S, 0.05))
+    [found] = make().turns.values()
+    assert same(found.scene, both)
+    assert set(kinds_of_lenses([found.scene])) == {'pinhole', 'fisheye'}
 
 
 def test_what_is_stored_comes_back_with_keys_of_its_own(make):
@@ -182,14 +202,6 @@ def test_turns_of_resized_images_come_back(make):
         assert len(make(Origin(size, scale)).turns) == 1
 
 
-def test_turns_from_before_small_images_were_enlarged_are_of_use(make):
-    store = make()
-    hold(store, stored())
-    [path] = store._folder.iterdir()
-    rewritten(path, enlarge=None)
-    assert len(make().turns) == 1 and make().said == []
-
-
 def test_a_camera_frame_that_is_not_known_fits_any(make):
     hold(make(Origin((800, 450))), stored())
     assert len(make().turns) == len(make(Origin((800, 450))).turns) == 1
@@ -201,13 +213,21 @@ def bare(path, values) -> None:
         np.save(stream, values, allow_pickle=True)
 
 
-def rewritten(path, **changes) -> None:
+def rewritten(path, about=(), **changes) -> None:
+    """Change arrays of a turn, and values in the text; None removes an array."""
     with np.load(path) as data:
-        values = {**data, **changes}
+        values = {**data, **{f'turn0.{name}': value for name, value in changes.items()}}
+    text = {**json.loads(str(values['about'])), **dict(about)}
+    values['about'] = np.asarray(json.dumps(text))
     np.savez(path, **{name: value for name, value in values.items() if value is not None})
 
 
-def bomb(path, compression: int, times: int = 10) -> None:
+def scaled(path, name: str, factor: float) -> None:
+    with np.load(path) as data:
+        rewritten(path, **{name: factor * data[f'turn0.{name}']})
+
+
+def bomb(path, compression: int, times: int = 20) -> None:
     """Write arrays of zeros: 8 MB each, a few thousand bytes in the file."""
     with np.load(path) as data:
         values = {**data}
@@ -231,9 +251,9 @@ def boast(path) -> None:
     """Have an array's header promise far more than follows."""
     with np.load(path) as data:
         values = {**data}
-    np.savez(path, **{name: value for name, value in values.items() if name != 'xy'})
+    np.savez(path, **{name: value for name, value in values.items() if name != 'turn0.xy'})
     with zipfile.ZipFile(path, 'a') as archive:
-        archive.writestr('xy.npy', npy_header((8, 10**9, 2)) + bytes(64))
+        archive.writestr('turn0.xy.npy', npy_header((8, 10**9, 2)) + bytes(64))
 
 
 SPOILED = {
@@ -243,19 +263,21 @@ SPOILED = {
     'flipped': lambda path: path.write_bytes(
         path.read_bytes()[:3000] + b'\xff' * 2000 + path.read_bytes()[5000:]),
     'foreign': lambda path: np.savez(path, weights=np.zeros(3)),
-    'pickle': lambda path: np.savez(path, format=np.array([{}], object)),
+    'pickle': lambda path: np.savez(path, about=np.array([{}], object)),
     'an array': lambda path: bare(path, np.zeros(3)),
-    'newer': lambda path: rewritten(path, format=room.FORMAT + 1),
+    'newer': lambda path: rewritten(path, {'format': scene_file.FORMAT + 1}),
+    'older': lambda path: np.savez(path, format=3, xy=np.zeros((8, 60, 2))),
+    'huge rotations': lambda path: scaled(path, 'rotations', 1e300),
+    'huge points': lambda path: scaled(path, 'points', 1e300),
     'incomplete': lambda path: rewritten(path, rotations=None),
     'other shape': lambda path: rewritten(path, points=np.zeros((3, 3))),
     'other type': lambda path: rewritten(path, used=np.zeros((8, 60))),
     'not finite': lambda path: rewritten(path, camera=np.full(6, np.nan)),
     'no points': lambda path: rewritten(path, points=np.full((60, 3), np.nan)),
-    'no scale': lambda path: rewritten(path, shrink=0),
-    'other scale': lambda path: rewritten(path, enlarge=2),
-    'other size': lambda path: rewritten(path, size=np.array([640, 450])),
+    'no scale': lambda path: rewritten(path, {'scale': {'shrink': 0, 'enlarge': 1}}),
+    'no turns': lambda path: rewritten(path, {'turns': []}),
     'no scene': lambda path: rewritten(path, used=np.zeros((8, 60), bool)),
-    'too large': lambda path: path.write_bytes(path.read_bytes() + bytes(room.LARGEST)),
+    'too large': lambda path: path.write_bytes(path.read_bytes() + bytes(scene_file.LARGEST)),
     'a folder': lambda path: path.unlink() or path.mkdir(),
     'a FIFO': lambda path: path.unlink() or os.mkfifo(path),
     'a link to nothing': lambda path: path.unlink() or path.symlink_to('nowhere'),
@@ -290,11 +312,11 @@ def test_a_small_file_takes_little_memory(make, kind):
         boast(path)
     else:
         bomb(path, zipfile.ZIP_DEFLATED)
-    assert path.stat().st_size < room.LARGEST
+    assert path.stat().st_size < scene_file.LARGEST
     tracemalloc.start()
     try:
         assert make().turns == {}
-        assert tracemalloc.get_traced_memory()[1] < room.LARGEST_UNPACKED
+        assert tracemalloc.get_traced_memory()[1] < scene_file.LARGEST_UNPACKED
     finally:
         tracemalloc.stop()
 
@@ -320,7 +342,7 @@ def test_nothing_is_ever_unpickled(make, tmp_path):
 
     hold(make(), stored())
     folder = tmp_path / 'turns'
-    np.savez(folder / 'trap.npz', format=np.array([Trap()], object))
+    np.savez(folder / 'trap.npz', about=np.array([Trap()], object))
     bare(folder / 'bare.npz', np.array([Trap()], object))
     assert len(make().turns) == 1
     assert not (tmp_path / 'sprung').exists()

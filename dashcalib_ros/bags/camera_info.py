@@ -14,7 +14,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, get_typestore
 
-from dashcalib_ros.bags.storage import check_unpacked
+from dashcalib_ros.bags.storage import check_unpacked, open_bag
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.camera_info import RosCamera
 from dashcalib_ros.camera.rectified import SAME
@@ -28,6 +28,31 @@ def camera_info_topic(image_topic: str) -> str:
     """Return the camera_info topic that image_transport expects for an image topic."""
     base = image_topic.removesuffix('/compressed')
     return f'{base.rpartition("/")[0]}/camera_info'
+
+
+def first_camera_info(path: Path, topic: str | None = None) -> tuple[str, Any]:
+    """Return the topic of a bag's camera_info, and the first message on it.
+
+    topic: that topic, or the camera's image topic; needed only where several cameras have
+    camera_info. Raises InputError, OSError.
+    """
+    bag = open_bag(path)
+    infos = [each.name for each in bag.topics if each.msgtype == CAMERA_INFO and each.count]
+    if topic is None:
+        wanted = {camera_info_topic(each.name) for each in bag.topics if each.is_image}
+        found = [name for name in infos if name in wanted] or infos
+    else:
+        wanted = {f'/{topic.strip("/")}', camera_info_topic(f'/{topic.strip("/")}')}
+        found = [name for name in infos if f'/{name.strip("/")}' in wanted]
+    if len(found) != 1:
+        there = f'it has {", ".join(infos)}' if infos else 'there is none'
+        raise InputError(f'{path}: no one camera_info belongs to '
+                         f'{topic or "its images"}: {there}; name its topic, as in '
+                         f'{path}:{(infos or ["/camera/camera_info"])[0]}, or give a file')
+    record = next(bag.records(found, lambda _: None), None)
+    if record is None:
+        raise InputError(f'{path} is damaged: there is no message on {found[0]}; {REPAIR}')
+    return found[0], record.message()
 
 
 def check_bag(source: str | os.PathLike[str], image_topic: str | None,

@@ -1,10 +1,11 @@
 """The camera models: projection, viewing rays, derivatives, limits; COLMAP's names and ROS's."""
-from dashcalib_ros.camera.camera import Camera
-from dashcalib_ros.camera.camera_info import ros_camera
+from dashcalib_ros.camera.camera import FISHEYE, PINHOLE, Camera
+from dashcalib_ros.camera.camera_info import ros_camera, ros_faults
 from dashcalib_ros.camera.equidistant import Fisheye
 from dashcalib_ros.camera.models import (
     AUTO,
     MODELS,
+    calibrated_models,
     camera_from_ros,
     camera_of,
     larger_models,
@@ -12,8 +13,9 @@ from dashcalib_ros.camera.models import (
     searched,
 )
 from dashcalib_ros.camera.plumb_bob import Brown, Radial
+from dashcalib_ros.camera.rational import Rational
 from dashcalib_ros.camera.rectified import RECTIFIED
 
-__all__ = ['AUTO', 'MODELS', 'RECTIFIED', 'Brown', 'Camera', 'Fisheye', 'Radial',
-           'camera_from_ros', 'camera_of', 'larger_models', 'model_named', 'ros_camera',
-           'searched']
+__all__ = ['AUTO', 'FISHEYE', 'MODELS', 'PINHOLE', 'RECTIFIED', 'Brown', 'Camera', 'Fisheye',
+           'Radial', 'Rational', 'calibrated_models', 'camera_from_ros', 'camera_of',
+           'larger_models', 'model_named', 'ros_camera', 'ros_faults', 'searched']

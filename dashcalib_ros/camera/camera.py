@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # COLMAP has the centre of the first pixel at (0.5, 0.5)
 HALF_PIXEL = 0.5
+# the families of lenses: distortion of the tangent of a ray's angle to the axis, or of the angle
+PINHOLE, FISHEYE = 'pinhole', 'fisheye'
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ class Camera(ABC):
     """image_size: (width, height); fx, fy, cx, cy in pixels; the rest is the model's own.
 
     model: its name in result.json and --model. ros_model: CameraInfo's distortion_model.
+    family: PINHOLE or FISHEYE; within one, a coefficient has one meaning. given_only:
+    whether no turns can determine its coefficients: then it may only be read from files.
     step1, step2: how COLMAP adjusts it with one focal length and the centre fixed, and with all
     parameters (paper, 3.2). spread: prior standard deviation of each distortion coefficient,
     around 0. focal_ratios: focal lengths over the image width that the search for a start tries.
@@ -74,6 +78,8 @@ class Camera(ABC):
 
     model: ClassVar[str]
     ros_model: ClassVar[str]
+    family: ClassVar[str]
+    given_only: ClassVar[bool] = False
     step1: ClassVar[ColmapModel]
     step2: ClassVar[ColmapModel]
     spread: ClassVar[tuple[float, ...]]

@@ -1,12 +1,21 @@
 """A camera as ROS has it: the fields of CameraInfo, and of a calibration file."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera.camera import Camera
 from dashcalib_ros.camera.rectified import SAME, rectified_matrix
+
+# of an entry of K, R or P; programs write them with more digits
+EXACT = 1e-3
+# of the width; the middle of the picture is so near to that of the rectified one, which shows it
+# at most so many times smaller or larger: P of twice the size moves the middle by half the width
+NEAR, ZOOM = 0.1, (0.1, 2.0)
 
 
 @dataclass(frozen=True)
@@ -30,3 +39,52 @@ def ros_camera(camera: Camera, rectified: str = SAME) -> RosCamera:
     return RosCamera(
         camera.image_size, camera.ros_model, [float(value) for value in camera.ros_distortion()],
         camera.matrix.ravel().tolist(), np.eye(3).ravel().tolist(), p.ravel().tolist())
+
+
+def ros_faults(camera: Camera, k: Sequence[float] | None = None, r: Sequence[float] | None = None,
+               p: Sequence[float] | None = None) -> tuple[str, ...]:
+    """Return in words what is wrong with CameraInfo's K (9,), R (9,) and P (12,) beside a camera.
+
+    The camera has their focal lengths, centre and distortion, of which this says nothing. None:
+    not known, and no fault. R and P of one camera are meant: those of a pair are faults.
+    """
+    faults = []
+    if k is not None:
+        faults += _odd('K', np.reshape(k, (3, 3)), camera.matrix)
+    if r is not None:
+        rotation = np.reshape(r, (3, 3))
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > EXACT or np.linalg.det(rotation) < 0:
+            faults.append('R is no rotation: of one camera, it is the identity')
+        elif np.abs(rotation - np.eye(3)).max() > EXACT:
+            angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
+            faults.append(f'R turns the rectified picture by {angle:.1f} degrees: of one camera, '
+                          f'it is the identity')
+    if p is not None:
+        view = np.reshape(p, (3, 4))
+        wanted = np.diag([view[0, 0], view[1, 1], 1.0, 0.0])[:3]
+        wanted[:2, 2] = view[:2, 2]
+        faults += _odd('P', view, wanted) or _of_another_picture(camera, view[:, :3])
+    return tuple(faults)
+
+
+def _odd(name: str, matrix: Floats, wanted: npt.ArrayLike) -> list[str]:
+    """Return the entries that are not as they must be."""
+    flat, right = matrix.ravel(), np.ravel(wanted)
+    odd = np.flatnonzero(~(np.abs(flat - right) <= EXACT))
+    texts = (f'{name}[{n}] is {flat[n]:.4g}, not {right[n]:.4g}' for n in odd)
+    return [', '.join(texts)] if len(odd) else []
+
+
+def _of_another_picture(camera: Camera, view: Floats) -> list[str]:
+    """Return whether a rectified picture (3, 3) does not show what the camera sees."""
+    size = np.array(camera.image_size)
+    middle, low, high = (share * (size - 1) for share in (0.5, 0.25, 0.75))
+    with np.errstate(all='ignore'):
+        seen = camera.rays(np.array([middle, low, high])) @ view.T
+        seen = seen[:, :2] / seen[:, 2:]
+        away = np.abs(seen[0] - middle).max() / size[0]
+        zoom = (seen[2] - seen[1]) / (high - low)
+        # NaN is a fault, too
+        fits = away <= NEAR and ZOOM[0] <= zoom.min() and zoom.max() <= ZOOM[1]
+    return [] if fits else [
+        'P does not show the picture: is it for pictures of another size?']

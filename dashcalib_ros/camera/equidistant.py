@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera.camera import Camera, ColmapModel
+from dashcalib_ros.camera.camera import FISHEYE, Camera, ColmapModel
 
 # radians (120 degrees): the corners of a picture that is 190 degrees wide see to 110
 WIDEST = 2.1
@@ -26,7 +26,11 @@ ON_AXIS = 1e-7
 
 @dataclass(frozen=True)
 class Fisheye(Camera):
-    """The equidistant model with four coefficients."""
+    """A fisheye lens: the equidistant model with four coefficients, as cv2.fisheye has it.
+
+    image_size: (width, height) in pixels. fx, fy, cx, cy: pixels; the centre of the first pixel is
+    at (0, 0). k1 to k4: of the powers 3, 5, 7, 9 of the angle to the axis.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
@@ -35,6 +39,7 @@ class Fisheye(Camera):
 
     model: ClassVar[str] = 'fisheye'
     ros_model: ClassVar[str] = 'equidistant'
+    family: ClassVar[str] = FISHEYE
     step1: ClassVar[ColmapModel] = ColmapModel('RADIAL_FISHEYE', 5, (0, 0, 1, 2, 3, 4))
     step2: ClassVar[ColmapModel] = ColmapModel('OPENCV_FISHEYE', 8, (0, 1, 2, 3, 4, 5, 6, 7))
     spread: ClassVar[tuple[float, ...]] = (0.2, 0.1, 0.05, 0.02)

@@ -6,6 +6,8 @@ the camera cannot be told from one of its mounting (Hagemann et al.).
 """
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
@@ -26,19 +28,44 @@ def grid_of(camera: Camera) -> Floats:
     return np.stack([u.ravel(), v.ravel()], -1)
 
 
+@dataclass(frozen=True)
+class Apart:
+    """By how much two cameras' images of the same rays differ, the best common rotation removed.
+
+    pixels: (n, 2) where the reference sees the rays; offsets: (n, 2) from there to where the other
+    camera sees them, px.
+    """
+
+    pixels: Floats
+    offsets: Floats
+
+    @property
+    def lengths(self) -> Floats:
+        """Return (n,) how many pixels they are apart."""
+        return np.asarray(np.linalg.norm(self.offsets, axis=1))
+
+    @property
+    def rms(self) -> float:
+        """Return how many pixels they are apart over the picture."""
+        return float(np.sqrt(np.mean(self.lengths**2)))
+
+    @property
+    def worst(self) -> float:
+        """Return how many pixels they are apart where it is most."""
+        return float(self.lengths.max())
+
+
 def mapping_error(camera: Camera, reference: Camera) -> float | None:
     """Return the RMS pixel distance between both cameras' images of the same rays.
 
-    None where mapping_difference() is.
+    None where apart() is.
     """
-    difference = mapping_difference(camera, reference)
-    if difference is None:
-        return None
-    return float(np.sqrt(np.mean(np.sum(difference**2, -1))))
+    found = apart(camera, reference)
+    return None if found is None else found.rms
 
 
-def mapping_difference(camera: Camera, reference: Camera) -> Floats | None:
-    """Return (n, 2) by how many pixels both cameras' images of the same rays differ.
+def apart(camera: Camera, reference: Camera) -> Apart | None:
+    """Return how far the images of the same rays are apart in both cameras.
 
     The rays are those of a grid over the reference's image, without those that no camera of this
     kind can see (unseen_share()). None when the reference has no ray for a pixel of the grid, or
@@ -64,7 +91,7 @@ def mapping_difference(camera: Camera, reference: Camera) -> Floats | None:
             rest = least_squares(residual, np.zeros(3)).fun
         except ValueError:  # a ray left the camera's view on the way
             return None
-    return np.asarray(rest.reshape(-1, 2))
+    return Apart(pixels, np.asarray(rest.reshape(-1, 2)))
 
 
 def unseen_share(camera: Camera, reference: Camera) -> float:
@@ -79,24 +106,33 @@ def _possible(camera: Camera, rays: Floats) -> Mask:
                                     else np.cos(np.radians(IN_FRONT_DEG))))
 
 
-def sensitivity(camera: Camera) -> tuple[Floats, Floats]:
+def sensitivity(camera: Camera, at: Floats | None = None) -> tuple[Floats, Floats]:
     """Return by how much parameters move the picture, the best common rotation removed.
 
     (m, 2, n) derivatives of the pixels of m viewing rays by the n parameters, and the rays'
-    pixels (m, 2): those of a grid over the picture for which the camera has a ray.
+    pixels (m, 2): those of a grid over the picture, or those given, for which the camera has a
+    ray. The rotation is the best one over the grid.
     """
-    pixels = grid_of(camera)
+    pixels, flat, by_rotation = _derivatives(camera, grid_of(camera))
+    rotation, *_ = np.linalg.lstsq(by_rotation, flat, rcond=None)
+    if at is not None:
+        pixels, flat, by_rotation = _derivatives(camera, at)
+    return (flat - by_rotation @ rotation).reshape(len(pixels), 2, -1), pixels
+
+
+def _derivatives(camera: Camera, pixels: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return those of the pixels that have a ray, (m, 2), and derivatives of them.
+
+    (2 m, n) by the parameters, and (2 m, 3) by a rotation of the ray.
+    """
     rays = camera.rays(pixels)
     known = np.isfinite(rays[:, 0])
-    pixels, rays = pixels[known], rays[known]
-    by_params, by_point, _ = camera.derivatives(rays)
-    x, y, z = rays.T
+    by_params, by_point, _ = camera.derivatives(rays[known])
+    x, y, z = rays[known].T
     zero = np.zeros_like(x)
     turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    by_rotation = (by_point @ turned).reshape(-1, 3)
-    flat = by_params.reshape(-1, by_params.shape[2])
-    rotation, *_ = np.linalg.lstsq(by_rotation, flat, rcond=None)
-    return (flat - by_rotation @ rotation).reshape(by_params.shape), pixels
+    return (pixels[known], by_params.reshape(-1, by_params.shape[2]),
+            (by_point @ turned).reshape(-1, 3))
 
 
 def as_model(camera: Camera, model: type[Camera], pixels: Floats | None = None) -> Camera:
@@ -111,7 +147,7 @@ def as_model(camera: Camera, model: type[Camera], pixels: Floats | None = None) 
     pixels, rays = pixels[known], rays[known]
     start = model.centred(camera.image_size, camera.fx).params
     start[:4] = camera.params[:4]
-    if model.ros_model == camera.ros_model:
+    if model.family == camera.family:
         shared = min(len(start), len(camera.params))
         start[4:shared] = camera.params[4:shared]
     scale = np.ones(len(start))

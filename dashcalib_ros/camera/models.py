@@ -7,37 +7,46 @@ import numpy.typing as npt
 from dashcalib_ros.camera.camera import Camera
 from dashcalib_ros.camera.equidistant import Fisheye
 from dashcalib_ros.camera.plumb_bob import Brown, Radial
+from dashcalib_ros.camera.rational import Rational
 from dashcalib_ros.errors import ConfigError, InputError, shortened
 
 # as a setting: the turns choose
 AUTO = 'auto'
-MODELS: dict[str, type[Camera]] = {model.model: model for model in (Radial, Brown, Fisheye)}
+MODELS: dict[str, type[Camera]] = {
+    model.model: model for model in (Radial, Brown, Fisheye, Rational)}
+
+
+def calibrated_models() -> list[type[Camera]]:
+    """Return the models that turns can determine."""
+    return [model for model in MODELS.values() if not model.given_only]
 
 
 def model_named(name: str) -> type[Camera]:
-    """Return a model by its name; raises ConfigError for one that is not known."""
-    if name not in MODELS:
-        raise ConfigError(f'there is no camera model {shortened(repr(name))}; there are '
-                          f'{", ".join([AUTO, *MODELS])}')
-    return MODELS[name]
+    """Return the model of this name that is to be calibrated. Raises ConfigError."""
+    if name in MODELS and not MODELS[name].given_only:
+        return MODELS[name]
+    what = (f'the coefficients of {name} can be given, but not found from turns' if name in MODELS
+            else f'there is no camera model {shortened(repr(name))}')
+    raise ConfigError(f'{what}; there are '
+                      f'{", ".join([AUTO, *(model.model for model in calibrated_models())])}')
 
 
 def searched(name: str) -> tuple[type[Camera], ...]:
-    """Return the models that the search for a start tries; 'auto': one for each kind of lens.
+    """Return the models that the search for a start tries; 'auto': one for each family.
 
     Raises ConfigError for a name that is not known.
     """
     if name != AUTO:
         return (model_named(name),)
-    kinds: dict[str, type[Camera]] = {}
-    for model in MODELS.values():
-        kinds.setdefault(model.ros_model, model)
-    return tuple(kinds.values())
+    families: dict[str, type[Camera]] = {}
+    for model in calibrated_models():
+        families.setdefault(model.family, model)
+    return tuple(families.values())
 
 
 def larger_models(camera: Camera) -> list[type[Camera]]:
-    """Return the models with more parameters than the camera's."""
-    return [model for model in MODELS.values() if len(model.names()) > len(camera.names())]
+    """Return the models that turns can determine with more parameters than the camera's."""
+    return [model for model in calibrated_models() if len(model.names()) > len(camera.names())]
 
 
 def camera_of(model: str, image_size: tuple[int, int], params: npt.ArrayLike) -> Camera:
@@ -54,7 +63,11 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
 
     Raises InputError where no model here has such a distortion.
     """
-    fx, _, cx, _, fy, cy = np.asarray(k, np.float64)[:6]
+    matrix = np.asarray(k, np.float64)
+    fx, _, cx, _, fy, cy = matrix[:6]
+    if not np.array_equal(matrix, [fx, 0, cx, 0, fy, cy, 0, 0, 1]):
+        raise InputError('the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1], and no model here '
+                         'has skew: calibrate without it')
     wanted = np.trim_zeros(np.asarray(d, np.float64), 'b')
     # fewer parameters come first in the table
     for model in MODELS.values():
@@ -65,9 +78,10 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
                                        *np.zeros(max(0, size - len(wanted)))])
         if np.array_equal(np.trim_zeros(np.array(camera.ros_distortion()), 'b'), wanted):
             return camera
-    raise InputError(f'a camera of {distortion_model} with {len(wanted)} coefficients is none of '
-                     f'the models here: {", ".join(MODELS)}')
+    raise InputError(f'a camera of {shortened(distortion_model)} with {len(wanted)} coefficients '
+                     f'is none of the models here; calibrate it as one of {", ".join(ROS_MODELS)}')
 
 
+ROS_MODELS = tuple(dict.fromkeys(model.ros_model for model in MODELS.values()))
 # other names that ROS has for a model, or for one that contains it
 SAME = {'plumb_bob': ('rational_polynomial',), 'equidistant': ('fisheye',)}

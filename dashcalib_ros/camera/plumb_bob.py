@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera.camera import Camera, ColmapModel
+from dashcalib_ros.camera.camera import PINHOLE, Camera, ColmapModel
 
 # tangent of 85 degrees: no pinhole camera sees farther out
 WIDEST = 11.4
@@ -26,13 +26,18 @@ NEAREST = 1e-9
 
 @dataclass(frozen=True)
 class Radial(Camera):
-    """The paper's six parameters (Eq. 1, 2): two radial terms."""
+    """A pinhole camera with two radial terms of distortion: the paper's six parameters.
+
+    image_size: (width, height) in pixels. fx, fy, cx, cy: pixels; the centre of the first pixel is
+    at (0, 0). k1, k2: OpenCV's, ROS's plumb_bob.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
 
     model: ClassVar[str] = 'radial'
     ros_model: ClassVar[str] = 'plumb_bob'
+    family: ClassVar[str] = PINHOLE
     step1: ClassVar[ColmapModel] = ColmapModel('RADIAL', 5, (0, 0, 1, 2, 3, 4))
     step2: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4, 5))
     spread: ClassVar[tuple[float, ...]] = (1.0, 1.0)
@@ -50,9 +55,9 @@ class Radial(Camera):
         depth = points[..., 2]
         depth = np.where(depth > NEAREST, depth, np.nan)
         x, y = points[..., 0] / depth, points[..., 1] / depth
-        k1, k2, p1, p2, k3 = self.ros_distortion()
+        _, _, p1, p2, *_ = self.ros_distortion()
         square = x * x + y * y
-        scale = 1 + square * (k1 + square * (k2 + square * k3))
+        scale = self._stretch(square)
         if p1 or p2:
             product = 2 * x * y
             x, y = (x * scale + p1 * product + p2 * (square + 2 * x * x),
@@ -60,6 +65,11 @@ class Radial(Camera):
         else:
             x, y = x * scale, y * scale
         return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
+
+    def _stretch(self, square: Floats) -> Floats:
+        """Return the radial factor at squared radii (...)."""
+        k1, k2, _, _, k3 = self.ros_distortion()
+        return 1 + square * (k1 + square * (k2 + square * k3))
 
     def derivatives(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the derivatives of the pixels of points (m, 3); see Camera."""
@@ -101,7 +111,11 @@ class Radial(Camera):
 
 @dataclass(frozen=True)
 class Brown(Radial):
-    """Brown's model: also decentred (p1, p2), and a third radial term."""
+    """Brown's model: a Radial that may be decentred (p1, p2), with a third radial term k3.
+
+    image_size: (width, height) in pixels. fx, fy, cx, cy: pixels; the centre of the first pixel is
+    at (0, 0). The coefficients, here in the order k1, k2, p1, p2, k3, are OpenCV's.
+    """
 
     p1: float = 0.0
     p2: float = 0.0

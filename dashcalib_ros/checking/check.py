@@ -19,22 +19,21 @@ from dashcalib_ros.solve.solution import Solution
 
 Answer = Literal['right', 'wrong', 'cannot tell']
 
-# of the focal length; a drive must be able to see an error as large as this one makes in pixels
-RELEVANT = 0.02
-
 
 @dataclass(frozen=True)
 class Check:
     """What a drive says of a calibration that was given.
 
-    answer: wrong means that chance does not explain the difference; right, that the drive would
-    have shown an error of 2 % in the focal length, or one as large in pixels. rms_px, worst_px:
-    over the picture, between the given camera and the drive's own, the best common rotation
-    removed; None where they cannot be compared. sigma_px: of the drive's own. distance: of the
-    given parameters from the drive's, in sigmas with all correlations; limit: what chance exceeds
-    once in a thousand drives. loss: by how much worse the turns are explained when they must use
-    the given camera, of the cost with their own; None where it was not tried.
-    straight_lines: what they say of the given camera; None where there are too few.
+    answer: wrong means that neither chance nor what good calibrations differ by explains the
+    difference; right, that the drive would have shown an error of 2 % in the focal length, or one
+    as large in pixels. rms_px, worst_px: over the picture, between the given camera and the
+    drive's own, the best common rotation removed; None where they cannot be compared. sigma_px:
+    of the drive's own. told_apart: whether more than chance is between them. distance: of the
+    given parameters from the nearest that good calibrations may have, in sigmas with all
+    correlations; limit: what chance exceeds once in a thousand drives. loss: by how much worse the
+    turns are explained when they must use the given camera, of the cost with their own; None where
+    it was not tried. straight_lines: what they say of the given camera; None where there are too
+    few.
     """
 
     answer: Answer
@@ -42,6 +41,7 @@ class Check:
     rms_px: float | None = None
     worst_px: float | None = None
     sigma_px: PictureSigma | None = None
+    told_apart: bool | None = None
     distance: float | None = None
     limit: float | None = None
     loss: float | None = None
@@ -66,26 +66,29 @@ def check(given: Camera, image_size: tuple[int, int], solution: Solution | None,
     px = Scale.of(image_size, config).px
 
     def difference(camera: Camera) -> Difference:
-        return difference_of(camera, solution, px, RELEVANT, config.intrinsics)
+        return difference_of(camera, solution, px)
 
     here = difference(replace(given, image_size=image_size))
     if given.image_size != image_size:
-        return Check('wrong', (size_reason(given, image_size, difference),), here.rms_px,
-                     here.worst_px, here.sigma_px, here.distance, here.limit)
+        # pixels of one size are no error in those of another
+        return Check('wrong', (size_reason(given, image_size, difference),))
     loss = loss_of(given.resized(1 / px, solution.camera.image_size), solution, config)
     scaled = scaled_parameters(here, difference) if here.significant else ''
     reasons = (*((scaled,) if scaled else reasons_of(here)), _loss_text(loss))
     return Check(_answer(here, loss), reasons, here.rms_px, here.worst_px, here.sigma_px,
-                 here.distance, here.limit, loss)
+                 here.told_apart, here.distance, here.limit, loss)
+
+
+def with_faults(found: Check, faults: tuple[str, ...]) -> Check:
+    """Return a check with the faults of what stands beside the camera: with any, it is wrong."""
+    return replace(found, answer='wrong', reasons=(*faults, *found.reasons)) if faults else found
 
 
 def _answer(found: Difference, loss: float) -> Answer:
-    if found.significant:
+    if found.matters:
         # a calibration that explains the turns as well as their own is not contradicted by them
         return 'wrong' if loss > 0 else 'cannot tell'
-    if found.bound_px is not None and found.bound_px <= found.relevant_px:
-        return 'right'
-    return 'cannot tell'
+    return 'cannot tell' if found.matters is None else 'right'
 
 
 def loss_of(given: Camera, solution: Solution, config: Config) -> float:

@@ -1,74 +1,140 @@
-"""How far a given camera is from a drive's own solution: in pixels, and in its full covariance.
+"""How far two calibrations are apart, whether that can be told, and whether it matters.
 
-The solution is a normal distribution of its n parameters. The given camera is a point among them,
-at a Mahalanobis distance that chance explains or not. Which parameters make it far is asked by
-leaving them out: what the rest alone is away from its own distribution.
+One answer for `check`, where a given camera meets a drive's own, and for `compare`, where two
+files meet. The camera that was found is a normal distribution of its n parameters. The other is a
+point among them, at a Mahalanobis distance that chance explains or not. Good calibrations of one
+lens differ by a little in any case: only what goes beyond that matters. Which parameters make it
+far is asked by leaving them out: what the rest alone is away from its own distribution.
 """
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property
+from typing import Literal, Protocol
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.mapping import as_model, mapping_difference, sensitivity
-from dashcalib_ros.checking.contradiction import LEAST_SIGMA
-from dashcalib_ros.config import IntrinsicsConfig
-from dashcalib_ros.solve.opinions import covariance_of, seen_by_turns
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
+from dashcalib_ros.solve.opinions import seen_by_turns
+from dashcalib_ros.solve.picture import PictureSigma, SigmaMap, sigma_over
 from dashcalib_ros.solve.solution import Solution
 
 Way = Literal['focal length', 'centre', 'distortion']
 # the first parameters of every camera; all behind them are of the distortion
 PLACES: dict[Way, tuple[int, ...]] = {'focal length': (0, 1), 'centre': (2, 3)}
-# px; by this much cx and cy of two programs differ where their pixels begin elsewhere
-HALF_PIXEL = 0.5
-# how often chance alone exceeds the limit of a distance
+# by how much good calibrations of one lens differ: of fx and fy (two that KITTI ships: 0.44 %),
+# and px of cx and cy (pixels begin half a pixel elsewhere in some programs)
+ALLOWED_FOCAL = 0.005
+ALLOWED_CENTRE_PX = 1.0
+# of the focal length; a drive that calls a camera right must be able to see what this one makes
+RELEVANT = 0.02
+# how often chance alone exceeds the limit of a distance, and where it begins to be doubtful
 CHANCE = 1e-3
+DOUBT = 0.05
 
 
 @dataclass(frozen=True)
 class Difference:
-    """A given camera beside a solution, in the input's pixels.
+    """A given camera beside one that was found, in px of the same pictures.
 
-    offsets: (n,) given minus found, for the solution's model; covariance: (n, n) of what was
-    found, with what good calibrations may differ by. rms_px, worst_px: how far apart both see a
-    ray, the best common rotation removed; None where they cannot be compared. sigma_px: of the
-    solution. limit: of the distance, in sigmas; relevant_px: what a focal length
-    RELEVANT of fx off would move.
+    offsets: (n,) given minus found, in the parameters of a model that has both; covariance: (n, n)
+    of them; None where neither is known. apart: how far both see a ray; None where they cannot be
+    compared. sigma_px: of what is known of both, over the picture.
     """
 
     given: Camera
     found: Camera
     offsets: Floats
-    covariance: Floats
-    rms_px: float | None
-    worst_px: float | None
-    sigma_px: PictureSigma
-    relevant_px: float
+    covariance: Floats | None
+    apart: Apart | None
+    sigma_px: PictureSigma | None
 
     @property
     def limit(self) -> float:
         """Return the distance that chance alone exceeds once in a thousand drives."""
         return limit_of(len(self.offsets))
 
-    @property
-    def distance(self) -> float:
-        """Return the Mahalanobis distance, in sigmas."""
-        return distance(self.offsets, self.covariance)
+    @cached_property
+    def distance(self) -> float | None:
+        """Return by how many sigmas they differ more than good calibrations of one lens do."""
+        return None if self.covariance is None else distance(self.offsets, self.covariance,
+                                                             self._allowed)
 
     @property
     def significant(self) -> bool:
-        """Return whether chance does not explain the distance."""
-        return not self.distance <= self.limit
+        """Return whether they differ more than chance and good calibrations do."""
+        if self.distance is None or self.sigma_px is None:
+            return self.rms_px is None or self.rms_px > self.allowed_px
+        return not self.distance <= self.limit or (
+            self.rms_px is not None and self.rms_px - 2 * self.sigma_px.rms > self.relevant_px)
 
     @property
-    def bound_px(self) -> float | None:
+    def told_apart(self) -> bool | None:
+        """Return whether more than chance is between them; None where no sigma is known."""
+        if self.covariance is None or self.sigma_px is None:
+            return None
+        return not distance(self.offsets, self.covariance) <= self.limit or (
+            self.rms_px is None or self.rms_px > self.limit * self.sigma_px.rms)
+
+    @property
+    def matters(self) -> bool | None:
+        """Return whether the difference is one that good calibrations do not have.
+
+        False: it is below what a focal length RELEVANT off makes, with 95 %. None: neither.
+        """
+        if self.significant:
+            return True
+        if self.distance is None:
+            return False
+        doubtful = self.distance > limit_of(len(self.offsets), DOUBT)
+        return False if self.bound_px <= self.relevant_px and not doubtful else None
+
+    @property
+    def rms_px(self) -> float | None:
+        """Return how far apart they are over the picture."""
+        return None if self.apart is None else self.apart.rms
+
+    @property
+    def worst_px(self) -> float | None:
+        """Return how far apart they are where it is most."""
+        return None if self.apart is None else self.apart.worst
+
+    @property
+    def bound_px(self) -> float:
         """Return what the given camera's error over the picture stays below with 95 %."""
-        return None if self.rms_px is None else self.rms_px + 2 * self.sigma_px.rms
+        sigma = 0.0 if self.sigma_px is None else self.sigma_px.rms
+        return np.inf if self.rms_px is None else self.rms_px + 2 * sigma
+
+    @property
+    def allowed_px(self) -> float:
+        """Return what the focal length moves, over the picture, where good calibrations differ."""
+        return ALLOWED_FOCAL / RELEVANT * self.relevant_px
+
+    @cached_property
+    def relevant_px(self) -> float:
+        """Return what a focal length RELEVANT off moves, over the picture."""
+        moves, _ = sensitivity(self.found)
+        longer = RELEVANT * self.found.params * (np.arange(len(self.found.params)) < 2)
+        return float(np.sqrt(np.mean(np.sum((moves @ longer)**2, axis=1))))
+
+    @property
+    def sigma_map(self) -> SigmaMap | None:
+        """Return the sigma of the difference at the pixels of a grid over the picture."""
+        if self.covariance is None:
+            return None
+        model = self.found if len(self.found.params) == len(self.offsets) else self.given
+        moves, pixels = sensitivity(model)
+        return SigmaMap(pixels, sigma_over(moves, self.covariance))
+
+    @property
+    def _allowed(self) -> Floats:
+        allowed = np.zeros(len(self.offsets))
+        allowed[:2] = ALLOWED_FOCAL * self.found.params[:2]
+        allowed[2:4] = ALLOWED_CENTRE_PX
+        return allowed
 
     def ways(self) -> Mapping[Way, Floats]:
         """Return the fewest parts of the camera that explain the distance, the largest first.
@@ -83,6 +149,7 @@ class Difference:
             count = len(self.offsets) - len(self._places(chosen))
             if self._without(chosen) <= limit_of(count):
                 break
+        assert self.covariance is not None
         places = np.array(self._places(chosen))
         rest = np.setdiff1d(np.arange(len(self.offsets)), places)
         # what the rest, as it is given, leads one to expect of the chosen parts
@@ -92,31 +159,44 @@ class Difference:
         return {way: np.array([own[place] for place in self._places([way])]) for way in chosen}
 
     def _without(self, ways: Sequence[Way]) -> float:
+        assert self.covariance is not None
         rest = np.setdiff1d(np.arange(len(self.offsets)), self._places(ways))
-        return distance(self.offsets[rest], self.covariance[np.ix_(rest, rest)])
+        return distance(self.offsets[rest], self.covariance[np.ix_(rest, rest)],
+                        self._allowed[rest])
 
     def _places(self, ways: Sequence[Way]) -> list[int]:
         count = len(self.offsets)
         return [place for way in ways for place in PLACES.get(way, range(4, count))]
 
 
-def limit_of(count: int) -> float:
-    """Return the Mahalanobis distance of so many parameters that chance exceeds with CHANCE."""
+def limit_of(count: int, chance: float = CHANCE) -> float:
+    """Return the Mahalanobis distance of so many parameters that chance exceeds so often."""
     from scipy import special
-    return float(np.sqrt(special.chdtri(count, CHANCE))) if count else 0.0
+    return float(np.sqrt(special.chdtri(count, chance))) if count else 0.0
 
 
-def distance(offsets: Floats, covariance: Floats) -> float:
-    """Return the Mahalanobis distance of offsets (n,); 0 for none."""
-    return float(np.sqrt(offsets @ np.linalg.solve(covariance, offsets))) if len(offsets) else 0.0
+def distance(offsets: Floats, covariance: Floats, allowed: Floats | None = None) -> float:
+    """Return the Mahalanobis distance of offsets (n,); 0 for none.
+
+    allowed: (n,) by how much each may be nearer to 0; the nearest point counts.
+    """
+    from scipy.optimize import lsq_linear
+    if not len(offsets):
+        return 0.0
+    root = np.linalg.cholesky(covariance)
+    free = np.zeros(0, int) if allowed is None else np.flatnonzero(allowed)
+    away = np.linalg.solve(root, offsets)
+    if allowed is None or not len(free):
+        return float(np.linalg.norm(away))
+    slack = np.linalg.solve(root, np.diag(allowed)[:, free])
+    return float(np.sqrt(2 * lsq_linear(slack, away, (-1.0, 1.0), method='bvls').cost))
 
 
-def difference_of(given: Camera, solution: Solution, px: float, relevant: float,
-                  settings: IntrinsicsConfig) -> Difference:
+def difference_of(given: Camera, solution: Solution, px: float
+                  ) -> Difference:
     """Compare a camera with a solution.
 
     given: of the input's pictures. px: of the input, in one pixel of the solution's pictures.
-    relevant: of the focal length; an error of such a size is what a drive must be able to see.
     """
     found = solution.camera
     small = given.resized(1 / px, found.image_size)
@@ -125,21 +205,53 @@ def difference_of(given: Camera, solution: Solution, px: float, relevant: float,
     padded = type(wide).of(wide.image_size, np.pad(
         alike.params, (0, len(wide.params) - len(alike.params))))
     offsets = seen_by_turns(solution, padded) - found.params
-    covariance = covariance_of(solution, settings)
-    moves, _ = sensitivity(found)
-    longer = np.zeros(len(offsets))
-    longer[:2] = relevant * found.params[:2]
-    relevant_px = np.sqrt(np.mean(np.sum((moves @ longer)**2, axis=1)))
-    floor = np.zeros(len(offsets))
-    floor[:2] = LEAST_SIGMA * found.fx
-    floor[2:4] = HALF_PIXEL / px
     units = np.where(np.arange(len(offsets)) < 4, px, 1.0)
-    apart = mapping_difference(small, found)
-    lengths = None if apart is None else np.linalg.norm(apart, axis=1) * px
+    own = found.resized(px, given.image_size)
     return Difference(
-        given=given, found=found.resized(px, given.image_size), offsets=offsets * units,
-        covariance=(covariance + np.diag(floor**2)) * np.outer(units, units),
-        rms_px=None if lengths is None else float(np.sqrt(np.mean(lengths**2))),
-        worst_px=None if lengths is None else float(lengths.max()),
-        sigma_px=PictureSigma(solution.picture.rms * px, solution.picture.worst * px),
-        relevant_px=float(relevant_px) * px)
+        given, own, offsets * units,
+        solution.covariance * np.outer(units, units), apart(given, own),
+        PictureSigma(solution.picture.rms * px, solution.picture.worst * px))
+
+
+class Known(Protocol):
+    """A camera of a file, with what the file says of its uncertainty; None: nothing."""
+
+    @property
+    def camera(self) -> Camera:
+        """Return the camera."""
+
+    @property
+    def covariance(self) -> Floats | None:
+        """Return the (n, n) covariance of its parameters, the one behind sigma_px."""
+
+    @property
+    def sigma_px(self) -> PictureSigma | None:
+        """Return its sigma over the picture."""
+
+
+def difference_between(given: Known, found: Known) -> Difference:
+    """Compare two cameras of which there is no more than what their files say."""
+    # in the parameters of one whose covariance is known, so that theirs together has full rank
+    base = found if found.covariance is not None else given
+    a, b = (each.camera if type(each.camera) is type(base.camera)
+            else as_model(each.camera, type(base.camera)) for each in (given, found))
+    covariances = [_carried(each.covariance, each.camera, base.camera)
+                   for each in (given, found) if each.covariance is not None]
+    sigmas = [each.sigma_px for each in (given, found) if each.sigma_px is not None]
+    return Difference(
+        given.camera, found.camera, a.params - b.params,
+        np.sum(covariances, axis=0) if covariances else None,
+        apart(given.camera, found.camera),
+        PictureSigma(float(np.hypot.reduce([each.rms for each in sigmas])),
+                     float(np.hypot.reduce([each.worst for each in sigmas]))) if sigmas else None)
+
+
+def _carried(covariance: Floats, camera: Camera, to: Camera) -> Floats:
+    """Return what a camera's covariance is in the parameters of another model."""
+    if type(camera) is type(to):
+        return covariance
+    (moves, pixels), (others, also) = sensitivity(camera), sensitivity(to)
+    mine, theirs = np.nonzero((pixels[:, None] == also).all(axis=2))
+    carry, *_ = np.linalg.lstsq(others[theirs].reshape(-1, others.shape[2]),
+                                moves[mine].reshape(-1, moves.shape[2]), rcond=None)
+    return np.asarray(carry @ covariance @ carry.T)

@@ -35,7 +35,10 @@ def size_reason(given: Camera, image_size: tuple[int, int], compare: Compare | N
             return text
         scaled = compare(given.resized(factor, image_size))
         if scaled.significant:
-            return f'{text}; scaled to that size, it is wrong, too'
+            unscaled = compare(replace(given, image_size=image_size))
+            return text + ('; scaled to that size, it is wrong, too' if unscaled.significant else
+                           f'; its parameters fit these as they are (to {unscaled.bound_px:.1f} '
+                           f'px): only the size is wrong')
         return (f'{text}; scaled to that size, it fits them (to {scaled.bound_px:.1f} px): '
                 f'dashcalib export --size {width}x{height}')
     part = None if compare is None else _part(given, image_size, compare)

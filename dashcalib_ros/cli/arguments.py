@@ -17,12 +17,16 @@ INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, or a fo
               "('clips/*.mp4'): bags by their time, all else by name")
 EXIT_HELP = ('exit codes: 0 accepted; 3 weak or refused (the input was fine, the evidence was '
              'not enough); 2 bad input or usage')
+CALIBRATION_HELP = ('result.json (or its folder), calibration.yaml, a file of ROS, OpenCV, '
+                    'Kalibr, COLMAP, nerfstudio, OpenSfM or mrcal, a JSON of fx, fy, cx, cy, k1, '
+                    'k2 ..., width and height, or a bag with camera_info; FILE:NAME for one of '
+                    'several cameras')
 SHORT_EXIT_HELP = 'exit codes: 0 done; 2 bad input or usage'
 CHECK_EXIT_HELP = 'exit codes: 0 right; 1 wrong; 3 the drive cannot tell; 2 bad input or usage'
 BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera refused; 3 some were not; '
                    '2 bad manifest or usage')
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
-KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'ros')
+KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'rays', 'maps')
 
 
 class UsageError(DashcalibError):
@@ -136,12 +140,13 @@ def _add_demo(commands: Any) -> None:
 
 def _add_compare(commands: Any) -> None:
     parser = _command(commands, 'compare', 'compare two calibrations',
-                      'Per-parameter difference, and the RMS distance in pixels between the '
-                      'images of the same rays over the image, best common rotation removed.',
-                      'dashcalib compare calibration /etc/camera/old.yaml')
-    what = 'a result.json (or its folder), a camera_info YAML or a truth JSON'
-    parser.add_argument('a', metavar='A', type=Path, help=what)
-    parser.add_argument('b', metavar='B', type=Path, help=f'the reference: {what}')
+                      'How far apart both see a ray, in pixels over the picture, best common '
+                      'rotation removed; whether that can be told, and whether it matters.',
+                      'dashcalib compare calibration /etc/camera/old.yaml --html compare.html')
+    parser.add_argument('a', metavar='A', type=Path, help=CALIBRATION_HELP)
+    parser.add_argument('b', metavar='B', type=Path, help='the reference: the same kinds of files')
+    parser.add_argument('--html', type=path_or('give a file'), metavar='FILE',
+                        help='write a page with maps of the difference, in px and in sigmas')
     parser.add_argument('--json', action='store_true', help='print JSON')
 
 
@@ -150,7 +155,7 @@ def _add_export(commands: Any) -> None:
                       'Prints the camera in the format of another program, or writes it to FILE.',
                       'dashcalib export calibration --to colmap --out cameras.txt')
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
-                        help='a result.json (or its folder), a camera_info YAML or a truth JSON')
+                        help=CALIBRATION_HELP)
     # the names are not taken from the table of exports: that would load numpy and OpenCV
     kind = parser.add_argument('--to', required=True, metavar='KIND',
                                help=f'{", ".join(KINDS[:-1])} or {KINDS[-1]}')
@@ -170,8 +175,8 @@ def _add_check(commands: Any) -> None:
                       'and by how much), or whether the drive cannot tell.',
                       'dashcalib check calibration drive.mcap', CHECK_EXIT_HELP)
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
-                        help='a result.json (or its folder), a camera_info YAML or a truth JSON')
-    _add_drive_arguments(parser)
+                        help=CALIBRATION_HELP)
+    _add_drive_arguments(parser, '*', 'left away: the bag that CALIBRATION is; else: ')
     _add_model(parser)
     _add_seed(parser)
     parser.add_argument('--poses', type=Path, metavar='FILE',
@@ -234,8 +239,9 @@ def _lazily(name: str) -> Callable[[argparse.Namespace], int]:
     return command
 
 
-def _add_drive_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('input', metavar='INPUT', nargs='+', help=INPUT_HELP)
+def _add_drive_arguments(parser: argparse.ArgumentParser, count: str = '+', more: str = ''
+                         ) -> None:
+    parser.add_argument('input', metavar='INPUT', nargs=count, help=more + INPUT_HELP)
     parser.add_argument('--topic', metavar='T', help="the bag's image topic")
     parser.add_argument('--fps', type=positive, metavar='F',
                         help='rate of a video or image folder')

@@ -12,6 +12,7 @@ from dashcalib_ros.cli import exit_codes
 from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import counted
 from dashcalib_ros.fleet.batch import Camera, Fleet, problems, shard_of
 from dashcalib_ros.fleet.batch import batch as calibrate_fleet
 from dashcalib_ros.fleet.effort import Effort
@@ -19,6 +20,7 @@ from dashcalib_ros.fleet.engine import Engine, OneWorker, RayEngine
 from dashcalib_ros.fleet.manifest import Row, by_camera, read_manifest
 from dashcalib_ros.fleet.storage import Folder
 from dashcalib_ros.fleet.tasks import ClipResult
+from dashcalib_ros.standard_streams import folded, write_stderr
 
 # problems that are shown; the table has all
 SHOWN = 10
@@ -35,11 +37,19 @@ def batch(args: argparse.Namespace) -> int:
     # before hours of work, and not after them
     Folder(args.out).write('.writable', b'')
     Folder(args.out).remove('.writable')
-    engine = _engine(args, config)
     progress = _Progress(sum(len(each) for each in mine), Screen(args.quiet), Stages(args.quiet))
+    if not args.quiet:  # before workers start, which takes a while
+        write_stderr(folded(
+            f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(mine), "camera")}; '
+            f'Ctrl-C keeps what is done in {args.out}, and the same command goes on'))
+    engine = _engine(args, config)
     try:
         with progress.stages:
             fleet = calibrate_fleet(rows, args.out, config, engine, shard, progress.tell)
+    except KeyboardInterrupt:
+        warn([f'{progress.done} of {counted(progress.clips, "clip")} done, and kept in '
+              f'{args.out}: the same command goes on'])
+        raise
     finally:
         engine.close()
     name = EFFORT if shard is None else f'effort-{shard[0]}-of-{shard[1]}.json'
@@ -65,7 +75,8 @@ def _summarise(fleet: Fleet, out: str, screen: Screen) -> None:
                        for level in ('accepted', 'weak', 'refused'))
     if fleet.files:
         screen.show(Text(f'written to {out}: ' + ', '.join(fleet.files)))
-    screen.show(Text(f'{len(verdicts)} cameras: {counts}; {len(found)} clips could not be read'))
+    screen.show(Text(f'{counted(len(verdicts), "camera")}: {counts}; '
+                     f'{counted(len(found), "clip")} could not be read'))
 
 
 def _problem(row: Row, why: str) -> str:

@@ -9,16 +9,19 @@ from rich.text import Text
 
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.checking import Check, Odometry, path_files, read_poses
+from dashcalib_ros.checking import Check, Odometry, path_files, read_poses, with_faults
 from dashcalib_ros.cli import exit_codes
 from dashcalib_ros.cli.arguments import UsageError
 from dashcalib_ros.cli.drive import feed, open_calibrator, open_drive
 from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
+from dashcalib_ros.errors import counted
 from dashcalib_ros.frames.mask_file import read_mask
+from dashcalib_ros.inputs import fits_bag
 from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.report import answer_dict, check_writable, load_camera, write_text
-from dashcalib_ros.report.tables import text_table
+from dashcalib_ros.report import answer_dict, check_writable, write_text
+from dashcalib_ros.report.camera_file import load_with_faults
+from dashcalib_ros.report.tables import TextTable, labelled
 
 COLOURS = {'right': 'bold green', 'wrong': 'bold red', 'cannot tell': 'bold yellow'}
 # what is said of the poses, by its name in the JSON
@@ -30,7 +33,16 @@ MEASURED = {'rotation_deg': ('rotation missed, degrees', 1.0),
 def check(args: argparse.Namespace) -> int:
     """Calibrate the drive, ask it about the calibration; return the answer's exit code."""
     config = read_config(args)
-    given = load_camera(args.calibration).camera
+    if not args.input:
+        # a bag's own camera_info, beside its pictures
+        if not fits_bag(args.calibration):
+            raise UsageError('INPUT is missing, the drive: only a bag has its calibration beside '
+                             'its pictures; see dashcalib check --help')
+        args.input = [str(args.calibration)]
+        named = load_with_faults(args.calibration, args.topic)
+    else:
+        named = load_with_faults(args.calibration)
+    given = named.camera
     poses = None if args.poses is None else read_poses(args.poses)
     if args.out is not None:
         if poses is None:
@@ -42,7 +54,7 @@ def check(args: argparse.Namespace) -> int:
     with open_calibrator(config, mask, args.verbose) as calibrator, Stages(args.quiet) as stages:
         feed(calibrator, source, mask, stages)
         calibration = calibrator.calibrate(stages.show)
-        found = calibrator.check(given, calibration, stages.show)
+        found = with_faults(calibrator.check(given, calibration, stages.show), named.faults)
         # one for pictures of another size is wrong, and explains no motion
         changes = _changes(calibrator, given, calibration)
         if poses is not None and given.image_size == calibration.image_size:
@@ -68,7 +80,7 @@ def _changes(calibrator: Calibrator, given: Camera, calibration: Calibration) ->
 
 
 def _show(found: Check, motion: Odometry | None, changes: Sequence[str]) -> None:
-    show(Text(found.answer, COLOURS[found.answer]))
+    show(labelled('answer', found.answer, COLOURS[found.answer]))
     for reason in (*found.reasons, *changes):
         show(Text(f'- {reason}'))
     if motion is None:
@@ -76,4 +88,4 @@ def _show(found: Check, motion: Odometry | None, changes: Sequence[str]) -> None
     medians = motion.medians()
     rows = [(text, *(f'{unit * medians[key][name]:.3f}' for name in motion.names))
             for key, (text, unit) in MEASURED.items()]
-    show(text_table((f'median of {len(motion.turns)} turns', *motion.names), rows))
+    show(TextTable((f'median of {counted(len(motion.turns), "turn")}', *motion.names), rows))

@@ -31,7 +31,7 @@ from dashcalib_ros.report import (
     write_text,
 )
 from dashcalib_ros.report.files import TRUTH
-from dashcalib_ros.report.tables import against_truth, conclusion, summary
+from dashcalib_ros.report.tables import against_truth, conclusion, next_step, summary
 
 
 def demo(args: argparse.Namespace) -> int:
@@ -51,11 +51,12 @@ def demo(args: argparse.Namespace) -> int:
     warn((*calibration.warnings, *set_aside_lines(written)))
     files = [*written.files, truth, *([out / 'bag'] if args.keep_bag else [])]
     screen = Screen(args.quiet)
+    screen.show(conclusion(calibration.verdict))
     screen.show(summary(calibration))
     _show_errors(calibration, drive.truth, screen)
     screen.show(Text(files_line(out, files)))
     screen.show(Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'))
-    screen.show(conclusion(calibration.verdict))
+    screen.show(next_step(calibration.verdict))
     return exit_codes.of_verdict(calibration.verdict.level)
 
 

@@ -12,6 +12,7 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import counted
 from dashcalib_ros.frames import Frame, FrameSource
 from dashcalib_ros.frames.mask_file import check_mask
 from dashcalib_ros.inputs import open_frames
@@ -57,7 +58,7 @@ def feed(taker: Taker, source: FrameSource, mask: Mask | None, stages: Stages) -
         frames += 1
         count = len(taker.turns())
         stages.show('reading', frames / source.count if source.count else None,
-                    f'frame {frames}, {count} turn{"" if count == 1 else "s"}')
+                    f'frame {frames}, {counted(count, "turn")}')
     return frames
 
 

@@ -18,7 +18,7 @@ from dashcalib_ros.frames.mask_file import read_mask
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.report import Written, output_folder, result_json, write_results
 from dashcalib_ros.report.files import ACCEPTED
-from dashcalib_ros.report.tables import conclusion, summary
+from dashcalib_ros.report.tables import conclusion, next_step, summary
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,11 +36,12 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         show_text(result_json(calibration).rstrip('\n'))
     screen = Screen(args.quiet, to_stderr=bool(args.json))
+    screen.show(conclusion(calibration.verdict))
     screen.show(summary(calibration))
     screen.show(Text(files_line(args.out, written.files)))
     if args.write_bag is not None:
         _write_bag(args, str(source.topic), calibration, screen)
-    screen.show(conclusion(calibration.verdict))
+    screen.show(next_step(calibration.verdict))
     return exit_codes.of_verdict(calibration.verdict.level)
 
 

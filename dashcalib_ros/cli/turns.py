@@ -11,9 +11,10 @@ from dashcalib_ros.cli import exit_codes
 from dashcalib_ros.cli.drive import feed, open_drive
 from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
+from dashcalib_ros.errors import counted
 from dashcalib_ros.frames.mask_file import read_mask
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.report.tables import text_table
+from dashcalib_ros.report.tables import TextTable
 from dashcalib_ros.turns import Turn
 from dashcalib_ros.turns.detection import Detection
 
@@ -39,14 +40,14 @@ def turns(args: argparse.Namespace) -> int:
             'warnings': (*source.warnings, *detection.warnings())}), indent=2, allow_nan=False))
         return exit_codes.ACCEPTED
     if found:
-        show(text_table(COLUMNS, [_cells(row, detection.start_s) for row in found]))
+        show(TextTable(COLUMNS, [_cells(row, detection.start_s) for row in found]))
         show(Text(PROMINENCE))
     show(Text(_conclusion(len(found), config.turns.wanted, frames)))
     return exit_codes.ACCEPTED
 
 
 def _conclusion(found: int, wanted: int, frames: int) -> str:
-    text = f'{found} of {wanted} turns wanted, in {frames} frames'
+    text = f'{found} of {counted(wanted, "turn")} wanted, in {counted(frames, "frame")}'
     if found:
         return f'{text}\nnext: dashcalib run, with the same INPUT'
     return f'{text}\nnext: record a drive with turns at crossings, in daylight'

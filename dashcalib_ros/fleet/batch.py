@@ -178,8 +178,8 @@ def _write_tables(cameras: Sequence[Camera], folder: Folder) -> tuple[str, ...]:
             camera_rows.append(tables.camera_row(camera.name, camera.make, camera.final,
                                                  camera.failure, own))
     clip_rows.sort(key=lambda row: int(row['row']))
-    files = [tables.write_table(folder, tables.CAMERAS, camera_rows, tables.CAMERA_COLUMNS),
-             tables.write_table(folder, tables.CLIPS, clip_rows, tables.CLIP_COLUMNS)]
+    files = [*tables.write_table(folder, tables.CAMERAS, camera_rows, tables.CAMERA_COLUMNS),
+             *tables.write_table(folder, tables.CLIPS, clip_rows, tables.CLIP_COLUMNS)]
     folder.write(overview.NAME, overview.overview_html(camera_rows, clip_rows).encode(
         'utf-8', 'replace'))
     return (*files, overview.NAME)
@@ -190,11 +190,11 @@ def _shares(camera: Camera) -> dict[int, ClipShare]:
     first: dict[str, int] = {}
     found = {}
     for row in camera.rows:
-        before = first.setdefault(row.clip, row.number)
+        before = first.setdefault(row.name, row.number)
         if before != row.number:
             found[row.number] = ClipShare(left_out=f'is the clip of row {before} again')
-        elif row.clip in camera.shares:
-            found[row.number] = camera.shares[row.clip]
+        elif row.name in camera.shares:
+            found[row.number] = camera.shares[row.name]
     return found
 
 

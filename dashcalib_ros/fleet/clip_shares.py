@@ -9,9 +9,9 @@ import numpy as np
 
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.judgement.agreement import turns_of_another_camera
+from dashcalib_ros.scene_file import StoredTurn
 from dashcalib_ros.solve.information import noise_of
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.turn_store import StoredTurn
 from dashcalib_ros.turns.turn import TurnId
 
 # a clip whose own fx is farther off that of most, in sigmas and in shares of it, is of another

@@ -149,13 +149,17 @@ class RayEngine:
         (self._waiting.appendleft if first else self._waiting.append)(task)
 
     def outcomes(self) -> Iterator[tuple[tuple[str, str], Any]]:
-        """Yield the outcomes; see Engine."""
+        """Yield the outcomes; see Engine. Raises WorkerError when Ray itself has ended."""
         while self._waiting or self._running:
-            self._hand_over()
-            ready, _ = self._ray.wait(list(self._running), timeout=LOOK_S)
-            for reference in ready:
-                task = self._running.pop(reference)
-                outcome = self._outcome(reference, task)
+            try:
+                self._hand_over()
+                ready, _ = self._ray.wait(list(self._running), timeout=LOOK_S)
+                done = [(task, self._outcome(reference, task)) for reference in ready
+                        for task in [self._running.pop(reference)]]
+            except Exception as error:  # of many kinds, none of them ours
+                raise WorkerError(f'Ray has ended ({one_line(error)}); start the command again: '
+                                  f'what is done stays') from error
+            for task, outcome in done:
                 if outcome is None:
                     self.submit(task, first=True)
                 else:
@@ -177,6 +181,8 @@ class RayEngine:
             return (self._ray.get(reference),)
         except errors.RayTaskError as error:
             return (_known(error.cause or error),)
+        except errors.LocalRayletDiedError:
+            raise
         except (errors.NodeDiedError, errors.ObjectLostError, errors.RaySystemError):
             return None
         except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
@@ -184,6 +190,8 @@ class RayEngine:
                 return None
             count = self._died[task.key] = self._died.get(task.key, 0) + 1
             return (Died(count, one_line(error)),) if count >= self._attempts else None
+        except errors.RayError as error:
+            return (WorkerError(one_line(error)),)
 
     def _node_was_lost(self) -> bool:
         """Return whether a node of the cluster died since the last look."""

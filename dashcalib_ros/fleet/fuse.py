@@ -13,30 +13,26 @@ import numpy as np
 from dashcalib_ros import stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.fleet.clip_shares import ClipShare, ClipTurn, contradicting, shares_of
-from dashcalib_ros.fleet.gathered import Gathered
 from dashcalib_ros.frames.scale import FULL_SIZE, Scale
 from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.judgement.conclude import Evidence
 from dashcalib_ros.judgement.verdict import lacks_knowledge_only
 from dashcalib_ros.reconstruction.repeated import without_repeated
 from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.scene_file import Origin, SceneFile, StoredTurn
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.turn_store import StoredTurn
 from dashcalib_ros.turns.turn import TurnId
 
 # solutions at the most; each leaves out the clips that contradict the one before
 ROUNDS = 3
-# of the input, and how it was resized
-Size = tuple[tuple[int, int], int, int]
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip of the camera. time_s: when it was recorded, None where unknown."""
+    """A clip of the camera. gathered: its content is that of what was read, whatever it says."""
 
     name: str
-    gathered: Gathered
-    time_s: float | None = None
+    gathered: SceneFile
 
 
 @dataclass(frozen=True)
@@ -86,7 +82,8 @@ def fuse(clips: Sequence[Clip], config: Config) -> Fused:
 
 def _scale(clips: Sequence[Clip], left_out: Mapping[str, str]) -> Scale:
     """Return how the pictures of the clips that are left were resized: all alike."""
-    return next((clip.gathered.scale for clip in clips if clip.name not in left_out), FULL_SIZE)
+    return next((clip.gathered.origin.scale for clip in clips if clip.name not in left_out),
+                FULL_SIZE)
 
 
 def _same_content(clips: Sequence[Clip]) -> dict[str, str]:
@@ -105,22 +102,20 @@ def _other_sizes(clips: Sequence[Clip]) -> dict[str, str]:
 
     Pictures that were resized differently, with other settings, are of another size, too.
     """
-    def size_of(clip: Clip) -> Size:
-        scale = clip.gathered.scale
-        return clip.gathered.image_size, scale.shrink, scale.enlarge
+    def weight(origin: Origin) -> tuple[int, int, int, str]:
+        turns = [len(clip.gathered.turns) for clip in clips if clip.gathered.origin == origin]
+        # clips count before turns: one clip with many does not decide
+        return sum(map(bool, turns)), sum(turns), len(turns), str(origin)
 
-    def weight(size: Size) -> tuple[int, int, Size]:
-        of_size = [clip for clip in clips if size_of(clip) == size]
-        return sum(len(clip.gathered.scenes) for clip in of_size), len(of_size), size
-
-    sizes = {size_of(clip) for clip in clips}
-    if len(sizes) < 2:
+    origins = {clip.gathered.origin for clip in clips}
+    if len(origins) < 2:
         return {}
-    main = max(sizes, key=weight)
-    return {clip.name: f'is {_by(clip.gathered.image_size)}, most of this camera are '
-                       f'{_by(main[0])}' if clip.gathered.image_size != main[0] else
+    main = max(origins, key=weight)
+    return {clip.name: f'is {_by(clip.gathered.origin.image_size)}, most of this camera are '
+                       f'{_by(main.image_size)}'
+            if clip.gathered.origin.image_size != main.image_size else
             'was gathered with other settings of max_width or min_width than most'
-            for clip in clips if size_of(clip) != main}
+            for clip in clips if clip.gathered.origin != main}
 
 
 def _by(size: tuple[int, int]) -> str:
@@ -132,10 +127,8 @@ def _numbered(clips: Sequence[Clip]) -> dict[TurnId, ClipTurn]:
     found: dict[TurnId, ClipTurn] = {}
     for clip in clips:
         for turn in clip.gathered.turns:
-            if turn.scene:
-                key = TurnId.stored(len(found))
-                scene = replace(clip.gathered.scenes[turn.center], turn=key)
-                found[key] = ClipTurn(clip.name, StoredTurn(scene, turn.stamp_s, turn.prominence))
+            key = TurnId.stored(len(found))
+            found[key] = ClipTurn(clip.name, replace(turn, scene=replace(turn.scene, turn=key)))
     return found
 
 
@@ -169,9 +162,9 @@ def _judged(solution: Solution | None, clips: Sequence[Clip], stored: Sequence[S
                      for name, why in sorted(left_out.items()))
     first = clips[0].gathered if clips else None
     evidence = Evidence(
-        image_size=first.image_size if first else (0, 0),
+        image_size=first.origin.image_size if first else (0, 0),
         frames=sum(clip.gathered.frames for clip in clips), turns=(), built={},
-        magnitudes=np.zeros((0, 2)), mask=None, scale=first.scale if first else FULL_SIZE,
+        magnitudes=np.zeros((0, 2)), mask=None, scale=first.origin.scale if first else FULL_SIZE,
         timing={}, warnings=warnings, stored=tuple(stored))
     calibration = stages.judge(solution, evidence, config)
     if solution is None:
@@ -182,8 +175,8 @@ def _judged(solution: Solution | None, clips: Sequence[Clip], stored: Sequence[S
 def _nothing_found(clips: Sequence[Clip]) -> str:
     if not clips:
         return 'none of its clips could be read'
-    turns = sum(len(clip.gathered.turns) for clip in clips)
-    scenes = sum(len(clip.gathered.scenes) for clip in clips)
+    turns = sum(clip.gathered.found for clip in clips)
+    scenes = sum(len(clip.gathered.turns) for clip in clips)
     what = f'{len(clips)} clip{"s" * (len(clips) > 1)}'
     if not turns:
         return f'no turn was found in {what}: more clips with turns are needed'

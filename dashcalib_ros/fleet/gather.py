@@ -14,9 +14,10 @@ from pathlib import Path
 from dashcalib_ros import stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.fleet.gathered import FORMAT, Gathered, GatheredTurn
+from dashcalib_ros.fleet.storage import clip_files
 from dashcalib_ros.frames import Frame, FrameSource
 from dashcalib_ros.inputs import open_frames
+from dashcalib_ros.scene_file import FORMAT, Origin, SceneFile, StoredTurn
 
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.')
@@ -35,57 +36,51 @@ def settings_hash(config: Config, fps: float | None, topic: str | None) -> str:
 
 
 def content_hash(path: Path) -> str:
-    """Return a hash of a file's bytes, or of all files in a folder with their names.
+    """Return a hash of a file's bytes, or of all files that a folder's clip may be made of.
 
     Raises InputError.
     """
     found = hashlib.sha256()
     try:
-        for file in _files(path):
-            if path.is_dir():
-                found.update(os.fsencode(file.relative_to(path)) + b'\0')
-                found.update(file.stat().st_size.to_bytes(8, 'big'))
+        for file, about in clip_files(path):
+            found.update(os.fsencode(file.relative_to(path)) + b'\0' if file != path else b'')
+            found.update(about.st_size.to_bytes(8, 'big') if file != path else b'')
+            left = about.st_size  # files of /proc say 0, and reading some would wait for ever
             with file.open('rb') as stream:
-                while block := stream.read(BLOCK):
+                while left > 0 and (block := stream.read(min(BLOCK, left))):
                     found.update(block)
+                    left -= len(block)
     except OSError as error:
         raise InputError(f'cannot read {path} ({error.strerror or error})') from error
     return found.hexdigest()[:32]
 
 
-def _files(path: Path) -> list[Path]:
-    if not path.is_dir():
-        return [path]
-    return sorted(each for each in path.rglob('*') if each.is_file())
-
-
 def gather(path: Path, content: str, fps: float | None, topic: str | None, config: Config
-           ) -> Gathered:
+           ) -> SceneFile:
     """Return a clip's turns and their scenes.
 
-    content: the clip's content_hash(). Raises InputError for what cannot be read.
+    content: the clip's content_hash(). Raises InputError for what cannot be read, or changes
+    meanwhile.
     """
     source = open_frames(path, topic, fps)
     span = _Span(source)
     detection = stages.detect(span, config)
     best = detection.turns()[:max(config.turns.wanted, config.turns.at_most)]
     valid = detection.valid()
-    scenes = {}
-    for turn in best:
+    turns = []
+    for turn in sorted(best, key=lambda turn: turn.center):
         scene = stages.reconstruct(turn, config, valid)
         detection.release(turn.center)
         if scene is not None:
-            scenes[turn.center] = scene
+            turns.append(StoredTurn(scene, turn.stamp_s, turn.prominence))
+    if content_hash(path) != content:
+        raise InputError(f'{path} changed while it was read: start again when it is complete')
     assert detection.size is not None
-    turns = tuple(
-        GatheredTurn(turn.center, turn.stamp_s, turn.prominence, turn.center in scenes,
-                     scenes[turn.center].yaw_deg if turn.center in scenes else None)
-        for turn in sorted(best, key=lambda turn: turn.center))
     # the same content gives the same, wherever it lies
     warnings = tuple(line.replace(str(path), 'the clip')
                      for line in (*source.warnings, *detection.warnings()))
-    return Gathered(content, settings_hash(config, fps, topic), detection.size, detection.scale,
-                    detection.frames, span.seconds, turns, scenes, warnings)
+    return SceneFile(Origin(detection.size, detection.scale), tuple(turns), len(best), content,
+                     settings_hash(config, fps, topic), detection.frames, span.seconds, warnings)
 
 
 class _Span:

@@ -16,9 +16,10 @@ from dashcalib_ros.bags.names import is_bag_file
 from dashcalib_ros.errors import ConfigError, InputError, one_line, shortened
 from dashcalib_ros.fleet import storage
 from dashcalib_ros.fleet.extra import needs
-from dashcalib_ros.fleet.gathered import SUFFIX as GATHERED
 from dashcalib_ros.frames.source import IMAGE_SUFFIXES
 from dashcalib_ros.inputs import VIDEO_SUFFIXES
+from dashcalib_ros.scene_file import LAST_S
+from dashcalib_ros.scene_file import SUFFIX as GATHERED
 
 # bytes of a manifest: ten million rows
 LARGEST = 2**31
@@ -44,6 +45,11 @@ class Row:
     topic: str | None = None
     time_s: float | None = None
     problem: str = ''
+
+    @property
+    def name(self) -> str:
+        """Return what tells this clip from others: each topic of a bag is one of its own."""
+        return f'{self.clip} (topic {self.topic})' if self.topic else self.clip
 
 
 def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
@@ -203,8 +209,8 @@ def _time(values: Mapping[str, Any]) -> float | None:
         if date.tzinfo is None:
             date = date.replace(tzinfo=timezone.utc)
         seconds = date.timestamp()
-    if not math.isfinite(seconds):
-        raise ValueError('time must be a finite number')
+    if not abs(seconds) <= LAST_S:
+        raise ValueError('time must be a date before 2261')
     return seconds
 
 
@@ -230,5 +236,5 @@ def by_camera(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """
     found: dict[str, list[Row]] = {}
     for row in rows:
-        found.setdefault(row.camera or row.clip, []).append(row)
+        found.setdefault(row.camera or row.name, []).append(row)
     return dict(sorted(found.items()))

@@ -46,9 +46,9 @@ def unit_of(solved: Solved) -> Unit | None:
     estimate = solved.estimate
     if estimate is None or not solved.make or not estimate.sound:
         return None
-    if not np.isfinite(estimate.covariance).all():
+    if not np.isfinite(estimate.of_its_noise).all():
         return None
-    lens, covariance = _in_units_of_prior(estimate.camera, estimate.covariance)
+    lens, covariance = _in_units_of_prior(estimate.camera, estimate.of_its_noise)
     which = _lens_places(len(lens))
     size = estimate.camera.image_size
     return Unit(solved.camera, (solved.make, f'{size[0]}x{size[1]}', estimate.camera.model),
@@ -83,7 +83,7 @@ def _why_none(solved: Solved) -> str:
 def _with_prior(result: Final, solved: Solved, estimate: Estimate, prior: LensPrior) -> Final:
     unit = unit_of(solved)
     assert unit is not None
-    own_covariance = prior.excess_of(unit) * estimate.covariance
+    own_covariance = prior.excess_of(unit) * estimate.of_its_noise
     camera, covariance = conditioned(estimate.camera, own_covariance, prior)
     share = float(1 - covariance[0, 0] / own_covariance[0, 0]
                   * (estimate.camera.fx / camera.fx)**2)
@@ -95,7 +95,7 @@ def _with_prior(result: Final, solved: Solved, estimate: Estimate, prior: LensPr
             camera=camera, sigma=sigmas(camera, covariance),
             reprojection_error_px=estimate.reprojection_error_px,
             sigma_px=_picture_sigma(camera, covariance, estimate.sigma_px),
-            details={**own.details, 'prior': {
+            details={**own.details, 'picture_covariance': covariance.tolist(), 'prior': {
                 'make': solved.make, 'units': prior.units, 'share_of_fx': share,
                 'fx_alone': estimate.camera.fx,
                 'sigma_alone': sigmas(estimate.camera, estimate.covariance)}}))

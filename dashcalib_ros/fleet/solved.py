@@ -18,7 +18,8 @@ from dashcalib_ros.fleet.fuse import Fused
 from dashcalib_ros.judgement import Calibration, Verdict
 from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.information import pooled
+from dashcalib_ros.solve.picture import PictureSigma, of_one_turn
 from dashcalib_ros.turns.turn import TurnId
 
 FORMAT = 1
@@ -28,11 +29,13 @@ FORMAT = 1
 class Estimate:
     """A camera as its own turns have it, whatever the verdict, in px of the input.
 
-    covariance: (n, n). sound: nothing but a lack of knowledge speaks against it.
+    covariance: (n, n). of_its_noise: the same without what a single turn gets for how much turns
+    differ: a make shows that better. sound: nothing but a lack of knowledge speaks against it.
     """
 
     camera: Camera
     covariance: Floats
+    of_its_noise: Floats
     sigma_px: PictureSigma
     reprojection_error_px: float
     sound: bool
@@ -64,9 +67,13 @@ def _estimate(fused: Fused) -> Estimate | None:
         return None
     px = fused.scale.px
     units = np.where(np.arange(len(solution.sigma)) < 4, px, 1.0)
+    lone = of_one_turn(
+        pooled(solution.parts, solution.prior_information), len(solution.sigma),
+        solution.one_turn_sigma if len(solution.parts) == 1 else 0.0)
     return Estimate(
         solution.camera.resized(px, fused.calibration.image_size),
         solution.covariance * np.outer(units, units),
+        (solution.covariance - lone) * np.outer(units, units),
         PictureSigma(solution.picture.rms * px, solution.picture.worst * px),
         solution.reprojection_error_px * px, fused.sound)
 
@@ -80,6 +87,7 @@ def encoded(solved: Solved) -> bytes:
         'estimate': None if estimate is None else {
             'model': estimate.camera.model, 'params': estimate.camera.params,
             'image_size': estimate.camera.image_size, 'covariance': estimate.covariance,
+            'of_its_noise': estimate.of_its_noise,
             'sigma_px': estimate.sigma_px, 'sound': estimate.sound,
             'reprojection_error_px': estimate.reprojection_error_px},
         'calibration': {
@@ -112,9 +120,10 @@ def _decoded_estimate(data: Mapping[str, Any] | None) -> Estimate | None:
         return None
     camera = camera_of(data['model'], _size(data['image_size']), data['params'])
     # JSON has no infinity: what was not finite is not known at all
-    covariance = np.array([[np.inf if value is None else value for value in row]
-                           for row in data['covariance']], float)
-    return Estimate(camera, covariance, _picture(data['sigma_px']),
+    covariance, of_its_noise = (
+        np.array([[np.inf if value is None else value for value in row] for row in table], float)
+        for table in (data['covariance'], data.get('of_its_noise', data['covariance'])))
+    return Estimate(camera, covariance, of_its_noise, _picture(data['sigma_px']),
                     data['reprojection_error_px'], data['sound'])
 
 

@@ -5,13 +5,14 @@ Only URLs need fsspec.
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import posixpath
 import re
-import secrets
 import shutil
+import stat as stat_module
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,9 @@ from typing import Any
 
 from dashcalib_ros.errors import InputError, OutputError, one_line
 from dashcalib_ros.fleet.extra import needs
+from dashcalib_ros.inputs import named_like
+from dashcalib_ros.limits import CLIP_BYTES, CLIP_FILES, check_file, read_file
+from dashcalib_ros.report import write_whole
 
 URL = re.compile(r'[a-z][a-z0-9+.-]+://')
 
@@ -51,11 +55,10 @@ def listed(pattern: str) -> list[str]:
             raise InputError(f'cannot list {pattern} ({one_line(error)}); check the address and '
                              f'your access to it') from error
         return sorted(f'{scheme}://{name}' for name in found)
-    here = Path(pattern)
-    if not _is_glob(pattern):
-        return sorted(str(entry) for entry in here.iterdir() if not entry.name.startswith('.'))
-    base = Path(here.anchor or '.')
-    return sorted(str(found) for found in base.glob(str(here.relative_to(here.anchor))))
+    if _is_glob(pattern):
+        return sorted(map(str, named_like(pattern)))
+    return sorted(str(entry) for entry in Path(pattern).iterdir()
+                  if not entry.name.startswith('.'))
 
 
 def _is_glob(pattern: str) -> bool:
@@ -70,24 +73,60 @@ def is_folder(place: str) -> bool:
     return bool(system.isdir(path))
 
 
+def clip_files(path: Path) -> list[tuple[Path, os.stat_result]]:
+    """Return the regular files that a clip may be made of, sorted: itself, or a folder's.
+
+    A folder may have bags that are folders. Raises InputError beyond limits, OSError.
+    """
+    if not path.is_dir():
+        check_file(path, limit=CLIP_BYTES)
+        return [(path, path.stat())]
+    found: list[tuple[Path, os.stat_result]] = []
+    size = 0
+    for each in (*path.iterdir(), *path.glob('*/*')):
+        with suppress(OSError):  # such as a link to nothing
+            about = each.stat()
+            if stat_module.S_ISREG(about.st_mode):
+                found.append((each, about))
+                size += about.st_size
+        if size > CLIP_BYTES or len(found) > CLIP_FILES:
+            raise InputError(f'{path} has more than {CLIP_FILES} files or {CLIP_BYTES >> 30} GB: '
+                             f'is it one clip?')
+    return sorted(found, key=lambda pair: pair[0])
+
+
 def stamp(place: str) -> str | None:
-    """Return a text that changes with a file's or folder's content; None where there is none."""
+    """Return a text that changes with a file, or with any file of a folder; None without one."""
     if is_url(place):
         system, path = _system(place)
         try:
             about = system.info(path)
+            entries = {'.': about} if about.get('type') != 'directory' else {
+                name.removeprefix(path): each
+                for name, each in system.find(path, maxdepth=2, detail=True).items()}
         except FileNotFoundError:
             return None
         except Exception as error:
             raise InputError(f'cannot read {place} ({one_line(error)})') from error
-        changes = [about.get(key) for key in ('size', 'ETag', 'etag', 'mtime', 'created',
-                                              'LastModified', 'generation')]
-        return ' '.join(str(each) for each in changes if each is not None)
+        return _joined_stamps((name, ' '.join(
+            f'{each[key]}' for key in ('size', 'ETag', 'etag', 'mtime', 'created', 'LastModified',
+                                       'generation') if each.get(key) is not None))
+            for name, each in sorted(entries.items()))
+    here = Path(place)
     try:
-        found = Path(place).stat()
+        files = clip_files(here)
+    except InputError as error:
+        return str(error)  # until it is something else
     except (OSError, ValueError):
         return None
-    return f'{found.st_size} {found.st_mtime_ns}'
+    # the time of change is also that of a file put in its place, whose other times are older
+    return _joined_stamps((os.path.relpath(file, here), f'{about.st_size} {about.st_mtime_ns} '
+                           f'{about.st_ctime_ns}') for file, about in files)
+
+
+def _joined_stamps(stamps: Iterable[tuple[str, str]]) -> str:
+    text = '\n'.join(f'{name}: {each}' for name, each in stamps)
+    return hashlib.sha256(os.fsencode(text)).hexdigest()[:32]
 
 
 @contextmanager
@@ -123,10 +162,11 @@ def read(place: str, limit: int) -> bytes | None:
             system, path = _system(place)
             data = bytes(system.cat_file(path, start=0, end=limit + 1))
         else:
-            with open(place, 'rb') as stream:
-                data = stream.read(limit + 1)
+            return read_file(Path(place), limit) if Path(place).exists() else None
     except FileNotFoundError:
         return None
+    except InputError:
+        raise
     except Exception as error:
         raise InputError(f'cannot read {place} ({one_line(error)})') from error
     if len(data) > limit:
@@ -159,7 +199,8 @@ class Folder:
                 system, path = _system(place)
                 system.pipe_file(path, data)  # object stores show complete objects only
             else:
-                _write_local(Path(place), data)
+                Path(place).parent.mkdir(parents=True, exist_ok=True)
+                write_whole(Path(place), data)
         except OSError as error:
             full = error.errno in (errno.ENOSPC, errno.EDQUOT)
             raise OutputError(
@@ -177,20 +218,6 @@ class Folder:
             (Path(self.place) / name).unlink(missing_ok=True)
 
 
-def _write_local(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f'.{path.name}.{secrets.token_hex(4)}.tmp')
-    try:
-        with temporary.open('xb') as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(path)
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
-
-
 def _system(url: str) -> tuple[Any, str]:
     """Return fsspec's file system of a URL, and the path there; raises InputError."""
     fsspec = needs('fsspec', f'{url.partition("://")[0]}:// addresses')
@@ -198,4 +225,6 @@ def _system(url: str) -> tuple[Any, str]:
         system, path = fsspec.core.url_to_fs(url)
     except (ImportError, ValueError) as error:
         raise InputError(f'cannot use {url} ({one_line(error)})') from error
+    if 'file' in system.protocol:
+        raise InputError(f'{url} is a file of this machine: give its path')
     return system, str(path)

@@ -1,9 +1,10 @@
 """The fleet's tables: a row a camera, a row a clip; the same results give the same bytes.
 
-Parquet with pyarrow, without it JSON Lines; DuckDB reads both.
+Parquet with pyarrow, without it JSON Lines, and CSV; DuckDB reads all.
 """
 from __future__ import annotations
 
+import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dashcalib_ros.camera import MODELS
+from dashcalib_ros.camera import calibrated_models
 from dashcalib_ros.fleet.clip_shares import ClipShare
 from dashcalib_ros.fleet.extra import has
 from dashcalib_ros.fleet.manifest import Row
@@ -19,10 +20,10 @@ from dashcalib_ros.fleet.posterior import Final
 from dashcalib_ros.fleet.storage import Folder
 from dashcalib_ros.fleet.tasks import ClipResult, camera_folder
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.turn_store import DATES_S
+from dashcalib_ros.scene_file import DATES_S
 
 CAMERAS, CLIPS = 'cameras', 'clips'
-PARAMETERS = tuple(dict.fromkeys(name for model in MODELS.values() for name in model.names()))
+PARAMETERS = tuple(dict.fromkeys(name for model in calibrated_models() for name in model.names()))
 YEAR_S = 365.25 * 86400
 # clips at different times from which a drift is told
 LEAST_CLIPS = 3
@@ -127,8 +128,18 @@ def _drift(clips: Sequence[Mapping[str, Any]]) -> tuple[float | None, float | No
 
 
 def write_table(folder: Folder, name: str, rows: Sequence[Mapping[str, Any]],
-                schema: Mapping[str, str]) -> str:
-    """Write a table; return its file's name. schema: each column's type."""
+                schema: Mapping[str, str]) -> tuple[str, str]:
+    """Write a table, and as CSV, too; return the files' names. schema: each column's type."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator='\n').writerows([schema, *(
+        ['; '.join(value) if isinstance(value, (list, tuple)) else value
+         for value in (_plain(row[key]) for key in schema)] for row in rows)])
+    folder.write(f'{name}.csv', text.getvalue().encode('utf-8', 'replace'))
+    return _write_typed(folder, name, rows, schema), f'{name}.csv'
+
+
+def _write_typed(folder: Folder, name: str, rows: Sequence[Mapping[str, Any]],
+                 schema: Mapping[str, str]) -> str:
     if has('pyarrow') is None:
         text = ''.join(json.dumps(plain_values(row), ensure_ascii=False, allow_nan=False) + '\n'
                        for row in rows)

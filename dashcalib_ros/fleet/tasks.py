@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
-from dashcalib_ros.fleet import gathered, solved
+from dashcalib_ros.fleet import solved
 from dashcalib_ros.fleet.effort import Clock, Effort
 from dashcalib_ros.fleet.fuse import Clip, fuse
 from dashcalib_ros.fleet.gather import content_hash, gather, settings_hash
@@ -24,17 +24,23 @@ from dashcalib_ros.fleet.lens_prior import Verdict
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.posterior import Final, final_of
 from dashcalib_ros.fleet.storage import Folder, is_url, local_copy, stamp
+from dashcalib_ros.limits import read_file
 from dashcalib_ros.report import write_results
 from dashcalib_ros.report.files import ACCEPTED, NAMES, WEAK
+from dashcalib_ros.scene_file import LARGEST, SUFFIX, SceneFile, decoded, encoded
 
 T = TypeVar('T')
+# names of gathered turns: nothing from inside a file becomes a path
+GATHERED = re.compile(rf'gathered/[0-9a-f]{{2}}/[0-9a-f]+(-[0-9a-f]+)?\{SUFFIX}')
+# the end of a camera's folder whose name is not the camera's
+HASHED = re.compile(r'-[0-9a-f]{32}$')
 
 
 @dataclass(frozen=True)
 class ClipResult:
     """What became of a clip. file: its gathered turns, '' if there are none; problem: why.
 
-    kept: a result that need not be tried again. stamp: as storage.stamp() when it was read.
+    kept: a result that need not be tried again. stamp: as storage.stamp() before it was read.
     time_s: of its first turn, s; only a date if the clip has dates.
     """
 
@@ -57,26 +63,30 @@ def gather_clip(row: Row, out: str, config: Config) -> tuple[ClipResult, Effort]
     """Read a clip, unless that was done; never raises what a clip can cause."""
     folder, started = Folder(out), Clock()
     name = clip_file(row, config)
-    before = _earlier(folder, name, row)
-    if before is not None:
-        return before, started.effort(again=True)
+    now: str | None = None
     try:
-        result = _gathered(row, folder, config)
+        # before it is read: what changes later is read again
+        now = stamp(row.place)
+        before = _earlier(folder, name, row, now)
+        if before is not None:
+            return before, started.effort(again=True)
+        result = _gathered(row, folder, config, now)
     except DashcalibError as error:
         # what is not the clip's own fault is tried again the next time
-        result = ClipResult(row.clip, problem=one_line(error, 300),
-                            kept=isinstance(error, InputError))
+        result = ClipResult(row.clip, problem=one_line(error, 300), stamp=now or '',
+                            kept=isinstance(error, InputError) and now is not None)
     except OSError as error:
         result = ClipResult(row.clip, problem=f'cannot be read here: {one_line(error)}',
                             kept=False)
-    return _noted(folder, name, result, row), started.effort()
+    return _noted(folder, name, result), started.effort()
 
 
 def set_aside(row: Row, out: str, config: Config, attempts: int) -> ClipResult:
     """Note that a clip is not tried again, as it killed its worker so many times."""
     result = ClipResult(row.clip, problem=f'killed its worker {attempts} times: it is set aside; '
-                                          f'is it damaged, or is there too little memory?')
-    return _noted(Folder(out), clip_file(row, config), result, row)
+                                          f'is it damaged, or is there too little memory?',
+                        stamp=stamp(row.place) or '')
+    return _noted(Folder(out), clip_file(row, config), result)
 
 
 def clip_file(row: Row, config: Config) -> str:
@@ -85,7 +95,7 @@ def clip_file(row: Row, config: Config) -> str:
     return f'clips/{key[:2]}/{key}.json'
 
 
-def _earlier(folder: Folder, name: str, row: Row) -> ClipResult | None:
+def _earlier(folder: Folder, name: str, row: Row, now: str | None) -> ClipResult | None:
     """Return what became of the clip before, if that still holds.
 
     A clip that changed since is read again. One that is gone is not needed any more.
@@ -100,60 +110,76 @@ def _earlier(folder: Folder, name: str, row: Row) -> ClipResult | None:
                                'image_size': None if size is None else tuple(size)})
     except (ValueError, KeyError, TypeError):
         return None
-    now = stamp(row.place)
     if now is None and not result.file:
         return None
-    if now not in (None, result.stamp) or (result.file and not folder.exists(result.file)):
+    if now not in (None, result.stamp) or (result.file and not (
+            GATHERED.fullmatch(result.file) and folder.exists(result.file))):
         return None
     return replace(result, clip=row.clip)
 
 
-def _gathered(row: Row, folder: Folder, config: Config) -> ClipResult:
-    now = stamp(row.place)
+def _gathered(row: Row, folder: Folder, config: Config, now: str | None) -> ClipResult:
     if now is None:
         return ClipResult(row.clip, problem='there is no such file; check the path', kept=False)
     with local_copy(row.place) as path:
         try:
-            if path.suffix == gathered.SUFFIX:
-                return _given(row, path, folder)
+            if path.suffix == SUFFIX:
+                return _given(row, path, folder, now)
             content = content_hash(path)
             name = gathered_file(content, settings_hash(config, row.fps, row.topic))
-            data = folder.read(name)
-            found = None if data is None else gathered.decoded(data, name)
+            found = _kept(folder, name)
             if found is None:
                 found = gather(path, content, row.fps, row.topic, config)
-                folder.write(name, gathered.encoded(found))
+                folder.write(name, encoded(found))
         except InputError as error:
             # the tables must not depend on where the clip, or its copy, lies
             raise InputError(str(error).replace(str(path), row.clip)) from error
-    return _result(row, name, found, now)
+    return _result(row, name, found, content, now)
 
 
-def _given(row: Row, path: Path, folder: Folder) -> ClipResult:
-    """Take turns that were gathered elsewhere, with whatever settings."""
-    data = path.read_bytes()
-    found = gathered.decoded(data, path.name)
-    name = gathered_file(found.content, found.settings)
-    if not folder.exists(name):
-        folder.write(name, data)
-    return _result(row, name, found, stamp(row.place) or '')
+def _kept(folder: Folder, name: str) -> SceneFile | None:
+    """Return turns that were gathered before; None where there are none, or they are damaged."""
+    data = folder.read(name)
+    try:
+        return None if data is None else decoded(data)
+    except ValueError:
+        return None
 
 
-def gathered_file(content: str, settings: str) -> str:
-    """Return the name of a clip's file of gathered turns."""
-    return f'gathered/{content[:2]}/{content}-{settings}{gathered.SUFFIX}'
+def _given(row: Row, path: Path, folder: Folder, now: str) -> ClipResult:
+    """Take turns that were gathered elsewhere, with whatever settings.
+
+    Their identity is that of the file itself: what it says it was made from may be false.
+    """
+    data = read_file(path, LARGEST)
+    try:
+        found = decoded(data)
+    except ValueError as error:
+        raise InputError(f'{path.name} is no file of gathered turns ({one_line(error)}); gather '
+                         f'its clip anew') from error
+    content = hashlib.sha256(data).hexdigest()[:32]
+    name = gathered_file(content)
+    folder.write(name, data)
+    return _result(row, name, found, content, now)
 
 
-def _result(row: Row, name: str, found: gathered.Gathered, now: str) -> ClipResult:
+def gathered_file(*hashes: str) -> str:
+    """Return the name of a clip's file of gathered turns; raises ValueError for other texts."""
+    name = f'gathered/{hashes[0][:2]}/{"-".join(hashes)}{SUFFIX}'
+    if not GATHERED.fullmatch(name):
+        raise ValueError(f'{name!r} is not made of hashes')
+    return name
+
+
+def _result(row: Row, name: str, found: SceneFile, content: str, now: str) -> ClipResult:
     time_s = found.turns[0].stamp_s if found.turns else None
-    return ClipResult(row.clip, name, '', now, True, found.content, found.image_size,
-                      found.frames, found.seconds, len(found.turns), len(found.scenes), time_s,
+    return ClipResult(row.clip, name, '', now, True, content, found.origin.image_size,
+                      found.frames, found.seconds, found.found, len(found.turns), time_s,
                       found.warnings)
 
 
-def _noted(folder: Folder, name: str, result: ClipResult, row: Row) -> ClipResult:
+def _noted(folder: Folder, name: str, result: ClipResult) -> ClipResult:
     if result.kept:
-        result = replace(result, stamp=result.stamp or stamp(row.place) or '')
         try:
             folder.write(name, json.dumps(asdict(result), sort_keys=True).encode())
         except DashcalibError as error:
@@ -166,19 +192,20 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
     """Solve a camera from its gathered clips, unless that was done; return the result's file."""
     folder, started = Folder(out), Clock()
     # a clip that the manifest names twice counts once
-    files = {result.clip: (result.file, row.time_s) for row, result in reversed(clips)
-             if result.file}
-    usable = [(clip, *files[clip]) for clip in sorted(files)]
+    used = {row.name: (result.file, f'{result.content}{row.topic or ""}')
+            for row, result in reversed(clips) if result.file}
+    usable = [(clip, *used[clip]) for clip in sorted(used)]
     name = solved_file(camera, make, usable, config)
     data = folder.read(name)
     if data is not None:
         return name, solved.decoded(data, name), started.effort(again=True)
     loaded = []
-    for clip, file, time_s in usable:
-        content = folder.read(file)
-        if content is None:
-            raise InputError(f'{file} has gone while the fleet was solved; start again')
-        loaded.append(Clip(clip, gathered.decoded(content, file), time_s))
+    for clip, file, content in usable:
+        found = _kept(folder, file)
+        if found is None:
+            raise InputError(f'{file} has gone or changed while the fleet was solved; remove it '
+                             f'and start again')
+        loaded.append(Clip(clip, replace(found, content=content)))
     text = solved.encoded(solved.solved_of(camera, make, fuse(loaded, config)))
     result = solved.decoded(text, name)
     publish(folder, result, None, config)
@@ -186,8 +213,8 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
     return name, result, started.effort()
 
 
-def solved_file(camera: str, make: str, usable: Sequence[tuple[str, str, float | None]],
-                config: Config) -> str:
+def solved_file(camera: str, make: str, usable: Sequence[tuple[str, str, str]], config: Config
+                ) -> str:
     """Return the name of a camera's own result.
 
     Other clips, other settings and another version of this package have another one.
@@ -231,7 +258,9 @@ def publish(folder: Folder, result: solved.Solved, prior: Verdict | None, config
 def camera_folder(camera: str) -> str:
     """Return the folder of a camera's files; different names never share one."""
     plain = re.sub(r'[^A-Za-z0-9._-]+', '_', camera).strip('._')[:80]
-    return f'cameras/{camera}' if plain == camera else f'cameras/{plain}-{_hash([camera])[:8]}'
+    if plain == camera and not HASHED.search(camera):
+        return f'cameras/{camera}'
+    return f'cameras/{plain}-{_hash([camera])}'
 
 
 def _hash(values: object) -> str:

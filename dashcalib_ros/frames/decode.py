@@ -1,4 +1,4 @@
-"""Image messages and image files -> grey images of 8 bits.
+"""Image messages and image files -> images of 8 bits: grey, or as they are for people to look at.
 
 Works on anything with the fields of sensor_msgs/Image or sensor_msgs/CompressedImage: messages of
 rclpy and of rosbags alike. Needs neither ROS nor cv_bridge.
@@ -47,54 +47,55 @@ class _Layout:
     """How an encoding stores a pixel.
 
     channels, bits: of one pixel in a row of the message.
-    to_grey: OpenCV's conversion; without one, channel number `luma` is the grey value.
+    conversion: OpenCV's, with GRAY or BGR for its star. luma: the channel that is the grey value;
+    None: the conversion gives it.
     planar: all pixels' brightness comes first, then their colours.
     """
 
     channels: int
     bits: int = 8
-    to_grey: int | None = None
-    luma: int = 0
+    conversion: str = ''
+    luma: int | None = 0
     planar: bool = False
 
 
 _LAYOUTS = {
     'mono8': _Layout(1), '8uc1': _Layout(1),
     'mono16': _Layout(1, 16), '16uc1': _Layout(1, 16),
-    'bgr8': _Layout(3, 8, cv2.COLOR_BGR2GRAY), '8uc3': _Layout(3, 8, cv2.COLOR_BGR2GRAY),
-    'rgb8': _Layout(3, 8, cv2.COLOR_RGB2GRAY),
-    'bgra8': _Layout(4, 8, cv2.COLOR_BGRA2GRAY), '8uc4': _Layout(4, 8, cv2.COLOR_BGRA2GRAY),
-    'rgba8': _Layout(4, 8, cv2.COLOR_RGBA2GRAY),
-    'bgr16': _Layout(3, 16, cv2.COLOR_BGR2GRAY), '16uc3': _Layout(3, 16, cv2.COLOR_BGR2GRAY),
-    'rgb16': _Layout(3, 16, cv2.COLOR_RGB2GRAY),
-    'bgra16': _Layout(4, 16, cv2.COLOR_BGRA2GRAY), '16uc4': _Layout(4, 16, cv2.COLOR_BGRA2GRAY),
-    'rgba16': _Layout(4, 16, cv2.COLOR_RGBA2GRAY),
+    'bgr8': _Layout(3, 8, 'BGR2*', None), '8uc3': _Layout(3, 8, 'BGR2*', None),
+    'rgb8': _Layout(3, 8, 'RGB2*', None),
+    'bgra8': _Layout(4, 8, 'BGRA2*', None), '8uc4': _Layout(4, 8, 'BGRA2*', None),
+    'rgba8': _Layout(4, 8, 'RGBA2*', None),
+    'bgr16': _Layout(3, 16, 'BGR2*', None), '16uc3': _Layout(3, 16, 'BGR2*', None),
+    'rgb16': _Layout(3, 16, 'RGB2*', None),
+    'bgra16': _Layout(4, 16, 'BGRA2*', None), '16uc4': _Layout(4, 16, 'BGRA2*', None),
+    'rgba16': _Layout(4, 16, 'RGBA2*', None),
     # ROS: yuv422 is U Y V Y, yuv422_yuy2 is Y U Y V; every second byte is a pixel's brightness
-    'yuv422': _Layout(2, luma=1), 'uyvy': _Layout(2, luma=1),
-    'yuv422_yuy2': _Layout(2), 'yuyv': _Layout(2), 'yuy2': _Layout(2),
-    'nv12': _Layout(1, planar=True), 'nv21': _Layout(1, planar=True),
-    'nv24': _Layout(1, planar=True), 'i420': _Layout(1, planar=True),
-    # ROS and these constants of OpenCV name the colours of the first two rows, from the corner on
-    # (OpenCV's older names, BayerBG for rggb, start one pixel further down the diagonal)
-    **{f'bayer_{name}{bits}': _Layout(1, bits, code)
-       for bits in (8, 16)
-       for name, code in (('rggb', cv2.COLOR_BayerRGGB2GRAY), ('bggr', cv2.COLOR_BayerBGGR2GRAY),
-                          ('gbrg', cv2.COLOR_BayerGBRG2GRAY), ('grbg', cv2.COLOR_BayerGRBG2GRAY))},
+    'yuv422': _Layout(2, 8, 'YUV2*_UYVY', 1), 'uyvy': _Layout(2, 8, 'YUV2*_UYVY', 1),
+    **{name: _Layout(2, 8, 'YUV2*_YUY2') for name in ('yuv422_yuy2', 'yuyv', 'yuy2')},
+    **{name: _Layout(1, 8, f'YUV2*_{name.upper()}', planar=True)
+       for name in ('nv12', 'nv21', 'i420')},
+    'nv24': _Layout(1, planar=True),  # OpenCV does not know its colours
+    # ROS and OpenCV name the colours of the first two rows so, from the corner on (OpenCV's older
+    # names, BayerBG for rggb, start one pixel further down the diagonal)
+    **{f'bayer_{name}{bits}': _Layout(1, bits, f'Bayer{name.upper()}2*', None)
+       for bits in (8, 16) for name in ('rggb', 'bggr', 'gbrg', 'grbg')},
 }
 
 
-def decode(message: Any, depth: BitDepth | None = None) -> GreyImage:
+def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) -> Pixels:
     """Decode an Image or a CompressedImage message, whichever it is; see the two below."""
     if hasattr(message, 'encoding'):
-        return decode_image(message, depth)
-    return decode_compressed(message, depth)
+        return decode_image(message, depth, colour)
+    return decode_compressed(message, depth, colour)
 
 
-def decode_image(message: Any, depth: BitDepth | None = None) -> GreyImage:
+def decode_image(message: Any, depth: BitDepth | None = None, colour: bool = False) -> Pixels:
     """Decode a sensor_msgs/Image: (height, width) uint8, a copy.
 
     message: has encoding, height, width, step, is_bigendian and data.
     depth: the stream's bit depth, for 16-bit encodings; without it, only this image counts.
+    colour: (height, width, 3) BGR uint8, unless the image is grey.
 
     Raises InputError for an unknown encoding, or a size that does not fit the data.
     """
@@ -102,24 +103,26 @@ def decode_image(message: Any, depth: BitDepth | None = None) -> GreyImage:
     if layout is None:
         raise InputError(f'encoding {message.encoding!r} is not supported: '
                          f'publish mono8, bgr8, rgb8, yuv422 or a bayer encoding')
-    pixels = _pixels(message, layout)
-    if layout.to_grey is None:
-        grey = np.array(pixels[..., layout.luma], order='C')
+    colour = colour and bool(layout.conversion)
+    pixels = _pixels(message, layout, colour)
+    if colour or layout.luma is None:
+        image = _convert(pixels, layout.conversion.replace('*', 'BGR' if colour else 'GRAY'))
     else:
-        grey = _convert(pixels, layout.to_grey)
-    return _to_8_bits(grey, depth)
+        image = np.array(pixels[..., layout.luma], order='C')
+    return _to_8_bits(image, depth)
 
 
-def decode_compressed(message: Any, depth: BitDepth | None = None) -> GreyImage:
+def decode_compressed(message: Any, depth: BitDepth | None = None, colour: bool = False
+                      ) -> Pixels:
     """Decode a sensor_msgs/CompressedImage: (height, width) uint8.
 
     message: has format and data: a JPEG, PNG, TIFF, WebP, BMP, PGM or PPM.
-    depth: as for decode_image.
+    depth, colour: as for decode_image.
 
     Raises InputError for depth images, video streams, data that is cut off or damaged, and for
     more pixels than limits allow.
     """
-    return decode_file(memoryview(message.data), depth, _name(message))
+    return decode_file(memoryview(message.data), depth, _name(message), colour)
 
 
 def message_size(message: Any) -> tuple[int, int]:
@@ -146,19 +149,19 @@ def _name(message: Any) -> str:
 
 
 def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
-                what: str = 'image') -> GreyImage:
+                what: str = 'image', colour: bool = False) -> Pixels:
     """Decode the bytes of an image file: (height, width) uint8; an EXIF orientation is applied.
 
-    Raises InputError as decode_pixels does.
+    colour: as for decode_image. Raises InputError as decode_pixels does.
     """
-    return _to_8_bits(decode_pixels(data, what), depth)
+    return _to_8_bits(decode_pixels(data, what, colour), depth)
 
 
-def decode_pixels(data: bytes | memoryview, what: str = 'image') -> Pixels:
+def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = False) -> Pixels:
     """Decode the bytes of an image file: (height, width) of 8 or 16 bits.
 
-    what: the image's name in errors. Raises InputError when the bytes are cut off or no image, or
-    have more pixels than limits allow.
+    colour: as for decode_image. what: the image's name in errors. Raises InputError when the bytes
+    are cut off or no image, or have more pixels than limits allow.
     """
     _encoded_size(memoryview(data), what)  # check the size before memory is used
     buffer = np.frombuffer(data, np.uint8)
@@ -167,7 +170,8 @@ def decode_pixels(data: bytes | memoryview, what: str = 'image') -> Pixels:
         # OpenCV would fill the rest with grey
         raise InputError(f'{what} is cut off: record or copy it again')
     try:
-        image = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+        image = cv2.imdecode(buffer, cv2.IMREAD_ANYDEPTH | (
+            cv2.IMREAD_ANYCOLOR if colour else cv2.IMREAD_GRAYSCALE))
     except cv2.error:
         image = None
     if image is None:
@@ -190,8 +194,11 @@ def _damaged(what: str, size: int) -> InputError:
                       f'as jpeg or png')
 
 
-def _pixels(message: Any, layout: _Layout) -> Pixels:
-    """Return (height, width, channels), a view of the message where its bytes allow."""
+def _pixels(message: Any, layout: _Layout, colour: bool) -> Pixels:
+    """Return (height, width, channels), a view of the message where its bytes allow.
+
+    colour: of planar ones all the rows, those of the colours last.
+    """
     width, height, step = int(message.width), int(message.height), int(message.step)
     data = np.frombuffer(message.data, np.uint8)
     check_pixels(width, height)
@@ -201,6 +208,7 @@ def _pixels(message: Any, layout: _Layout) -> Pixels:
         raise InputError(
             f'an image says {width}x{height} {message.encoding} with step {step} but has '
             f'{data.size} bytes: the camera driver or the recording is broken')
+    height = min(height * 3 // 2, data.size // step) if layout.planar and colour else height
     rows = data[:step * height].reshape(height, step)[:, :row]
     if layout.bits == 16:
         kind = '>u2' if message.is_bigendian else '<u2'
@@ -208,16 +216,18 @@ def _pixels(message: Any, layout: _Layout) -> Pixels:
     return rows.reshape(height, width, layout.channels)
 
 
-def _convert(pixels: Pixels, code: int) -> Pixels:
-    plain = pixels[..., 0] if pixels.shape[2] == 1 else pixels
+def _convert(pixels: Pixels, conversion: str) -> Pixels:
+    plain = np.ascontiguousarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels)
+    if conversion == 'BGR2BGR':
+        return plain
     try:
-        return np.asarray(cv2.cvtColor(np.ascontiguousarray(plain), code))
+        return np.asarray(cv2.cvtColor(plain, getattr(cv2, f'COLOR_{conversion}')))
     except cv2.error as error:
-        raise InputError(f'an image of {plain.shape[1]}x{plain.shape[0]} cannot be turned grey: '
+        raise InputError(f'an image of {plain.shape[1]}x{plain.shape[0]} cannot be converted: '
                          f'publish mono8 or bgr8 ({error.err})') from error
 
 
-def _to_8_bits(grey: Pixels, depth: BitDepth | None) -> GreyImage:
-    if grey.dtype == np.uint16:
-        return (depth or BitDepth()).to_8_bits(grey)
-    return grey
+def _to_8_bits(image: Pixels, depth: BitDepth | None) -> Pixels:
+    if image.dtype == np.uint16:
+        return (depth or BitDepth()).to_8_bits(image)
+    return image

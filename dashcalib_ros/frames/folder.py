@@ -6,7 +6,7 @@ from collections.abc import Generator
 from functools import partial
 from pathlib import Path
 
-from dashcalib_ros.arrays import GreyImage
+from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.decode import BitDepth, decode_file
 from dashcalib_ros.frames.source import IMAGE_SUFFIXES, FrameSource, Picture, Reading, by_name
@@ -44,8 +44,8 @@ class FolderSource(FrameSource):
             yield Picture(index, round(index * 1e9 / self._fps),
                           partial(self._image, self._names[index], depth))
 
-    def _image(self, name: str, depth: BitDepth) -> GreyImage:
-        return decode_file(read_file(self._path / name, PICTURE_BYTES, name), depth, name)
+    def _image(self, name: str, depth: BitDepth, colour: bool = False) -> Pixels:
+        return decode_file(read_file(self._path / name, PICTURE_BYTES, name), depth, name, colour)
 
 
 def _is_image(name: str) -> bool:

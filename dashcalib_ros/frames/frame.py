@@ -2,8 +2,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 
 from dashcalib_ros.arrays import GreyImage
+from dashcalib_ros.errors import InputError, shortened
+
+# ns; what a stamp of 64 bits holds
+LAST_NS = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -17,6 +22,7 @@ class Frame:
     after_gap: images are missing before it, or it is of another drive.
     perhaps_after_gap: the first of another file that may or may not go on where the one before
     ended, as the next video of a dashcam; how the picture moves tells (motion/continuity.py).
+    Raises InputError for a stamp that is no finite number of 64 bits.
     """
 
     index: int
@@ -25,6 +31,12 @@ class Frame:
     frame_id: str = ''
     after_gap: bool = False
     perhaps_after_gap: bool = False
+
+    def __post_init__(self) -> None:
+        # NaN is in no range
+        if not (isinstance(self.stamp_ns, Real) and -LAST_NS <= self.stamp_ns <= LAST_NS):
+            raise InputError(f'Frame.stamp_ns must be a number of nanoseconds, not '
+                             f'{shortened(repr(self.stamp_ns))}')
 
     @property
     def size(self) -> tuple[int, int]:

@@ -41,6 +41,8 @@ class JoinedSource(FrameSource):
             f'{first.name} and {len(self._parts) - 1} more',
             None if None in counts else sum(filter(None, counts)), first.topic,
             (*warnings, *_together([(part.name, part.warnings) for part in self._parts])))
+        self.contradictions = tuple(dict.fromkeys(
+            line for part in self._parts for line in part.contradictions))
         self.length_ns = None if None in lengths else sum(filter(None, lengths))
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:

@@ -4,17 +4,20 @@ from __future__ import annotations
 import copy
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dashcalib_ros.arrays import GreyImage
+from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.frame import Frame
 
 IMAGE_SUFFIXES = frozenset(
     ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'))
+
+# images are further apart; stamps are rounded
+CLOSE_NS = 1_000_000
 
 
 def by_name(name: str) -> tuple[list[tuple[int, str]], str]:
@@ -37,13 +40,13 @@ def os_error(path: Path, error: OSError) -> str:
 class Picture:
     """One image of the drive that is not decoded yet; index, stamp_ns and others as a Frame's.
 
-    decode: returns the image; raises InputError where that is not possible. file: that it is in,
-    where the drive has several.
+    decode: returns the image, grey; with colour=True (h, w, 3) BGR where it has colours. Raises
+    InputError where that is not possible. file: that it is in, where the drive has several.
     """
 
     index: int
     stamp_ns: int
-    decode: Callable[[], GreyImage]
+    decode: Callable[..., Pixels]
     frame_id: str = ''
     after_gap: bool = False
     perhaps_after_gap: bool = False
@@ -84,8 +87,10 @@ class FrameSource(ABC):
     topic: the bag's image topic; None for videos and folders.
     size: (width, height) where it is known before the first image, else None.
     length_ns: how long the drive is where its stamps are counted from 0, else None.
-    recorded: its stamps are times of recording, as a bag has them. begin_ns: when it began, if so.
+    recorded: its stamps are times of recording, as a bag has them. begin_ns: when it began, None
+    where that is not known.
     warnings: what the user should know about the input; complete after the last frame.
+    contradictions: those of them that may be why a drive teaches too little, with the cure.
 
     Frames are read one by one; no memory grows with the drive. Their stamps always increase.
     Frame.index counts all images of the input, also those that were skipped.
@@ -95,6 +100,7 @@ class FrameSource(ABC):
     size: tuple[int, int] | None = None
     length_ns: int | None = None
     recorded = False
+    contradictions: tuple[str, ...] = ()
     _cure = 'check that it plays in another program, or record it again'
     _start_ns = 0
     _duration_ns: int | None = None
@@ -115,7 +121,7 @@ class FrameSource(ABC):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return what the user should know, one line each; complete after the last frame."""
-        return self._opening_warnings + self._reading_warnings
+        return self.contradictions + self._opening_warnings + self._reading_warnings
 
     def excerpt(self, start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
         """Return the part of the drive from start_s on, duration_s long; None: to its end."""
@@ -138,6 +144,26 @@ class FrameSource(ABC):
             raise InputError(os_error(Path(self.name), error)) from error
         finally:
             self._reading_warnings = reading.summary()
+
+    def in_colour(self, stamps_ns: Mapping[int, int]) -> dict[int, Pixels]:
+        """Return images by their index, read again: (h, w, 3) BGR uint8, (h, w) of grey ones.
+
+        stamps_ns: theirs, by index. What cannot be read again is left out.
+        """
+        found: dict[int, Pixels] = {}
+        wanted = sorted(stamps_ns)
+        # where stamps are counted from 0, the way to an image is short
+        starts = ([(stamps_ns[index] - CLOSE_NS, index) for index in wanted]
+                  if self.length_ns is not None else [(0, index) for index in wanted[-1:]])
+        for start_ns, last in starts:
+            with suppress(InputError, OSError), closing(
+                    self._pictures(Reading(), max(0, start_ns))) as pictures:
+                for picture in pictures:
+                    if picture.index in stamps_ns:
+                        found[picture.index] = picture.decode(colour=True)
+                    if picture.index >= last:
+                        break
+        return found
 
     def _frames(self, reading: Reading) -> Iterator[Frame]:
         size: tuple[int, int] | None = None

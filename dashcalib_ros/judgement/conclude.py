@@ -3,7 +3,8 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
+from dataclasses import field as default
 from importlib import metadata
 from types import MappingProxyType
 
@@ -16,6 +17,7 @@ from dashcalib_ros.frames.scale import Scale
 from dashcalib_ros.judgement.agreement import focal_disagreement
 from dashcalib_ros.judgement.calibration import (
     Calibration,
+    LensField,
     Material,
     Shutter,
     Stabiliser,
@@ -23,15 +25,21 @@ from dashcalib_ros.judgement.calibration import (
     TurnSummary,
     Verdict,
 )
-from dashcalib_ros.judgement.verdict import Finding, judge, profile_contrast, verdict_of
+from dashcalib_ros.judgement.verdict import (
+    STEADY,
+    Finding,
+    judge,
+    profile_contrast,
+    verdict_of,
+)
 from dashcalib_ros.lines import Bend, Lines, bend
 from dashcalib_ros.reconstruction.picture import TurnPicture, picture_of
-from dashcalib_ros.reconstruction.scene import Scene, errors_px
+from dashcalib_ros.reconstruction.scene import Scene, rms_px
+from dashcalib_ros.scene_file import StoredTurn
 from dashcalib_ros.solve.departures import largest_crop
-from dashcalib_ros.solve.opinions import HeldOut, held_out
+from dashcalib_ros.solve.opinions import HeldOut, held_out, wider_covariance_of
 from dashcalib_ros.solve.picture import PictureSigma
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.turn_store import StoredTurn
 from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.turns.turn import Turn, TurnId
 
@@ -40,7 +48,8 @@ CONTRADICTS = 'the camera of the other turns does not explain it'
 NOT_NEEDED = 'more prominent turns were enough'
 
 # result.json has their versions: a result's last digits depend on them
-PACKAGES = ('dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'pycolmap', 'pyceres')
+PACKAGES = (
+    'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap', 'pyceres')
 
 
 @dataclass(frozen=True)
@@ -64,8 +73,8 @@ class Evidence:
     timing: dict[str, float]
     warnings: tuple[str, ...] = ()
     stored: tuple[StoredTurn, ...] = ()
-    left_out: Mapping[TurnId, str] = field(default_factory=dict)
-    pictures: Mapping[TurnId, TurnPicture] | None = field(default_factory=dict)
+    left_out: Mapping[TurnId, str] = default(default_factory=dict)
+    pictures: Mapping[TurnId, TurnPicture] | None = default(default_factory=dict)
     start_s: float = 0.0
     lines: Lines | None = None
 
@@ -93,10 +102,13 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
     """Return the calibration; a refused one has no intrinsics, so that they cannot be used."""
+    if solution is not None:
+        solution = replace(solution, px=evidence.scale.px)
     witness = _witness(solution, evidence, config)
-    verdict = (judge(solution, config.verdict, witness) if solution
+    verdict = (judge(solution, config.verdict, witness, True) if solution
                else _verdict_without_solution(evidence))
     camera = sigma = error = shutter = sigma_px = stabiliser = straight_lines = None
+    field = None
     details: dict[str, object] = {}
     without: tuple[HeldOut, ...] = ()
     warnings = evidence.warnings
@@ -111,19 +123,28 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
             # fx, fy, cx and cy are pixels
             units = np.where(np.arange(len(solution.sigma)) < 4, px, 1)
             sigma = dict(zip(camera.names(), (solution.sigma * units).tolist(), strict=True))
+            wider = wider_covariance_of(solution)
+            units = np.where(np.arange(len(wider)) < 4, px, 1)
+            details['picture_covariance'] = (wider * np.outer(units, units)).tolist()
             error = solution.reprojection_error_px * px
             sigma_px = PictureSigma(solution.picture.rms * px, solution.picture.worst * px)
-            without = tuple(each.times(px) for each in held_out(solution, config.intrinsics))
+            without = tuple(each.times(px) for each in held_out(solution))
             straight_lines = witness and witness.resized(px)
             warnings += _model_error_warnings(solution, px, config)
+            field = _field(solution, px, evidence.image_size)
+            if field is not None and field.used and field.rms_px >= config.verdict.told_field_px:
+                warnings += (f'the picture is bent by {field.rms_px:.1f} px (up to '
+                             f'{field.worst_px:.1f} px), as by a windscreen or a rectification: '
+                             f'camera_info cannot say that, and sigma over the picture allows '
+                             f'for it; `dashcalib export --to rays` has it',)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.crops:
             stabiliser = Stabiliser(largest_crop(solution.crops) * evidence.scale.px)
-            warnings += (f'the video is stabilised: its picture moves by up to '
-                         f'{stabiliser.largest_px:.0f} px against the lens; that was taken out, '
-                         f'and the result is for the picture in its middle: switch the '
-                         f'stabiliser off',)
+            if STEADY not in verdict.cures:
+                warnings += (f'the picture seems to move by up to {stabiliser.largest_px:.0f} px '
+                             f'against the lens, no more than the lens is uncertain; that was '
+                             f'taken out: {STEADY}',)
     return Calibration(
         verdict=verdict, image_size=evidence.image_size, camera=camera, sigma=sigma,
         turns=tuple(_summary(turn, evidence, solution)
@@ -132,7 +153,8 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         versions=_versions(), config=config, magnitudes=evidence.magnitudes,
         mask=_of_size(evidence.mask, evidence.image_size), held_out=without,
         details=details, rolling_shutter=shutter, stabiliser=stabiliser, sigma_px=sigma_px,
-        warnings=warnings, start_s=evidence.start_s, straight_lines=straight_lines,
+        field=field, warnings=warnings, start_s=evidence.start_s,
+        straight_lines=straight_lines,
         material=_material(solution, evidence),
         stored_turns=tuple(_stored_summary(turn, evidence, solution) for turn in evidence.stored))
 
@@ -151,6 +173,16 @@ def _of_size(mask: Mask | None, size: tuple[int, int]) -> Mask | None:
     row, column = (np.arange(length) * count // length
                    for length, count in zip(size[::-1], mask.shape, strict=True))
     return np.asarray(mask[np.ix_(row, column)], bool)
+
+
+def _field(solution: Solution, px: float, image_size: tuple[int, int]) -> LensField | None:
+    """Return the field for the full-size images; px: of the input, in one pixel of the scenes."""
+    if solution.field is None:
+        return None
+    sizes = px * solution.field.field.over(solution.camera)
+    return LensField(
+        solution.field.field.resized(px, image_size), solution.field.used,
+        float(np.sqrt(np.mean(sizes**2))), float(sizes.max()), px * solution.rays_sigma_px)
 
 
 def _model_error_warnings(solution: Solution, px: float, config: Config) -> tuple[str, ...]:
@@ -189,11 +221,7 @@ def _verdict_without_solution(evidence: Evidence) -> Verdict:
 def _summary(turn: Turn, evidence: Evidence, solution: Solution | None) -> TurnSummary:
     used = {scene.turn: scene for scene in solution.scenes} if solution else {}
     scene = used.get(turn.id) or evidence.built.get(turn.id)
-    error = None
-    if scene is not None:
-        camera = solution.camera if solution and turn.id in used else scene.camera
-        squares = errors_px(scene, camera)[scene.structure.used] ** 2
-        error = float(np.sqrt(np.mean(squares))) * evidence.scale.px
+    error = None if scene is None else _error_px(scene, evidence, solution)
     return TurnSummary(
         center=turn.center, first=turn.first, last=turn.last, stamp_s=turn.stamp_s,
         prominence=turn.prominence, images=len(scene.tracks.frames) if scene else turn.images,
@@ -239,13 +267,21 @@ def _material(solution: Solution | None, evidence: Evidence) -> Material | None:
 
 def _stored_summary(turn: StoredTurn, evidence: Evidence, solution: Solution | None
                     ) -> StoredTurnSummary:
-    scene = turn.scene
-    used = {each.turn for each in solution.scenes} if solution else set()
-    return StoredTurnSummary(scene.turn, turn.stamp_s, turn.prominence, scene.yaw_deg,
+    used = {each.turn: each for each in solution.scenes} if solution else {}
+    scene = used.get(turn.scene.turn, turn.scene)
+    return StoredTurnSummary(scene.turn, turn.stamp_s, turn.prominence, turn.scene.yaw_deg,
                              len(scene.tracks.frames), scene.turn in used,
                              solution.misfits.get(scene.turn) if solution else None,
                              None if scene.turn in used else evidence.left_out.get(
-                                 scene.turn, _scene_unused_because(scene.turn, solution)))
+                                 scene.turn, _scene_unused_because(scene.turn, solution)),
+                             _error_px(scene, evidence, solution))
+
+
+def _error_px(scene: Scene, evidence: Evidence, solution: Solution | None) -> float:
+    """Return a turn's reprojection error in px of the input; unused, by its own camera."""
+    used = solution is not None and any(scene is each for each in solution.scenes)
+    camera = solution.camera if solution and used else scene.camera
+    return rms_px([scene], camera) * evidence.scale.px
 
 
 def _details(solution: Solution) -> dict[str, object]:

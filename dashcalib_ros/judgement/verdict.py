@@ -7,7 +7,7 @@ RULES.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -20,13 +20,16 @@ from dashcalib_ros.judgement.agreement import (
     turns_of_another_camera,
 )
 from dashcalib_ros.judgement.calibration import Verdict
+from dashcalib_ros.judgement.next_turn import next_turn
 from dashcalib_ros.lines import Bend
-from dashcalib_ros.solve.departures import Departure
+from dashcalib_ros.reconstruction.heading import roll_deg
+from dashcalib_ros.solve.departures import Departure, largest_crop
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turns.turn import TurnId
 
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
 ON_BOUND = 0.01
+STEADY = 'switch the stabiliser off'
 
 
 @dataclass(frozen=True)
@@ -34,29 +37,39 @@ class Finding:
     """A rule's objection to a solution: the verdict it leads to, what is wrong, and what to do.
 
     Both are in the words of the driver, with the figures; docs/troubleshooting.md explains each.
+    cause: whether the other findings may come from it; then it is the first one.
     """
 
     level: Literal['weak', 'refused']
     what: str
     cure: str
+    cause: bool = False
 
 
-def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None) -> Verdict:
-    """Return the verdict on a solution, its reasons sorted: those that refuse it come first.
+def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
+          outlook: bool = False) -> Verdict:
+    """Return the verdict on a solution, its reasons sorted: causes, then those that refuse it.
 
-    lines: what straight lines say of it, if there are enough of them.
+    lines: what straight lines say of it, if there are enough of them. outlook: to tell what one
+    more turn would bring, where only knowledge is missing.
     """
     findings = [found for rule in RULES if (found := rule(solution, config)) is not None]
-    if lines is not None and (found := _lines_disagree(lines, solution, config)) is not None:
-        findings.append(found)
-    return verdict_of(sorted(findings, key=lambda found: found.level != 'refused'))
+    against = None if lines is None else _lines_disagree(lines, solution, config)
+    findings += [against] if against is not None else []
+    findings.sort(key=lambda found: (not found.cause, found.level != 'refused'))
+    if findings and outlook and against is None and lacks_knowledge_only(solution, config):
+        more = next_turn(solution)
+        findings[0] = replace(findings[0], cure=findings[0].cure + (more and f' ({more})'))
+    return verdict_of(findings)
 
 
 def verdict_of(findings: Sequence[Finding]) -> Verdict:
-    """Return the verdict that findings lead to, the gravest first; without any it is accepted."""
+    """Return the verdict that findings lead to, in their order; without any it is accepted."""
     if not findings:
         return Verdict('accepted')
-    return Verdict(findings[0].level, tuple(f'{found.what}: {found.cure}' for found in findings),
+    refused = any(found.level == 'refused' for found in findings)
+    return Verdict('refused' if refused else 'weak',
+                   tuple(f'{found.what}: {found.cure}' for found in findings),
                    tuple(dict.fromkeys(found.cure for found in findings)))
 
 
@@ -73,8 +86,9 @@ def _too_few_turns(solution: Solution, config: VerdictConfig) -> Finding | None:
     count = len(solution.scenes)
     if count >= config.min_turns:
         return None
-    return Finding('weak', f'only {count} of at least {config.min_turns} turns could be used',
-                   'drive more turns, as at crossings')
+    lone = ', so that nothing confirms the numbers and their sigma' if count == 1 else ''
+    return Finding('weak', f'only {count} of at least {config.min_turns} turns could be used'
+                           f'{lone}', 'drive more turns, as at crossings')
 
 
 def _too_little_yaw(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -117,8 +131,8 @@ def _far_from_profile(solution: Solution, config: VerdictConfig) -> Finding | No
     if np.isclose(best, solution.camera.fx):
         return None
     return Finding('refused', f'two ways to find the focal length contradict each other, with '
-                              f'{solution.camera.fx:.0f} px and about {best:.0f} px, so that '
-                              f'neither can be trusted',
+                              f'{solution.px * solution.camera.fx:.0f} px and about '
+                              f'{solution.px * best:.0f} px, so that neither can be trusted',
                    'record another drive, with sharper turns and less traffic')
 
 
@@ -175,19 +189,31 @@ def _turns(turns: list[TurnId]) -> str:
 
 
 def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """Name what no fixed camera does; a stabilised video's movement may have been taken out."""
+    """Name what no fixed camera does.
+
+    A stabilised video's movement may have been taken out. The lens is right then, but no
+    camera_info holds for pictures that move.
+    """
     clear = [each for each in solution.departures if each.clear]
+    crop = largest_crop(solution.crops) if solution.crops else 0.0
+    if crop > config.max_crop_sigmas * solution.picture.rms:
+        return _moving('up to', crop, solution)
     if not clear:
         return None
+    if clear[0].kind == 'shift':
+        return _moving('about', clear[0].size, solution)
     return Finding('weak', *_departure_texts(clear[0], solution))
+
+
+def _moving(how: str, px: float, solution: Solution) -> Finding:
+    share = 100 * px / solution.camera.image_size[0]
+    return Finding('weak', f'the picture moves against the lens by {how} {share:.1f} % of its '
+                           f'width, as that of a stabilised video does: no camera_info holds for '
+                           f'all pictures', STEADY, cause=True)
 
 
 def _departure_texts(departure: Departure, solution: Solution) -> tuple[str, str]:
     """Return what is wrong, and what to do."""
-    if departure.kind == 'shift':
-        share = 100 * departure.size / solution.camera.image_size[0]
-        return (f'the picture moves against the lens by about {share:.1f} % of its width, as that '
-                f'of a stabilised video does', 'switch the stabiliser off')
     if departure.kind == 'bend':
         return (f'the picture is bent in places, as no lens of the model {solution.camera.model} '
                 f'bends it', 'take away the windscreen or cover that does so, or try another '
@@ -201,6 +227,18 @@ def _departure_texts(departure: Departure, solution: Solution) -> tuple[str, str
                 cure)
     return (f'the zoom changes by about {100 * apart:.1f} %, it is larger in {_turns(larger)} '
             f'than in the others', cure)
+
+
+def _turned_pictures(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """A car turns about the vertical, and the road is below it."""
+    turned = abs(roll_deg(solution.scenes))
+    if turned <= config.max_roll_deg:
+        return None
+    return Finding('weak', f'the pictures are turned by about {90 * round(turned / 90)}°, as the '
+                           f'axis about which the car turns and the road under it say',
+                   'mend what the video says of it (ffmpeg -display_rotation 0 -i IN -c copy '
+                   'OUT.mp4), or --set verdict.max_roll_deg=180 for a camera mounted so',
+                   cause=True)
 
 
 def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -259,7 +297,7 @@ def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
     apart = own.apart_px
     if apart is not None and apart <= config.max_model_sigmas * solution.picture.rms:
         return None
-    far = f'{apart:.1f} px' if apart is not None else 'far'
+    far = f'{solution.px * apart:.1f} px' if apart is not None else 'far'
     return Finding('weak', f'the turns ask for a lens of the model {chosen.model}, not '
                            f'{own.model}, and that one is {far} away', 'leave --model away')
 
@@ -269,7 +307,7 @@ def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
     camera = solution.camera
     for each in solution.tried:
         model = MODELS[each.model]
-        if model.ros_model == camera.ros_model or len(model.names()) >= len(camera.names()):
+        if model.family == camera.family or len(model.names()) >= len(camera.names()):
             continue
         alike_px = config.max_kind_sigmas * solution.picture.rms
         far = each.apart_px is None or each.apart_px > alike_px
@@ -307,5 +345,5 @@ ENOUGH: tuple[Rule, ...] = (
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
     _turns_disagree, _other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,
-    _folds_over, _other_model, _other_kind)
+    _folds_over, _other_model, _other_kind, _turned_pictures)
 RULES = (*ENOUGH, *SOUND)

@@ -7,12 +7,13 @@ it brakes before the turn, and rises as much when it gathers speed after it.
 """
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.reconstruction.scene import Scene, main_axis
 
 # rounds of reweighting; ten drives changed by less than 0.01 degrees after the fifth
 ROUNDS = 10
@@ -24,6 +25,10 @@ MAD = 1.4826
 LEAST_SCATTER = 1e-3
 # of the steps at either end, left out of a mean: bumps and bad poses
 TRIMMED = 0.1
+# points near the path; fewer do not tell how high the world is
+LEAST_POINTS = 30
+# of the logarithm; the turns of six upright drives have -4.9 to -0.7
+OPEN = 0.4
 # keyframes; a line needs more steps between them than it has parameters
 LEAST_KEYFRAMES = 6
 
@@ -64,6 +69,38 @@ def heading(scene: Scene) -> Heading | None:
     yaw_deg, yaw_sigma = _at_no_curvature(curvature, yaw)
     return Heading(yaw_deg, float(stats.trim_mean(pitch, TRIMMED)), yaw_sigma,
                    float(np.std(pitch) / np.sqrt(len(pitch))))
+
+
+def roll_deg(scenes: Sequence[Scene]) -> float:
+    """Return by how much the pictures of these turns are turned against the upright, degrees.
+
+    Of the axis about which the car turns, the end where the road is points downwards: points on
+    the road all lie as deep, those above the camera at any height.
+    """
+    down = main_axis(np.concatenate([scene.turned for scene in scenes]))
+    if np.median([_open_below(scene, down) for scene in scenes]) > OPEN:
+        down = -down
+    return float(np.degrees(np.arctan2(down[0], down[1])))
+
+
+def _open_below(scene: Scene, down: Floats) -> float:
+    """Return the log of how much farther the deepest points spread than the highest ones."""
+    structure = scene.structure
+    rotations = structure.rotations[structure.registered]
+    centres = -np.einsum('kji,kj->ki', rotations, structure.translations[structure.registered])
+    points = structure.points[structure.used.any(axis=0)]
+    offsets = points[:, None] - centres
+    far = np.linalg.norm(offsets, axis=2)
+    nearest = np.argmin(far, axis=1)
+    path_length = np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()
+    near = far.min(axis=1) < path_length
+    depth = offsets[np.arange(len(points)), nearest][near] @ (rotations.transpose(0, 2, 1)
+                                                            @ down).mean(axis=0)
+    if len(depth) < LEAST_POINTS:
+        return 0.0
+    highest, high, deep, deepest = np.percentile(depth, [2, 25, 75, 98])
+    tiny = np.finfo(float).tiny
+    return float(np.log((deepest - deep + tiny) / (high - highest + tiny)))
 
 
 def _at_no_curvature(curvature: Floats, angle: Floats) -> tuple[float, float]:

@@ -1,12 +1,12 @@
 """One picture of each turn, for people: small, and of a keyframe, so that tracks fit on it."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from dashcalib_ros.arrays import GreyImage
+from dashcalib_ros.arrays import GreyImage, Pixels
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.turns.turn import Turn
 
@@ -16,10 +16,19 @@ WIDTH = 720
 
 @dataclass(frozen=True)
 class TurnPicture:
-    """frame: its index among the input's frames. image: (h, w) uint8, grey, at most WIDTH wide."""
+    """frame: its index among the input's frames; stamp_ns: its time.
+
+    image: uint8, at most WIDTH wide; (h, w) grey, or (h, w, 3) BGR.
+    """
 
     frame: int
-    image: GreyImage
+    stamp_ns: int
+    image: Pixels
+
+    def coloured(self, image: Pixels) -> TurnPicture:
+        """Return the same with the input's own image of this frame, grey or in colour."""
+        size = self.image.shape[1::-1]
+        return replace(self, image=cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def picture_of(turn: Turn, scene: Scene | None) -> TurnPicture | None:
@@ -27,14 +36,14 @@ def picture_of(turn: Turn, scene: Scene | None) -> TurnPicture | None:
 
     None where the turn has no frames any more.
     """
-    shown = {frame.index: frame.image for frame in turn.frames}
+    shown = {frame.index: frame for frame in turn.frames}
     if scene is not None:
         registered = scene.tracks.frames[scene.structure.registered]
         shown = {index: shown[index] for index in map(int, registered) if index in shown}
     if not shown:
         return None
     index = min(shown, key=lambda index: abs(index - turn.center))
-    return TurnPicture(index, _small(shown[index]))
+    return TurnPicture(index, shown[index].stamp_ns, _small(shown[index].image))
 
 
 def _small(image: GreyImage) -> GreyImage:

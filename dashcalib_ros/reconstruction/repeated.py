@@ -1,8 +1,10 @@
-"""Turns that show the same pictures: a bag that is played in a loop adds nothing but the first.
+"""Turns that show the same pictures: what is played again, forwards or backwards, adds nothing.
 
-Two scenes are compared by what they are made of. Their yaw over time tells by how much one has to
-be moved in time, forwards or backwards, to fit the other; then the places of their tracks tell
-whether the pictures are the same. A second drive through the same bend has other pictures.
+Two scenes are compared by what they are made of. Where their pictures are the same, tracks that
+are near each other in the picture move alike over the next keyframes, whichever corners were
+followed: they lie on the same surface, seen from the same places. Elsewhere hardly any do; nor on
+a second drive through the same bend, on another path at another speed. The yaw over time tells by
+how much one scene may be moved in time, forwards or backwards, to fit a part of the other.
 """
 from __future__ import annotations
 
@@ -15,46 +17,45 @@ from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.turns.turn import TurnId
 
-# s between the offsets in time that are tried
-OFFSET_S = 0.02
-# two turns that share less have too little in common to be compared: of the shorter one
-LEAST_OVERLAP = 0.25
-# degrees; scatter of the difference of the yaw of two scenes with the same pictures
-SAME_YAW_DEG = 0.5
-# the yaw of the same turn in two reconstructions differs by this factor at the most
-YAW_RATIO = 1.2
-# px; how near a track must be to one of the other scene
-NEAR_PX = 2.0
-# the share of tracks that have one as near: chance alone gives 1 to 2 %, the same pictures 5
-# (played backwards: other corners are followed) to 90 %
-LEAST_SHARE, TIMES_CHANCE = 0.01, 2.5
-# where tracks are moved to, to see what chance gives
-DISPLACED_PX = (11.0, 7.0)
-# tracks of a keyframe that are compared, at the most and at least
-MOST_PLACES, FEWEST_PLACES = 100, 20
-# keyframes that tell the offset in time, and how many offsets are tried
-PROBES, MOST_OFFSETS = 5, 60
-# of a turn's keyframes; with fewer new ones it is left out
-LEAST_NEW = 0.5
+# s between the offsets in time that are tried; neighbouring tracks forgive half of it
+OFFSET_S = 0.05
+# keyframes over which tracks are compared: they move by a tenth of the width
+SPAN = 3
+# how many such spans two scenes must have in common
+LEAST_SPANS = 2
+# degrees; a span that turns less fits everywhere. The yaw of the same turn in two reconstructions
+# differs by this factor, and by so many degrees, at the most
+LEAST_YAW_DEG, YAW_RATIO, SAME_YAW_DEG = 1.0, 1.2, 0.5
+# spans that tell whether an offset is worth comparing all
+PROBES = 3
+# px; tracks as near as that lie on one surface, and those that move alike differ by so much
+NEAR_PX, ALIKE_PX = 8.0, 1.5
+# the share of near tracks that move alike, the mean of three spans: 0.8 to 1 in the same pictures,
+# 0.33 at the most in 100 pairs of other real turns, 0.3 at 4 % another speed through the same bend
+LEAST_ALIKE = 0.5
+# tracks of a span that are compared at the most, and how many must be near another
+MOST_TRACKS, FEWEST_NEAR = 60, 8
+# of a turn's keyframes; with fewer new ones it is left out: one place counts once
+LEAST_NEW = 0.75
 
 
 def without_repeated(scenes: Sequence[Scene], min_images: int
                      ) -> tuple[list[Scene], dict[TurnId, TurnId]]:
     """Return the scenes without those that repeat an earlier one, and which turn each repeats.
 
-    A scene of which at least half is new is cut to that. min_images: least keyframes of a scene.
+    A scene of which most is new is cut to that. min_images: least keyframes of a scene.
     """
     kept: list[Scene] = []
     repeated: dict[TurnId, TurnId] = {}
     for n, scene in enumerate(scenes):
+        whole = int(scene.structure.registered.sum())
         # with those that were left out, too: backwards, a third turn may show it better
         for other in scenes[:n]:
             again = repeats(scene, other)
             new = scene.structure.registered & ~again
             if not again.any():
                 continue
-            count = int(new.sum())
-            if count < max(min_images, LEAST_NEW * int(scene.structure.registered.sum())):
+            if new.sum() < max(min_images, LEAST_NEW * whole):
                 repeated[scene.turn] = repeated.get(other.turn, other.turn)
                 break
             scene = _cut(scene, new)
@@ -70,31 +71,67 @@ def repeats(scene: Scene, other: Scene) -> Mask:
         return again
     rows = np.flatnonzero(scene.structure.registered)
     for direction in (1.0, -1.0):
-        offsets = _offsets(scene, other, direction)
-        if not len(offsets):
-            continue
-        some = rows[np.linspace(0, len(rows) - 1, PROBES).astype(int)]
-        # a steady turn fits in many places: tracks tell which one is right
-        offset = max(offsets, key=lambda each: float(
-            np.sum(_shares(scene, other, some, direction, each))))
-        shares = _shares(scene, other, rows, direction, offset)
-        by_chance = _shares(scene, other, rows, direction, offset, DISPLACED_PX)
-        both = shares + by_chance > 0
-        if both.any() and (shares[both].mean()
-                           > LEAST_SHARE + TIMES_CHANCE * by_chance[both].mean()):
-            again[rows[both]] = True
+        for offset, turning in _offsets(scene, other, direction):
+            times = direction * _seconds(scene) + offset
+            probes = turning[np.linspace(0, len(turning) - 1, PROBES).astype(int)]
+            if not (_alike(scene, other, rows, probes, times) > LEAST_ALIKE).any():
+                continue
+            starts = np.arange(len(rows) - SPAN)
+            share = _alike(scene, other, rows, starts, times)
+            # one span may agree by chance, not its neighbours, too
+            same = np.flatnonzero(np.convolve(share, np.ones(3) / 3, 'same') > LEAST_ALIKE)
+            if len(same) >= LEAST_SPANS:
+                again[rows[np.unique(same[:, None] + np.arange(SPAN + 1))]] = True
     return again
 
 
-def _shares(scene: Scene, other: Scene, rows: Ints, direction: float, offset: float,
-            displaced_px: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Return for each of these keyframes the share of its tracks that the other scene has, too.
+def _offsets(scene: Scene, other: Scene, direction: float) -> list[tuple[float, Ints]]:
+    """Return by how much the scene's time may be moved so that it fits the other's yaw, s.
 
-    displaced_px: by how much the tracks are moved before: where pictures differ, that is all one.
+    direction: -1 turns its time round. Beside each stands which spans of the scene, (n,) by their
+    first registered keyframe, turn as much there.
     """
-    times = direction * _seconds(scene) + offset
-    return np.array([_share(scene.tracks.xy[row] + displaced_px, _places_at(other, times[row]))
-                     for row in rows])
+    times, yaw = _yaw_deg(scene)
+    other_times, other_yaw = _yaw_deg(other)
+    if len(times) <= SPAN or len(other_times) < 2:
+        return []
+    times = direction * times
+    offsets = np.arange(other_times[0] - times.max(), other_times[-1] - times.min(), OFFSET_S)
+    begin, end = times[:-SPAN] + offsets[:, None], times[SPAN:] + offsets[:, None]
+    inside = ((np.minimum(begin, end) >= other_times[0])
+              & (np.maximum(begin, end) <= other_times[-1]))
+    there = np.interp(end, other_times, other_yaw) - np.interp(begin, other_times, other_yaw)
+    own = yaw[SPAN:] - yaw[:-SPAN]
+    # the focal lengths that the turns were reconstructed with differ, and their yaw with them
+    fits = inside & (np.abs(own) > LEAST_YAW_DEG) & (
+        np.abs(there - own) < (YAW_RATIO - 1) * np.abs(own) + SAME_YAW_DEG)
+    return [(float(offset), np.flatnonzero(each))
+            for offset, each in zip(offsets, fits, strict=True) if each.sum() >= LEAST_SPANS]
+
+
+def _alike(scene: Scene, other: Scene, rows: Ints, starts: Ints, times: Floats) -> Floats:
+    """Return (n,) of the tracks near one of the other scene, the share that moves as that does.
+
+    rows: the registered keyframes. starts: (n,) with which of them spans begin. times: (k,) when
+    the other scene shows the keyframes. 0 where too few tracks are near one.
+    """
+    shares = np.zeros(len(starts))
+    for n, start in enumerate(starts):
+        ends = rows[[start, start + SPAN]]
+        own = scene.tracks.xy[ends]
+        there = np.array([_places_at(other, times[row]) for row in ends])
+        own, there = (each[:, np.isfinite(each).all(axis=(0, 2))] for each in (own, there))
+        own = own[:, ::max(1, own.shape[1] // MOST_TRACKS)]
+        if not own.shape[1] or not there.shape[1]:
+            continue
+        across, down = (own[0][:, None, axis] - there[0][:, axis] for axis in (0, 1))
+        apart = across**2 + down**2
+        nearest = apart.argmin(axis=1)
+        near = apart.min(axis=1) < NEAR_PX**2
+        if near.sum() >= FEWEST_NEAR:
+            moved = (own[1] - own[0]) - (there[1] - there[0])[nearest]
+            shares[n] = np.mean(np.linalg.norm(moved[near], axis=1) < ALIKE_PX)
+    return shares
 
 
 def _seconds(scene: Scene) -> Floats:
@@ -108,63 +145,17 @@ def _yaw_deg(scene: Scene) -> tuple[Floats, Floats]:
     return _seconds(scene)[scene.structure.registered], scene.yaws_deg
 
 
-def _offsets(scene: Scene, other: Scene, direction: float) -> Floats:
-    """Return (n,) by how much the scene's time may be moved so that it fits the other's yaw, s.
-
-    direction: -1 turns its time round.
-    """
-    times, yaw = _yaw_deg(scene)
-    other_times, other_yaw = _yaw_deg(other)
-    if len(times) < 2 or len(other_times) < 2:
-        return np.zeros(0)
-    times = direction * times
-    reach = LEAST_OVERLAP * min(np.ptp(times), np.ptp(other_times))
-    offsets = np.arange(other_times[0] - times.max() + reach,
-                        other_times[-1] - times.min() - reach, OFFSET_S)
-    moved = times + offsets[:, None]
-    inside = (moved >= other_times[0]) & (moved <= other_times[-1])
-    count = np.maximum(inside.sum(axis=1), 1)
-
-    def centred(angles: Floats) -> Floats:
-        mean = np.sum(angles * inside, axis=1) / count
-        return np.asarray((angles - mean[:, None]) * inside)
-
-    own = centred(np.broadcast_to(yaw, moved.shape))
-    there = centred(np.interp(moved, other_times, other_yaw))
-    # the focal lengths that the turns were reconstructed with differ, and their yaw with them
-    slope = np.clip(np.sum(own * there, axis=1) / np.maximum(np.sum(there**2, axis=1), 1e-9),
-                    1 / YAW_RATIO, YAW_RATIO)
-    scatter = np.sqrt(np.sum((own - slope[:, None] * there)**2, axis=1) / count)
-    # a stretch without yaw fits everywhere: the longer one of two is the better
-    scatter = scatter * np.sqrt(len(times) / count)
-    scatter[(count < 3) | (np.ptp(own, axis=1) < 2 * SAME_YAW_DEG)] = np.inf
-    fitting = np.flatnonzero(scatter < SAME_YAW_DEG)
-    best = fitting[np.argsort(scatter[fitting], kind='stable')[:MOST_OFFSETS]]
-    return np.asarray(offsets[best])
-
-
 def _places_at(scene: Scene, time: float) -> Floats:
     """Return (t, 2) where a scene's tracks are at a time, between two keyframes; NaN unseen."""
     times = _seconds(scene)
-    after = int(np.searchsorted(times, time))
     # a keyframe that is as near as that counts as this picture
-    if after == len(times) or (after == 0 and times[0] - time > OFFSET_S):
+    inside = float(np.clip(time, times[0], times[-1]))
+    if abs(time - inside) > OFFSET_S / 2:
         return np.full((scene.tracks.xy.shape[1], 2), np.nan)
-    if after == 0:
-        return np.asarray(scene.tracks.xy[0])
-    share = (time - times[after - 1]) / max(times[after] - times[after - 1], 1e-9)
+    after = max(int(np.searchsorted(times, inside)), 1)
+    share = (inside - times[after - 1]) / max(times[after] - times[after - 1], 1e-9)
     before, later = scene.tracks.xy[after - 1], scene.tracks.xy[after]
     return np.asarray((1 - share) * before + share * later)
-
-
-def _share(places: Floats, others: Floats) -> float:
-    """Return the share of places (t, 2) that have one of the others near; 0 where few are seen."""
-    places = places[np.isfinite(places[:, 0])][:MOST_PLACES]
-    others = others[np.isfinite(others[:, 0])]
-    if len(places) < FEWEST_PLACES or len(others) < FEWEST_PLACES:
-        return 0.0
-    apart = np.square(places[:, None] - others).sum(axis=2).min(axis=1)
-    return float(np.mean(apart < NEAR_PX**2))
 
 
 def _cut(scene: Scene, rows: Mask) -> Scene:

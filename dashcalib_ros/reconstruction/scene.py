@@ -1,6 +1,7 @@
 """A reconstructed turn: its tracks, structure, camera and focal profile."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,9 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruction.structure import Structure, triangulate
 from dashcalib_ros.reconstruction.tracks import Tracks
 from dashcalib_ros.turns.turn import TurnId
+
+# by which the road may turn a car about any axis
+BUMPS_DEG = 10.0
 
 
 @dataclass(frozen=True)
@@ -66,27 +70,44 @@ class Scene:
 
     @property
     def starts(self) -> dict[str, Start]:
-        """Return a start for each kind of lens that was tried, by its ros_model."""
+        """Return a start for each kind of lens that was tried, by its family."""
         starts = (*self.rivals, Start(self.profile, self.camera))
-        return {start.camera.ros_model: start for start in starts}
+        return {start.camera.family: start for start in starts}
 
     @property
     def yaw_deg(self) -> float:
-        """Return by how much the camera turned about its vertical axis, in degrees."""
+        """Return by how much the camera turned about the axis of the turn, in degrees."""
         return float(np.ptp(self.yaws_deg))
 
     @property
     def yaws_deg(self) -> Floats:
         """Return the yaw of each registered keyframe since the first one, degrees."""
+        yaws = -np.degrees(self.turned @ main_axis(self.turned))
+        # less than bumps do: then what counts is the vertical of upright pictures
+        return np.asarray(yaws if np.ptp(yaws) > BUMPS_DEG else -np.degrees(self.turned[:, 1]))
+
+    @property
+    def turned(self) -> Floats:
+        """Return (k, 3) rad, by how much each registered keyframe turned about x, y and z.
+
+        It is the sum of the steps since the first one, each in the camera's own frame: a car turns
+        about one axis of it, the vertical, which is (0, 1, 0) where the pictures are upright.
+        """
+        from scipy.spatial.transform import Rotation
         rotations = self.structure.rotations[self.structure.registered]
-        # the optical axes in the first camera's frame: pitch and roll do not count
-        ahead = rotations[:, 2] @ rotations[0].T
-        return np.asarray(np.degrees(np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))))
+        steps = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps.as_rotvec(), axis=0)])
 
     @property
     def explained(self) -> float:
         """Return the share of all observations that the structure explains."""
         return float(self.structure.used.sum() / max(int(self.tracks.seen.sum()), 1))
+
+
+def main_axis(turned: Floats) -> Floats:
+    """Return the unit vector about which was turned most, its largest component positive."""
+    axis = np.linalg.svd(turned, full_matrices=False)[2][0]
+    return np.asarray(axis * np.sign(axis[np.argmax(np.abs(axis))]))
 
 
 def errors_px(scene: Scene, camera: Camera) -> Floats:
@@ -96,6 +117,15 @@ def errors_px(scene: Scene, camera: Camera) -> Floats:
     explained = structure.registered[:, None] & structure.used.any(axis=0)
     error = np.linalg.norm(residual, axis=2)
     return np.asarray(np.where(explained & np.isfinite(error), error, np.inf))
+
+
+def rms_px(scenes: Sequence[Scene], camera: Camera) -> float:
+    """Return the root mean square of the used observations' errors in px, of those it projects.
+
+    One that a camera, found later, no longer projects has no error.
+    """
+    errors = np.concatenate([errors_px(scene, camera)[scene.structure.used] for scene in scenes])
+    return float(np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2)))
 
 
 def residuals_px(scene: Scene, camera: Camera) -> Floats:

@@ -2,7 +2,7 @@
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.report.answer import answer_dict
 from dashcalib_ros.report.camera_file import load_camera
-from dashcalib_ros.report.camera_yaml import calibration_yaml, load_calibration_yaml
+from dashcalib_ros.report.camera_yaml import calibration_yaml
 from dashcalib_ros.report.compare import Comparison, Difference, compare
 from dashcalib_ros.report.files import (
     Written,
@@ -12,10 +12,11 @@ from dashcalib_ros.report.files import (
     set_aside,
     write_results,
     write_text,
+    write_whole,
 )
 from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
 from dashcalib_ros.report.page import report_html
-from dashcalib_ros.report.result import load_result, result_dict, result_json
+from dashcalib_ros.report.result import load_calibration, load_result, result_dict, result_json
 
 __all__ = [
     'Comparison',
@@ -27,7 +28,7 @@ __all__ = [
     'calibration_yaml',
     'check_writable',
     'compare',
-    'load_calibration_yaml',
+    'load_calibration',
     'load_camera',
     'load_result',
     'mapping_error',
@@ -39,4 +40,5 @@ __all__ = [
     'set_aside',
     'write_results',
     'write_text',
+    'write_whole',
 ]

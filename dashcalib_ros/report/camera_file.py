@@ -1,75 +1,458 @@
-"""Reads a camera from a file of any of the three formats."""
+"""Reads a camera from a calibration of any common kind: load_camera().
+
+What a file says must be one of the models in camera/ exactly: what they lack (skew, thin prisms,
+other projections) is an InputError, and is never left out. Where a file has several cameras, its
+reader gives them all by name, and the caller names one.
+"""
 from __future__ import annotations
 
-from collections.abc import Mapping
+import ast
+import math
+import os
+import re
+import struct
+import xml.etree.ElementTree as ElementTree
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from dashcalib_ros.camera import MODELS, Camera, Radial
+import numpy as np
+
+from dashcalib_ros.bags.camera_info import first_camera_info
+from dashcalib_ros.camera import FISHEYE, MODELS, Camera, Radial, camera_from_ros, ros_faults
+from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.errors import InputError, shortened
-from dashcalib_ros.limits import JSON_BYTES, read_text
-from dashcalib_ros.report.camera_yaml import parse_calibration_yaml
+from dashcalib_ros.frames.source import os_error
+from dashcalib_ros.inputs import fits_bag
+from dashcalib_ros.limits import (
+    JSON_BYTES,
+    check_file,
+    parse_json,
+    parse_yaml,
+    read_file,
+    read_text,
+)
 from dashcalib_ros.report.named_camera import (
     NamedCamera,
     check_focal,
     no_intrinsics,
+    read_covariance,
+    read_field,
     read_number,
     read_sigma,
+    read_sigma_px,
     read_size,
 )
-from dashcalib_ros.report.result import parse_json, parse_result
 
-# of distortion, in any model's truth
-TERMS = ('k1', 'k2', 'k3', 'k4', 'k5', 'k6', 'p1', 'p2')
+Data = Mapping[str, Any]
+# reads one camera of a file; one that says nothing but the camera gives just that
+Reader = Callable[[], Camera | NamedCamera]
+
+# the first of these that a folder has is read
+IN_FOLDER = ('result.json', 'calibration.yaml', 'cameras.bin', 'cameras.txt',
+             'sparse/0/cameras.bin', 'sparse/0/cameras.txt', 'camera_models.json',
+             'transforms.json')
+KNOWN = ('a result.json (or its folder), a camera_info YAML, a file of OpenCV, Kalibr, COLMAP, '
+         'nerfstudio, OpenSfM or mrcal, a JSON of fx, fy, cx, cy, k1, k2, width and height, or a '
+         'bag with camera_info')
+# ROS's distortion models; RATIONAL has all pinholes in it
+PLUMB_BOB, RATIONAL, EQUIDISTANT = 'plumb_bob', 'rational_polynomial', 'equidistant'
+# the coefficients by name, in the order of D
+TERMS = {RATIONAL: ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6'),
+         PLUMB_BOB: ('k1', 'k2', 'p1', 'p2', 'k3'), EQUIDISTANT: ('k1', 'k2', 'k3', 'k4')}
+# COLMAP's models, by their number: name, focal lengths, our distortion model, coefficients; None
+# where no model here is the same
+COLMAP = (('SIMPLE_PINHOLE', 1, PLUMB_BOB, 0), ('PINHOLE', 2, PLUMB_BOB, 0),
+          ('SIMPLE_RADIAL', 1, PLUMB_BOB, 1), ('RADIAL', 1, PLUMB_BOB, 2),
+          ('OPENCV', 2, PLUMB_BOB, 4), ('OPENCV_FISHEYE', 2, EQUIDISTANT, 4),
+          ('FULL_OPENCV', 2, RATIONAL, 8), ('FOV', 2, None, 1),
+          ('SIMPLE_RADIAL_FISHEYE', 1, EQUIDISTANT, 1), ('RADIAL_FISHEYE', 1, EQUIDISTANT, 2),
+          ('THIN_PRISM_FISHEYE', 2, None, 8))
+KALIBR = {'radtan': PLUMB_BOB, 'equidistant': EQUIDISTANT, 'equi': EQUIDISTANT, 'none': PLUMB_BOB}
+OPENSFM = {'perspective': PLUMB_BOB, 'simple_radial': PLUMB_BOB, 'radial': PLUMB_BOB,
+           'brown': PLUMB_BOB, 'fisheye': EQUIDISTANT, 'fisheye_opencv': EQUIDISTANT}
+NERFSTUDIO = {'SIMPLE_PINHOLE': PLUMB_BOB, 'PINHOLE': PLUMB_BOB, 'SIMPLE_RADIAL': PLUMB_BOB,
+              'RADIAL': PLUMB_BOB, 'OPENCV': PLUMB_BOB, 'OPENCV_FISHEYE': EQUIDISTANT}
+MRCAL = {'LENSMODEL_PINHOLE': PLUMB_BOB, 'LENSMODEL_OPENCV4': PLUMB_BOB,
+         'LENSMODEL_OPENCV5': PLUMB_BOB, 'LENSMODEL_OPENCV8': RATIONAL,
+         'LENSMODEL_OPENCV12': RATIONAL}
+# how files name OpenCV's values, in small letters without anything between them
+MATRIX = ('cameramatrix', 'intrinsicmatrix', 'intrinsics', 'k', 'mtx')
+DISTORTION = ('distortioncoefficients', 'distortioncoeffs', 'distcoeffs', 'distcoeff', 'dist', 'd')
+# bytes of one array of an .npz that may be part of a calibration
+ARRAY_BYTES = 4096
 
 
-def load_camera(path: str | Path) -> NamedCamera:
-    """Read a result.json (or the folder it is in), a camera_info YAML or a truth JSON.
+def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
+    """Read a camera from a calibration; returns it with its name, and sigma and verdict if known.
 
-    Raises InputError for anything else, and when a size or a parameter is missing.
+    path: a result.json (or its folder) or calibration.yaml of this package; a camera_info YAML; a
+    YAML, XML, JSON or .npz with OpenCV's camera matrix and distortion coefficients; Kalibr's
+    camchain; COLMAP's cameras.txt or cameras.bin, or the folder of a model; the JSON of nerfstudio
+    or OpenSfM; mrcal's .cameramodel; a JSON of fx, fy, cx, cy, k1, k2 ..., width and height, which
+    may say its "model"; a bag that has camera_info.
+    name: which camera, of a file that has several: as the file names it (cam1, 2), for a bag its
+    image topic or its camera_info topic. FILE:NAME as the path means the same.
+
+    Returns a NamedCamera: its `camera` is a Radial, Brown, Rational or Fisheye, in px of the full
+    pictures, with the centre of the first pixel at (0, 0). Raises InputError, in one line that
+    says what to do, for a file that cannot be read, a lens that none of these describes, and a
+    choice that is not made.
     """
-    path = Path(path)
-    if path.is_dir():
-        path = path / 'result.json'
-    text = read_text(path, JSON_BYTES)
-    if not text.lstrip().startswith('{'):
-        return parse_calibration_yaml(text, path)
-    data = parse_json(text, path)
-    if 'fx' in data:
-        return _truth_camera(data, path)
-    return _result_camera(parse_result(text, path), path)
+    return load_with_faults(path, name).without_faults()
 
 
-def _read_camera(model: type[Camera], size: tuple[int, int], data: Any, path: Path) -> Camera:
-    if not isinstance(data, Mapping):
-        raise InputError(f'{path} has no intrinsics; give a complete calibration')
-    params = [read_number(data, name, path) for name in model.names()]
-    return check_focal(model.of(size, params), path)
+def load_with_faults(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
+    """Read a camera as load_camera() does; what stands wrong beside it is in its faults."""
+    place, name = _place(path, name)
+    try:
+        return _loaded(place, name)
+    except OSError as error:
+        raise InputError(os_error(place, error)) from error
 
 
-def _truth_camera(data: Mapping[str, Any], path: Path) -> NamedCamera:
-    size = read_size(data.get('width'), data.get('height'), path)
-    model = _truth_model(data, path)
-    # the terms after k2 may be left out: they are 0
-    filled = {**dict.fromkeys(model.names()[len(Radial.names()):], 0.0), **data}
-    camera = _read_camera(model, size, filled, path)
+def _loaded(place: Path, name: str | None) -> NamedCamera:
+    if fits_bag(place):
+        topic, message = first_camera_info(place, name)
+        return camera_of_message(message, f'{place}:{topic}')
+    if place.is_dir():
+        inside = [place / each for each in IN_FOLDER if (place / each).exists()]
+        if not inside:
+            raise InputError(f'{place} is a folder without a calibration; give {KNOWN}')
+        place = inside[0]
+    if place.suffix == '.npz':
+        return _chosen(_cameras_of(_arrays(place), place), name, place)
+    if place.suffix == '.bin':
+        return _chosen(_colmap_binary(place), name, place)
+    return parse_camera(read_text(place, JSON_BYTES), place, name)
+
+
+def parse_camera(text: str, path: str | Path, name: str | None = None) -> NamedCamera:
+    """Read a camera from a calibration's text; path is for messages only. See load_camera()."""
+    return _chosen(_parsed(text, Path(path)), name, path)
+
+
+def camera_of_message(message: Any, name: str) -> NamedCamera:
+    """Return the camera of a CameraInfo of ROS 1 or 2. Raises InputError where there is none."""
+    k, d = ([float(value) for value in getattr(message, key, getattr(message, key.upper(), ()))]
+            for key in 'kd')
+    size, roi = (int(message.width), int(message.height)), message.roi
+    cut = (roi.x_offset, roi.y_offset, roi.width, roi.height) not in ((0, 0, 0, 0), (0, 0, *size))
+    if cut or max(message.binning_x, message.binning_y) > 1:
+        raise InputError(f'{name} has binning or a region of interest: give the calibration of '
+                         f'the images as they are')
+    r, p = ([float(value) for value in getattr(message, key, getattr(message, key.upper(), ()))]
+            for key in 'rp')
+    if not k or not k[0] > 0:
+        raise InputError(f'{name} is uncalibrated: K[0] is not positive; give the driver a '
+                         f'calibration')
+    if not np.isfinite([*k, *d, *r, *p]).all():
+        raise InputError(f'{name} has numbers that are not finite; give a calibration')
+    camera = _camera(size, _plain_matrix(k), str(message.distortion_model), d, name)
+    return NamedCamera(name, camera, faults=ros_faults(camera, k, r, p))
+
+
+def _place(path: str | os.PathLike[str], name: str | None) -> tuple[Path, str | None]:
+    """Return the file, and the camera's name, which may stand behind it: FILE:NAME."""
+    text = os.fspath(path)
+    before, _, after = text.rpartition(':')
+    if name is None and before and _exists(before) and not _exists(text):
+        return Path(before), after
+    return Path(text), name
+
+
+def _exists(path: str) -> bool:
+    try:
+        return Path(path).exists()
+    except (OSError, ValueError):  # a name that is too long, or has a zero byte
+        return False
+
+
+def _chosen(cameras: Mapping[str, Reader], name: str | None, path: str | Path) -> NamedCamera:
+    if name is None and len(cameras) == 1:
+        name = next(iter(cameras))
+    if name is not None and name in cameras:
+        found = cameras[name]()
+        return found if isinstance(found, NamedCamera) else NamedCamera(
+            f'{path}:{name}' if len(cameras) > 1 else str(path), found)
+    there = shortened(', '.join(cameras)) or 'one camera without a name'
+    if name is not None:
+        raise InputError(f'{path} has no camera {shortened(name)!r}; there is {there}')
+    raise InputError(f'{path} has {len(cameras)} cameras; name one, as in '
+                     f'{path}:{next(iter(cameras), "1")}; there are {there}')
+
+
+def _parsed(text: str, path: Path) -> Mapping[str, Reader]:
+    start = text.lstrip()
+    if re.search(r'''["']lensmodel["']\s*:''', text):
+        return {'': partial(_mrcal, text, path)}
+    if start.startswith('<'):
+        return _cameras_of(_xml(text, path), path)
+    lines = [line.split() for line in text.splitlines() if not line.lstrip().startswith('#')]
+    lines = [line for line in lines if line]
+    if lines and re.match(r'\d+ [A-Z_]+ ', ' '.join(lines[0])):
+        return {line[0]: partial(_colmap, line[1:], path) for line in lines}
+    if start[:1] in ('{', '['):
+        return _cameras_of(parse_json(text, str(path)), path)
+    # OpenCV writes a head and a tag of its own
+    plain = re.sub(r'\A%YAML[^\n]*', '', text).replace('!!opencv-matrix', '')
+    try:
+        return _cameras_of(parse_yaml(plain, str(path)), path)
+    except InputError as error:
+        if 'not valid YAML' in str(error):
+            raise InputError(f'{error}; give {KNOWN}') from error
+        raise
+
+
+def _cameras_of(data: Any, path: Path) -> Mapping[str, Reader]:
+    """Return the readers of the cameras that a file's content has, by name."""
+    if isinstance(data, list) and data and isinstance(data[0], Mapping):
+        data = data[0].get('cameras')  # OpenSfM's reconstruction.json
+    if isinstance(data, Mapping):
+        if 'fx' in data:
+            return {'': partial(_plain, data, path)}
+        if 'verdict' in data and 'image_size' in data:
+            return {'': partial(_result, data, path)}
+        if {'fl_x', 'camera_angle_x'} & data.keys():
+            return {'': partial(_nerfstudio, data, path)}
+        if isinstance(data.get('frames'), list):
+            return {str(frame.get('file_path', number)): partial(
+                _nerfstudio, {**data, **frame}, path)
+                for number, frame in enumerate(data['frames']) if isinstance(frame, Mapping)}
+        if 'distortion_coeffs' in data:
+            return {'': partial(_kalibr, data, path)}
+        for key, read in (('distortion_coeffs', _kalibr), ('projection_type', _opensfm)):
+            found: dict[str, Reader] = {
+                str(name): partial(read, each, path) for name, each in data.items()
+                if isinstance(each, Mapping) and key in each}
+            if found:
+                return found
+        keys = {re.sub('[^a-z0-9]', '', str(key).lower()): key for key in data}
+        if any(each in keys for each in MATRIX):
+            return {'': partial(_opencv, data, keys, path)}
+    raise InputError(f'{path} is no camera calibration known here; give {KNOWN}')
+
+
+def _camera(size: Sequence[Any], k: Sequence[float], kind: str, d: Sequence[float],
+            path: str | Path) -> Camera:
+    """Return the simplest camera with these values, checked."""
+    check_focal(k[0], k[4], path)
+    width, height = read_size(*size, path=path)
+    try:
+        return camera_from_ros((width, height), kind, k, d)
+    except InputError as error:
+        raise InputError(f'{path}: {error}') from error
+
+
+def _plain_matrix(k: Sequence[float]) -> list[float]:
+    """Return K without what no model here has; ros_faults() names that."""
+    return _matrix(k[0], k[4], k[2], k[5])
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float) -> list[float]:
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
+def _model(models: Mapping[str, str], name: Any, what: str, path: Path) -> str:
+    """Return our distortion model for another program's. Raises InputError where it has none."""
+    kind = models.get(name) if isinstance(name, str) else None
+    if kind is None:
+        raise InputError(f'{path} has {what} {shortened(repr(name))}, which is none of the models '
+                         f'here; calibrate or convert it as one of {", ".join(models)}')
+    return kind
+
+
+def _coefficients(data: Data, kind: str, path: Path) -> list[float]:
+    """Return D of coefficients by name; those left out are 0."""
+    known = dict.fromkeys((*TERMS[RATIONAL], 'skew', 'xi'))
+    there = [name for name in known if read_number(data, name, path, 0.0)]
+    more = [name for name in there if name not in TERMS[kind]]
+    if more:
+        raise InputError(f'{path} has {", ".join(there)}, and a {kind} model here has no '
+                         f'{", ".join(more)}; calibrate without')
+    return [read_number(data, name, path, 0.0) for name in TERMS[kind]]
+
+
+def _numbers(value: Any, what: str, path: str | Path) -> list[float]:
+    """Return the numbers of a list, of lists in it, or of a block with data."""
+    if isinstance(value, Mapping):
+        value = value.get('data')
+    if not isinstance(value, list):
+        raise InputError(f'{path} has no {what}, a list of numbers; give a complete calibration')
+    found: list[float] = []
+    for each in value:
+        found += (_numbers(each, what, path) if isinstance(each, list)
+                  else [read_number({what: each}, what, path)])
+    return found
+
+
+def _values(data: Data, key: str, count: int, path: Path) -> list[float]:
+    found = _numbers(data.get(key), key, path)
+    if len(found) != count:
+        raise InputError(f'{path}: {key} must have data of {count} numbers')
+    return found
+
+
+def _opencv(data: Data, keys: Mapping[str, str], path: Path) -> NamedCamera:
+    """Read a camera matrix and distortion coefficients: those of ROS, OpenCV, and scripts.
+
+    keys: the file's, by what they are without capitals and signs.
+    """
+    def first(*names: str) -> Any:
+        return next((data[keys[name]] for name in names if name in keys), None)
+
+    k = _values(data, next(keys[name] for name in MATRIX if name in keys), 9, path)
+    names = [keys[name] for name in DISTORTION if name in keys]
+    d = _numbers(data[names[0]] if names else None, names[0] if names else
+                 'distortion_coefficients', path)
+    both = first('imagesize', 'imgsize', 'resolution')
+    size = both if isinstance(both, list) and len(both) == 2 else (
+        first('imagewidth', 'width', 'w'), first('imageheight', 'height', 'h'))
+    kind, lens = first('distortionmodel'), str(first('cameramodel')).lower()
+    if kind is None:
+        fisheye = 'fisheye' in lens or first('fisheyemodel', 'fisheye') in (1, '1', True)
+        if len(d) == 4 and any(d) and not fisheye and 'pinhole' not in lens:
+            raise InputError(f'{path} has 4 distortion coefficients, which may be a fisheye\'s; '
+                             f'add a line distortion_model: {PLUMB_BOB}, or {EQUIDISTANT}')
+        kind = EQUIDISTANT if fisheye else PLUMB_BOB if len(d) <= 5 else RATIONAL
+    camera = _camera(size, _plain_matrix(k), str(kind), d, path)
+    r, p = (_values(data, key, count, path) if key in data else None
+            for key, count in (('rectification_matrix', 9), ('projection_matrix', 12)))
+    own = data.get('dashcalib')
+    own = own if isinstance(own, Mapping) else {}
+    verdict = own.get('verdict')
+    return NamedCamera(str(path), camera, read_sigma(own.get('sigma'), camera),
+                       None if verdict is None else str(verdict),
+                       faults=ros_faults(camera, k, r, p))
+
+
+def _kalibr(data: Data, path: Path) -> Camera:
+    if data.get('camera_model', 'pinhole') != 'pinhole':
+        raise InputError(f'{path} has the camera model {shortened(repr(data["camera_model"]))}; '
+                         f'calibrate with --models pinhole-radtan, or pinhole-equi')
+    kind = _model(KALIBR, data.get('distortion_model'), 'the distortion model', path)
+    return _camera(_pair(data, 'resolution', path),
+                   _matrix(*_values(data, 'intrinsics', 4, path)), kind,
+                   _numbers(data['distortion_coeffs'], 'distortion_coeffs', path), path)
+
+
+def _pair(data: Data, key: str, path: Path) -> list[Any]:
+    value = data.get(key)
+    if not isinstance(value, list) or len(value) != 2:
+        raise InputError(f'{path}: {key} must be [width, height], not {shortened(repr(value))}')
+    return value
+
+
+def _colmap(values: Sequence[Any], path: Path) -> Camera:
+    """Read a line of cameras.txt without its number: model, width, height, parameters."""
+    if len(values) < 3:
+        raise InputError(f'{path} has a line without model, width and height; write it anew')
+    model, *size = values[:3]
+    kind = _model({name: kind for name, _, kind, _ in COLMAP if kind}, model, 'the model', path)
+    focals, count = next((each[1], each[3]) for each in COLMAP if each[0] == model)
+    params = _numbers(list(values[3:]), model, path)
+    if len(params) != focals + 2 + count:
+        raise InputError(f'{path}: a {model} has {focals + 2 + count} parameters, not '
+                         f'{len(params)}; write it anew')
+    cx, cy = (value - HALF_PIXEL for value in params[focals:focals + 2])
+    return _camera([int(side) if str(side).isdecimal() else side for side in size],
+                   _matrix(params[0], params[focals - 1], cx, cy), kind, params[focals + 2:], path)
+
+
+def _colmap_binary(path: Path) -> Mapping[str, Reader]:
+    data, at = read_file(path, JSON_BYTES), 8
+    cameras: dict[str, Reader] = {}
+    try:
+        for _ in range(struct.unpack_from('<Q', data)[0]):
+            number, model, *size = struct.unpack_from('<iiQQ', data, at)
+            name, focals, _, count = COLMAP[model]
+            params = struct.unpack_from(f'<{focals + 2 + count}d', data, at + 24)
+            cameras[str(number)] = partial(_colmap, (name, *size, *params), path)
+            at += 24 + 8 * len(params)
+    except (struct.error, IndexError) as error:
+        raise InputError(f'{path} is no cameras.bin that can be read here; convert it '
+                         f'(colmap model_converter --output_type TXT)') from error
+    return cameras
+
+
+def _nerfstudio(data: Data, path: Path) -> Camera:
+    name = 'OPENCV_FISHEYE' if data.get('is_fisheye') else data.get('camera_model', 'OPENCV')
+    kind = _model(NERFSTUDIO, name, 'the camera_model', path)
+    width, height = read_size(data.get('w'), data.get('h'), path=path)
+    if 'fl_x' in data:
+        fx = read_number(data, 'fl_x', path)
+    else:
+        fx = width / 2 / math.tan(read_number(data, 'camera_angle_x', path) / 2)
+    k = _matrix(fx, read_number(data, 'fl_y', path, fx),
+                read_number(data, 'cx', path, width / 2) - HALF_PIXEL,
+                read_number(data, 'cy', path, height / 2) - HALF_PIXEL)
+    return _camera((width, height), k, kind, _coefficients(data, kind, path), path)
+
+
+def _opensfm(data: Data, path: Path) -> Camera:
+    kind = _model(OPENSFM, data['projection_type'], 'the projection_type', path)
+    size = read_size(data.get('width'), data.get('height'), path=path)
+    longer = max(size)
+    # one focal length, or two
+    fx, fy = (longer * read_number(data, key if key in data else 'focal', path)
+              for key in ('focal_x', 'focal_y'))
+    cx, cy = (longer * read_number(data, key, path, 0.0) + side / 2 - HALF_PIXEL
+              for key, side in zip(('c_x', 'c_y'), size, strict=True))
+    return _camera(size, _matrix(fx, fy, cx, cy), kind, _coefficients(data, kind, path), path)
+
+
+def _mrcal(text: str, path: Path) -> Camera:
+    try:
+        data = ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
+        raise InputError(f'{path} is no .cameramodel that can be read; write it anew') from error
+    kind = _model(MRCAL, data.get('lensmodel'), 'the lensmodel', path)
+    values = _numbers(data.get('intrinsics'), 'intrinsics', path)
+    if len(values) < 4:
+        raise InputError(f'{path}: intrinsics must have 4 numbers or more')
+    return _camera(_pair(data, 'imagersize', path), _matrix(*values[:4]), kind, values[4:], path)
+
+
+def _plain(data: Data, path: Path) -> NamedCamera:
+    """Read fx, fy, cx, cy and coefficients by name; those after k2 may be left out."""
+    name = data.get('model', data.get('distortion_model'))
+    models = [model for model in MODELS.values()
+              if name in (None, model.model, model.ros_model, model.family)]
+    if not models:
+        raise InputError(_no_model(name, path))
+    if name is None and read_number(data, 'k4', path, 0.0) and not {'k5', 'k6'} & data.keys():
+        raise InputError(f'{path} has k4, which may be a fisheye\'s; add "model": "fisheye", or '
+                         f'"{RATIONAL}"')
+    kind = (EQUIDISTANT if models[0].family == FISHEYE else
+            PLUMB_BOB if name == PLUMB_BOB else RATIONAL)
+    for needed in Radial.names()[4:]:
+        read_number(data, needed, path)
+    camera = _camera((data.get('width'), data.get('height')), _matrix(
+        *(read_number(data, key, path) for key in Radial.names()[:4])), kind,
+        _coefficients(data, kind, path), path)
     return NamedCamera(str(path), camera, read_sigma(data.get('sigma'), camera))
 
 
-def _truth_model(data: Mapping[str, Any], path: Path) -> type[Camera]:
-    """Return the simplest model of the kind that is named which has all terms that are not 0."""
-    name = data.get('model', Radial.model)
-    kinds = [model.ros_model for model in MODELS.values() if name in (model.model,
-                                                                      model.ros_model)]
-    if not kinds:
+def _result(data: Data, path: Path) -> NamedCamera:
+    given = data.get('intrinsics')
+    if not given:
+        raise InputError(no_intrinsics(str(path), data['verdict'], data.get('reasons')))
+    name = data.get('camera_model', Radial.model)
+    if not isinstance(name, str) or name not in MODELS:
         raise InputError(_no_model(name, path))
-    terms = [each for each in TERMS if read_number(data, each, path, 0.0)]
-    found = [model for model in MODELS.values()
-             if model.ros_model in kinds and set(terms) <= set(model.names())]
-    if not found:
-        raise InputError(f'{path} has {", ".join(terms)}, and no {kinds[0]} model here has all of '
-                         f'these')
-    return found[0]
+    if not isinstance(given, Mapping):
+        raise InputError(f'{path} has no intrinsics; give a complete calibration')
+    size = read_size(*_pair(data, 'image_size', path), path=path)
+    camera = MODELS[name].of(
+        size, [read_number(given, each, path) for each in MODELS[name].names()])
+    check_focal(camera.fx, camera.fy, path)
+    sigma = read_sigma(data.get('sigma'), camera)
+    return NamedCamera(str(path), camera, sigma, str(data['verdict']),
+                       read_covariance(data.get('details'), camera, sigma),
+                       read_sigma_px(data.get('sigma_px')),
+                       read_field(data.get('field'), size))
 
 
 def _no_model(name: Any, path: Path) -> str:
@@ -77,16 +460,37 @@ def _no_model(name: Any, path: Path) -> str:
             f'{", ".join(MODELS)}')
 
 
-def _result_camera(data: Mapping[str, Any], path: Path) -> NamedCamera:
-    if not data['intrinsics']:
-        raise InputError(no_intrinsics(str(path), data['verdict'], data.get('reasons')))
-    size = data['image_size']
-    if not isinstance(size, list) or len(size) != 2:
-        raise InputError(f'{path}: image_size must be [width, height], not {size!r}')
-    name = str(data.get('camera_model', Radial.model))
-    if name not in MODELS:
-        raise InputError(_no_model(name, path))
-    camera = _read_camera(MODELS[name], read_size(size[0], size[1], path), data['intrinsics'],
-                          path)
-    return NamedCamera(str(path), camera, read_sigma(data.get('sigma'), camera),
-                       str(data['verdict']))
+def _xml(text: str, path: Path) -> Any:
+    """Return the content of OpenCV's XML. It has no declarations, which could be made to grow."""
+    try:
+        if '<!DOCTYPE' in text or '<!ENTITY' in text:
+            raise ElementTree.ParseError('declarations')
+        return _element(ElementTree.fromstring(text))
+    except (ElementTree.ParseError, RecursionError, ValueError) as error:
+        raise InputError(f'{path} is no XML that can be read; give {KNOWN}') from error
+
+
+def _element(node: ElementTree.Element) -> Any:
+    if len(node):
+        return {child.tag: _element(child) for child in node}
+    words = (node.text or '').split()
+    try:
+        numbers = [int(word) if word.lstrip('+-').isdecimal() else float(word) for word in words]
+    except ValueError:
+        return (node.text or '').strip().strip('"')
+    return numbers[0] if len(numbers) == 1 and node.tag != 'data' else numbers
+
+
+def _arrays(path: Path) -> Data:
+    """Return the small arrays of an .npz, as lists."""
+    try:
+        check_file(path)
+        with zipfile.ZipFile(path) as packed:
+            names = [info.filename.removesuffix('.npy') for info in packed.infolist()
+                     if info.file_size <= ARRAY_BYTES]
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name].tolist() for name in names}
+    except InputError:
+        raise
+    except Exception as error:  # a damaged file makes numpy raise nearly anything
+        raise InputError(f'{path} is no .npz that can be read; write it anew') from error

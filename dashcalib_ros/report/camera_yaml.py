@@ -1,41 +1,37 @@
 """calibration.yaml: the file that camera_info_manager, usb_cam, v4l2_camera and others load.
 
 Keys, order and layout are those that camera_calibration_parsers writes. Its parser looks keys up
-by name, so it ignores our one extra block, dashcalib, which has sigma and provenance. Texts in
-it are quoted: OpenCV's FileStorage, which reads the file, too, takes 4.2.1 for a broken number.
+by name, so it ignores our one extra block, dashcalib, which has sigma and provenance.
+
+OpenCV's FileStorage reads the file, too. Version 4 wants the line %YAML; 4 and 5 want lists that
+are indented, texts of 4096 characters at the most, and quotes: 4.2.1 is a broken number to them.
 """
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from dashcalib_ros.camera import Camera, Radial, camera_from_ros, ros_camera
+from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.rectified import SAME
-from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.errors import ConfigError, shortened
 from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
-from dashcalib_ros.report.named_camera import (
-    NamedCamera,
-    check_focal,
-    read_number,
-    read_sigma,
-    read_size,
-)
 from dashcalib_ros.report.result import plain_values
 
 CAMERA_NAME = 'dashcam'
+# OpenCV's limit is 4096, and an escaped character has up to ten
+TEXT_LENGTH = 400
 
 
 def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
-                     created: str | None = None) -> str:
+                     created: str | None = None, frame_id: str | None = None) -> str:
     """Return the YAML text of an accepted or weak calibration, at full precision.
 
     created: the time, as ISO 8601 text; without it, the same calibration gives the same text.
+    frame_id: of the images, where it is known.
     Raises ConfigError for a camera name that the drivers would refuse, ValueError without
     intrinsics.
     """
@@ -43,12 +39,14 @@ def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
     if calibration.camera is None or not np.isfinite(calibration.camera.params).all():
         raise ValueError('a calibration without finite intrinsics has no calibration.yaml')
     document = _document(calibration.camera, camera_name, calibration.config.rectified)
-    return _text({**document, 'dashcalib': _quoted(_provenance(calibration, created))})
+    own = _provenance(calibration, created)
+    return yaml_text({**document, 'dashcalib': own if frame_id is None
+                      else {**own, 'frame_id': frame_id}})
 
 
 def camera_info_yaml(camera: Camera) -> str:
     """Return the YAML text of a camera alone, without a calibration's sigma and provenance."""
-    return _text(_document(camera, CAMERA_NAME, SAME))
+    return yaml_text(_document(camera, CAMERA_NAME, SAME))
 
 
 def _document(camera: Camera, camera_name: str, rectified: str) -> dict[str, Any]:
@@ -58,45 +56,23 @@ def _document(camera: Camera, camera_name: str, rectified: str) -> dict[str, Any
         'image_width': int(width),
         'image_height': int(height),
         'camera_name': camera_name,
-        'camera_matrix': _matrix(3, 3, c.k),
+        'camera_matrix': matrix_block(3, 3, c.k),
         'distortion_model': c.distortion_model,
-        'distortion_coefficients': _matrix(1, len(c.d), c.d),
-        'rectification_matrix': _matrix(3, 3, c.r),
-        'projection_matrix': _matrix(3, 4, c.p),
+        'distortion_coefficients': matrix_block(1, len(c.d), c.d),
+        'rectification_matrix': matrix_block(3, 3, c.r),
+        'projection_matrix': matrix_block(3, 4, c.p),
     }
 
 
-def _text(document: Mapping[str, Any]) -> str:
-    return str(yaml.dump(dict(document), Dumper=_Dumper, sort_keys=False, default_flow_style=None,
-                         width=2**20, allow_unicode=True))
-
-
-def load_calibration_yaml(path: str | Path) -> NamedCamera:
-    """Read a camera_info YAML, ours or another tool's. Raises InputError."""
-    return parse_calibration_yaml(read_text(Path(path), YAML_BYTES), path)
-
-
-def parse_calibration_yaml(text: str, path: str | Path) -> NamedCamera:
-    """Parse a camera_info YAML's text; path is for messages only."""
-    try:
-        data = parse_yaml(text, str(path))
-    except InputError as error:
-        raise InputError(f'{error}; give a calibration.yaml') from error
-    if not isinstance(data, Mapping) or 'camera_matrix' not in data:
-        raise InputError(f'{path} is no camera calibration; '
-                         'give a result.json, a camera_info YAML or a truth JSON')
-    k = _read_matrix(data, 'camera_matrix', 9, path)
-    size = read_size(data.get('image_width'), data.get('image_height'), path)
-    try:
-        camera = camera_from_ros(size, str(data.get('distortion_model', Radial.ros_model)), k,
-                                 _read_distortion(data, path))
-    except InputError as error:
-        raise InputError(f'{path}: {error}') from error
-    own = data.get('dashcalib')
-    own = own if isinstance(own, Mapping) else {}
-    verdict = own.get('verdict')
-    return NamedCamera(str(path), check_focal(camera, path), read_sigma(own.get('sigma'), camera),
-                       None if verdict is None else str(verdict))
+def yaml_text(document: Mapping[str, Any]) -> str:
+    """Return a camera_info document as text that ROS's parsers and OpenCV 4 and 5 read."""
+    own = {key: _quoted(document[key]) for key in ('dashcalib',) if key in document}
+    name = document.get('camera_name')
+    if isinstance(name, str) and not name.isidentifier():  # OpenCV: 4k is a broken number
+        own['camera_name'] = _Text(name)
+    return str(yaml.dump({**document, **own}, Dumper=_Dumper, sort_keys=False,
+                         default_flow_style=None, width=2**20, allow_unicode=True,
+                         version=(1, 2)))
 
 
 def check_camera_name(name: str) -> None:
@@ -114,7 +90,10 @@ class _Text(str):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes plain values, and texts with quotes."""
+    """Writes plain values, texts with quotes, and lists that are indented."""
+
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        super().increase_indent(flow, False)
 
 
 _Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(
@@ -124,13 +103,14 @@ _Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(
 def _quoted(value: Any) -> Any:
     """Return a value with every text in it, other than keys, as one that is written in quotes."""
     if isinstance(value, str):
-        return _Text(value)
+        return _Text(shortened(value, TEXT_LENGTH))
     if isinstance(value, Mapping):
         return {key: _quoted(each) for key, each in value.items()}
     return [_quoted(each) for each in value] if isinstance(value, (list, tuple)) else value
 
 
-def _matrix(rows: int, cols: int, data: Sequence[float]) -> dict[str, Any]:
+def matrix_block(rows: int, cols: int, data: Sequence[float]) -> dict[str, Any]:
+    """Return a matrix as the document has it."""
     # dt: OpenCV reads the matrix by it, as doubles; the other readers look up what they know
     return {'rows': rows, 'cols': cols, 'dt': 'd', 'data': [float(value) for value in data]}
 
@@ -148,19 +128,3 @@ def _provenance(calibration: Calibration, created: str | None) -> dict[str, Any]
         'versions': calibration.versions,
     })
     return block if created is None else {**block, 'created': created}
-
-
-def _read_matrix(data: Mapping[str, Any], key: str, count: int, path: str | Path) -> list[float]:
-    block = data.get(key)
-    values = block.get('data') if isinstance(block, Mapping) else None
-    if not isinstance(values, list) or len(values) != count:
-        raise InputError(f'{path}: {key} must have data of {count} numbers')
-    return [read_number({key: value}, key, path) for value in values]
-
-
-def _read_distortion(data: Mapping[str, Any], path: str | Path) -> list[float]:
-    block = data.get('distortion_coefficients')
-    values = block.get('data') if isinstance(block, Mapping) else None
-    if not isinstance(values, list):
-        raise InputError(f'{path} has no distortion_coefficients; give a complete calibration')
-    return _read_matrix(data, 'distortion_coefficients', len(values), path)

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.mapping import mapping_error, unseen_share
+from dashcalib_ros.camera.mapping import unseen_share
+from dashcalib_ros.checking.difference import Difference as WholeDifference
+from dashcalib_ros.checking.difference import difference_between
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.result import plain_values
@@ -34,15 +36,19 @@ class Difference:
 class Comparison:
     """What compare() found.
 
-    mapping_px: RMS over the image; None where a model folds over inside. unseen: of the image,
-    where a's model can see no rays; it is left out.
+    whole: of both cameras. unseen: of the image, where a's model can see no rays; it is left out.
     """
 
     a: NamedCamera
     b: NamedCamera
     differences: tuple[Difference, ...]
-    mapping_px: float | None
+    whole: WholeDifference
     unseen: float = 0.0
+
+    @property
+    def mapping_px(self) -> float | None:
+        """Return the RMS over the image; None where a model folds over inside."""
+        return self.whole.rms_px
 
     def as_dict(self) -> dict[str, Any]:
         """Return the comparison as values of strict JSON."""
@@ -53,7 +59,10 @@ class Comparison:
             del row['name']
         plain: dict[str, Any] = plain_values({
             **sides, 'image_size': self.b.image_size, 'parameters': rows,
-            'mapping_px': self.mapping_px, 'unseen': self.unseen})
+            'mapping_px': self.mapping_px, 'worst_px': self.whole.worst_px,
+            'unseen': self.unseen, 'sigma_px': self.whole.sigma_px,
+            'told_apart': self.whole.told_apart, 'matters': self.whole.matters,
+            'distance': self.whole.distance, 'limit': self.whole.limit})
         return plain
 
 
@@ -62,16 +71,16 @@ def compare(a: NamedCamera, b: NamedCamera) -> Comparison:
     if a.image_size != b.image_size:
         raise InputError(
             f'{a.name} is for {a.image_size[0]} x {a.image_size[1]} images and {b.name} for '
-            f'{b.image_size[0]} x {b.image_size[1]}; compare calibrations of the same image size')
+            f'{b.image_size[0]} x {b.image_size[1]}; compare calibrations of the same image size; '
+            f'dashcalib export --size WxH makes one for resized pictures')
     names = _common_names(a.camera, b.camera)
     rows = tuple(_difference(name, a, b) for name in names)
-    return Comparison(a, b, rows, mapping_error(a.camera, b.camera),
-                      unseen_share(a.camera, b.camera))
+    return Comparison(a, b, rows, difference_between(a, b), unseen_share(a.camera, b.camera))
 
 
 def _common_names(a: Camera, b: Camera) -> tuple[str, ...]:
     """Return the parameters to compare: all of the larger model, if both are of one family."""
-    if a.ros_model != b.ros_model:
+    if a.family != b.family:
         # a distortion coefficient of the same name has another meaning there
         return a.names()[:4]
     return max(a.names(), b.names(), key=len)

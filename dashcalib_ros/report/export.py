@@ -6,25 +6,31 @@ OpenCV do.
 """
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import yaml
 
-from dashcalib_ros.camera import Camera, Fisheye
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.camera.camera import HALF_PIXEL
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.report.camera_file import EQUIDISTANT, RATIONAL, TERMS
 from dashcalib_ros.report.camera_yaml import camera_info_yaml
 
 # a resized picture's columns and rows may round differently by so much
 ROUNDING_PX = 1.0
 
 
-def exported(camera: Camera, kind: str) -> str:
-    """Return the text of a camera file of one of EXPORTS.
+def exported(camera: Camera, kind: str) -> str | bytes:
+    """Return the content of a camera file of one of EXPORTS: text, or bytes of an .npz.
 
     Raises ConfigError for a kind that there is not, and for a lens that it cannot describe.
     """
@@ -80,15 +86,12 @@ def _colmap(camera: Camera) -> str:
 
 
 def _kalibr(camera: Camera) -> str:
-    """Return kalibr's camchain.yaml. Raises ConfigError for k3, which its radtan has not."""
-    d = camera.ros_distortion()
-    if not _is_fisheye(camera) and d[4]:
-        raise ConfigError('kalibr has no k3; calibrate with --model radial, or export to opencv')
+    """Return kalibr's camchain.yaml."""
     return str(yaml.safe_dump({'cam0': {
         'camera_model': 'pinhole',
         'intrinsics': [camera.fx, camera.fy, camera.cx, camera.cy],
         'distortion_model': 'equidistant' if _is_fisheye(camera) else 'radtan',
-        'distortion_coeffs': d[:4],
+        'distortion_coeffs': list(_coefficients(camera, 4, 'kalibr').values()),
         'resolution': list(camera.image_size),
         'rostopic': '/image_raw'}}, sort_keys=False, default_flow_style=None))
 
@@ -103,7 +106,7 @@ def _opensfm(camera: Camera) -> str:
         'focal_x': camera.fx / longer, 'focal_y': camera.fy / longer,
         'c_x': (camera.cx + HALF_PIXEL - width / 2) / longer,
         'c_y': (camera.cy + HALF_PIXEL - height / 2) / longer,
-        **_coefficients(camera)}}, indent=2) + '\n'
+        **_coefficients(camera, 5, 'opensfm')}}, indent=2) + '\n'
 
 
 def _nerfstudio(camera: Camera) -> str:
@@ -114,19 +117,83 @@ def _nerfstudio(camera: Camera) -> str:
         'w': width, 'h': height,
         'fl_x': camera.fx, 'fl_y': camera.fy, 'cx': camera.cx + HALF_PIXEL,
         'cy': camera.cy + HALF_PIXEL,
-        **_coefficients(camera), 'frames': []}, indent=2) + '\n'
+        **_coefficients(camera, 5, 'nerfstudio'), 'frames': []}, indent=2) + '\n'
 
 
-def _coefficients(camera: Camera) -> dict[str, float]:
-    """Return the distortion coefficients by OpenCV's names."""
-    names = ('k1', 'k2', 'k3', 'k4') if _is_fisheye(camera) else ('k1', 'k2', 'p1', 'p2', 'k3')
-    return dict(zip(names, camera.ros_distortion(), strict=True))
+def _mrcal(camera: Camera) -> str:
+    """Return mrcal's .cameramodel."""
+    if _is_fisheye(camera):
+        raise ConfigError('mrcal has no fisheye lens of four coefficients; export to opencv')
+    d = camera.ros_distortion()
+    values = ', '.join(repr(float(value)) for value in [*camera.params[:4], *d])
+    width, height = camera.image_size
+    return (f"{{\n    'lensmodel':  'LENSMODEL_OPENCV{len(d)}',\n"
+            f"    'intrinsics': [ {values} ],\n"
+            f"    'extrinsics': [ 0, 0, 0, 0, 0, 0 ],\n"
+            f"    'imagersize': [ {width}, {height} ],\n}}\n")
+
+
+def rays_file(camera: Camera, field: Field | None = None) -> bytes:
+    """Return an .npz with rays (h, w, 3): the unit viewing ray of each pixel, NaN for none.
+
+    field: what the camera leaves over.
+    """
+    pixels = _pixels(camera)
+    ideal = pixels if field is None else field.ideal(pixels)
+    return _npz(camera, rays=camera.rays(ideal).astype(np.float32))
+
+
+def maps_file(camera: Camera, field: Field | None = None) -> bytes:
+    """Return an .npz with map_x, map_y (h, w) for cv2.remap: to a pinhole with the same K.
+
+    field: what the camera leaves over.
+    """
+    x, y = np.moveaxis((_pixels(camera) - [camera.cx, camera.cy]) / [camera.fx, camera.fy], -1, 0)
+    # cv2.remap leaves black what is outside
+    pixels = camera.project(np.stack([x, y, np.ones_like(x)], -1))
+    found = np.nan_to_num(pixels if field is None else field.observed(pixels), nan=-1.0)
+    return _npz(camera, map_x=found[..., 0].astype(np.float32),
+                map_y=found[..., 1].astype(np.float32))
+
+
+def _pixels(camera: Camera) -> Floats:
+    """Return the coordinates (h, w, 2) of all pixels."""
+    width, height = camera.image_size
+    return np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), -1)
+
+
+def _npz(camera: Camera, **arrays: npt.NDArray[np.float32]) -> bytes:
+    """Return an .npz of arrays, and of the camera that they are of."""
+    file = io.BytesIO()
+    both: dict[str, Any] = {
+        **arrays, 'K': camera.matrix, 'D': np.array(camera.ros_distortion()),
+        'distortion_model': np.array(camera.ros_model), 'image_size': np.array(camera.image_size)}
+    np.savez(file, **both)
+    return file.getvalue()
+
+
+def _coefficients(camera: Camera, most: int, program: str) -> dict[str, float]:
+    """Return the distortion coefficients by OpenCV's names, as many as the program has.
+
+    Raises ConfigError where others of the camera are not 0.
+    """
+    named = dict(zip(TERMS[EQUIDISTANT if _is_fisheye(camera) else RATIONAL],
+                     camera.ros_distortion(), strict=False))
+    more = [name for name in list(named)[most:] if named[name]]
+    if more:
+        raise ConfigError(f'{program} has no {", ".join(more)}; calibrate with --model radial, or '
+                          f'export to opencv')
+    return dict(list(named.items())[:most])
 
 
 def _is_fisheye(camera: Camera) -> bool:
-    return camera.ros_model == Fisheye.ros_model
+    return camera.family == FISHEYE
 
 
-EXPORTS: dict[str, Callable[[Camera], str]] = {
+EXPORTS: dict[str, Callable[[Camera], str | bytes]] = {
     'opencv': _opencv, 'colmap': _colmap, 'kalibr': _kalibr, 'opensfm': _opensfm,
-    'nerfstudio': _nerfstudio, 'ros': camera_info_yaml}
+    'nerfstudio': _nerfstudio, 'mrcal': _mrcal, 'ros': camera_info_yaml, 'rays': rays_file,
+    'maps': maps_file}
+# those that can tell a field
+WITH_FIELD: dict[str, Callable[[Camera, Field | None], bytes]] = {
+    'rays': rays_file, 'maps': maps_file}

@@ -15,11 +15,8 @@ from typing import BinaryIO
 
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.report.camera_yaml import (
-    CAMERA_NAME,
-    calibration_yaml,
-    load_calibration_yaml,
-)
+from dashcalib_ros.report.camera_file import load_camera
+from dashcalib_ros.report.camera_yaml import CAMERA_NAME, calibration_yaml
 from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.result import result_json
@@ -62,7 +59,8 @@ def write_results(calibration: Calibration, out_dir: str | Path, camera_name: st
     texts[REPORT] = report_html(calibration, truth, folder / name)
     with _output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with _prepared(folder, texts) as prepared:
+        with _prepared(folder, {name: text.encode('utf-8', 'replace')
+                                for name, text in texts.items()}) as prepared:
             moved = None
             if ACCEPTED not in texts or not _is_ours(folder / ACCEPTED):
                 moved = set_aside(folder / ACCEPTED)
@@ -74,12 +72,18 @@ def write_results(calibration: Calibration, out_dir: str | Path, camera_name: st
     return Written(tuple(folder / name for name in texts), moved)
 
 
-def write_text(path: str | Path, text: str) -> None:
+def write_text(path: str | Path, text: str | bytes) -> None:
     """Write one file, completely or not at all. Raises OutputError."""
     path = Path(path)
-    with _output_errors(path.parent), _prepared(path.parent, {path.name: text}) as prepared:
-        prepared[path.name].replace(path)
+    with _output_errors(path.parent):
+        write_whole(path, text if isinstance(text, bytes) else text.encode('utf-8', 'replace'))
         _sync(path.parent)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write one file, completely or not at all. Raises OSError."""
+    with _prepared(path.parent, {path.name: data}) as prepared:
+        prepared[path.name].replace(path)
 
 
 def set_aside(path: Path) -> Path | None:
@@ -142,7 +146,7 @@ def check_writable(out_dir: str | Path) -> None:
     with _output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder, NAMES)
-        with _prepared(folder, {PROBE: 'yes\n'}):
+        with _prepared(folder, {PROBE: b'yes\n'}):
             pass
 
 
@@ -162,15 +166,19 @@ def output_folder(out_dir: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _prepared(folder: Path, texts: Mapping[str, str]) -> Iterator[dict[str, Path]]:
-    """Write each text to a temporary file beside its final place; those left are removed."""
+def _prepared(folder: Path, contents: Mapping[str, bytes]) -> Iterator[dict[str, Path]]:
+    """Write each content to a temporary file beside its final place.
+
+    Those left are removed, and those of the same names that killed processes left.
+    """
     temporary: dict[str, Path] = {}
+    remove_leftovers(folder, contents)
     with ExitStack() as stack:
-        for name, text in texts.items():
+        for name, content in contents.items():
             if (folder / name).is_dir():
                 raise IsADirectoryError(errno.EISDIR, f'{name} is a folder there')
             temporary[name], stream = stack.enter_context(_temporary_file(folder, name))
-            stream.write(text.encode('utf-8', 'replace'))
+            stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         yield temporary
@@ -196,7 +204,7 @@ def _temporary_file(folder: Path, name: str) -> Iterator[tuple[Path, BinaryIO]]:
 def _is_ours(path: Path) -> bool:
     """Return whether a calibration file was written by this package: ours have a verdict."""
     try:
-        return load_calibration_yaml(path).verdict is not None
+        return load_camera(path).verdict is not None
     except InputError:
         return False
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats, GreyImage, Ints
+from dashcalib_ros.arrays import Floats, Ints, Pixels
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.rectified import WIDEST, rectified_matrix
 from dashcalib_ros.reconstruction.scene import Profile, Scene, residuals_px
@@ -31,8 +31,12 @@ GRID_LINES = 12  # over the picture's width
 RAMP = np.array([(250, 243, 236), (238, 205, 160), (206, 148, 78), (142, 86, 34), (72, 38, 16)])
 
 
-def sigma_svg(found: SigmaMap, size: tuple[int, int], px: float) -> str:
-    """Return the uncertainty over the picture, numbers in px on it. px: of the input, in one."""
+def sigma_svg(found: SigmaMap, size: tuple[int, int], px: float,
+              label: str = 'uncertainty over the picture', over: str = '') -> str:
+    """Return the uncertainty over the picture, numbers in px on it. px: of the input, in one.
+
+    over: a drawing between the colours and the numbers.
+    """
     import cv2
     columns, rows = (len(np.unique(found.pixels[:, n])) for n in (0, 1))
     table = np.full((rows, columns), np.nan)
@@ -44,7 +48,7 @@ def sigma_svg(found: SigmaMap, size: tuple[int, int], px: float) -> str:
                         np.float64)
     top = float(filled.max())
     height = _height(size)
-    parts = [_heat(smooth / max(top, 1e-12), WIDTH, height)]
+    parts = [_heat(smooth / max(top, 1e-12), WIDTH, height), over]
     for v in (0.0, 0.5, 1.0):
         for u in (0.0, 0.25, 0.5, 0.75, 1.0):
             value = table[round(v * (rows - 1)), round(u * (columns - 1))]
@@ -53,7 +57,7 @@ def sigma_svg(found: SigmaMap, size: tuple[int, int], px: float) -> str:
                 # at the edges, a little inside
                 parts.append(text(u * WIDTH + (0.5 - u) * 44, v * height + 4 + (0.5 - v) * 26,
                                   f'{value:.2g}', kind))
-    return svg(WIDTH, height, 'uncertainty over the picture', ''.join(parts), 'plot map')
+    return svg(WIDTH, height, label, ''.join(parts), 'plot map')
 
 
 def observations_of(scenes: Sequence[Scene], camera: Camera | None) -> tuple[Floats, Floats]:
@@ -109,24 +113,6 @@ def coverage_svg(xy: Floats, size: tuple[int, int], mask_id: str | None) -> tupl
             float(np.mean(count == 0)))
 
 
-def histogram_svg(residual: Floats, px: float) -> str:
-    """Return how long the residuals are, in px of the input."""
-    length = np.linalg.norm(residual, axis=1) * px
-    top = max(float(np.quantile(length, 0.99)), 1e-9) if len(length) else 1.0
-    share, edges = np.histogram(np.minimum(length, top), bins=36, range=(0.0, top))
-    share = 100 * share / max(len(length), 1)
-    axes = Axes(WIDTH, 220, (0.0, top), (0.0, 1.08 * max(float(share.max()), 1e-9)))
-    bars = ''.join(
-        f'<rect class="column" x="{float(axes.across(low)) + 0.5:.1f}" '
-        f'y="{float(axes.down(value)):.1f}" '
-        f'width="{float(axes.across(high) - axes.across(low)) - 1:.1f}" '
-        f'height="{float(axes.down(0.0) - axes.down(value)):.1f}"/>'
-        for low, high, value in zip(edges[:-1], edges[1:], share, strict=True))
-    frame = axes.frame('residual, px', '% of the observations', ticks(0.0, top, 6),
-                       ticks(0.0, axes.y[1], 4))
-    return svg(WIDTH, axes.height, 'histogram of residuals', frame + bars)
-
-
 def profile_svg(each: Sequence[Profile], total: Profile | None, width_px: float,
                 fx: float | None) -> str:
     """Return the error that is left at each focal length held fixed, by turn and for all.
@@ -170,8 +156,8 @@ def growth_svg(percent: Sequence[float]) -> str:
                frame + drawn + dots(where[:1], 'dot other') + dots(where[1:], 'dot own') + labels)
 
 
-def undistorted(image: GreyImage, camera: Camera, rectified: str
-                ) -> tuple[GreyImage, str, str, float]:
+def undistorted(image: Pixels, camera: Camera, rectified: str
+                ) -> tuple[Pixels, str, str, float]:
     """Return an image without distortion, and a grid over it and over the original.
 
     camera: of images of this size. The grids are of the same rays: paths of an SVG in px, first
@@ -179,7 +165,7 @@ def undistorted(image: GreyImage, camera: Camera, rectified: str
     point at the most, px, within 75 degrees of its axis.
     """
     import cv2
-    height, width = image.shape
+    height, width = image.shape[:2]
     with np.errstate(all='ignore'):
         matrix = rectified_matrix(camera, rectified)
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height))

@@ -14,7 +14,6 @@ from dashcalib_ros.report.figures import jpeg_data_uri
 from dashcalib_ros.report.lens_figures import (
     coverage_svg,
     growth_svg,
-    histogram_svg,
     observations_of,
     profile_svg,
     residual_svg,
@@ -80,7 +79,7 @@ def _slider(c: Calibration, material: Material) -> Slider | None:
         return None
     best = max(turns, key=lambda turn: (turn.used, turn.prominence))
     image = material.pictures[best.id].image
-    height, width = image.shape
+    height, width = image.shape[:2]
     camera = c.camera.resized(width / c.image_size[0], (width, height))
     straight, bent_grid, straight_grid, moved = undistorted(image, camera, c.config.rectified)
     moved *= c.image_size[0] / width
@@ -106,8 +105,7 @@ def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
     xy, residual = observations_of(scenes, camera)
     if len(xy):
         size = scenes[0].tracks.image_size
-        drawings += [_residuals(xy, residual, size),
-                     _histogram(residual, material.px), _coverage(xy, size, mask_id)]
+        drawings += [_residuals(xy, residual, size, material.px), _coverage(xy, size, mask_id)]
     return drawings
 
 
@@ -115,8 +113,8 @@ def _profile(c: Calibration, material: Material, scenes: list[Scene]) -> Drawing
     solution, fx = material.solution, None if c.camera is None else c.camera.fx
     if solution is not None and c.camera is not None:
         # one kind of lens: the profiles of others mean something else
-        kind = c.camera.ros_model
-        each = [scene.starts[kind].profile for scene in scenes if kind in scene.starts]
+        family = c.camera.family
+        each = [scene.starts[family].profile for scene in scenes if family in scene.starts]
     else:
         each = [scene.profile for scene in scenes]
     each = [profile for profile in each if len(profile.ratios)]
@@ -131,7 +129,7 @@ def _profile(c: Calibration, material: Material, scenes: list[Scene]) -> Drawing
 
 def _growth(c: Calibration, solution: Solution, px: float) -> list[Drawing]:
     assert c.camera is not None
-    percent = [100 * sigma * px / c.camera.fx for sigma in sigma_by_count(solution, c.config)]
+    percent = [100 * sigma * px / c.camera.fx for sigma in sigma_by_count(solution)]
     if not np.isfinite(percent).all() or not percent:
         return []
     return [Drawing('Uncertainty against number of turns', growth_svg(percent),
@@ -139,20 +137,14 @@ def _growth(c: Calibration, solution: Solution, px: float) -> list[Drawing]:
                     'differ; that comes in with the second, and few turns know it badly.')]
 
 
-def _residuals(xy: Floats, residual: Floats, size: tuple[int, int]) -> Drawing:
+def _residuals(xy: Floats, residual: Floats, size: tuple[int, int], px: float) -> Drawing:
     drawn, magnified = residual_svg(xy, residual, size)
+    half = np.median(np.linalg.norm(residual, axis=1)) * px
     return Drawing('Residuals over the picture', drawn,
-                   f'Arrows: mean residual of a cell, {magnified} times as long as it is. Tint: '
-                   'how much residuals scatter there. Arrows that point the same way over a large '
-                   'part of the picture mean that the lens model does not fit there.')
-
-
-def _histogram(residual: Floats, px: float) -> Drawing:
-    length = np.linalg.norm(residual, axis=1) * px
-    return Drawing('How long the residuals are', histogram_svg(residual, px),
-                   f'{len(length):,} observations; half of them are below '
-                   f'{np.median(length):.2f} px, the root mean square is '
-                   f'{np.sqrt(np.mean(length**2)):.2f} px. The last column holds all longer ones.')
+                   f'Half of the {len(residual):,} are below {half:.2f} px. Arrows: mean residual '
+                   f'of a cell, {magnified} times as long as it is; tint: how much residuals '
+                   'scatter there. Arrows that point the same way over a large part of the '
+                   'picture mean that the lens model does not fit there.')
 
 
 def _coverage(xy: Floats, size: tuple[int, int], mask_id: str | None) -> Drawing:

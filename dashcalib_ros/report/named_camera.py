@@ -4,13 +4,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from dataclasses import field as default
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.limits import SIDE
+from dashcalib_ros.solve.picture import PictureSigma
 
 
 @dataclass(frozen=True)
@@ -19,12 +25,26 @@ class NamedCamera:
 
     name: where it is from, for messages. sigma: by the parameters' names; None unless all are
     known. verdict: accepted or weak; None where the file has none (a truth, another tool's file).
+    covariance: (n, n) of the parameters, as the picture shows them, and sigma_px: over the
+    picture; None where the file does not say.
+    field: what its lens model leaves over, where a result.json has one that is used.
+    faults: in words, of what else stands beside the camera (ROS's K, R and P).
     """
 
     name: str
     camera: Camera
     sigma: Mapping[str, float] | None = None
     verdict: str | None = None
+    covariance: Floats | None = default(default=None, compare=False)
+    sigma_px: PictureSigma | None = None
+    field: Field | None = default(default=None, compare=False)
+    faults: tuple[str, ...] = ()
+
+    def without_faults(self) -> NamedCamera:
+        """Return it; raises InputError where something beside the camera is wrong."""
+        if self.faults:
+            raise InputError(f'{self.name}: {"; ".join(self.faults)}; no model here has that')
+        return self
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -37,20 +57,25 @@ def calibrated_camera(calibration: Calibration, name: str = 'estimate') -> Named
     if calibration.camera is None:
         raise InputError(no_intrinsics(name, calibration.verdict.level,
                                         calibration.verdict.reasons))
-    return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level)
+    return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
+                       read_covariance(calibration.details, calibration.camera,
+                                       calibration.sigma),
+                       calibration.sigma_px)
 
 
-def read_size(width: Any, height: Any, path: str | Path) -> tuple[int, int]:
+def read_size(width: Any, height: Any, *, path: str | Path) -> tuple[int, int]:
     """Check an image size that was read from a file. Raises InputError."""
     for key, value in (('width', width), ('height', height)):
         if value is None:
-            raise InputError(f'{path} does not say the image {key}; add it, in pixels')
+            raise InputError(f'{path} does not say the image {key}; add image_{key}, in pixels')
+        if type(value) is float and value.is_integer():
+            value = int(value)
         if type(value) is not int or value <= 0:
             raise InputError(f'{path}: the image {key} must be a positive integer, not '
                              f'{shortened(repr(value))}')
         if value > SIDE:
             raise InputError(f'{path}: the image {key} must be {SIDE} at the most; is it in px?')
-    return width, height
+    return int(width), int(height)
 
 
 def read_number(data: Mapping[str, Any], key: str, path: str | Path,
@@ -70,11 +95,10 @@ def read_number(data: Mapping[str, Any], key: str, path: str | Path,
     return number
 
 
-def check_focal(camera: Camera, path: str | Path) -> Camera:
-    """Return a camera that was read from a file. Raises InputError where it is uncalibrated."""
-    if camera.fx <= 0 or camera.fy <= 0:
+def check_focal(fx: float, fy: float, path: str | Path) -> None:
+    """Raise InputError for the focal lengths of a camera that is not calibrated."""
+    if not (fx > 0 and fy > 0):
         raise InputError(f'{path} is uncalibrated: its focal length is not positive')
-    return camera
 
 
 def read_sigma(data: Any, camera: Camera) -> dict[str, float] | None:
@@ -84,6 +108,50 @@ def read_sigma(data: Any, camera: Camera) -> dict[str, float] | None:
     try:
         return {name: read_number(data, name, '') for name in camera.names()}
     except InputError:
+        return None
+
+
+def read_covariance(details: Any, camera: Camera, sigma: Mapping[str, float] | None
+                    ) -> Floats | None:
+    """Return the covariance in result.json's details, None where there is none that can be one.
+
+    That of the picture may be of the wider model's parameters: the camera's own come first. Files
+    of 0.2.0 have the correlations only, which say nearly the same.
+    """
+    data, count = details if isinstance(details, Mapping) else {}, len(camera.params)
+    try:
+        covariance = np.array(data.get('picture_covariance'), np.float64)
+        if covariance.ndim == 2:
+            covariance = covariance[:count, :count]
+        if 'picture_covariance' not in data and sigma is not None:
+            each = [sigma[name] for name in camera.names()]
+            covariance = np.array(data.get('correlation'), np.float64) * np.outer(each, each)
+        if covariance.shape == (count, count) and np.isfinite(covariance).all():
+            np.linalg.cholesky(covariance)
+            return covariance
+    except (TypeError, ValueError, np.linalg.LinAlgError):
+        pass
+    return None
+
+
+def read_field(data: Any, image_size: tuple[int, int]) -> Field | None:
+    """Return result.json's field, None where there is none that is used."""
+    if not isinstance(data, Mapping) or data.get('used') is not True:
+        return None
+    try:
+        coefficients = np.array(data['coefficients'], np.float64)
+    except (KeyError, TypeError, ValueError):
+        coefficients = np.zeros(0)
+    if coefficients.shape != (2, len(TERMS)) or not np.isfinite(coefficients).all():
+        raise InputError('its field has no coefficients that can be read; calibrate again')
+    return Field(image_size, coefficients)
+
+
+def read_sigma_px(data: Any) -> PictureSigma | None:
+    """Return result.json's sigma over the picture; a missing one is no error."""
+    try:
+        return PictureSigma(*(read_number(data, key, '') for key in ('rms', 'worst')))
+    except (AttributeError, TypeError, InputError):
         return None
 
 

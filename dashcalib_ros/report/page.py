@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from functools import lru_cache
 from importlib import resources
@@ -18,7 +17,6 @@ from dashcalib_ros.report.compare import compare
 from dashcalib_ros.report.figures import magnitude_svg, mask_data_uri
 from dashcalib_ros.report.lens_sections import evidence_of, lens_of
 from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
-from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.turn_sections import turn_rows, turn_sections
 from dashcalib_ros.report.usage import field_of_view, snippets
 from dashcalib_ros.report.wording import (
@@ -49,7 +47,7 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
     c = calibration
     mask = c.mask is not None and not bool(c.mask.all())
     mask_id = MASK_ID if mask else None
-    return _template().render(
+    return template('report.html').render(
         c=c, title=f'Calibration of {c.input_name}' if c.input_name else 'Calibration',
         headline=ADVICE[c.verdict.level], figures=key_figures(c, _field_of_view(c)),
         steps=next_steps(c), checks=checks(c), parameters=parameter_rows(c),
@@ -60,8 +58,7 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
         evidence=evidence_of(c, mask_id), facts=run_facts(c),
         mask=mask_data_uri(c.mask) if mask and c.mask is not None else '', mask_id=MASK_ID,
         masked=0.0 if c.mask is None else 100 * (1 - float(np.mean(c.mask))),
-        changed=_changed(c.config), settings=_text(c.config.flat()), details=_text(c.details),
-        versions=_text(c.versions))
+        changed=_changed(c.config), settings=_text(c.config.flat()), versions=_text(c.versions))
 
 
 def page_style() -> str:
@@ -70,14 +67,15 @@ def page_style() -> str:
     return folder.joinpath('templates/style.css').read_text('utf-8')
 
 
-@lru_cache(maxsize=1)
-def _template() -> jinja2.Template:
+@lru_cache(maxsize=2)
+def template(name: str) -> jinja2.Template:
+    """Return a page's template."""
     # loaded here: only who writes a report needs it
     import jinja2
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader('dashcalib_ros.report'), autoescape=True, trim_blocks=True,
         lstrip_blocks=True, undefined=jinja2.StrictUndefined)
-    return environment.get_template('report.html')
+    return environment.get_template(name)
 
 
 def _field_of_view(c: Calibration) -> Any:
@@ -100,7 +98,7 @@ def _snippets(c: Calibration, path: Path | None) -> Any:
 def _truth_rows(c: Calibration, truth: NamedCamera | None) -> list[tuple[str, ...]]:
     if truth is None or c.camera is None:
         return []
-    return [(d.name, number(d.name, d.a), number(d.name, d.b),
+    return [(d.name, number(d.name, d.b),
              f'{d.difference:+.{digits_of(d.name)}f}',
              '' if d.percent is None else f'{d.percent:+.2f} %', optional(d.z, 1))
             for d in compare(calibrated_camera(c), truth).differences]
@@ -120,15 +118,4 @@ def _changed(config: Config) -> dict[str, Any]:
 
 def _text(values: Mapping[str, Any]) -> str:
     return '\n'.join(f'{key}: {value if isinstance(value, str) else json.dumps(value)}'
-                     for key, value in _rounded(plain_values(values)).items())
-
-
-def _rounded(value: Any) -> Any:
-    """Return values with at most four significant digits: result.json has them all."""
-    if isinstance(value, float):
-        return value if not value or not math.isfinite(value) else float(f'{value:.4g}')
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_rounded(item) for item in value]
-    return value
+                     for key, value in values.items())

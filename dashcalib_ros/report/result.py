@@ -4,18 +4,26 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dashcalib_ros.errors import InputError
-from dashcalib_ros.judgement import Calibration, TurnSummary
-from dashcalib_ros.judgement.calibration import StoredTurnSummary
-from dashcalib_ros.limits import JSON_BYTES, read_text
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.field import BASIS, Field
+from dashcalib_ros.config import Config
+from dashcalib_ros.errors import DashcalibError, InputError, one_line
+from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judgement.calibration import LensField, Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.limits import JSON_BYTES, parse_yaml, read_text
 from dashcalib_ros.limits import parse_json as parse_any_json
+from dashcalib_ros.lines import Bend
+from dashcalib_ros.report.camera_file import parse_camera
 from dashcalib_ros.solve.opinions import HeldOut
+from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.turns import TurnId
 
 
 def result_dict(calibration: Calibration) -> dict[str, Any]:
@@ -39,6 +47,10 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'stored_turns': [_turn_dict(turn) for turn in c.stored_turns],
         'rolling_shutter': c.rolling_shutter,
         'stabiliser': c.stabiliser,
+        'field': None if c.field is None else {
+            'rms_px': c.field.rms_px, 'worst_px': c.field.worst_px, 'used': c.field.used,
+            'sigma_px': c.field.sigma_px, 'basis': BASIS,
+            'coefficients': c.field.field.coefficients},
         'held_out': [_held_out_dict(turn) for turn in c.held_out],
         'straight_lines': c.straight_lines,
         'input': c.input_name,
@@ -58,6 +70,74 @@ def result_json(calibration: Calibration) -> str:
 def load_result(path: str | Path) -> dict[str, Any]:
     """Read a result.json. Raises InputError if it is not one."""
     return parse_result(read_text(Path(path), JSON_BYTES), path)
+
+
+def load_calibration(path: str | os.PathLike[str]) -> Calibration:
+    """Read a calibration from result.json, its folder, or calibration.yaml; see Calibration.load.
+
+    Raises InputError.
+    """
+    place = Path(path)
+    place = place / 'result.json' if place.is_dir() else place
+    text = read_text(place, JSON_BYTES)
+    if text.lstrip().startswith('{'):
+        data: Mapping[str, Any] = parse_result(text, place)
+    else:
+        data = parse_yaml(text, str(place))
+        own = data.get('dashcalib') if isinstance(data, Mapping) else None
+        if not isinstance(own, Mapping):
+            raise InputError(f'{place} is no calibration of dashcalib; load_camera() reads it')
+        data = {**own, 'image_size': [data.get('image_width'), data.get('image_height')]}
+    refused = data.get('verdict') == 'refused'
+    camera = None if refused else parse_camera(text, place).camera
+    try:
+        return _calibration(data, camera)
+    except (KeyError, TypeError, ValueError, AttributeError, DashcalibError) as error:
+        raise InputError(f'{place} is damaged ({one_line(error)}); calibrate again') from error
+
+
+def _calibration(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
+    """Return the calibration that result_dict() gave these values."""
+    def made(kind: type[Any], key: str) -> Any:
+        return None if data.get(key) is None else kind(**data[key])
+
+    known = Config().flat()
+    config = Config().replace({name: value for name, value in data.get('config', {}).items()
+                               if name in known})
+    stored = [StoredTurnSummary(id=TurnId.stored(place), stamp_s=turn['stamp'],
+                                **{key: turn[key] for key in turn if key != 'stamp'})
+              for place, turn in enumerate(data.get('stored_turns', ()))]
+    held_out = [HeldOut(
+        TurnId.stored(place) if turn['center'] is None else TurnId.at(turn['center']),
+        turn['px'], turn['sigma_px'], turn['others_sigma_px'])
+        for place, turn in enumerate(data.get('held_out', ()))]
+    sigma = data.get('sigma')
+    return Calibration(
+        verdict=Verdict(data['verdict'], tuple(data['reasons'])),
+        image_size=(data['image_size'][0], data['image_size'][1]), camera=camera,
+        sigma=None if sigma is None else {name: math.nan if value is None else float(value)
+                                          for name, value in sigma.items()},
+        turns=tuple(TurnSummary(stamp_s=turn['stamp'],
+                                **{key: turn[key] for key in turn if key != 'stamp'})
+                    for turn in data.get('turns', ())),
+        frames=data.get('frames', 0), reprojection_error_px=data.get('reprojection_error_px'),
+        timing=dict(data.get('timing', {})), versions=dict(data.get('versions', {})),
+        config=config.replace({'seed': data.get('seed', config.seed)}),
+        input_name=data.get('input', ''), warnings=tuple(data.get('warnings', ())),
+        details=dict(data.get('details', {})), stored_turns=tuple(stored),
+        rolling_shutter=made(Shutter, 'rolling_shutter'),
+        sigma_px=made(PictureSigma, 'sigma_px'), stabiliser=made(Stabiliser, 'stabiliser'),
+        field=_field(data),
+        held_out=tuple(held_out), straight_lines=made(Bend, 'straight_lines'))
+
+
+def _field(data: Mapping[str, Any]) -> LensField | None:
+    found = data.get('field')
+    if found is None:
+        return None
+    width, height = data['image_size']
+    return LensField(Field((width, height), np.array(found['coefficients'], np.float64)),
+                     bool(found['used']), found['rms_px'], found['worst_px'], found['sigma_px'])
 
 
 def parse_result(text: str, path: str | Path) -> dict[str, Any]:

@@ -6,11 +6,14 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from rich import box
-from rich.console import Group, RenderableType
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from dashcalib_ros.checking.wording import answers_of
+from dashcalib_ros.errors import counted
 from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
 from dashcalib_ros.report.compare import Comparison, Difference
 from dashcalib_ros.report.wording import (
@@ -25,7 +28,8 @@ from dashcalib_ros.report.wording import (
     stored_text,
 )
 
-# narrow enough for 80 columns
+# columns between two of a table
+APART = 3
 TURNS = ('at s', 'frames', 'yaw °', 'images', 'error px', 'used')
 # where the reasons do not say it
 NEXT = {
@@ -41,20 +45,32 @@ def summary(calibration: Calibration) -> RenderableType:
     c = calibration
     parts: list[RenderableType] = []
     if c.camera is not None:
-        parts.append(text_table(('', 'estimate', 'sigma', ''), parameter_rows(c)))
+        parts.append(TextTable(('', 'estimate', 'sigma', 'relative'), parameter_rows(c)))
+        if c.caveat:
+            parts.append(Text(f'{c.caveat}\n'))
     if c.turns:
-        parts.append(text_table(TURNS, [_turn_row(turn, c.start_s) for turn in c.turns]))
+        parts.append(TextTable(TURNS, [_turn_row(turn, c.start_s) for turn in c.turns]))
     parts.append(Text(_facts(c)))
     return Group(*parts)
 
 
 def conclusion(verdict: Verdict) -> RenderableType:
-    """Return the verdict, coloured, its reasons, and what to do next."""
-    parts: list[RenderableType] = [Text(verdict.level, COLOURS[verdict.level])]
+    """Return the verdict, coloured, and its reasons."""
+    parts: list[RenderableType] = [labelled('verdict', verdict.level, COLOURS[verdict.level])]
     for reason in verdict.reasons:
         cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), None)
         parts.append(Padding.indent(Text(reason.removesuffix(f': {cure}')), 2))
-    return Group(*parts, Text(f'next: {(verdict.cures or (NEXT[verdict.level],))[0]}'))
+    return Group(*parts)
+
+
+def labelled(label: str, word: str, colour: str) -> Text:
+    """Return the line that all others explain: its word is coloured."""
+    return Text.assemble(f'{label}: ', (word, colour))
+
+
+def next_step(verdict: Verdict) -> Text:
+    """Return what to do next."""
+    return Text(f'next: {(verdict.cures or (NEXT[verdict.level],))[0]}')
 
 
 def _turn_row(turn: TurnSummary, start_s: float) -> tuple[str, ...]:
@@ -65,13 +81,28 @@ def _turn_row(turn: TurnSummary, start_s: float) -> tuple[str, ...]:
 
 def comparison(found: Comparison) -> RenderableType:
     """Return two calibrations side by side, and the mapping error."""
-    known = any(d.z is not None for d in found.differences)
-    rows = [_difference_row(d)[:None if known else -1] for d in found.differences]
-    head = ('', 'A', 'B', 'A - B', 'of B', 'sigmas')[:None if known else -1]
     sides = Text('\n'.join(
         f'{side}: {camera.name}' + (f' ({camera.verdict})' if camera.verdict else '')
         for side, camera in (('A', found.a), ('B', found.b))))
-    return Group(sides, text_table(head, rows), mapping_text(found))
+    return Group(sides, *answers(found), TextTable(*comparison_rows(found)))
+
+
+def comparison_rows(found: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return the head and the rows of the parameters of both."""
+    known = any(d.z is not None for d in found.differences)
+    rows = [_difference_row(d)[:None if known else -1] for d in found.differences]
+    return ('', 'A', 'B', 'A - B', 'of B', 'sigmas')[:None if known else -1], rows
+
+
+def answers(found: Comparison) -> list[Text]:
+    """Return how far both are apart, whether that can be told, and whether it matters."""
+    whose = ' and '.join(side for side, camera in (('A', found.a), ('B', found.b))
+                         if camera.sigma_px is not None)
+    lines = list(answers_of(found.whole, whose))
+    if found.unseen and found.whole.apart is not None:
+        lines[0] += (f', without the {100 * found.unseen:.0f} % of the picture that the '
+                     f'{found.a.camera.model} model cannot see')
+    return [Text(line) for line in lines]
 
 
 def against_truth(found: Comparison) -> RenderableType:
@@ -80,7 +111,7 @@ def against_truth(found: Comparison) -> RenderableType:
              '-' if d.sigma is None else '± ' + number(d.name, d.sigma), number(d.name, d.b),
              *_difference_row(d)[-2:]) for d in found.differences]
     head = ('', 'estimate', 'sigma', 'truth', 'error', 'in sigmas')
-    return Group(text_table(head, rows), mapping_text(found))
+    return Group(TextTable(head, rows), mapping_text(found))
 
 
 def mapping_text(found: Comparison) -> Text:
@@ -94,14 +125,34 @@ def mapping_text(found: Comparison) -> Text:
     return Text(text)
 
 
-def text_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a plain table of literal text: the first column to the left, numbers to the right."""
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for i, title in enumerate(head):
-        table.add_column(Text(title), justify='left' if i == 0 else 'right', no_wrap=True)
-    for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
-    return table
+class TextTable:
+    """A plain table of literal text: the first column to the left, numbers to the right.
+
+    What does not fit beside it on a narrow terminal comes below, again with the first column.
+    """
+
+    def __init__(self, head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+        self._columns = list(zip(head, *rows, strict=True))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Return as many tables as the width asks for."""
+        first, *others = self._columns
+        while others:
+            room = options.max_width - _width(first)
+            table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+            table.add_column(Text(first[0]), no_wrap=True)
+            shown = [first]
+            while others and (len(shown) == 1 or APART + _width(others[0]) <= room):
+                shown.append(others.pop(0))
+                room -= APART + _width(shown[-1])
+                table.add_column(Text(shown[-1][0]), justify='right', no_wrap=True)
+            for row in zip(*(column[1:] for column in shown), strict=True):
+                table.add_row(*map(Text, row))
+            yield table
+
+
+def _width(column: Sequence[str]) -> int:
+    return max(map(cell_len, column))
 
 
 def _difference_row(d: Difference) -> tuple[str, ...]:
@@ -112,7 +163,7 @@ def _difference_row(d: Difference) -> tuple[str, ...]:
 
 def _facts(c: Calibration) -> str:
     used = sum(turn.used for turn in c.turns)
-    facts = [f'{c.frames} frames', f'{used} of {len(c.turns)} turns used']
+    facts = [counted(c.frames, 'frame'), f'{used} of {counted(len(c.turns), "turn")} used']
     if c.camera is not None:
         facts.append(f'{c.camera.model} model')
     if c.stored_turns:

@@ -1,4 +1,4 @@
-"""What is drawn of one turn: its picture with tracks and residuals, and its path from above."""
+"""What is drawn of one turn: its picture with tracks and residuals, and a view in space."""
 from __future__ import annotations
 
 import math
@@ -9,7 +9,7 @@ from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruction.picture import TurnPicture
 from dashcalib_ros.reconstruction.scene import Scene, residuals_px
-from dashcalib_ros.report.charts import dots, line, polyline, segments, svg, text
+from dashcalib_ros.report.charts import dots, line, segments, svg, text
 from dashcalib_ros.report.figures import jpeg_data_uri
 
 # keyframes before and after the picture whose observations are drawn as a track
@@ -17,10 +17,15 @@ TRAIL = 4
 # px of the drawing; a residual that only one of ten exceeds is drawn about so long
 ARROW = 9.0
 MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
-# px; of the view from above
-ABOVE = (440, 260)
+# px; of the view in space, its margin, and how long its cameras are
+VIEW, MARGIN, CAMERA = (440, 270), 8, 13.0
+# degrees, as in script.js; 90 is from above
+TILT = 50.0
 # at the most, of points drawn
 POINTS = 1500
+# one stroke along all edges of a camera's pyramid, as wide as it is long
+FRUSTUM = np.array([(0, 0, 0), (-.5, -.5, 1), (.5, -.5, 1), (0, 0, 0), (.5, .5, 1), (-.5, .5, 1),
+                    (0, 0, 0), (-.5, -.5, 1), (-.5, .5, 1), (.5, .5, 1), (.5, -.5, 1)])
 
 
 def picture_svg(picture: TurnPicture, scene: Scene | None, camera: Camera | None,
@@ -29,7 +34,7 @@ def picture_svg(picture: TurnPicture, scene: Scene | None, camera: Camera | None
 
     camera: of the scene's images. mask_id: of an element of the page that is the mask.
     """
-    height, width = picture.image.shape
+    height, width = picture.image.shape[:2]
     parts = [f'<image href="{jpeg_data_uri(picture.image)}" width="{width}" height="{height}"/>']
     if mask_id is not None:
         parts.append(f'<svg width="{width}" height="{height}" viewBox="0 0 100 100" '
@@ -69,52 +74,64 @@ def _trails(trails: list[Floats]) -> str:
     return f'<path class="track" d="{"".join(parts)}"/>'
 
 
-def above_svg(scene: Scene, frame: int | None = None) -> str:
-    """Return the turn's path and points from above; up is where the car went first.
+def view_svg(scene: Scene, frame: int | None = None) -> str:
+    """Return the turn's path, cameras and points, seen from behind and above where it began.
 
-    frame: of the picture that is shown; its place is marked. '' where no path is known.
+    The page's script turns it: each part has its points in space, from the middle of the drawing,
+    px. frame: of the picture that is shown; its camera stands out. '' where no path is known.
     """
-    structure = scene.structure
-    registered = structure.registered
+    structure, registered = scene.structure, scene.structure.registered
     if registered.sum() < 2:
         return ''
     rotations = structure.rotations[registered]
     centres = -np.einsum('kji,kj->ki', rotations, structure.translations[registered])
-    right, ahead = _ground(rotations)
-    path = np.column_stack([centres @ right, centres @ ahead])
-    points = structure.points[structure.used.any(axis=0)]
-    points = np.column_stack([points @ right, points @ ahead])[:POINTS]
-    reach = 2.0 * max(float(np.ptp(path, axis=0).max()), 1e-9)
-    low, high = path.min(axis=0) - reach, path.max(axis=0) + reach
-    points = points[_inside(points, low, high)]
-    if len(points):
-        # as much as there is to see around the path
-        low = np.minimum(path.min(axis=0), np.quantile(points, 0.04, axis=0))
-        high = np.maximum(path.max(axis=0), np.quantile(points, 0.96, axis=0))
-        points = points[_inside(points, low, high)]
-    width, height = ABOVE
-    margin = 14
-    scale = float(((np.array(ABOVE) - 2 * margin) / np.maximum(high - low, 1e-9)).min())
+    axes = _axes(rotations)
+    path = centres @ axes
+    points = structure.points[structure.used.any(axis=0)] @ axes
+    reach = 2.0 * max(float(np.ptp(path[:, :2], axis=0).max()), 1e-9)
+    points = points[_inside(points, path.min(axis=0) - reach, path.max(axis=0) + reach)][:POINTS]
+    # all of the path is seen, and most of the points
+    most = np.quantile(points, (0.12, 0.88), axis=0) if len(points) else path
+    low, high = np.minimum(path, most[0]).min(axis=0), np.maximum(path, most[-1]).max(axis=0)
+    corners = np.stack(np.meshgrid(*np.stack([low, high], 1)), -1).reshape(-1, 3)
+    spread = np.ptp(_seen(corners), axis=0)
+    scale = float(((np.array(VIEW) - 2 * MARGIN) / np.maximum(spread, 1e-9)).min())
+    width, height = scene.tracks.image_size
+    frustum = CAMERA / scale * (FRUSTUM * (1, height / width, 1))
+    cameras = np.einsum('nj,kji->kni', frustum, rotations) + centres[:, None]
+    here = scene.tracks.frames[registered] == frame
 
-    def placed(xy: Floats) -> Floats:
-        off = (xy - (low + high) / 2) * scale
-        return np.asarray(np.column_stack([width / 2 + off[:, 0], height / 2 - off[:, 1]]))
+    def part(xyz: Floats, kind: str) -> str:
+        """Return a path of strokes (n, points of each, 3)."""
+        placed = (xyz - (low + high) / 2) * scale
+        shown = np.array(VIEW) / 2 + _seen(placed)
+        run = xyz.shape[1]
+        strokes = ''.join('M' + 'L'.join(f'{u:.1f} {v:.1f}' for u, v in stroke) + 'h0' * (run == 1)
+                          for stroke in shown)
+        flat = ' '.join(f'{value:.1f}' for value in placed.ravel())
+        return f'<path class="{kind}" data-run="{run}" data-xyz="{flat}" d="{strokes}"/>'
 
-    drawn = dots(placed(points), 'point') + polyline(placed(path), 'path')
-    drawn += dots(placed(path), 'stop') + dots(placed(path)[:1], 'start')
-    at = np.flatnonzero(scene.tracks.frames[registered] == frame)
-    if len(at):
-        drawn += dots(placed(path)[at], 'here')
-    return svg(width, height, 'path and points from above', drawn, 'above')
+    drawn = (part(points[:, None], 'point') + part(path[None], 'path')
+             + part(cameras @ axes, 'camera') + part(path[:1, None], 'start'))
+    if here.any():
+        drawn += part(cameras[here] @ axes, 'camera here')
+    return svg(*VIEW, 'path, cameras and points', drawn, 'space')
 
 
-def _ground(rotations: Floats) -> tuple[Floats, Floats]:
-    """Return the directions to the right and ahead, of the first camera, on the ground (3,)."""
+def _seen(xyz: Floats) -> Floats:
+    """Return where points (..., 3), to the right, ahead and up, are seen (..., 2), in an SVG."""
+    tilt = math.radians(TILT)
+    return np.asarray(np.stack([xyz[..., 0], -math.sin(tilt) * xyz[..., 1]
+                                - math.cos(tilt) * xyz[..., 2]], -1))
+
+
+def _axes(rotations: Floats) -> Floats:
+    """Return the directions to the right, ahead and up, of the first camera: columns (3, 3)."""
     down = rotations[:, 1].mean(axis=0)
     down /= np.linalg.norm(down)
     ahead = rotations[0, 2] - (rotations[0, 2] @ down) * down
     ahead /= np.linalg.norm(ahead)
-    return np.cross(down, ahead), ahead
+    return np.column_stack([np.cross(down, ahead), ahead, -down])
 
 
 def _inside(points: Floats, low: Floats, high: Floats) -> Mask:
@@ -130,11 +147,10 @@ def direction(scene: Scene) -> str:
     return 'to the right' if net > 0 else 'to the left'
 
 
-def estimates_svg(rows: list[tuple[str, float, float]], own: int | None, joint: tuple[
-        float, float]) -> str:
+def estimates_svg(rows: list[tuple[str, float, float]], joint: tuple[float, float]) -> str:
     """Return what each turn says of fx, beside the result of all.
 
-    rows: a name, fx and its sigma, px. own: the row that stands out. joint: fx and its sigma.
+    rows: a name, fx and its sigma, px. joint: fx and its sigma.
     """
     width, row, left, right, top = 440, 21, 62, 122, 8
     reach = 4 * joint[1]
@@ -156,7 +172,7 @@ def estimates_svg(rows: list[tuple[str, float, float]], own: int | None, joint: 
              line(left, bottom, width - right, bottom, 'grid')]
     for n, (name, fx, sigma) in enumerate([*rows, ('all', *joint)]):
         y = top + row * (n + 0.5)
-        kind = 'all' if n == len(rows) else 'own' if n == own else 'other'
+        kind = 'all' if n == len(rows) else 'other'
         beyond = abs(fx - joint[0]) > reach
         parts.append(line(across(fx - sigma), y, across(fx + sigma), y, f'bar {kind}'))
         if not beyond:

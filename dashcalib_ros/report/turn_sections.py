@@ -12,10 +12,10 @@ from dashcalib_ros.judgement.calibration import Material, StoredTurnSummary
 from dashcalib_ros.judgement.focal_by_turn import focal_alone
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.report.turn_figures import (
-    above_svg,
     direction,
     estimates_svg,
     picture_svg,
+    view_svg,
     with_sigma,
 )
 from dashcalib_ros.report.wording import optional, since_start
@@ -39,8 +39,7 @@ class TurnSection:
     picture: str
     frame: int | None
     magnified: int
-    above: str
-    estimates: str
+    view: str
     alone: str
 
 
@@ -50,7 +49,7 @@ def turn_sections(c: Calibration, mask_id: str | None) -> list[TurnSection]:
         return []
     said = _said_of_fx(c, c.material)
     found = [_section(turn, c, c.material, said, mask_id) for turn in c.all_turns]
-    return [each for each in found if each.picture or each.above]
+    return [each for each in found if each.picture or each.view]
 
 
 @dataclass(frozen=True)
@@ -64,12 +63,6 @@ class _SaidOfFx:
     shares: dict[TurnId, float]
     joint: tuple[float, float]
 
-    def drawn(self, names: dict[TurnId, str], own: TurnId | None) -> str:
-        """Return a plot of it; own: the turn that stands out."""
-        order = [turn for turn in names if turn in self.alone]
-        return estimates_svg([(f'turn {names[turn]}', *self.alone[turn]) for turn in order],
-                             order.index(own) if own is not None else None, self.joint)
-
 
 def _said_of_fx(c: Calibration, material: Material) -> _SaidOfFx | None:
     """Return what the turns say of fx; None of a refused calibration, which has no numbers."""
@@ -77,7 +70,7 @@ def _said_of_fx(c: Calibration, material: Material) -> _SaidOfFx | None:
     if c.camera is None or solution is None or not 0 < sigma < math.inf:
         return None
     alone = {turn: (found.fx * material.px, found.sigma * material.px)
-             for turn, found in focal_alone(solution, c.config).items()}
+             for turn, found in focal_alone(solution).items()}
     if not np.isfinite(list(alone.values())).all():
         return None
     return _SaidOfFx(alone, leverages(solution), (c.camera.fx, sigma))
@@ -86,7 +79,10 @@ def _said_of_fx(c: Calibration, material: Material) -> _SaidOfFx | None:
 def focal_by_turn(c: Calibration) -> str:
     """Return the plot of what all turns say of fx, '' where there is none."""
     said = None if c.material is None else _said_of_fx(c, c.material)
-    return '' if said is None else said.drawn(names(c), None)
+    if said is None:
+        return ''
+    return estimates_svg([(f'turn {name}', *said.alone[turn]) for turn, name in names(c).items()
+                          if turn in said.alone], said.joint)
 
 
 def names(c: Calibration) -> dict[TurnId, str]:
@@ -104,14 +100,11 @@ def _section(turn: AnySummary, c: Calibration, material: Material,
     drawn, magnified = ('', 0)
     if picture is not None:
         drawn, magnified = picture_svg(picture, scene, camera, mask_id)
-    estimates = said = ''
-    if of_fx is not None and turn.id in of_fx.alone:
-        estimates, said = of_fx.drawn(names(c), turn.id), _said(turn.id, of_fx)
     return TurnSection(
         _title(turn, c), _facts(turn, scene, c), turn.used, turn.unused_because, drawn,
         None if picture is None else picture.frame, magnified,
-        '' if scene is None else above_svg(scene, None if picture is None else picture.frame),
-        estimates, said)
+        '' if scene is None else view_svg(scene, None if picture is None else picture.frame),
+        '' if of_fx is None or turn.id not in of_fx.alone else _said(turn.id, of_fx))
 
 
 def _title(turn: AnySummary, c: Calibration) -> str:
@@ -126,9 +119,6 @@ def _facts(turn: AnySummary, scene: Scene | None, c: Calibration) -> tuple[str, 
     if turn.yaw_deg is not None:
         way = '' if scene is None else ' ' + direction(scene)
         facts.append(f'{turn.yaw_deg:.0f}°{way}')
-    if isinstance(turn, TurnSummary) and scene is not None:
-        facts.append(f'{turn.registered} of {turn.images} keyframes placed')
-        facts.append('error ' + optional(turn.reprojection_error_px, 2, ' px'))
     if turn.misfit is not None and turn.misfit > c.config.verdict.max_misfit:
         facts.append(f'fits another camera: {turn.misfit:.1f} times the error of its own')
     return tuple(facts)
@@ -140,17 +130,19 @@ def _said(turn: TurnId, of_fx: _SaidOfFx) -> str:
             f'{f"{share:.0f}" if share >= 1 else "less than 1"} % of what is known of fx.')
 
 
-def turn_rows(c: Calibration) -> list[tuple[str, ...]]:
+def turn_rows(c: Calibration) -> list[dict[str, str]]:
     """Return the table of all turns: name, time, frames, yaw, keyframes, error, why unused."""
     short = names(c)
-    rows: list[tuple[str, ...]] = []
+    apart = {each.turn: f'{each.px:.3g} px, {each.sigmas:.1f} sigmas' for each in c.held_out}
+    rows = []
     for turn in c.all_turns:
-        why = 'used' if turn.used else f'no: {turn.unused_because or "not needed"}'
-        yaw = optional(turn.yaw_deg, 0, '°')
-        if isinstance(turn, StoredTurnSummary):
-            rows.append((short[turn.id], 'earlier', '-', yaw, str(turn.images), '-', why))
-            continue
-        rows.append((short[turn.id], f'{since_start(turn, c)} s', f'{turn.first} to {turn.last}',
-                     yaw, f'{turn.registered} of {turn.images}' if turn.registered else '-',
-                     optional(turn.reprojection_error_px, 2, ' px'), why))
+        row = {'turn': short[turn.id], 'at': 'earlier', 'frames': '-',
+               'yaw': optional(turn.yaw_deg, 0, '°'), 'keyframes': str(turn.images),
+               'error': optional(turn.reprojection_error_px, 2, ' px'),
+               'held out': apart.get(turn.id, '-'),
+               'used': 'used' if turn.used else f'no: {turn.unused_because or "not needed"}'}
+        if isinstance(turn, TurnSummary):
+            row |= {'at': f'{since_start(turn, c)} s', 'frames': f'{turn.first} to {turn.last}',
+                    'keyframes': f'{turn.registered} of {turn.images}' if turn.registered else '-'}
+        rows.append(row)
     return rows

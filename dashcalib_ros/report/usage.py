@@ -8,7 +8,7 @@ from shlex import quote
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import Camera, Fisheye
+from dashcalib_ros.camera import FISHEYE, Camera
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ def snippets(camera: Camera, calibration_file: Path) -> tuple[Snippet, ...]:
 def _opencv(camera: Camera) -> str:
     fx, fy, cx, cy = (f'{value:.4f}' for value in camera.params[:4])
     distortion = ', '.join(f'{value:.8g}' for value in camera.ros_distortion())
-    fisheye = camera.ros_model == Fisheye.ros_model
+    fisheye = camera.family == FISHEYE
     call = ('cv2.fisheye.undistortImage(image, K, D, Knew=K)' if fisheye
             else 'cv2.undistort(image, K, D)')
     return ('import cv2\nimport numpy as np\n'

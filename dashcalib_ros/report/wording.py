@@ -4,11 +4,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from dashcalib_ros.errors import counted
 from dashcalib_ros.judgement import Calibration, TurnSummary
 from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.lines import Bend
 from dashcalib_ros.report.usage import FieldOfView
-from dashcalib_ros.solve.opinions import HeldOut
 from dashcalib_ros.solve.picture import PictureSigma
 
 ADVICE = {
@@ -19,8 +19,6 @@ ADVICE = {
 
 # parameters that are lengths in the picture; the others have no unit
 PIXELS = ('fx', 'fy', 'cx', 'cy')
-
-TURN_COLUMNS = ('frame', 'from', 'to', 'at s', 'prominence', 'yaw °', 'images', 'error px', 'used')
 
 
 def parameter_rows(calibration: Calibration) -> list[tuple[str, str, str, str]]:
@@ -57,18 +55,10 @@ def digits_of(name: str) -> int:
     return 4 if name in ('k1', 'k2') else 6
 
 
-def turn_row(turn: TurnSummary) -> tuple[str, ...]:
-    """Return a turn's cells for TURN_COLUMNS."""
-    return (str(turn.center), str(turn.first), str(turn.last), f'{turn.stamp_s:.1f}',
-            f'{turn.prominence:.4f}', optional(turn.yaw_deg, 1),
-            f'{turn.registered} of {turn.images}', optional(turn.reprojection_error_px, 2),
-            'yes' if turn.used else 'no')
-
-
 def stored_text(turns: Sequence[StoredTurnSummary]) -> str:
     """Return how many turns of earlier drives were used."""
     used = sum(turn.used for turn in turns)
-    return f'{used} of {len(turns)} stored turn{"" if len(turns) == 1 else "s"} used'
+    return f'{used} of {counted(len(turns), "stored turn")} used'
 
 
 def stabiliser_text(stabiliser: Stabiliser) -> str:
@@ -86,12 +76,6 @@ def lines_text(lines: Bend) -> str:
     """Return a line about what straight lines say of the distortion."""
     return (f'{lines.lines} upright lines, bent by {lines.bend_px:.2f} px: k1 off by '
             f'{lines.k1:+.4f} ± {lines.sigma:.4f}')
-
-
-def held_out_text(turns: Sequence[HeldOut]) -> str:
-    """Return a line about how far each turn is from the calibration that the others give."""
-    pixels = ', '.join(f'{turn.px:.1f} px ({turn.sigmas:.1f} sigma)' for turn in turns)
-    return f'each alone, from the calibration without it: {pixels}'
 
 
 def picture_text(sigma: PictureSigma) -> str:
@@ -113,14 +97,14 @@ def key_figures(c: Calibration, view: FieldOfView | None) -> list[tuple[str, str
         return [*found, ('images', f'{c.frames}', f'of {c.image_size[0]} × {c.image_size[1]} px'),
                 ('yaw of these turns', f'{yaw:.0f}°',
                  f'at least {c.config.verdict.min_yaw_deg:.0f}° needed')]
-    front = []
+    front, lone = [], c.caveat and f'; {c.caveat}'
     if c.sigma_px is not None:
         front.append(('uncertainty in the picture', optional(c.sigma_px.rms, 2, ' px'),
-                      f'RMS; {optional(c.sigma_px.worst, 2)} px at the worst'))
+                      f'RMS; {optional(c.sigma_px.worst, 2)} px at the worst{lone}'))
     sigma = (c.sigma or {}).get('fx', math.nan)
     front.append(('focal length fx', f'{c.camera.fx:.1f} px',
-                  f'± {sigma:.1f} px, {100 * sigma / c.camera.fx:.2f} %'
-                  if math.isfinite(sigma) else 'uncertainty unknown'))
+                  (f'± {sigma:.1f} px, {100 * sigma / c.camera.fx:.2f} %'
+                   if math.isfinite(sigma) else 'uncertainty unknown') + lone))
     if view is not None:
         front.append(('field of view', optional(view.horizontal, 1, '°'),
                       f'by {optional(view.vertical, 1, "°")}, '
@@ -172,21 +156,14 @@ def removed_effects(c: Calibration) -> list[str]:
 def run_facts(c: Calibration) -> list[tuple[str, str]]:
     """Return what else is to be said of the run."""
     facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
-    if c.camera is not None:
-        facts.append(('lens model', f'{c.camera.model} model, {c.camera.ros_model} in ROS'))
-        facts.append(('rectified pictures', f'P: {c.config.rectified}'))
     if c.reprojection_error_px is not None:
         facts.append(('reprojection error', f'{c.reprojection_error_px:.2f} px'))
-    if c.sigma_px is not None:
-        facts.append(('sigma', picture_text(c.sigma_px)))
     if c.straight_lines is not None:
         facts.append(('straight lines', lines_text(c.straight_lines)))
-    if c.held_out:
-        facts.append(('turns held out', held_out_text(c.held_out)))
     if c.stored_turns:
         facts.append(('earlier drives', stored_text(c.stored_turns)))
-    facts += [(f'time: {name}', f'{seconds:.1f} s') for name, seconds in c.timing.items()]
-    return facts
+    times = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in c.timing.items())
+    return [*facts, ('time', times)] if times else facts
 
 
 def optional(value: float | None, digits: int, unit: str = '') -> str:

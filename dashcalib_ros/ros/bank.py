@@ -13,7 +13,8 @@ class Bank:
     """A Calibrator and what belongs to its images only.
 
     depth: used by the detecting thread only. tried: the turns of the last calibration. told: the
-    turns that the node knows of. The learner's lock guards both.
+    turns that the node knows of. more: turns of this drive that are used beyond those
+    wanted. The learner's lock guards these.
     """
 
     def __init__(self, number: int, calibrator: Calibrator) -> None:
@@ -22,6 +23,7 @@ class Bank:
         self.depth = BitDepth()
         self.tried: frozenset[TurnId] = frozenset()
         self.told: frozenset[TurnId] = frozenset()
+        self.more = 0
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,15 @@ class CameraInUse(ABC):
 
     verdict: of the last calibration, used or not. contradictions: number of calibrations in a row
     that contradict the one in use. stale: it was given up, and is published only because of
-    publish_stale.
+    publish_stale. confirmed: False for one of a file until turns of this drive agree with it.
+    settled: whether the last calibration's turns have told all that they can of it.
     """
 
     def __init__(self, node: Node) -> None:
         self.verdict: Verdict | None = None
         self.contradictions = 0
         self.stale = False
+        self.confirmed = self.settled = True
         self.changes = Changes(node.get_logger())
         self._watched: NamedCamera | None = None
 
@@ -104,6 +106,9 @@ class CameraInUse(ABC):
     @abstractmethod
     def save(self) -> tuple[bool, str]:
         """Write the file; return whether it was written, and a line about it."""
+
+    def close(self) -> None:  # noqa: B027, there may be nothing to leave
+        """Leave the calibration's file to other nodes."""
 
     @abstractmethod
     def warnings(self) -> list[str]:

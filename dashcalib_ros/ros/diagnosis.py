@@ -74,7 +74,7 @@ class Diagnosis:
             verdict.reasons if verdict else (), intake.silent_s,
             self._images.listening, in_use.file, tuple(self._warnings()), counts,
             in_use.changes.texts, tuple(map(str, in_use.changes.suspected)),
-            in_use.changes.misfit, answer)
+            in_use.changes.misfit, answer, in_use.confirmed)
 
     def _warnings(self) -> list[str]:
         warnings = self._in_use.warnings()

@@ -10,13 +10,13 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header, String
 
-from dashcalib_ros.checking import Check
+from dashcalib_ros.checking import Check, with_faults
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.report import NamedCamera, answer_dict
+from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.camera_in_use import CameraInUse
 from dashcalib_ros.ros.complaints import Complaints
-from dashcalib_ros.ros.messages import given_camera
 from dashcalib_ros.ros.news import Result, Watched
 from dashcalib_ros.ros.publication import LATCHED
 from dashcalib_ros.ros.qos import make_publisher, make_subscription
@@ -42,7 +42,7 @@ class GivenCalibration(CameraInUse):
         self._infos: SourceWatch[Hashable] = SourceWatch()
         self._camera: NamedCamera | None = None
         self._size: tuple[int, int] | None = None
-        self._answer = NOT_YET
+        self._found = NOT_YET
         # why there is no camera, or it is not of the images
         self._problem = f'no camera_info on {self.topic} yet'
         self._publisher = make_publisher(node, String, '~/check', LATCHED)
@@ -65,12 +65,16 @@ class GivenCalibration(CameraInUse):
 
     @property
     def answer(self) -> Check:
-        """Return what the turns say of it."""
-        return self._answer
+        """Return what the turns say of it, and what no turn is needed for."""
+        return with_faults(self._found, self._camera.faults if self._camera else ())
 
     def goal(self, config: Config) -> int | None:
-        """Return how many turns a check needs, None while there is no camera."""
-        return None if self._camera is None else config.turns.wanted
+        """Return from how many turns on one is tried, None while there is no camera.
+
+        A single turn may be wrong; the next ones are waited for where two cannot tell.
+        """
+        return (None if self._camera is None
+                else min(config.verdict.min_turns, config.turns.wanted))
 
     def on_watched(self, watched: Watched) -> None:
         """Take what new turns show; publish it where it says more than before."""
@@ -89,23 +93,28 @@ class GivenCalibration(CameraInUse):
 
     def judge(self, result: Result, frame_id: str, publish_stale: bool) -> Action:
         """Take an answer; 'keep' where the next one should be of new turns."""
-        if result.check is None or result.given is not self._camera:
+        if result.check is None or self._camera is None or result.given is not self._camera:
             return 'wait'
         self.verdict = result.calibration.verdict
         for text in result.calibration.warnings:
             self._complaints.once(text)
-        self._answer = result.check
+        before, found = self._found.answer, result.check
+        if found.answer == 'cannot tell' and before != 'cannot tell' and not result.complete:
+            return 'wait'  # that of more turns stays
+        self._found = found
         self._publish()
-        reasons = '; '.join(self._answer.reasons)
+        if not result.complete and found.answer == before:
+            return 'wait'
+        answer, reasons = self.answer.answer, '; '.join(self.answer.reasons)
         # rclpy takes one severity for each line of code
-        if self._answer.answer == 'wrong':
+        if answer == 'wrong':
             self._log.warning(f'the calibration on {self.topic} is wrong: {reasons}')
-        elif self._answer.answer == 'right':
+        elif answer == 'right':
             self._log.info(f'the calibration on {self.topic} is right: {reasons}')
         else:
             self._log.info(f'the turns cannot tell whether the calibration on {self.topic} is '
                            f'right: {reasons}')
-        return 'wait' if self._answer.answer == 'cannot tell' else 'keep'
+        return 'wait' if found.answer == 'cannot tell' else 'keep'
 
     def accompany(self, header: Header, size: tuple[int, int]) -> None:
         """Do nothing: the driver publishes the camera_info."""
@@ -116,7 +125,7 @@ class GivenCalibration(CameraInUse):
         self._camera = None if self._camera is None else replace(self._camera)
         self.verdict = None
         self.changes.forget()
-        self._answer = NOT_YET
+        self._found = NOT_YET
         if self._infos.current is not None:
             self._publish()
 
@@ -140,7 +149,8 @@ class GivenCalibration(CameraInUse):
         roi = message.roi
         what = self._infos.take((
             message.width, message.height, message.distortion_model, tuple(message.d),
-            tuple(message.k), message.binning_x, message.binning_y, roi.width, roi.height))
+            tuple(message.k), tuple(message.r), tuple(message.p), message.binning_x,
+            message.binning_y, roi.x_offset, roi.y_offset, roi.width, roi.height))
         if what == 'stray':
             self._complaints.say('other_calibrations', f'a camera_info on {self.topic} differs '
                                  f'from those before: is there a second publisher?')
@@ -152,10 +162,13 @@ class GivenCalibration(CameraInUse):
         if changed:
             self._log.warning(f'the calibration on {self.topic} has changed: it is checked anew')
         try:
-            self._camera, self._problem = given_camera(message, self.topic), ''
+            self._camera, self._problem = camera_of_message(message, self.topic), ''
         except InputError as error:
             self._camera, self._problem = None, str(error)
             self._log.warning(self._problem)
+        if self._camera is not None and self._camera.faults:
+            self._log.warning(f'the calibration on {self.topic} is wrong: '
+                              f'{"; ".join(self._camera.faults)}')
         self._tell_size()
         self.drop()
         self._changed()
@@ -171,7 +184,7 @@ class GivenCalibration(CameraInUse):
             self._log.warning(self._problem)
 
     def _publish(self) -> None:
-        values = answer_dict(self._answer, self.changes.texts)
+        values = answer_dict(self.answer, self.changes.texts)
         if self._camera is None:
             values['reasons'] = self.warnings()
         self._publisher.publish(String(data=json.dumps(values, allow_nan=False)))

@@ -10,29 +10,33 @@ from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.camera_in_use import CameraInUse
 from dashcalib_ros.ros.complaints import Complaints
-from dashcalib_ros.ros.news import Result
+from dashcalib_ros.ros.kept import Kept, Whose
+from dashcalib_ros.ros.news import Result, Watched
 from dashcalib_ros.ros.publication import Publication
 from dashcalib_ros.ros.state import Action, Rules, judge, sigma_text
-from dashcalib_ros.ros.store import Kept, Store
+from dashcalib_ros.ros.store import Store
 from dashcalib_ros.ros.stream import Source
 from dashcalib_ros.ros.wording import outcome_text
+from dashcalib_ros.turns import TurnId
 
 
 class CalibrationInUse(CameraInUse):
     """At most one calibration; its topics and its file are always changed together."""
 
-    def __init__(self, node: Node, name: str, store: Store, rules: Rules,
+    def __init__(self, node: Node, whose: Whose, store: Store, rules: Rules,
                  complaints: Complaints, rectified: str) -> None:
         super().__init__(node)
         self._node = node
         self._publication = Publication(node, rectified)
         self._kept: Kept | None = None
         self._log = node.get_logger()
-        self._name = name
+        self._whose = whose
         self._store = store
         self._rules = rules
         self._complaints = complaints
         self._rectified = rectified
+        # turns of this drive, with their bank, that were in a contradiction that was counted
+        self._counted: frozenset[tuple[int, TurnId]] = frozenset()
 
     @property
     def camera(self) -> NamedCamera | None:
@@ -84,15 +88,18 @@ class CalibrationInUse(CameraInUse):
         if wanted is not kept:
             self._log.warning(f'the projection_matrix in {self.file} is not that of rectified: '
                               f'{self._rectified}, which is published; ~/save writes it there')
-        self._use(wanted)
-        self._log.info(f'loaded {self.file}: {sigma_text(kept.camera)}')
+        self._use(wanted, confirmed=False)
+        self.contradictions = kept.contradictions
+        self._log.info(f'loaded {self.file}: {sigma_text(kept.camera)}; unconfirmed until turns '
+                       f'agree with it')
 
     def check(self, source: Source) -> None:
         """Stop using it if it is for other images than these; the file stays where it is."""
         kept = self._kept
         if kept is None:
             return
-        of = Source(kept.camera.image_size, kept.frame_id or source.frame_id)
+        of = Source(kept.camera.image_size,
+                    source.frame_id if kept.frame_id is None else kept.frame_id)
         if of != source:
             self._log.warning(f'{self.file} is ignored: it is for {of}, the images are {source}')
             self._unpublish()
@@ -106,15 +113,26 @@ class CalibrationInUse(CameraInUse):
         self.verdict = calibration.verdict
         for text in calibration.warnings:
             self._complaints.once(text)
+        self.settled = False
+        turns = frozenset((result.bank, turn) for turn in calibration.misfits
+                          if turn.of_this_drive)
+        if self.trusted is not None and turns and turns <= self._counted:
+            return 'keep'  # again, by request or with other stored turns: they count once
         judged = judge(calibration, result.complete, self.trusted, self.contradictions,
                        self._rules)
-        self.contradictions = judged.contradictions
+        if judged.action == 'keep':
+            if judged.contradictions > self.contradictions:
+                self._counted |= turns
+            self._count(judged.contradictions)
+            self.settled = judged.confirmed
+            self.confirmed = self.confirmed or judged.confirmed
         if judged.action in ('adopt', 'replace'):
             if judged.action == 'replace':
                 self._log.warning(f'the calibration is replaced: {judged.why}')
-            self._adopt(Kept.of(calibration, self._name, frame_id))
+            self._adopt(Kept.of(calibration, self._whose, frame_id))
         elif judged.action == 'give_up':
             self._log.error(f'the published calibration is given up: {judged.why}')
+            self.contradictions = 0
             self.retire()
             if publish_stale:
                 self.stale = True
@@ -136,6 +154,8 @@ class CalibrationInUse(CameraInUse):
 
     def retire(self) -> tuple[bool, str]:
         """Move the file aside; return whether it is out of the way, and a line about it."""
+        if self._store.taken:
+            return True, self._store.taken
         try:
             moved = self._store.retire()
         except OutputError as error:
@@ -159,9 +179,26 @@ class CalibrationInUse(CameraInUse):
             self._log.warning(f'{self.file} was written by another program: it is now {moved}')
         return True, f'written: {self.file}'
 
+    def close(self) -> None:
+        """Leave the file to other nodes."""
+        self._store.close()
+
+    def on_watched(self, watched: Watched) -> None:
+        """Take what new turns show; those that agree confirm a calibration that was loaded."""
+        super().on_watched(watched)
+        if watched.camera is self.watched() and watched.monitor.agrees:
+            self.confirmed = True
+
     def warnings(self) -> list[str]:
         """Return warnings about the file and the topic, for the operator."""
-        found = []
+        found = [self._store.taken] if self._store.taken else []
+        if self.contradictions:
+            found.append(f'{self.contradictions} of {self._rules.contradictions} calibrations in '
+                         f'a row contradict the published one: was the camera moved, or its lens '
+                         f'changed?')
+        if self._kept is not None and self._kept.edited and not self.confirmed:
+            found.append(f'{self.file} was edited since a node wrote it: unconfirmed until turns '
+                         f'agree with it')
         if self._store.given_up:
             found.append(f'{self.file} was given up, but could not be moved aside: remove it, or '
                          f'the next start of the node publishes it again')
@@ -170,6 +207,17 @@ class CalibrationInUse(CameraInUse):
             found.append(f'another node publishes {beside}: remap it, or its subscribers get both')
         return found
 
+    def _count(self, contradictions: int) -> None:
+        """Keep the count in the file too: it outlives the node."""
+        if contradictions == self.contradictions or self._kept is None:
+            return
+        self.contradictions = contradictions
+        self._kept = self._kept.contradicted(contradictions)
+        try:
+            self._store.update(self._kept)
+        except OutputError as error:
+            self._complaints.say('unsaved', str(error))
+
     def _adopt(self, kept: Kept) -> None:
         self._use(kept)
         self.contradictions = 0
@@ -177,9 +225,9 @@ class CalibrationInUse(CameraInUse):
         self._log.info(f'accepted: {sigma_text(kept.camera)}; '
                        + (f'saved to {self.file}' if saved else f'not saved: {text}'))
 
-    def _use(self, kept: Kept) -> None:
-        self._kept, self.stale = kept, False
-        self._publication.set(kept.camera, kept.frame_id)
+    def _use(self, kept: Kept, confirmed: bool = True) -> None:
+        self._kept, self.stale, self.confirmed = kept, False, confirmed
+        self._publication.set(kept.camera, kept.frame_id or '')
 
     def _unpublish(self) -> None:
         self._kept, self.stale = None, False

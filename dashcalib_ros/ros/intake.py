@@ -1,6 +1,7 @@
 """What arrives: which images are the camera's, what is wrong with the others, and what is missing.
 
-All of this runs in the executor's thread and reads no pixels.
+All of this runs in the executor's thread. It reads no pixels, but of images that tell of another
+camera than before: damaged ones must not be believed.
 """
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.frames.decode import message_size
 from dashcalib_ros.frames.stamps import StampGate, live
 from dashcalib_ros.ros.complaints import Complaints
+from dashcalib_ros.ros.detecting import whole
 from dashcalib_ros.ros.stream import Source, SourceWatch
 
 CURES = {
@@ -61,10 +63,10 @@ class Intake:
         self._last = time.monotonic()
         try:
             source = Source(message_size(message), message.header.frame_id)
+            what = self._watch.take(source, lambda: whole(message, source.size))
         except InputError as error:
             self._complaints.say('undecodable', str(error))
             return None
-        what = self._watch.take(source)
         if what == 'stray':
             self._complaints.say('strays', f'an image is {source}, the camera is '
                                            f'{self.source}: is there a second publisher?')

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from dashcalib_ros.ros.detecting import detect
 from dashcalib_ros.ros.news import NOTHING, Activity, Listener, Result, call, named, new_turns
 from dashcalib_ros.ros.watch import Watch
 from dashcalib_ros.status import Status
+from dashcalib_ros.turns import TurnId
 
 # s between two checks whether enough turns are built: scenes are finished without a push
 LOOK_S = 0.25
@@ -124,10 +125,20 @@ class Learner:
             self._aside(old.calibrator.close if keep_stored else lambda: _clear(old.calibrator))
             self._changed.notify_all()
 
-    def forget_stored(self) -> None:
-        """Drop the turns of earlier drives: they are of a camera that has changed since."""
+    def extend(self) -> bool:
+        """Use one turn of this drive more with this bank; False where no more are kept."""
         with self._changed:
-            self._aside(self._bank.calibrator.forget_stored)
+            turns = self._config.turns
+            if turns.wanted + self._bank.more >= turns.capacity:
+                return False
+            self._bank.more += 1
+            return True
+
+    def forget_stored(self, but: Set[TurnId]) -> None:
+        """Drop the turns of earlier drives but these: the camera has changed since."""
+        with self._changed:
+            calibrator = self._bank.calibrator
+            self._aside(lambda: calibrator.forget_stored(but))
 
     def close(self) -> None:
         """End both threads and every child process."""
@@ -196,7 +207,7 @@ class Learner:
             bank = self._bank
             try:
                 # here, as it may wait for an image that is being searched for points
-                bank.calibrator.want(self._config.turns.wanted)
+                bank.calibrator.want(self._config.turns.wanted, bank.more)
                 status = bank.calibrator.status()
                 self._note(bank, status)
                 self._read(bank, status)
@@ -219,6 +230,10 @@ class Learner:
         """Compare turns that are new with the camera in use."""
         try:
             found = self._watch.read(bank, status)
+            lens = None if found is None else found.monitor.lens
+            if lens is not None and lens.confirmed and lens.since.of_this_drive:
+                # those of earlier drives are of the camera before the change
+                bank.calibrator.forget_stored()
         except Exception as error:
             with self._changed:
                 cancelled = bank is not self._bank or self._closed

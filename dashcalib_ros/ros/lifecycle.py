@@ -16,6 +16,7 @@ class LifecycleCalibratorNode(LifecycleNodeMixin, CalibratorNode):  # type: igno
     def __init__(self) -> None:
         CalibratorNode.__init__(self, listen=False)
         LifecycleNodeMixin.__init__(self)
+        self.answer_always()
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe the images."""

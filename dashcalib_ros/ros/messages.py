@@ -4,16 +4,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
-from dashcalib_ros.camera import Camera, camera_from_ros, ros_camera
+from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.checking import Check
-from dashcalib_ros.errors import InputError
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.report.named_camera import check_focal, read_size
 from dashcalib_ros.ros.news import NOTHING
 from dashcalib_ros.ros.state import State, sigma_text
 from dashcalib_ros.status import Status
@@ -30,27 +27,6 @@ def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:
                       distortion_model=c.distortion_model, d=c.d, k=c.k, r=c.r, p=c.p)
 
 
-def given_camera(message: CameraInfo, topic: str) -> NamedCamera:
-    """Return the camera that a driver publishes. Raises InputError where it cannot be used."""
-    what = f'the camera_info on {topic}'
-    if not message.k[0] > 0:
-        raise InputError(f'{what} is uncalibrated: K[0] is not positive; give the driver a '
-                         f'calibration')
-    if not np.isfinite([*message.k, *message.d]).all():
-        raise InputError(f'{what} has numbers that are not finite')
-    roi = message.roi
-    cut = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
-    if cut or max(message.binning_x, message.binning_y) > 1:
-        raise InputError(f'{what} has binning or a region of interest: publish the calibration of '
-                         f'the images as they are')
-    size = read_size(message.width, message.height, what)
-    try:
-        camera = camera_from_ros(size, message.distortion_model, message.k, message.d)
-    except InputError as error:
-        raise InputError(f'{what}: {error}') from error
-    return NamedCamera(topic, check_focal(camera, what))
-
-
 def uncalibrated(header: Header) -> CameraInfo:
     """Return an uncalibrated CameraInfo, K[0] = 0 (sensor_msgs). It replaces a latched one."""
     return CameraInfo(header=header)
@@ -64,7 +40,7 @@ class Health:
     the last calibration. silent_s: s since the last image, None before the first. listening:
     False for a managed node that is not active. changes, suspicions: of the camera in use, in
     words; misfit: why the calibration no longer fits it, '' where it does. check: with check_only,
-    what was found.
+    what was found. confirmed: False for one of a file until turns agree with it.
     """
 
     state: State
@@ -86,6 +62,7 @@ class Health:
     suspicions: tuple[str, ...] = ()
     misfit: str = ''
     check: Check | None = None
+    confirmed: bool = True
 
 
 # s; a camera that is silent for longer has stopped
@@ -110,6 +87,8 @@ def diagnostic_status(health: Health, name: str, hardware_id: str) -> Diagnostic
         'verdict': health.verdict,
         'reasons': '; '.join(health.reasons),
         'published': sigma_text(health.published) if health.published else 'nothing',
+        'calibration': ('' if health.published is None
+                        else 'confirmed' if health.confirmed else 'unconfirmed'),
         'camera model': health.published.camera.model if health.published else '',
         'sigma fx (px)': _sigma(health.published),
         'file': health.file,
@@ -150,7 +129,8 @@ def _summary(health: Health) -> tuple[bytes, str]:
     if health.check is not None:
         return _checked(health.check, turns)
     if health.published is not None:
-        return OK, f'calibrated; {turns} for the next check of it'
+        state = 'calibrated' if health.confirmed else 'calibrated, unconfirmed'
+        return OK, f'{state}; {turns} for the next check of it'
     if health.state == 'calibrating':
         return WARN, f'calibrating with {turns}: {health.stage}'
     if health.state == 'refused_so_far':

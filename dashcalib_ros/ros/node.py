@@ -25,6 +25,7 @@ from dashcalib_ros.ros.given import GivenCalibration
 from dashcalib_ros.ros.images import ImageInput
 from dashcalib_ros.ros.in_use import CalibrationInUse
 from dashcalib_ros.ros.intake import Intake
+from dashcalib_ros.ros.kept import Whose
 from dashcalib_ros.ros.learner import Learner
 from dashcalib_ros.ros.mailbox import Mailbox
 from dashcalib_ros.ros.news import Listener, NewTurn, Result
@@ -33,6 +34,7 @@ from dashcalib_ros.ros.parameters import (
     changed,
     check_known,
     declare,
+    refusal,
     why_read_only,
 )
 from dashcalib_ros.ros.preview import Preview
@@ -59,7 +61,8 @@ class CalibratorNode(Node):
         """listen: subscribe the images at once."""
         super().__init__('calibrator')
         self._core, self._own = declare(self)
-        self._name = camera_name(self._own, self.get_namespace())
+        self._topic = self.resolve_topic_name('image_raw')
+        self._name = camera_name(self._own, self._topic)
         check_camera_name(self._name)
         self._mask = read_mask(Path(self._own.mask_file)) if self._own.mask_file else None
         self._complaints = Complaints(self.get_logger().warning)
@@ -89,7 +92,8 @@ class CalibratorNode(Node):
         self.create_timer(PERIOD_S, self._on_tick, clock=steady)
         for name, action in (('calibrate', self._calibrate), ('reset', self._reset),
                              ('save', self._in_use.save)):
-            self.create_service(Trigger, f'~/{name}', self._answering(action))
+            self.create_service(Trigger, f'~/{name}', _service(action))
+        self.answer_always()
         self.add_on_set_parameters_callback(self._on_parameters)
         doing = 'checking' if self._own.check_only else 'learning'
         self.get_logger().info(f'{doing} the camera {self._name!r} from the turns seen on '
@@ -98,8 +102,10 @@ class CalibratorNode(Node):
     def _make_in_use(self) -> CalibrationInUse | GivenCalibration:
         if self._own.check_only:
             return GivenCalibration(self, self._complaints, self._set_goal)
+        plain = self._topic == f'{self.get_namespace().rstrip("/")}/image_raw'
+        whose = Whose(self._name, self._topic, plain)
         return CalibrationInUse(
-            self, self._name, Store(camera_info_path(self._own.calibration_url, self._name)),
+            self, whose, Store(camera_info_path(self._own.calibration_url, self._name), whose),
             Rules(self._own.better, self._own.contradictions), self._complaints,
             self._core.rectified)
 
@@ -107,6 +113,7 @@ class CalibratorNode(Node):
         """End the learner with its child processes, the drawing, then the node."""
         self._learner.close()
         self._preview.close()
+        self._in_use.close()
         self.destroy_node()
 
     def survive(self, error: Exception) -> None:
@@ -189,8 +196,10 @@ class CalibratorNode(Node):
                 self._commit.call(self._in_use.info)
         elif action == 'give_up':
             # the turns that contradict it stay, and are used for the next one
-            self._learner.forget_stored()
-        elif action == 'keep' and result.complete:
+            self._learner.forget_stored(result.calibration.used_turns)
+        elif (action == 'keep' and result.complete
+              # turns that do not confirm it may be all that is known of another camera: they stay
+              and (self._in_use.settled or not self._learner.extend())):
             # the next calibration must be independent: it uses new turns only
             self._learner.restart()
         self._set_goal()
@@ -208,16 +217,22 @@ class CalibratorNode(Node):
 
     # services and parameters -----------------------------------------------------------------
 
-    def _answering(self, action: Callable[[], tuple[bool, str]]) -> Callable[..., Any]:
-        """Return a service's callback; action: returns success and a message."""
-        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def answer_always(self) -> None:
+        """Let each service, rclpy's own too, answer where its callback fails.
+
+        A client waits for ever for an answer that does not come.
+        """
+        for service in self.services:
+            service.callback = self._answering(service.callback)
+
+    def _answering(self, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        def answer(request: Any, response: Any) -> Any:
             try:
-                response.success, response.message = action()
+                return callback(request, response)
             except Exception as error:
                 self.survive(error)
-                response.success = False
-                response.message = f'failed: {one_line(error)}; the log of the node has more'
-            return response
+                return refusal(request, response,
+                               f'failed: {one_line(error)}; the log of the node has more')
         return answer
 
     def _calibrate(self) -> tuple[bool, str]:
@@ -259,3 +274,11 @@ class CalibratorNode(Node):
     def _later(self, action: Callable[[], None]) -> None:
         """Let the executor's thread run an action; called from other threads."""
         self._mail.put(action)
+
+
+def _service(action: Callable[[], tuple[bool, str]]) -> Callable[..., Trigger.Response]:
+    """Return a service's callback; action: returns success and a message."""
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = action()
+        return response
+    return answer

@@ -13,11 +13,14 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
 
 from dashcalib_ros.config import Config, describe
 from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.report.camera_yaml import CAMERA_NAME
 from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig
 
 OF_ROS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
@@ -79,12 +82,22 @@ def why_read_only(name: str) -> str:
             f'-p {name}:=VALUE. These can be changed: {", ".join(CHANGEABLE)}')
 
 
-def camera_name(config: NodeConfig, namespace: str) -> str:
-    """Return the camera's name; a node in /front calibrates the camera called front."""
-    if config.camera_name:
-        return config.camera_name
-    last = namespace.rstrip('/').rpartition('/')[2]
-    return re.sub(r'[^A-Za-z0-9_]', '_', last) or 'dashcam'
+def refusal(request: Any, response: Any, reason: str) -> Any:
+    """Return the response of a service that failed; what its fields are by themselves is no."""
+    failed = SetParametersResult(successful=False, reason=reason)
+    if isinstance(response, SetParameters.Response):
+        response.results += [failed] * (len(request.parameters) - len(response.results))
+    elif isinstance(response, SetParametersAtomically.Response):
+        response.result = failed
+    elif isinstance(response, Trigger.Response):
+        response.success, response.message = False, reason
+    return response
+
+
+def camera_name(config: NodeConfig, topic: str) -> str:
+    """Return the camera's name; images on /camera/front/image_raw are of camera_front."""
+    namespace = topic.rpartition('/')[0].strip('/')
+    return config.camera_name or re.sub(r'[^A-Za-z0-9_]', '_', namespace) or CAMERA_NAME
 
 
 def _declared(node: Node, name: str, spec: dataclasses.Field[Any]) -> Any:

@@ -22,7 +22,7 @@ class NodeConfig:
         'auto', 'auto does as the publishers do: best effort if any of them does',
         choices=('auto', 'best_effort', 'reliable'))
     camera_name: str = setting(
-        '', "in the file and its name; empty: the last part of the node's namespace, or dashcam")
+        '', "in the file and its name; empty: the namespace of the images' topic, or dashcam")
     camera_info_url: str = setting(
         '', 'of the accepted calibration: a path, file:// or package://, with ${ROS_HOME} and '
             '${NAME}; empty: file://${ROS_HOME}/camera_info/${NAME}.yaml')

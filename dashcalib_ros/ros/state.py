@@ -29,11 +29,15 @@ class Rules:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What to do with a new calibration, why, and the contradictions in a row so far."""
+    """What to do with a new calibration, why, and the contradictions in a row so far.
+
+    confirmed: it agrees with the published one.
+    """
 
     action: Action
     why: str = ''
     contradictions: int = 0
+    confirmed: bool = False
 
 
 def judge(new: Calibration, complete: bool, published: NamedCamera | None, contradictions: int,
@@ -56,12 +60,14 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
         if count < rules.contradictions:
             return Judgement('keep', why, count)
         return Judgement('replace' if complete else 'give_up', why)
-    assert published.sigma is not None
-    before, after = published.sigma['fx'], new.sigma['fx']
-    if complete and after <= rules.replace_ratio * before:
-        return Judgement('replace', f'it is more exact: fx is known to ± {after:.2f} px, it was ± '
-                                    f'{before:.2f} px')
-    return Judgement('keep', 'it confirms the published one')
+    # the sigma of a file that was edited is not known
+    before = 'not known' if published.sigma is None else f'± {published.sigma["fx"]:.2f} px'
+    after = new.sigma['fx']
+    if complete and (published.sigma is None
+                     or after <= rules.replace_ratio * published.sigma['fx']):
+        return Judgement('replace', f'it is more exact: fx is known to ± {after:.2f} px, it was '
+                                    f'{before}')
+    return Judgement('keep', 'it confirms the published one', confirmed=True)
 
 
 def state_of(published: bool, calibrating: bool, refused: bool) -> State:

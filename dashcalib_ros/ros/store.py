@@ -1,83 +1,71 @@
 """The last accepted calibration on disk, by default where camera_info_manager finds it."""
 from __future__ import annotations
 
+import fcntl
+import os
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from datetime import datetime, timezone
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import yaml
-
-from dashcalib_ros.camera import ros_camera
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
-from dashcalib_ros.report import (
-    NamedCamera,
-    calibrated_camera,
-    calibration_yaml,
-    remove_leftovers,
-    set_aside,
-    write_text,
-)
-from dashcalib_ros.report.camera_yaml import parse_calibration_yaml
-
-
-@dataclass(frozen=True)
-class Kept:
-    """An accepted calibration: the camera, the frame its images were in, and the file's text."""
-
-    camera: NamedCamera
-    frame_id: str
-    text: str
-
-    @classmethod
-    def of(cls, calibration: Calibration, name: str, frame_id: str) -> Kept:
-        """Make it of a calibration that was accepted just now."""
-        now = datetime.now(timezone.utc).isoformat(timespec='seconds')
-        document = yaml.safe_load(calibration_yaml(calibration, name, now))
-        document['dashcalib']['frame_id'] = frame_id
-        return cls(calibrated_camera(calibration, name), frame_id, _dumped(document))
-
-    def rectified(self, rectified: str) -> Kept:
-        """Return it with the P of a setting, itself where the file has that already.
-
-        P is no measurement but the user's choice: the present one counts, not the file's.
-        """
-        document = parse_yaml(self.text, self.camera.name)
-        p = ros_camera(self.camera.camera, rectified).p
-        before = document.get('projection_matrix')
-        if isinstance(before, dict) and _equal(before.get('data'), p):
-            return self
-        document['projection_matrix'] = {'rows': 3, 'cols': 4, 'data': p}
-        return replace(self, text=_dumped(document))
-
-
-def _dumped(document: dict[str, Any]) -> str:
-    text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=2**20,
-                               allow_unicode=True)
-    return text
-
-
-def _equal(data: Any, p: list[float]) -> bool:
-    try:
-        return bool(np.allclose(np.asarray(data, np.float64), p, rtol=1e-9, atol=0))
-    except (TypeError, ValueError):
-        return False
+from dashcalib_ros.limits import YAML_BYTES, read_text
+from dashcalib_ros.report import remove_leftovers, set_aside, write_text
+from dashcalib_ros.ros.kept import Kept, Whose, implausible
 
 
 class Store:
-    """One file. If another program has written it, it is set aside, never overwritten."""
+    """One file of one node. If another program has written it, it is set aside, never overwritten.
 
-    def __init__(self, path: Path) -> None:
+    While a node has it, no other node reads or writes it: a file beside it is locked.
+    """
+
+    def __init__(self, path: Path, whose: Whose) -> None:
         self.path = path
+        self._whose = whose
+        self._lock: int | None = None
         # the text that this node last read or wrote: a different one is another program's
         self._text: str | None = None
         # the text of a calibration that was given up, but could not be moved aside
         self._given_up: str | None = None
         remove_leftovers(self.path.parent, (self.path.name,))
+
+    def claim(self) -> bool:
+        """Take the file unless another node has it; return whether this node has it."""
+        if self._lock is not None:
+            return True
+        real = Path(os.path.realpath(self.path))
+        with suppress(OSError):
+            real.parent.mkdir(parents=True, exist_ok=True)
+        # where nothing can be written, the file itself
+        for path, flags in ((real.with_name(f'.{real.name}.lock'), os.O_CREAT), (real, 0)):
+            try:
+                lock = os.open(path, os.O_RDONLY | os.O_NONBLOCK | flags, 0o644)
+            except OSError:
+                continue
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                os.close(lock)
+                if isinstance(error, BlockingIOError):
+                    return False
+                continue  # not every file system has locks
+            self._lock = lock
+            return True
+        return True
+
+    def close(self) -> None:
+        """Leave the file to other nodes."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    @property
+    def taken(self) -> str:
+        """Return the line for the operator where another node has the file, else ''."""
+        if self.claim():
+            return ''
+        return (f'another node uses {self.path}: this one neither publishes nor writes it; set '
+                f'camera_name or camera_info_url to give each a file of its own')
 
     @property
     def given_up(self) -> bool:
@@ -87,33 +75,40 @@ class Store:
     def load(self) -> Kept | None:
         """Return the calibration, None if there is no file.
 
-        Raises InputError when it is damaged, was given up, or is another tool's: that has no sigma
-        to compare with.
+        Raises InputError when it is damaged, was given up, is another node's, another tool's (that
+        has no sigma to compare with), or another camera's. One that no lens can have is set aside.
         """
         self._text = None
+        if self.taken:
+            raise InputError(self.taken)
         with suppress(OSError):  # reading fails, too, and raises InputError below
             if not self._exists():
                 return None
         try:
             text = read_text(self.path, YAML_BYTES)
-            camera = parse_calibration_yaml(text, self.path)
+            kept = Kept.read(text, self.path, self._whose)
         except (InputError, ValueError, OverflowError) as error:
             raise InputError(f'{self.path} is ignored: {error}') from error
         if text == self._given_up:
             raise InputError(f'{self.path} is ignored: it was given up, but could not be moved '
                              f'aside; remove it')
-        if camera.verdict != 'accepted' or camera.sigma is None:
-            raise InputError(f'{self.path} is ignored: it is no accepted calibration of this '
-                             f'node; it is moved aside when there is one')
+        if why := implausible(kept.camera):
+            try:
+                end = f'it is now {set_aside(self.path)}'
+            except OutputError as error:
+                end = str(error)
+            raise InputError(f'{self.path} is not used: {why}; {end}')
         self._text = text
-        own = parse_yaml(text, str(self.path))['dashcalib']
-        return Kept(camera, str(own.get('frame_id', '')), text)
+        # its sigma may be what was edited
+        return replace(kept, camera=replace(kept.camera, sigma=None)) if kept.edited else kept
 
     def save(self, kept: Kept) -> Path | None:
         """Write it, completely or not at all. Raises OutputError.
 
         Returns the new path of another program's file, None if there was none.
         """
+        if self.taken:
+            raise OutputError(self.taken)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -125,12 +120,21 @@ class Store:
         self._text, self._given_up = kept.text, None
         return moved
 
+    def update(self, kept: Kept) -> None:
+        """Write it where the file is still what this node read or wrote. Raises OutputError."""
+        if self._text is not None and self._read() == self._text and self.claim():
+            write_text(self.path, kept.text)
+            self._text = kept.text
+
     def retire(self) -> Path | None:
         """Set the file aside, so that it is not loaded again; return its new path.
 
         None if there was no file. Raises OutputError when it could not be moved: this process
-        does not load it again then, but the next start of the node does.
+        does not load it again then, but the next start of the node does; and where another node
+        has it.
         """
+        if self.taken:
+            raise OutputError(self.taken)
         try:
             moved = set_aside(self.path)
         except OutputError:

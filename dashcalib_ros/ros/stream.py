@@ -1,9 +1,7 @@
-"""Whether the messages of a stream are of one camera, judged by what they share.
-
-This runs in the image callback, so that no pixels are read.
-"""
+"""Whether the messages of a stream are of one camera, judged by what they share."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
@@ -36,17 +34,27 @@ class SourceWatch(Generic[T]):
         self._other: T | None = None
         self._run = 0
 
-    def take(self, source: T) -> Literal['first', 'same', 'stray', 'changed']:
-        """Take the next message's source."""
+    def take(self, source: T, check: Callable[[], object] = lambda: None
+             ) -> Literal['first', 'same', 'stray', 'changed']:
+        """Take the next message's source.
+
+        check: raises InputError, which goes on to the caller, for a damaged message: such a one
+        is no sign of a change. It is called for few messages: not for those of the present source,
+        nor for strays between them.
+        """
         if source == self.current:
             self._run = 0
             return 'same'
         if self.current is None:
+            check()
             self.current = source
             return 'first'
-        self._run = self._run + 1 if source == self._other else 1
-        self._other = source
-        if self._run < LASTING:
+        run = self._run + 1 if source == self._other else 1
+        self._other, self._run = source, 0
+        if run > 1:
+            check()
+        self._run = run
+        if run < LASTING:
             return 'stray'
         self.previous, self.current, self._run = self.current, source, 0
         return 'changed'

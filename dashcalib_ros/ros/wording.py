@@ -1,6 +1,7 @@
 """The lines that the node logs while it learns: one for each event."""
 from __future__ import annotations
 
+from dashcalib_ros.errors import counted
 from dashcalib_ros.judgement import Calibration
 from dashcalib_ros.ros.news import NewTurn
 from dashcalib_ros.status import Status
@@ -23,17 +24,13 @@ def turn_text(turn: NewTurn, wanted: int, checking: bool) -> str:
 def started_text(status: Status) -> str:
     """Return 'calibrating with 5 turns, 402° of yaw…'."""
     if not status.built:
-        return f'calibrating, as soon as {_turns(status.turns)} found so far can be used…'
-    return f'calibrating with {_turns(status.built)}, {status.yaw_deg:.0f}° of yaw…'
+        return f'calibrating, as soon as {counted(status.turns, "turn")} found so far can be used…'
+    return f'calibrating with {counted(status.built, "turn")}, {status.yaw_deg:.0f}° of yaw…'
 
 
 def outcome_text(calibration: Calibration, why: str) -> str:
     """Return a line about a calibration that is not adopted; why: the reasons."""
     level = calibration.verdict.level
-    parts = [f'a calibration of {_turns(calibration.turns_used)} is {level}'
+    parts = [f'a calibration of {counted(calibration.turns_used, "turn")} is {level}'
              + (f': {why}' if why else ''), NEXT.get(level, '')]
     return '; '.join(part for part in parts if part)
-
-
-def _turns(count: int) -> str:
-    return f'{count} turn{"" if count == 1 else "s"}'

@@ -18,6 +18,7 @@ from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.reconstruction.scene import Scene, residuals_px
+from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.normal import (
     IMAGE,
     ImagePrior,
@@ -35,6 +36,8 @@ Kind = Literal['shift', 'zoom', 'bend']
 FIELD = (5, 4)
 # prior sigma of the field at each of them, px
 FIELD_PX = 3.0
+# prior sigma of what is left of a rolling shutter's readout, s
+READOUT_S = 3.0
 # prior sigmas of the zoom: of one image, of a stretch, of a turn
 ZOOM_IMAGE, ZOOM_STRETCH, ZOOM_TURN = 0.01, 0.02, 0.03
 
@@ -133,10 +136,12 @@ class Problem:
 
 
 def problem_of(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: float,
-               config: IntrinsicsConfig, by_extra: Sequence[Floats] = ()) -> Problem:
+               config: IntrinsicsConfig, by_extra: Sequence[Floats] = (),
+               sigmas: Sequence[float] = ()) -> Problem:
     """Return the linearised problem of scenes at their solution.
 
-    by_extra: for each scene (k, t, 2, e) derivatives by parameters that follow the wider model's.
+    by_extra: for each scene (k, t, 2, e) derivatives by parameters that follow the wider model's;
+    sigmas: (e,) of their priors.
     """
     normals = tuple(
         normal_equations(scene, camera, loss_px, by_extra[n] if by_extra else None, by_image=True)
@@ -144,11 +149,9 @@ def problem_of(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: 
     noise = (sum(normal.squares for normal in normals)
              / sum(normal.freedom for normal in normals))
     information = prior_information(step1, config)
-    extra = np.square(extra_sigma_of(camera))
-    count = by_extra[0].shape[-1] if by_extra else 0
     return Problem(tuple(scenes), normals, information,
                    information @ (prior_of(step1, config, 1.0).mean - camera.params),
-                   np.concatenate([extra, np.full(count, FIELD_PX**2)]), noise)
+                   np.square(np.r_[extra_sigma_of(camera), sigmas]), noise)
 
 
 def shift_priors(problem: Problem, config: IntrinsicsConfig, crops: Crops) -> list[ImagePrior]:
@@ -198,21 +201,29 @@ def _indices(keyframes: Ints, *components: int) -> Ints:
 
 def departures(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: float,
                config: IntrinsicsConfig, crops: Crops | None = None, bent: bool = True,
-               rolling: bool = False) -> tuple[Departure, ...]:
+               rolling: bool = False, found: FoundField | None = None) -> tuple[Departure, ...]:
     """Return how the scenes depart from a fixed camera, the strongest first.
 
     crops: of a stabilised video, as taken out already. bent: False leaves out the field. rolling:
-    a rolling shutter was taken out: what is left of it is no departure.
+    a rolling shutter was taken out: what is left of it is no departure. found: the field that no
+    lens model has: what is left of that is none either.
     """
-    columns = []
+    columns, sigmas = [], []
     if rolling:
         columns.append([row_shift(scene, camera)[..., None] for scene in scenes])
+        sigmas.append(READOUT_S)
+    if found is not None:
+        columns.append([found.columns(scene, camera) for scene in scenes])
+        sigmas += [found.sigma_px] * found.basis.shape[1]
+    free = len(sigmas)
     if bent:
-        columns.append([_field(scene, camera) for scene in scenes])
+        columns.append([_bends(scene, camera) for scene in scenes])
+        sigmas += [FIELD_PX] * columns[-1][0].shape[-1]
     problem = problem_of(scenes, camera, step1, loss_px, config,
-                         [np.concatenate(parts, axis=-1) for parts in zip(*columns, strict=True)])
+                         [np.concatenate(parts, axis=-1) for parts in zip(*columns, strict=True)],
+                         sigmas)
     count, lens = len(camera.names()), len(camera.widened().names())
-    wide = range(count, lens + rolling)
+    wide = range(count, lens + free)
     shifts = shift_priors(problem, config, crops or {})
     zooms = [_zoom_prior(scene, problem.noise, config) for scene in scenes]
     fixed = problem.solved(None, wide)
@@ -246,7 +257,7 @@ def largest_crop(crops: Crops) -> float:
     return float(np.abs(paths - np.median(paths, axis=0)).max())
 
 
-def _field(scene: Scene, camera: Camera) -> Floats:
+def _bends(scene: Scene, camera: Camera) -> Floats:
     """Return (k, t, 2, 2 f) derivatives by a smooth field's displacements at its f supports.
 
     The weights of the supports at an observation sum to 1.

@@ -50,10 +50,15 @@ def with_poses_of(scene: Scene, part: Scene) -> Scene:
         registered=structure.registered))
 
 
+def is_far(scene: Scene, camera: Camera) -> bool:
+    """Return whether a scene's own camera is so far from this one that its poses may be wrong."""
+    far = abs(np.log(scene.camera.fx / camera.fx)) > np.log(1.08)
+    return bool(far or scene.camera.family != camera.family)
+
+
 def adapted_to(scene: Scene, camera: Camera, config: Config) -> Scene:
     """Return the scene with this camera, chained anew if its own camera was far from it."""
-    far = abs(np.log(scene.camera.fx / camera.fx)) > np.log(1.08)
-    if far or scene.camera.ros_model != camera.ros_model:
+    if is_far(scene, camera):
         anew = rechain(scene, camera, config)
         if anew is not None:
             return anew

@@ -33,7 +33,7 @@ def summed(profiles: Sequence[Profile]) -> Profile:
 
 
 def kinds_of_lenses(scenes: Sequence[Scene]) -> list[str]:
-    """Return the ros_models of the cameras that were tried for at least half of the scenes.
+    """Return the families of the cameras that were tried for at least half of the scenes.
 
     The profiles do not decide between them: with two coefficients of distortion, wide lenses of
     one kind may look more like the other.

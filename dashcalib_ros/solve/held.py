@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.config import Config
+from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.reconstruction.adjust import Solver, adjust_poses
-from dashcalib_ros.reconstruction.scene import Scene, errors_px
-from dashcalib_ros.solve.fitting import adapted_to, retriangulate
+from dashcalib_ros.reconstruction.scene import Scene, errors_px, truncated_cost
+from dashcalib_ros.solve.fitting import is_far, rechain, retriangulate
 from dashcalib_ros.solve.prior import loss_px_of
 
 # of an adjustment; it moves poses and points only, and is cheap
@@ -32,13 +32,21 @@ def costs_with(camera: Camera, scenes: Sequence[Scene], loss_px: float, limit_px
 def scene_with(camera: Camera, scene: Scene, config: Config) -> Scene | None:
     """Return the scene as a camera explains it; None where it explains no observation.
 
-    It is triangulated, or chained anew where its own camera is far from this one, and adjusted
-    with the camera held. The first rounds are generous: the camera may be wrong.
+    It is triangulated, and also chained anew where its own camera is far from this one, and
+    adjusted with the camera held: the better one counts, as a chain may break where images are
+    lost. The first rounds are generous: the camera may be wrong.
     """
     width = camera.image_size[0]
     generous = replace(config.scene, error_px=max(config.scene.error_px,
                                                   config.scene.chain_error * width))
-    found = adapted_to(scene, camera, replace(config, scene=generous))
+    anew = (rechain(scene, camera, replace(config, scene=generous)) if is_far(scene, camera)
+            else None)
+    found = [_held(camera, each, generous, config) for each in (scene, anew) if each is not None]
+    return min((each for each in found if each is not None), default=None,
+               key=lambda each: truncated_cost(each, camera, config.scene.error_px))
+
+
+def _held(camera: Camera, found: Scene, generous: SceneConfig, config: Config) -> Scene | None:
     for n in range(ROUNDS):
         limits = generous if n < ROUNDS - 1 else config.scene
         found = retriangulate(found, camera, limits)

@@ -6,14 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import AUTO
+from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruction.scene import Profile, Scene
 from dashcalib_ros.solve.choice import Candidate
 from dashcalib_ros.solve.departures import Departure
+from dashcalib_ros.solve.field import without_field
+from dashcalib_ros.solve.field_rounds import with_field, with_field_of_all_tracks
 from dashcalib_ros.solve.fitting import adapted_to
 from dashcalib_ros.solve.focal import kinds_of_lenses, nearest_start, profile_around, summed
-from dashcalib_ros.solve.information import covariance
+from dashcalib_ros.solve.information import step_to_wider_model
 from dashcalib_ros.solve.misfit import misfits
 from dashcalib_ros.solve.model_choice import (
     chosen_of,
@@ -21,11 +25,9 @@ from dashcalib_ros.solve.model_choice import (
     refitted,
     with_model_chosen,
 )
-from dashcalib_ros.solve.prior import (
-    bounds_of,
-    extra_sigma_of,
-    floor_of,
-)
+from dashcalib_ros.solve.picture import picture_covariance
+from dashcalib_ros.solve.prior import bounds_of, extra_sigma_of
+from dashcalib_ros.solve.shutter import readout_sigma
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.stabiliser import without_crops, without_stabiliser
 from dashcalib_ros.solve.steps import (
@@ -66,24 +68,29 @@ def solve(separate: Sequence[Scene], config: Config,
     if not begun:
         return None
     start, tried = _best_of(begun, config)
-    roughly = start.result
+    progress('looking for a field', 0.0)
+    roughly, full_scenes = with_field(start.result, config), start.full_scenes
+    field = roughly.used_field
+    if field is not None:
+        full_scenes = {turn: without_field(scene, field) for turn, scene in full_scenes.items()}
     roughly = _steadied(roughly, config)
-    crops, full_scenes = roughly.fit.crops, start.full_scenes
+    crops = roughly.fit.crops
     if crops:
         full_scenes = {turn: without_crops(full_scenes[turn], crops) for turn in crops}
     complete = with_all_tracks(roughly.fit, full_scenes, separate, config)
     if not complete.scenes:
         return None
+    complete = with_field_of_all_tracks(replace(roughly, fit=complete), config).fit
     final = step2(complete, full_scenes, roughly.step1, config, progress)
     result = Result(final, roughly.step1, config.intrinsics)
     if crops:
         # a part of the tracks leaves the crops uncertain
         result = without_stabiliser(result, config, FINAL_ROUNDS)
-    elif config.model == AUTO:
+    elif config.model == AUTO and field is None:
         progress('choosing the lens model', 0.0)
         result, others = with_model_chosen(result, full_scenes, config)
         tried = _merged(tried, others)
-    else:
+    elif config.model != AUTO:
         progress('comparing the lens model with others', 0.0)
         tried = compared_with_others(result, full_scenes, config)
     progress('trying other focal lengths', 0.0)
@@ -149,6 +156,20 @@ def _merged(first: Sequence[Candidate], later: Sequence[Candidate]) -> tuple[Can
     return tuple(found.values()) if len(found) > 1 else ()
 
 
+def _shared_with_field(result: Result) -> Floats:
+    """Return (n,) how far each parameter would go if it took up a field of this size.
+
+    Where the lens ends and the field begins is agreed on, not measured: another calibration may
+    have the same rays and another share of both. Over the picture it makes no difference.
+    """
+    camera, field = result.fit.camera, result.used_field
+    if field is None:
+        return np.zeros(len(camera.names()))
+    moves, _ = sensitivity(camera)
+    by_unit = np.sqrt(np.mean(np.sum(moves**2, axis=1), axis=0))
+    return np.asarray(np.sqrt(np.mean(field.over(camera)**2)) / by_unit)
+
+
 def _solution(result: Result, separate: Sequence[Scene], profiles: tuple[Profile, Profile],
               tried: tuple[Candidate, ...], config: Config) -> Solution:
     """Return the solution with its covariance. profiles: the coarse one, and that around it."""
@@ -159,13 +180,16 @@ def _solution(result: Result, separate: Sequence[Scene], profiles: tuple[Profile
     count = len(prior)
     departed = result.departures()
     systematic = max(1.0, *(each.strength for each in departed))
-    spread = covariance(parts, prior, extra_sigma_of(camera), systematic)
-    floor = floor_of(camera, settings)
+    step = step_to_wider_model(parts, prior, extra_sigma_of(camera))
+    spread = picture_covariance(camera, parts, prior, result.floor, step, systematic,
+                                result.one_turn_sigma)
     return Solution(
-        camera=camera, covariance=spread[:count, :count] + np.diag(floor**2), step1=step1,
+        camera=camera, covariance=spread[:count, :count] + np.diag(_shared_with_field(result)**2),
+        step1=step1,
         scenes=tuple(scenes), parts=parts, coarse=profiles[0], around=profiles[1],
         bounds=np.array(bounds_of(step1, settings)), prior_information=prior, readout_s=readout_s,
-        readout_sigma_s=float(np.sqrt(spread[count, count])) if readout_s else 0.0,
+        readout_sigma_s=readout_sigma(parts, prior, systematic) if readout_s else 0.0,
         misfits=misfits(separate, scenes, camera, config.scene.error_px), tried=tried,
         sigma_map=result.sigma_map(systematic), systematic=systematic, departures=departed,
-        crops=final.crops)
+        crops=final.crops, field=final.field, floor=result.floor,
+        one_turn_sigma=result.one_turn_sigma)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import MODELS, Camera, larger_models
+from dashcalib_ros.camera import Camera, calibrated_models, larger_models
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruction.scene import Scene
@@ -75,7 +75,7 @@ def compared_with_others(asked: Result, full_scenes: ByTurn, config: Config
     found = [_refitted(few, type(camera), measured, config)]
     if found[0] is None:
         return ()
-    for model in MODELS.values():
+    for model in calibrated_models():
         if model is not type(camera):
             fitted = _without_shutter if model in larger else _refitted
             found.append(fitted(few, model, measured, config))
@@ -170,7 +170,7 @@ def _refitted(first: Result, model: type[Camera], full_scenes: ByTurn, config: C
         # where nothing was seen the first one may be far off, and must not draw the other there
         camera = as_model(camera, model, _seen(first.fit.scenes))
     step1 = camera
-    if model.ros_model == first.step1.ros_model:
+    if model.family == first.step1.family:
         distortion = first.step1.params[4:len(model.names())]
         step1 = model.centred(camera.image_size, first.step1.fx, *distortion)
     scenes = retriangulate_all(first.fit.scenes, camera, config.scene)

@@ -8,10 +8,9 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.solve.information import Information, noise_of, step_to_wider_model
 from dashcalib_ros.solve.picture import picture_covariance, sigma_over
-from dashcalib_ros.solve.prior import extra_sigma_of, floor_of
+from dashcalib_ros.solve.prior import extra_sigma_of
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.turns.turn import TurnId
 
@@ -19,18 +18,14 @@ from dashcalib_ros.turns.turn import TurnId
 LEAST_TURNS = 3
 
 
-def covariance_of(solution: Solution, settings: IntrinsicsConfig) -> Floats:
-    """Return the (n, n) covariance that the sigma over the picture comes from.
+def wider_covariance_of(solution: Solution) -> Floats:
+    """Return the covariance of the wider model's parameters: the camera's own come first.
 
-    The variances of single parameters in solution.covariance are each the largest of several
-    estimates, which loses how the parameters make up for each other; here they keep it.
+    Of those that this model has not, the step is all that is known.
     """
-    camera = solution.camera
-    count = len(camera.names())
-    found = picture_covariance(
-        camera, solution.parts, solution.prior_information, floor_of(camera, settings),
-        solution.step_to_wider_model, solution.systematic)
-    return np.asarray(found[:count, :count])
+    return picture_covariance(
+        solution.camera, solution.parts, solution.prior_information, solution.floor,
+        solution.step_to_wider_model, solution.systematic, solution.one_turn_sigma)
 
 
 def seen_by_turns(solution: Solution, given: Camera) -> Floats:
@@ -74,7 +69,7 @@ class HeldOut:
         return self.px / float(np.hypot(self.sigma_px, self.others_sigma_px))
 
 
-def held_out(solution: Solution, settings: IntrinsicsConfig) -> tuple[HeldOut, ...]:
+def held_out(solution: Solution) -> tuple[HeldOut, ...]:
     """Return what each turn says of the calibration without it; () for fewer than three turns.
 
     At the solution each turn's cost is known as a quadratic function of the camera: neither
@@ -93,13 +88,14 @@ def held_out(solution: Solution, settings: IntrinsicsConfig) -> tuple[HeldOut, .
     def camera_of(some: list[Information]) -> tuple[Floats, float]:
         """Return the parameters' offsets from the solution (n,), and the sigma over the picture.
 
-        It is the sigma that a calibration of these turns would state.
+        It is the sigma that a calibration of these turns would state, but for what one turn cannot
+        show: that others differ from it is what is asked here.
         """
         total = sum((part.hessian[:count, :count] for part in some), noise * prior)
         # at the solution the prior balances the scores of all turns
         pull = sum((part.score[:count] for part in some), np.zeros(count)) - balance
         covariance = picture_covariance(
-            camera, some, prior, floor_of(camera, settings),
+            camera, some, prior, solution.floor,
             step_to_wider_model(some, prior, extra_sigma_of(camera)), systematic)
         return (np.asarray(np.linalg.solve(total, pull)),
                 _rms(sigma_over(moves, covariance[:count, :count])))

@@ -7,6 +7,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.prior import Prior
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.reconstruction.scene import Scene, errors_px
@@ -55,10 +56,17 @@ def extra_sigma_of(camera: Camera) -> Floats:
     return np.array(camera.widened().spread[len(camera.spread):])
 
 
-def floor_of(camera: Camera, config: IntrinsicsConfig) -> Floats:
-    """Return the sigmas (n,) of systematic errors, which no number of turns averages out."""
+def floor_of(camera: Camera, config: IntrinsicsConfig, field: Field | None = None) -> Floats:
+    """Return the sigmas (n,) of systematic errors, which no number of turns averages out.
+
+    field: that was taken out of the tracks: what is left of it is the same for all turns.
+    """
     floor = np.zeros(len(camera.names()))
-    floor[:2] = config.focal_floor * camera.fx
+    left = 0.0
+    if field is not None:
+        size_px = float(np.sqrt(np.mean(field.over(camera)**2)))
+        left = config.field_floor * min(1.0, size_px / config.whole_field_px)
+    floor[:2] = np.hypot(config.focal_floor, left) * camera.fx
     floor[2:4] = config.centre_floor * camera.image_size[0]
     return floor
 

@@ -16,7 +16,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.solve.information import information, pooled
+from dashcalib_ros.solve.information import Information, Pooled, information, pooled
 
 # s; step of the central difference for a point's speed in the picture
 STEP_S = 1e-3
@@ -61,12 +61,22 @@ def readout(scenes: Sequence[Scene], camera: Camera, loss_px: float, prior: Floa
     shifts = [row_shift(scene, camera) for scene in scenes]
     if not any(shift.any() for shift in shifts):
         return 0.0, float(np.inf)
-    together = pooled([information(scene, camera, loss_px, shift)
+    together = pooled([information(scene, camera, loss_px, shift[..., None])
                        for scene, shift in zip(scenes, shifts, strict=True)], prior)
     # the camera is at its optimum: only the readout has a gradient
-    variance = together.inverse[-1, -1]
-    seconds = variance * together.scores[:, -1].sum()
-    return float(seconds), float(np.sqrt(max(variance, together.clustered[-1, -1])))
+    seconds = together.inverse[-1, -1] * together.scores[:, -1].sum()
+    return float(seconds), _sigma(together, len(prior), 1.0)
+
+
+def readout_sigma(parts: Sequence[Information], prior: Floats, systematic: float) -> float:
+    """Return the sigma of the readout that was taken out, s; the arguments are as elsewhere."""
+    return _sigma(pooled(parts, prior), len(prior), systematic)
+
+
+def _sigma(together: Pooled, place: int, systematic: float) -> float:
+    """Return the sigma of the readout, the parameter behind the camera's."""
+    return float(np.sqrt(max(together.inverse[place, place],
+                             systematic * together.clustered[place, place])))
 
 
 def remove_rolling_shutter(scene: Scene, measured: Scene, camera: Camera, readout_s: float

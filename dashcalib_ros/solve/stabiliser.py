@@ -17,7 +17,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruction.adjust import Solver, adjust_step2
 from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.solve.departures import Crops, Problem, problem_of, shift_priors
+from dashcalib_ros.solve.departures import READOUT_S, Crops, Problem, problem_of, shift_priors
 from dashcalib_ros.solve.fitting import retriangulate_all
 from dashcalib_ros.solve.normal import IMAGE
 from dashcalib_ros.solve.prior import bounds_of, loss_px_of, prior_of
@@ -51,7 +51,8 @@ def without_stabiliser(given: Result, config: Config, rounds: int) -> Result:
         loss_px = loss_px_of(fit.scenes, fit.camera, settings)
         shutter = [row_shift(scene, fit.camera) for scene in fit.scenes] if fit.readout_s else []
         problem = problem_of(fit.scenes, fit.camera, now.step1, loss_px, settings,
-                             [shift[..., None] for shift in shutter])
+                             [shift[..., None] for shift in shutter],
+                             [READOUT_S] * bool(shutter))
         now, strength = _step(now, problem, shutter)
         found, camera = adjust_step2(
             now.fit.scenes, now.fit.camera, Solver(loss_px, config.scene.iterations),

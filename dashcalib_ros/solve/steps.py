@@ -2,17 +2,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from dataclasses import field as default
 from functools import cached_property
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.config import Config, IntrinsicsConfig
 from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1, adjust_step2
 from dashcalib_ros.reconstruction.scene import Scene
 from dashcalib_ros.solve.departures import Crops, Departure, departures, shift_prior
+from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.fitting import (
     explained_by,
     retriangulate_all,
@@ -41,14 +44,21 @@ Progress = Callable[[str, float], None]
 class Fit:
     """The state of the adjustment. readout_s: of the rolling shutter that was removed.
 
-    crops: of the stabilised video, as removed; empty for a fixed picture.
+    crops: of the stabilised video, as removed; empty for a fixed picture. field: what no lens
+    model has, as removed; None where nothing speaks for one.
     """
 
     scenes: list[Scene]
     camera: Camera
     solver: Solver
     readout_s: float = 0.0
-    crops: Crops = field(default_factory=dict)
+    crops: Crops = default(default_factory=dict)
+    field: FoundField | None = None
+
+    def noise(self, loss_px: float) -> float:
+        """Return the variance of a residual for the priors, px^2; loss_px: of the Cauchy loss."""
+        inflation = self.field.inflation if self.field is not None else 1.0
+        return inflation * noise_in(self.scenes, self.camera, loss_px)
 
 
 @dataclass(frozen=True)
@@ -65,9 +75,27 @@ class Result:
         fit, loss_px = self.fit, self.fit.solver.loss_px
         noise = noise_in(fit.scenes, fit.camera, loss_px) if fit.crops else 0.0
         return tuple(information(
-            scene, fit.camera, loss_px, row_shift(scene, fit.camera) if fit.readout_s else None,
+            scene, fit.camera, loss_px, *self._extras(scene),
             shift_prior(scene, noise, self.settings, fit.crops[scene.turn]) if fit.crops else None)
             for scene in fit.scenes)
+
+    def _extras(self, scene: Scene) -> tuple[Floats | None, tuple[Floats, Floats]]:
+        """Return a scene's derivatives by what all turns share beside the lens, and its prior.
+
+        (k, t, 2, e) for the readout of a rolling shutter and the directions of the field, and
+        (e,) the information and the negative gradient of their priors.
+        """
+        fit, columns, prior, pull = self.fit, [], [np.zeros(0)], [np.zeros(0)]
+        if fit.readout_s:
+            columns.append(row_shift(scene, fit.camera)[..., None])
+            prior.append(np.zeros(1))
+            pull.append(np.zeros(1))
+        if fit.field is not None:
+            columns.append(fit.field.columns(scene, fit.camera))
+            prior.append(np.full(columns[-1].shape[-1], fit.field.sigma_px**-2.0))
+            pull.append(-prior[-1] * fit.field.directions)
+        return (np.concatenate(columns, axis=-1) if columns else None,
+                (np.concatenate(prior), np.concatenate(pull)))
 
     @cached_property
     def prior(self) -> Floats:
@@ -79,14 +107,31 @@ class Result:
         fit = self.fit
         scenes = [subsample_tracks(scene, self.settings.first_tracks) for scene in fit.scenes]
         return departures(scenes, fit.camera, self.step1, fit.solver.loss_px, self.settings,
-                          fit.crops, bent, bool(fit.readout_s))
+                          fit.crops, bent, bool(fit.readout_s), fit.field)
+
+    @property
+    def floor(self) -> Floats:
+        """Return the sigmas (n,) of systematic errors."""
+        return floor_of(self.fit.camera, self.settings, self.used_field)
+
+    @property
+    def one_turn_sigma(self) -> float:
+        """Return by how much fx differs between single turns, px."""
+        return self.settings.one_turn_sigma * self.fit.camera.fx
+
+    @property
+    def used_field(self) -> Field | None:
+        """Return the field that was taken out of the tracks, None without one."""
+        found = self.fit.field
+        return found.field if found is not None and found.used else None
 
     def sigma_map(self, systematic: float = 1.0) -> SigmaMap:
-        """Return the sigma over the picture; systematic: as for covariance()."""
+        """Return the sigma over the picture; systematic: as for picture_covariance()."""
         camera = self.fit.camera
         return sigma_map(
-            camera, self.parts, self.prior, floor_of(camera, self.settings),
-            step_to_wider_model(self.parts, self.prior, extra_sigma_of(camera)), systematic)
+            camera, self.parts, self.prior, self.floor,
+            step_to_wider_model(self.parts, self.prior, extra_sigma_of(camera)), systematic,
+            self.one_turn_sigma, self.used_field)
 
 
 def step1(full_scenes: ByTurn, start: Camera, config: Config, progress: Progress) -> Fit:
@@ -166,7 +211,7 @@ def step2(complete: Fit, full_scenes: ByTurn, step1: Camera, config: Config,
                 break
             fit = ready
         solver = replace(fit.solver, loss_px=loss_px_of(fit.scenes, fit.camera, settings))
-        prior = prior_of(step1, settings, noise_in(fit.scenes, fit.camera, solver.loss_px))
+        prior = prior_of(step1, settings, fit.noise(solver.loss_px))
         scenes, camera = adjust_step2(fit.scenes, fit.camera, solver, prior, bounds)
         fit = replace(fit, scenes=scenes, camera=camera, solver=solver)
     return fit

@@ -29,7 +29,6 @@ from wide import WIDE
 
 from dashcalib_ros import Config, stages
 from dashcalib_ros.camera import MODELS, Camera
-from dashcalib_ros.checking.check import RELEVANT
 from dashcalib_ros.checking.difference import difference_of
 from dashcalib_ros.frames.scale import Scale
 
@@ -82,7 +81,7 @@ def ask(solved: Solved) -> dict[str, Any]:
                'worst_px': found.worst_px, 'distance': found.distance, 'limit': found.limit,
                'loss': found.loss, 'seconds': round(time.perf_counter() - started, 2)}
         if solution is not None and calibration.verdict.level == 'accepted':
-            spoiled, true = (difference_of(each, solution, px, RELEVANT, config.intrinsics)
+            spoiled, true = (difference_of(each, solution, px)
                              for each in (taken, truth))
             # the spoil alone, as exactly as this drive would see it
             alone = replace(spoiled, offsets=spoiled.offsets - true.offsets)

@@ -13,7 +13,6 @@ import numpy as np
 from drives import pictures_of
 from views import View, Viewed
 
-import dashcalib_ros.frames.quiet  # noqa: F401 (before our VideoWriter wakes FFmpeg)
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.frames import Frame
 

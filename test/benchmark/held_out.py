@@ -59,7 +59,7 @@ def drives_table(drives: Iterable[Solved]) -> str:
     for each in drives:
         if each.solution is None or each.calibration.verdict.level != 'accepted':
             continue
-        found = held_out(each.solution, Config().intrinsics)
+        found = held_out(each.solution)
         if not found:
             continue
         good = [turn.px <= turn.sigma_px + turn.others_sigma_px for turn in found]

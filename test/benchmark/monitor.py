@@ -29,7 +29,6 @@ from dashcalib_ros import Config, stages
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.checking import Change, Reading, watch
 from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.solve.opinions import covariance_of
 from dashcalib_ros.turns.turn import TurnId
 
 CONFIG = Config()
@@ -139,7 +138,7 @@ def library_of(drive: Solved, cache: Path) -> Library:
     # fx, fy, cx and cy are pixels
     sigma = {key: value / px if key in camera.names()[:4] else value
              for key, value in drive.calibration.sigma.items()}
-    return Library(name, camera, covariance_of(drive.solution, CONFIG.intrinsics), sigma, readings)
+    return Library(name, camera, drive.solution.covariance, sigma, readings)
 
 
 @dataclass(frozen=True)

@@ -145,8 +145,8 @@ def against(text: str | None, reference: dict[str, float]) -> None:
     if text is None:
         print('no calibration')
         return
-    from dashcalib_ros.report.camera_yaml import parse_calibration_yaml
-    camera = parse_calibration_yaml(text, 'the node')
+    from dashcalib_ros.report.camera_file import parse_camera
+    camera = parse_camera(text, 'the node')
     for name, value in reference.items():
         mine = camera.camera.named[name]
         sigma = (camera.sigma or {})[name]

@@ -13,8 +13,11 @@ from dashcalib_ros.camera import (
     Camera,
     Fisheye,
     Radial,
+    Rational,
+    calibrated_models,
     camera_from_ros,
     camera_of,
+    larger_models,
     model_named,
     ros_camera,
     searched,
@@ -28,6 +31,9 @@ PINHOLE = Radial(SIZE, 650.0, 650.0, 639.5, 359.5)
 # reaches a radius of 0.66 at k1 = -0.6 (fold at 0.745, distorted 0.497): the corners lie beyond
 FOLDED = Radial(SIZE, 700.0, 700.0, 639.5, 359.5, -0.6, 0.0)
 DECENTRED = Brown(SIZE, 700.0, 703.0, 652.0, 350.0, -0.30, 0.09, 0.002, -0.003, -0.01)
+# the size of the coefficients that an Azure Kinect has
+QUOTIENT = Rational(SIZE, 607.0, 606.5, 638.0, 366.0, 0.44, -2.66, 0.0006, -0.0003, 1.53, 0.32,
+                    -2.48, 1.46)
 FISHEYE = Fisheye(SIZE, 700.0, 703.0, 652.0, 350.0, -0.03, 0.01, -0.004, 0.001)
 # 190 degrees across; the corners see to 117
 ROUND = Fisheye(SIZE, 390.0, 391.0, 630.0, 365.0, -0.02, 0.004, -0.002, 0.0003)
@@ -35,7 +41,7 @@ ROUND = Fisheye(SIZE, 390.0, 391.0, 630.0, 365.0, -0.02, 0.004, -0.002, 0.0003)
 FOLDED_FISHEYE = Fisheye(SIZE, 600.0, 600.0, 639.5, 359.5, -0.3)
 CAMERAS: dict[str, Camera] = {
     'barrel': BARREL, 'pincushion': PINCUSHION, 'pinhole': PINHOLE, 'decentred': DECENTRED,
-    'fisheye': FISHEYE, 'round': ROUND}
+    'quotient': QUOTIENT, 'fisheye': FISHEYE, 'round': ROUND}
 FISHEYES = [name for name, camera in CAMERAS.items() if isinstance(camera, Fisheye)]
 
 
@@ -55,7 +61,8 @@ def test_projects_as_opencv_does(name):
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     named = camera.named
     fisheye = isinstance(camera, Fisheye)
-    names = ('k1', 'k2', 'k3', 'k4') if fisheye else ('k1', 'k2', 'p1', 'p2', 'k3')
+    names = ('k1', 'k2', 'k3', 'k4') if fisheye else ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5',
+                                                         'k6')
     distortion = np.array([named.get(name, 0.0) for name in names])
     origin = np.zeros(3)
     if fisheye:
@@ -275,7 +282,8 @@ def test_ros_describes_the_same_camera(name):
     camera = CAMERAS[name]
     ros = ros_camera(camera)
     assert (ros.distortion_model, len(ros.d)) == (
-        ('equidistant', 4) if name in FISHEYES else ('plumb_bob', 5))
+        ('equidistant', 4) if name in FISHEYES else
+        ('rational_polynomial', 8) if name == 'quotient' else ('plumb_bob', 5))
     assert len(ros.p) == 12 and ros.p[:3] == ros.k[:3]
     again = camera_from_ros(SIZE, ros.distortion_model, ros.k, ros.d)
     # the simplest that has these numbers
@@ -300,6 +308,32 @@ def test_a_model_that_nobody_knows_is_told_in_one_line():
         with pytest.raises(ConfigError):
             searched(name)
     assert [model.model for model in searched('auto')] == ['radial', 'fisheye']
+
+
+def test_the_turns_do_not_choose_the_rational_model_by_themselves():
+    assert MODELS['rational_polynomial'] is Rational and Rational not in calibrated_models()
+    assert not any(Rational in larger_models(camera) for camera in CAMERAS.values())
+    with pytest.raises(ConfigError, match='not found from turns; there are auto, radial'):
+        searched('rational_polynomial')
+
+
+def test_a_rational_lens_ends_where_its_radius_grows_no_more():
+    # r / (1 + 0.8 r^2) has its maximum 0.559 at r = 1.118
+    lens = Rational(SIZE, 500.0, 500.0, 639.5, 359.5, k4=0.8)
+    assert lens.fold == pytest.approx(1.118, abs=1e-3)
+    assert not lens.covers_picture() and QUOTIENT.covers_picture()
+    # 1 - 0.25 r^2 is 0 at r = 2
+    assert Rational(SIZE, 500.0, 500.0, 639.5, 359.5, k4=-0.25).fold == pytest.approx(2.0)
+    far = lens.rays(np.array([[639.5 + 0.6 * 500, 359.5], [639.5 + 0.5 * 500, 359.5]]))
+    assert np.isnan(far[0]).all() and np.isfinite(far[1]).all()
+
+
+def test_a_camera_matrix_with_skew_is_refused():
+    k = ros_camera(BARREL).k
+    for place in (1, 3, 6):
+        with pytest.raises(InputError, match='skew'):
+            camera_from_ros(SIZE, 'plumb_bob', [0.5 if n == place else value
+                                                for n, value in enumerate(k)], [0.0] * 5)
 
 
 def test_what_no_model_describes_is_refused():

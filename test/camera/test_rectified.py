@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dashcalib_ros.camera import RECTIFIED, Brown, Camera, Fisheye, Radial, ros_camera
+from dashcalib_ros.camera import RECTIFIED, Brown, Camera, Fisheye, Radial, ros_camera, ros_faults
 from dashcalib_ros.camera.rectified import WIDEST, rectified_matrix
 from dashcalib_ros.config import describe
 from dashcalib_ros.errors import ConfigError
@@ -46,6 +46,16 @@ def test_the_setting_has_these_choices():
     assert about.metadata['choices'] == RECTIFIED and about.default == 'same'
     with pytest.raises(ConfigError, match='same, crop, all'):
         ros_camera(PINHOLES['barrel'], 'whole')
+
+
+@pytest.mark.parametrize('rectified', RECTIFIED)
+@pytest.mark.parametrize('name', CAMERAS)
+def test_each_view_fits_its_camera_and_those_of_other_sizes_do_not(name, rectified):
+    camera = CAMERAS[name]
+    c = ros_camera(camera, rectified)
+    assert ros_faults(camera, c.k, c.r, c.p) == ros_faults(camera) == ()
+    for scale in (0.5, 1.5, 2.0):
+        assert ros_faults(camera, c.k, c.r, [scale * value for value in c.p[:8]] + c.p[8:])
 
 
 @pytest.mark.parametrize('name', CAMERAS)

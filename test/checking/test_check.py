@@ -11,10 +11,11 @@ from synthetic import LENS, SIZE
 
 from dashcalib_ros import stages
 from dashcalib_ros.camera import Brown, Fisheye
-from dashcalib_ros.camera.mapping import as_model
-from dashcalib_ros.checking.check import RELEVANT
+from dashcalib_ros.camera.mapping import apart, as_model
 from dashcalib_ros.checking.difference import Difference, difference_of, distance
+from dashcalib_ros.checking.wording import answers_of
 from dashcalib_ros.judgement import Verdict
+from dashcalib_ros.report import NamedCamera, compare
 from dashcalib_ros.solve.picture import PictureSigma
 
 ACCEPTED = Verdict('accepted')
@@ -33,7 +34,7 @@ def ask(given, solution, verdict=ACCEPTED):
 def test_the_truth_is_right_also_where_pixels_begin_elsewhere(solution, shift):
     found = ask(replace(LENS, cx=LENS.cx + shift, cy=LENS.cy + shift), solution)
     assert found.answer == 'right' and found.distance < found.limit
-    assert found.rms_px < 1.0 and 'it is right to' in found.reasons[0]
+    assert found.rms_px < 1.0 and 'matters: no, with 95 %' in found.reasons[2]
     assert abs(found.loss) < 0.05
 
 
@@ -49,8 +50,36 @@ def test_what_is_wrong_is_named(solution, changes, way):
     assert found.answer == 'wrong' and found.loss > 0
     assert found.distance > found.limit and found.rms_px <= found.worst_px
     assert any(re.search(way, reason) for reason in found.reasons), found.reasons
-    # nothing else is blamed: the distance, the part, and the loss
-    assert len(found.reasons) == 3
+    # nothing else is blamed: the three answers, the part, and the loss
+    assert len(found.reasons) == 5 and 'matters: yes' in found.reasons[2]
+
+
+def test_check_and_compare_say_the_same(solution):
+    own = NamedCamera('own', solution.camera, covariance=solution.covariance,
+                      sigma_px=solution.picture)
+    answers = []
+    for share in (0.0, 0.003, 0.01, 0.02):
+        given = replace(LENS, fx=(1 + share) * LENS.fx)
+        found, pair = ask(given, solution), compare(NamedCamera('given', given), own).whole
+        # one implementation: the same numbers, and the same answers in the same words
+        for name in ('rms_px', 'worst_px', 'sigma_px', 'told_apart', 'distance', 'limit'):
+            assert getattr(found, name) == pytest.approx(getattr(pair, name)), name
+        assert found.reasons[:3] == answers_of(pair, 'the drive')
+        assert pair.matters == {'right': False, 'wrong': True, 'cannot tell': None}[found.answer]
+        answers.append((found.told_apart, found.answer))
+    assert answers[0] == (False, 'right') and answers[1][1] == 'right'
+    assert answers[2][1] != 'right' and answers[3] == (True, 'wrong')
+
+
+@pytest.mark.parametrize(('share', 'told', 'matters'), [
+    (0.0, False, False), (0.003, True, False), (0.007, True, None), (0.01, True, True)])
+def test_a_sharp_drive_tells_one_percent_of_the_focal_length(share, told, matters):
+    # sigma of fx: 0.05 %; 0.3 % is more than that, but good calibrations differ by as much
+    covariance = np.diag([0.0005 * LENS.fx, 0.0005 * LENS.fy, 0.3, 0.3, 0.0003, 0.0003])**2
+    given = replace(LENS, fx=(1 + share) * LENS.fx)
+    found = Difference(given, LENS, given.params - LENS.params, covariance, apart(given, LENS),
+                       PictureSigma(0.2, 0.5))
+    assert (found.told_apart, found.matters) == (told, matters)
 
 
 def test_two_mistakes_are_both_named(solution):
@@ -65,6 +94,12 @@ def test_a_resized_calibration_is_recognised(solution):
     assert '1600x900' in found.reasons[0] and '--size 800x450' in found.reasons[0]
     small = LENS.resized(0.5, (400, 225))
     assert 'is wrong, too' in ask(replace(small, fx=1.05 * small.fx), solution).reasons[0]
+
+
+def test_a_size_that_alone_is_wrong_is_told_without_a_number_of_pixels(solution):
+    found = ask(replace(LENS, image_size=(1600, 900)), solution)
+    assert found.answer == 'wrong' and 'only the size is wrong' in found.reasons[0]
+    assert found.rms_px is None and found.distance is None
 
 
 def test_parameters_for_another_size_than_the_file_says(solution):
@@ -100,7 +135,7 @@ def test_a_drive_without_a_calibration_of_its_own_cannot_tell(solution):
 def test_a_drive_that_knows_its_camera_badly_cannot_tell(solution):
     flat = replace(solution.sigma_map, sigma=np.full(len(solution.sigma_map.sigma), 30.0))
     found = ask(LENS, replace(solution, sigma_map=flat))
-    assert found.answer == 'cannot tell' and 'may be there' in found.reasons[0]
+    assert found.answer == 'cannot tell' and 'may be there' in found.reasons[2]
 
 
 def test_a_distortion_that_folds_over_is_wrong(solution):
@@ -119,17 +154,17 @@ def test_a_decentred_lens_is_compared_as_the_turns_see_it():
     true = Brown.of(SIZE, [*LENS.params, 0.0004, -0.0004, 0.0])
     solution = solved(scenes_of(4, extra=(0.0004, -0.0004, 0.0)),
                       CONFIG.replace({'model': 'radial'}))
-    found = difference_of(true, solution, 1.0, RELEVANT, CONFIG.intrinsics)
-    plain = difference_of(LENS, solution, 1.0, RELEVANT, CONFIG.intrinsics)
+    found = difference_of(true, solution, 1.0)
+    plain = difference_of(LENS, solution, 1.0)
     assert found.distance < found.limit and found.distance < plain.distance
 
 
 def test_pixels_are_those_of_the_input(solution):
     whole = LENS.resized(2.0, (1600, 900))
-    small = difference_of(LENS, solution, 1.0, RELEVANT, CONFIG.intrinsics)
-    large = difference_of(whole, solution, 2.0, RELEVANT, CONFIG.intrinsics)
-    assert large.rms_px == pytest.approx(2 * small.rms_px, rel=1e-3)
-    assert large.relevant_px == pytest.approx(2 * small.relevant_px)
+    small = difference_of(LENS, solution, 1.0)
+    large = difference_of(whole, solution, 2.0)
+    assert large.rms_px == pytest.approx(2 * small.rms_px, rel=2e-3)
+    assert large.relevant_px == pytest.approx(2 * small.relevant_px, rel=2e-3)
     assert large.offsets[0] == pytest.approx(2 * small.offsets[0], rel=1e-3)
     assert large.offsets[4] == pytest.approx(small.offsets[4], rel=1e-3)
 
@@ -139,7 +174,7 @@ def test_the_part_that_explains_most_comes_first():
     # fx and k1 are known together only: k1, as it is, leads one to expect fx 0.9 larger
     covariance[0, 4] = covariance[4, 0] = 0.09
     offsets = np.array([9.0, 0.0, 0.0, 30.0, 0.1, 0.0])
-    found = Difference(LENS, LENS, offsets, covariance, 1.0, 2.0, PictureSigma(0.1, 0.2), 5.0)
+    found = Difference(LENS, LENS, offsets, covariance, None, PictureSigma(0.1, 0.2))
     ways = found.ways()
     assert list(ways) == ['centre', 'focal length']
     np.testing.assert_allclose(ways['centre'], [0.0, 30.0], atol=1e-9)

@@ -9,8 +9,11 @@ from solving import CONFIG
 from synthetic import LENS, rotation, synthetic_turn
 
 from dashcalib_ros import stages
+from dashcalib_ros.camera import Fisheye
+from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.checking import Reading, watch
 from dashcalib_ros.reconstruction.heading import Heading, heading
+from dashcalib_ros.solve import fitting
 from dashcalib_ros.turns.turn import TurnId
 
 ZOOMED = replace(LENS, fx=1.03 * LENS.fx, fy=1.03 * LENS.fy)
@@ -105,6 +108,17 @@ def test_the_first_turn_that_showed_a_change_is_kept(readings):
     assert change.since == TurnId.at(3)
 
 
+def test_turns_of_this_drive_that_know_the_lens_confirm_the_camera_in_use(readings):
+    turns = driven(*readings['same'][:2])
+    assert watched(turns).agrees
+    assert not watched(driven(*readings['zoomed'])).agrees
+    assert not watched(driven(*readings['exchanged'])).agrees
+    # not those of earlier drives, nor one that any camera would explain
+    assert not watched([replace(each, turn=TurnId.stored(n)) for n, each in
+                        enumerate(turns)]).agrees
+    assert not watched([replace(turns[0], hessian=np.zeros((6, 6)), score=np.zeros(6))]).agrees
+
+
 def test_one_odd_turn_is_no_change(readings):
     turns = driven(*readings['same'], readings['zoomed'][0], *readings['same'])
     assert watched(turns).lens is None
@@ -114,6 +128,43 @@ def test_a_change_is_taken_back_only_when_two_turns_speak_against_it(readings):
     turns = (*readings['same'], *readings['zoomed'][:2])
     assert watched(driven(*turns, readings['same'][0])).changes
     assert not watched(driven(*turns, *readings['same'][:2])).changes
+
+
+def unexplained(reading):
+    """As a turn in the middle of which images were lost."""
+    return replace(reading, hessian=np.zeros((6, 6)), score=np.zeros(6), explained=False,
+                   misfit=3.2)
+
+
+def test_a_chain_that_breaks_where_images_are_lost_is_no_other_camera(monkeypatch):
+    """A turn that was taken for a fisheye's is chained anew with the camera in use."""
+    scene = replace(scene_of(LENS, 80.0, 0), camera=as_model(LENS, Fisheye))
+    few = np.arange(len(scene.structure.registered)) < 8
+    broken = replace(scene, camera=LENS, structure=replace(
+        scene.structure, registered=few, used=scene.structure.used & few[:, None]))
+    monkeypatch.setattr(fitting, 'chain_scene', lambda *arguments: broken)
+    [reading] = stages.read([scene], LENS, CONFIG)
+    assert reading.explained and reading.misfit < CONFIG.monitor.max_misfit
+
+
+def test_odd_turns_with_good_ones_between_are_no_other_camera(readings):
+    good, bad = readings['same'], unexplained(readings['same'][0])
+    assert watched(driven(*good, bad, good[0], good[1], bad)).changes == ()
+    assert watched(driven(bad, good[0], bad, good[1], bad), None).changes == ()
+
+
+def test_what_two_odd_turns_showed_is_taken_back_although_others_are_odd_too(readings):
+    good, bad = readings['same'], unexplained(readings['same'][0])
+    turns = [*good, bad, bad]
+    assert watched(driven(*turns)).changes
+    assert watched(driven(*turns, good[0], bad)).changes
+    assert not watched(driven(*turns, good[0], bad, good[1])).changes
+    assert not watched(driven(*turns, good[0], bad, good[1], bad)).changes
+
+
+def test_a_turn_that_costs_more_and_asks_for_no_other_camera_shows_none(readings):
+    costly = [replace(each, misfit=1.5) for each in readings['same']]
+    assert watched(driven(*readings['same'], *costly)).lens is None
 
 
 def test_another_camera_is_told_although_no_size_can_be(readings):

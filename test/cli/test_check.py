@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from fakes import stands_in_for
 from made_calibration import TRUTH, make_calibration
+from made_drives import START, drive, images, info_of, write_bag
 
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.checking import Check, Odometry, Reading, watch
@@ -78,8 +79,18 @@ def test_the_answer_is_shown_and_is_the_exit_code(files, monkeypatch, capfd, ans
     monkeypatch.setattr(FakeCalibrator, 'answer', answer)
     assert main(files) == code
     out, errors = capfd.readouterr()
-    assert out.splitlines()[0] == answer and 'it is 0.2 px off' in out
+    assert out.splitlines()[0] == f'answer: {answer}' and 'it is 0.2 px off' in out
     assert 'dark' in errors and FakeCalibrator.asked == TRUTH
+
+
+def test_a_bag_s_own_calibration_is_checked(files, tmp_path, capfd):
+    write_bag(tmp_path / 'bag', [*images(drive(3)), ('/camera_info', START, info_of(TRUTH))])
+    FakeCalibrator.asked = None
+    assert main(['check', 'bag']) == 0 and FakeCalibrator.asked == TRUTH
+    assert main(['check', 'bag', '--topic', '/camera']) == 0
+    write_bag(tmp_path / 'without', images(drive(3)))
+    assert main(['check', 'without']) == 2
+    assert 'there is none' in capfd.readouterr().err
 
 
 def test_json_has_what_programs_need(files, capfd):

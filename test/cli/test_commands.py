@@ -23,7 +23,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.bags.write import BagWriter
 from dashcalib_ros.calibrator import Calibrator
-from dashcalib_ros.camera import AUTO, MODELS, ros_camera
+from dashcalib_ros.camera import AUTO, calibrated_models, ros_camera
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
@@ -35,6 +35,8 @@ from dashcalib_ros.standard_streams import folded
 from dashcalib_ros.status import Status
 from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.turns.turn import Turn
+
+NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
 
 
 @stands_in_for(Calibrator)
@@ -139,7 +141,8 @@ def test_run_writes_shows_and_says_the_verdict(
     assert names(tmp_path / 'work' / 'calibration') == files
     shown = capsys.readouterr()
     lines = shown.out.splitlines()
-    assert lines[-1].startswith('next: ') and level in lines and '\x1b' not in shown.out
+    assert lines[0] == f'verdict: {level}' and lines[-1].startswith('next: ')
+    assert '\x1b' not in shown.out
     assert all(name in shown.out.partition('written to calibration: ')[2] for name in files)
     assert shown.err == 'dashcalib: warning: dark\n'  # no progress in a pipe
     assert fake.made[0].frames == 4 and fake.made[0].closed
@@ -235,7 +238,7 @@ def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
     assert fake.made[0].config == wanted and fake.made[0].verbose
 
 
-@pytest.mark.parametrize('model', [AUTO, *MODELS])
+@pytest.mark.parametrize('model', NAMES_OF_MODELS)
 def test_model_is_a_setting(fake, drive, model):
     assert main(['run', drive, '--set', 'model=brown', '--model', model]) == 0
     assert main(['run', drive, '--set', f'model={model}']) == 0
@@ -246,7 +249,7 @@ def test_help_names_every_model(capsys):
     for command in ('run', 'demo'):
         assert main([command, '--help']) == 0
         text = capsys.readouterr().out.rpartition('--model NAME')[2].partition('\n  --')[0]
-        assert all(name in text for name in (AUTO, *MODELS)), text
+        assert all(name in text for name in NAMES_OF_MODELS), text
 
 
 def test_a_model_that_there_is_not_is_told_before_a_drive_is_rendered(

@@ -111,7 +111,7 @@ def test_compare_shows_the_difference(results):
     done = dashcalib('compare', results / 'a', results / 'truth.json')
     assert (done.returncode, done.stderr) == (0, '')
     assert re.search(r'fx +721.54 px +714.54 px +\+7.0000 +\+0.980 % +2.0\n', done.stdout)
-    assert 'mapping error: ' in done.stdout
+    assert 'matters: yes' in done.stdout
     assert '\x1b' not in done.stdout
 
 
@@ -135,6 +135,12 @@ def test_export_prints_or_writes_a_camera_file(results):
     assert out.read_text() == printed.stdout
     half = dashcalib('export', results / 'a', '--to', 'ros', '--size', '621x188')
     assert half.returncode == 0 and 'image_width: 621' in half.stdout
+    # an .npz is not for a terminal
+    rays = dashcalib('export', results / 'a', '--to', 'rays')
+    assert_one_line_error(rays)
+    assert '--out rays.npz' in rays.stderr
+    dashcalib('export', results / 'a', '--to', 'rays', '--out', results / 'rays.npz')
+    assert dashcalib('compare', results / 'a', results / 'rays.npz').returncode == 0
 
 
 def test_export_to_what_there_is_not(results):

@@ -2,11 +2,14 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import os
 
+import numpy as np
 import pytest
 from fleet_made import CONFIG, YAWS, Here, clip_of, lens_of, written
-from made_drives import smooth, write_video
+from made_drives import drive, images, smooth, write_bag, write_video
 
 from dashcalib_ros.errors import ConfigError, OutputError
 from dashcalib_ros.fleet.batch import batch, problems, shard_of
@@ -15,7 +18,7 @@ from dashcalib_ros.fleet.manifest import Row, read_manifest
 from dashcalib_ros.fleet.tasks import camera_folder
 
 FEW = {'tracks': 60, 'keyframes': 7}
-FILES = ('cameras.parquet', 'clips.parquet', 'overview.html')
+FILES = ('cameras.parquet', 'cameras.csv', 'clips.parquet', 'clips.csv', 'overview.html')
 SETTINGS = CONFIG.replace({'fleet.least_units': 3})
 
 
@@ -219,7 +222,8 @@ def test_without_pyarrow_the_tables_are_json_lines(manifest, tmp_path, monkeypat
     monkeypatch.setattr('dashcalib_ros.fleet.tables.has', lambda name: None)
     row = Row(1, 'gone.mp4', str(tmp_path / 'gone.mp4'))
     fleet = batch([row], str(tmp_path), SETTINGS, OneWorker(3, Here()))
-    assert fleet.files == ('cameras.jsonl', 'clips.jsonl', 'overview.html')
+    assert fleet.files == ('cameras.jsonl', 'cameras.csv', 'clips.jsonl', 'clips.csv',
+                           'overview.html')
     line, = (tmp_path / 'clips.jsonl').read_text().splitlines()
     assert json.loads(line)['status'] == 'unreadable'
 
@@ -230,8 +234,55 @@ def test_bad_shards(text):
         shard_of(text)
 
 
+def hostile(data, place):
+    """Spoil gathered turns in every way that once cost the tables, or the camera."""
+    arrays = dict(np.load(io.BytesIO(data)))
+    text = json.loads(str(arrays['about']))
+    odd = [{'turns': [{**text['turns'][0], 'stamp_s': stamp}]} for stamp in ('x', 10**400)]
+    odd += [{'frames': 1e308}, {'content': '../../../escaped'}, {'settings': '../../escaped'}]
+    files = [{**arrays, 'about': np.asarray(json.dumps({**text, **about}))} for about in odd]
+    files += [{**arrays, 'turn0.rotations': factor * arrays['turn0.rotations']}
+              for factor in (1e300, 0.0, 2.0)]
+    for n, file in enumerate(files):
+        np.savez(place / f'hostile{n}.npz', **file)
+        yield f'hostile{n}.npz'
+
+
+def test_a_hostile_clip_costs_its_row_only(tmp_path):
+    pytest.importorskip('pyarrow')
+    clips = tmp_path / 'clips'
+    for n in range(2):
+        path = written(clip_of(lens_of(), YAWS[n:n + 1], world=n, **FEW), clips / f'{n}.npz')
+    bad = list(hostile(path.read_bytes(), clips))
+    (clips / 'zero.npz').symlink_to('/dev/zero')
+    os.mkfifo(clips / 'fifo.avi')
+    bad += ['zero.npz', 'fifo.avi']
+    rows = [Row(n, name, str(clips / name), 'cam')
+            for n, name in enumerate(['0.npz', *bad, '1.npz'], 1)]
+    fleet = batch(rows, str(tmp_path / 'out'), SETTINGS, OneWorker(3, Here()))
+    assert [row.clip for row, _ in problems(fleet)] == bad
+    camera, = rows_of(tmp_path / 'out' / 'cameras.parquet')
+    assert (camera['clips_used'], camera['clips_unreadable']) == (2, len(bad))
+    assert not list(tmp_path.rglob('*escaped*'))
+
+
+def test_another_topic_of_a_bag_is_another_clip(tmp_path):
+    bag = write_bag(tmp_path / 'bag', [*images(drive(12), '/left'),
+                                       *images(drive(8), '/right')])
+    for camera in ('cam', ''):
+        rows = [Row(n, 'bag', str(bag), camera, topic=topic)
+                for n, topic in enumerate(('/left', '/right', '/right'), 1)]
+        fleet = batch(rows, str(tmp_path / 'out'), SETTINGS, OneWorker(3, Here()))
+        assert len(fleet.cameras) == (1 if camera else 2) and not list(problems(fleet))
+        left, right, again = rows_of(tmp_path / 'out' / 'clips.parquet')
+        assert [row['frames'] for row in (left, right)] == [12, 8]
+        assert left['status'] == right['status'] == 'no turn'
+        assert again['reason'] == 'is the clip of row 2 again'
+
+
 def test_names_of_cameras_never_share_a_folder():
-    names = ['a b', 'a_b', 'a/b', '../a', '..', 'CON', 'é', 'x' * 300, 'a b ', 'cameras']
+    names = ['a b', camera_folder('a b').split('/')[1], 'a_b-541e27fe', 'a_b',
+             'a/b', '../a', '..', 'CON', 'é', 'x' * 300, 'a b ', 'cameras']
     folders = [camera_folder(name) for name in names]
     assert len(set(folders)) == len(names)
     assert all(folder.count('/') == 1 and '..' not in folder for folder in folders)

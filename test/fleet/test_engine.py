@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import fleet_tasks
 import pytest
@@ -48,6 +49,26 @@ def test_one_worker(tmp_path):
 def test_ray(tmp_path):
     pytest.importorskip('ray')
     check(outcomes_of(RayEngine(3, 100, workers=2), tmp_path), tmp_path)
+
+
+def test_ray_that_has_ended_is_one_line(monkeypatch):
+    """A killed raylet: Ray raises it from get()."""
+    ray = pytest.importorskip('ray')
+
+    def dead(reference):
+        raise ray.exceptions.LocalRayletDiedError
+
+    remote = SimpleNamespace(remote=lambda *arguments: 'reference')
+    for name, value in {
+            'is_initialized': lambda: True, 'remote': lambda **options: lambda function: remote,
+            'cluster_resources': dict, 'wait': lambda found, timeout: (found, []),
+            'get': dead}.items():
+        monkeypatch.setattr(ray, name, value)
+    engine = RayEngine(3, 100, workers=1)
+    engine.submit(Task(('clip', '1'), fleet_tasks.double, (1,)))
+    with pytest.raises(WorkerError, match='start the command again') as caught:
+        list(engine.outcomes())
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_several_workers_say_which_extra_they_need(monkeypatch):

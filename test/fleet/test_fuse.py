@@ -10,6 +10,7 @@ from synthetic import LENS
 
 from dashcalib_ros.fleet import solved
 from dashcalib_ros.fleet.fuse import Clip, fuse
+from dashcalib_ros.scene_file import Origin
 
 FEW = {'tracks': 80, 'keyframes': 8}
 CLIPS = [Clip(f'{n}.mp4', clip_of(yaws=YAWS[n:n + 1], world=n, **FEW)) for n in range(4)]
@@ -18,7 +19,7 @@ CLIPS = [Clip(f'{n}.mp4', clip_of(yaws=YAWS[n:n + 1], world=n, **FEW)) for n in 
 @pytest.fixture(scope='module')
 def fused():
     """Four good clips, one twice, one zoomed, one of another size, one without turns."""
-    smaller = replace(clip_of(yaws=(), world=70), image_size=(640, 480))
+    smaller = replace(clip_of(yaws=(), world=70), origin=Origin((640, 480)))
     odd = [Clip('again.mp4', CLIPS[0].gathered), Clip('small.mp4', smaller),
            Clip('straight.mp4', clip_of(yaws=(), world=60)),
            Clip('zoomed.mp4', clip_of(lens_of(1.2), YAWS[4:5], world=40, **FEW))]
@@ -34,6 +35,13 @@ def test_what_contradicts_is_named_and_left_out(fused):
     assert not shares['straight.mp4'].left_out
     warnings = '; '.join(fused.calibration.warnings)
     assert all(name in warnings for name in ('again.mp4', 'small.mp4', 'zoomed.mp4'))
+
+
+def test_one_clip_with_many_turns_does_not_decide_the_size():
+    many = clip_of(yaws=YAWS, world=50, tracks=60, keyframes=7)
+    other = Clip('many.npz', replace(many, origin=Origin((640, 450))))
+    shares = fuse([other, *CLIPS[:2]], CONFIG).shares
+    assert '640x450, most of this camera are 800x450' in shares['many.npz'].left_out
 
 
 def test_the_others_give_one_camera(fused):

@@ -147,7 +147,8 @@ def solved_unit(level='weak', make='acme', sigma=15.0, sound=True):
         OwnVerdict(level, () if level == 'accepted' else ('too little yaw',)), (800, 450),
         None if level == 'refused' else camera, None, (), 100, 0.2, {}, {}, _config())
     return Solved('cam', make, calibration,
-                  Estimate(camera, covariance, PictureSigma(9.0, 20.0), 0.2, sound),
+                  Estimate(camera, 4 * covariance, covariance, PictureSigma(9.0, 20.0), 0.2,
+                           sound),
                   {'a': ClipShare(1)})
 
 

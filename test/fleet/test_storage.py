@@ -2,12 +2,15 @@
 from __future__ import annotations
 
 import errno
+import os
 
 import pytest
 
 from dashcalib_ros.errors import ConfigError, InputError, OutputError
 from dashcalib_ros.fleet import storage
+from dashcalib_ros.fleet.manifest import read_manifest
 from dashcalib_ros.fleet.storage import Folder
+from dashcalib_ros.inputs import named_like, open_frames
 
 
 @pytest.fixture(params=['path', 'memory'])
@@ -26,7 +29,7 @@ def test_files_are_written_read_and_removed(place):
     folder.write('a/b.txt', b'other')
     assert folder.read('a/b.txt') == b'other' and folder.exists('a/b.txt')
     assert [name.rpartition('/')[2] for name in storage.listed(f'{place}/a')] == ['b.txt']
-    with pytest.raises(InputError, match='larger than'):
+    with pytest.raises(InputError, match=r'(more|larger) than'):
         folder.read('a/b.txt', limit=3)
     before = storage.stamp(f'{place}/a/b.txt')
     folder.write('a/b.txt', b'longer than that')
@@ -82,7 +85,53 @@ def test_addresses_say_which_extra_they_need(monkeypatch):
         storage.stamp('s3://bucket/clip.mp4')
 
 
+def test_a_stamp_is_of_all_files_of_a_folder(place):
+    folder = Folder(place)
+    for name in ('clip/0.png', 'clip/bag/1.mcap'):
+        folder.write(name, b'one')
+    stamps = [storage.stamp(f'{place}/clip')]
+    for name in ('clip/0.png', 'clip/bag/1.mcap', 'clip/2.png'):
+        folder.write(name, b'another')
+        stamps.append(storage.stamp(f'{place}/clip'))
+    assert len(set(stamps)) == 4 and None not in stamps
+    assert storage.stamp(f'{place}/gone') is None
+
+
+def test_what_is_no_regular_file_is_not_read(tmp_path):
+    os.mkfifo(tmp_path / 'm.csv')
+    for place in ('m.csv', 'm.jsonl', 'm.parquet'):
+        if place != 'm.csv':
+            (tmp_path / place).symlink_to('/dev/zero')
+        with pytest.raises(InputError, match='no regular file'):
+            read_manifest(str(tmp_path / place))
+    pytest.importorskip('fsspec')
+    with pytest.raises(InputError, match='give its path'):
+        storage.read('file:///dev/zero', 10)
+
+
+def test_a_pattern_ends_where_links_lead_upwards(tmp_path):
+    for name in ('a', 'b', 'c', '.hidden'):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / '1.mp4').write_bytes(b'')
+        for up in range(4):
+            (tmp_path / name / f'up{up}').symlink_to('..')
+    found = storage.listed(f'{tmp_path}/**/*.mp4')
+    assert [name.removeprefix(f'{tmp_path}/') for name in found] == [
+        'a/1.mp4', 'b/1.mp4', 'c/1.mp4']
+    with pytest.raises(InputError, match='none of the files can be read'):
+        open_frames(f'{tmp_path}/**/*.mp4')
+    assert len(list(named_like(f'{tmp_path}/.hid*/*'))) == 5
+
+
 def test_an_unknown_kind_of_address():
     pytest.importorskip('fsspec')
     with pytest.raises(InputError, match='cannot use nosuch://'):
         storage.stamp('nosuch://bucket/clip.mp4')
+
+
+def test_what_a_killed_process_left_of_a_file_goes_with_the_next(tmp_path):
+    left = tmp_path / 'deep' / '.a.npz.0123abcd.tmp'
+    left.parent.mkdir()
+    left.touch()
+    Folder(str(tmp_path)).write('deep/a.npz', b'whole')
+    assert [path.name for path in left.parent.iterdir()] == ['a.npz']

@@ -1,10 +1,12 @@
 """The tables' rows: drift over time, texts of any kind, the overview."""
 from __future__ import annotations
 
+import csv
 import json
 
 import numpy as np
 import pytest
+from page_reader import Page
 
 from dashcalib_ros.fleet import tables
 from dashcalib_ros.fleet.clip_shares import ClipShare
@@ -56,7 +58,29 @@ def test_texts_that_are_no_unicode_and_numbers_that_are_none(tmp_path, monkeypat
     assert row['camera'] == 'b?<script>.mp4' and row['drift_sigma'] is None
     assert row['reasons'] == ['why'] and row['verdict'] == 'refused'
     page = overview_html(cameras, clips)
-    assert '<script>' not in page and '<b>bad' not in page
+    assert '<script>.mp4' not in page and '<b>bad' not in page
     monkeypatch.setattr('dashcalib_ros.fleet.tables.has', lambda name: None)
-    assert tables.write_table(folder, 'clips', clips, CLIP_COLUMNS) == 'clips.jsonl'
+    assert tables.write_table(folder, 'clips', clips, CLIP_COLUMNS) == (
+        'clips.jsonl', 'clips.csv')
     assert json.loads((tmp_path / 'clips.jsonl').read_text())['camera'] == 'b?<script>.mp4'
+    with (tmp_path / 'cameras.csv').open(newline='') as stream:
+        read, = csv.DictReader(stream)
+    assert (read['camera'], read['fx'], read['reasons']) == ('b?<script>.mp4', '', 'why')
+
+
+def test_the_overview_draws_the_fleet():
+    times = START_S + np.arange(5) * tables.YEAR_S / 2
+    clips = rows_at(times, 1000 * (1 + 0.05 * np.arange(5)), sigma=1.0)
+    failed = camera_row('cam', 'acme', None, 'failed', clips)
+    cameras = [{**failed, 'camera': name, 'make': make, 'verdict': verdict, 'fx': fx,
+                'width': 1280, 'sigma_fx': 5.0, 'turns_used': turns}
+               for turns, (name, make, verdict, fx) in enumerate((
+                   ('cam', 'acme', 'accepted', 1100.0), ('two', 'acme', 'weak', 1000.0),
+                   ('<b>three', '', 'weak', 900.0)))]
+    page = overview_html([*cameras, {**failed, 'camera': 'none'}], clips)
+    assert Page(page).tags.count('svg') == 3
+    # fx and sigma of three cameras, five clips, and the line of the one that drifts
+    assert page.count('class="all-turns"') == 1 and page.count('h0') == 3 + 3 + 5
+    for name in ('cameras', 'fx', 'sigma %', '% per year'):
+        assert f'<button>{name}</button>' in page
+    assert '<b>three' not in page and 'http' not in page.split('<body>')[1]

@@ -207,3 +207,45 @@ def test_float_pictures_are_refused():
     data = cv2.imencode('.tif', np.ones((4, 4), np.float32))[1].tobytes()
     with pytest.raises(InputError, match='float32 pixels'):
         decode_file(data, what='depth.tif')
+
+
+# for people to look at
+
+@pytest.mark.parametrize('encoding', ['mono8', 'mono16', 'nv24'])
+def test_what_has_no_colours_stays_grey(encoding):
+    pixels = np.full((HEIGHT, WIDTH), 4000 if encoding == 'mono16' else 40)
+    dtype = np.uint16 if encoding == 'mono16' else np.uint8
+    assert decode_image(message(encoding, pixels.astype(dtype)), colour=True).ndim == 2
+
+
+@pytest.mark.parametrize('encoding, channels', [
+    ('bgr8', (BLUE, GREEN, RED)), ('rgb8', (RED, GREEN, BLUE)), ('bgra8', (BLUE, GREEN, RED, 9)),
+    ('rgba8', (RED, GREEN, BLUE, 9))])
+def test_colours_are_kept_in_opencv_s_order(encoding, channels):
+    image = decode_image(message(encoding, colour(*channels), padding=3), colour=True)
+    np.testing.assert_array_equal(image[..., :3], colour(BLUE, GREEN, RED))
+    assert image.shape[2] == 3
+
+
+def test_colours_of_16_bits_planes_and_mosaics_are_found():
+    deep = decode_image(message('rgb16', colour(4000, 2000, 1000, dtype=np.uint16)), colour=True)
+    np.testing.assert_array_equal(deep[0, 0], [62, 125, 250])
+    shown = colour(BLUE, GREEN, RED)
+    yuv = cv2.cvtColor(shown, cv2.COLOR_BGR2YUV_I420)
+    planes = message('i420', yuv, height=HEIGHT)
+    assert np.abs(decode_image(planes, colour=True).astype(int) - shown).max() < 4
+    two = np.stack([np.tile(yuv[HEIGHT:].reshape(2, -1)[:, :1].T.repeat(HEIGHT, 0), WIDTH // 2),
+                    yuv[:HEIGHT]], -1)
+    assert np.abs(decode_image(message('uyvy', two), colour=True).astype(int) - shown).max() < 4
+    mosaic = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = RED, BLUE
+    mosaic[::2, 1::2] = mosaic[1::2, ::2] = GREEN
+    found = decode_image(message('bayer_rggb8', mosaic), colour=True)
+    np.testing.assert_array_equal(found[HEIGHT // 2, WIDTH // 2], [BLUE, GREEN, RED])
+
+
+@pytest.mark.parametrize('kind', ['.png', '.jpg'])
+def test_files_are_read_in_colour_where_they_have_it(kind):
+    for image in (GREY // 9, colour(BLUE, GREEN, RED)):
+        found = decode_file(cv2.imencode(kind, image)[1].tobytes(), colour=True)
+        assert np.abs(found.astype(int) - image).max() < 4

@@ -1,6 +1,7 @@
 """Videos, folders and what is no drive; broken ones say what is wrong, in one line."""
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -190,26 +191,6 @@ def test_nonsense_rates(tmp_path, fps):
     fails('fps must be above 0', write_folder(tmp_path / 'images', drive(2)), fps=fps)
 
 
-@pytest.mark.parametrize('rate', [0.0, float('nan'), 90000.0])
-def test_a_video_that_does_not_know_its_rate(tmp_path, rate, monkeypatch):
-    path = write_video(tmp_path / 'drive.avi', smooth())
-    capture = cv2.VideoCapture
-
-    class Nonsense:
-        def __init__(self, *arguments):
-            self.real = capture(*arguments)
-
-        def get(self, key):
-            return rate if key == cv2.CAP_PROP_FPS else self.real.get(key)
-
-        def __getattr__(self, name):
-            return getattr(self.real, name)
-
-    monkeypatch.setattr(cv2, 'VideoCapture', Nonsense)
-    fails('give the rate with --fps', path)
-    assert [frame.stamp_ns for frame in open_frames(path, fps=10)][1] == STEP
-
-
 @pytest.fixture
 def nobody(tmp_path):
     """Give up root's power to read everything, and a place where others may look."""
@@ -290,3 +271,51 @@ def test_pictures_too_flat_to_be_a_cameras(tmp_path):
 def test_frames_of_a_folder_do_not_know_their_camera(tmp_path):
     source = open_frames(write_folder(tmp_path / 'images', drive(2)), fps=5)
     assert [frame.frame_id for frame in source] == ['', '']
+
+
+def in_colour(count=12):
+    """Make frames in colour: blue grows, red falls."""
+    return [Frame(n, START + n * STEP, np.full((48, 64, 3), (20 + 15 * n, 90, 230 - 15 * n),
+                                               np.uint8)) for n in range(count)]
+
+
+@pytest.mark.parametrize('kind', ['folder', 'video', 'bag', 'joined', 'excerpt'])
+def test_images_are_read_again_in_colour(tmp_path, kind):
+    frames = in_colour()
+
+    def video(name):
+        writer = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter_fourcc(*'MJPG'), 25.0,
+                                 (64, 48))
+        for frame in frames:
+            writer.write(frame.image)
+        writer.release()
+        return tmp_path / name
+
+    source = {
+        'folder': lambda: open_frames(write_folder(tmp_path / 'images', frames), fps=7.3),
+        'video': lambda: open_frames(video('a.avi')),
+        'bag': lambda: open_frames(write_bag(tmp_path / 'bag', [
+            ('/camera', frame.stamp_ns, picture(frame)) for frame in frames])),
+        'joined': lambda: open_frames([video('a.avi'), video('b.avi')]),
+        'excerpt': lambda: open_frames(video('a.avi'), start_s=0.08)}[kind]()
+    stamps = {frame.index: frame.stamp_ns for frame in source}
+    wanted = {index: stamps[index] for index in list(stamps)[-1:2:-4]}
+    found = source.in_colour(wanted)
+    assert set(found) == set(wanted) and len(found) > 1
+    for index, shown in found.items():
+        assert np.abs(shown.astype(int) - frames[index % 12].image).max() < 9
+    assert source.in_colour({}) == {}
+
+
+def test_what_cannot_be_read_again_stays_as_it_is(tmp_path):
+    folder = write_folder(tmp_path / 'images', in_colour(3))
+    source = open_frames(folder, fps=10.0)
+    stamps = {frame.index: frame.stamp_ns for frame in source}
+    (folder / '0001.png').write_bytes(b'now it is broken')
+    assert set(source.in_colour(stamps)) == {0, 2}
+
+
+@pytest.mark.parametrize('stamp', [math.nan, math.inf, 2**64, None, '1'])
+def test_a_stamp_that_is_none_is_refused(stamp):
+    with pytest.raises(InputError, match='stamp_ns must be a number'):
+        Frame(0, stamp, np.zeros((8, 8), np.uint8))

@@ -9,6 +9,7 @@ import pytest
 from made_drives import (
     START,
     STEP,
+    TIMES,
     drive,
     fails,
     images,
@@ -17,6 +18,7 @@ from made_drives import (
     storage,
     write_bag,
     write_folder,
+    write_timed,
     write_video,
 )
 
@@ -52,7 +54,50 @@ def test_videos_are_one_drive(tmp_path, how):
         assert not any(frame.after_gap for frame in found)
         assert np.allclose(brightness(found),
                            [20 + 15 * (n % 12) + n // 12 for n in range(36)], atol=1)
-    assert source.warnings == ()
+    said = f'{tmp_path}/clips/*.avi' if how == 'pattern' else f'{tmp_path}/clips'
+    assert source.warnings == (() if how == 'list' else (
+        f'{said}: 3 files by name: clip9.avi, clip10.avi, clip11.avi',))
+
+
+NAMES = {
+    'GoPro': ('GX010001', 'GX020001', 'GX010002'),
+    'old GoPro': ('GOPR0001', 'GP010001', 'GOPR0002'),
+    'DJI': ('DJI_20230115123456_0009_D', 'DJI_20230115124456_0010_D', 'DJI_20230116000000_0001_D'),
+    'Garmin': ('GRMN0009', 'GRMN0010', 'GRMN0101'),
+    'Viofo': ('2023_0115_123456_0009F', '2023_0115_123556_0010PF', '2023_0115_123656_0011F'),
+    'BlackVue': ('20230115_123456_NF', '20230115_123556_EF', '20230115_123656_NF'),
+    'Insta360': ('VID_20230115_123456_00_009', 'VID_20230115_123456_00_010',
+                 'VID_20230115_130000_00_001')}
+
+
+@pytest.mark.parametrize('maker', NAMES)
+def test_files_in_the_order_of_the_camera(tmp_path, maker):
+    paths = videos(tmp_path / 'clips')
+    for path, name in zip(paths, NAMES[maker], strict=True):
+        path.rename(path.with_name(f'{name}.avi'))
+    source = open_frames(tmp_path / 'clips')
+    assert [round(each) % 15 for each in brightness(source)[::12]] == [5, 6, 7]
+    assert f'by {maker.split()[-1]} names: {".avi, ".join(NAMES[maker])}.avi' in source.warnings[0]
+    given = sorted((tmp_path / 'clips').iterdir(), reverse=True)
+    assert 'order in which they were given' in open_frames(given).warnings[0]
+
+
+def test_files_in_the_order_of_their_times(tmp_path):
+    videos(tmp_path / 'clips')
+    for name, minute in (('b', 1), ('c', 0), ('a', 2)):
+        write_timed(tmp_path / f'{name}.mp4', TIMES[:3],
+                    created=f'2023-01-15T12:3{minute}:00.000000Z')
+    assert 'time of recording: c.mp4, b.mp4, a.mp4' in open_frames(
+        str(tmp_path / '*.mp4')).warnings[0]
+    write_timed(tmp_path / 'b.mp4', TIMES[:3], created='2023-01-15T12:30:00.000000Z')
+    assert 'name: a.mp4, b.mp4, c.mp4' in open_frames(str(tmp_path / '*.mp4')).warnings[0]
+
+
+def test_front_and_rear_are_not_one_camera(tmp_path):
+    for path, name in zip(videos(tmp_path / 'clips'), 'FRF', strict=True):
+        path.rename(path.with_name(f'20230115_12345{path.stem[-1]}_N{name}.avi'))
+    fails('recordings of 2 cameras', tmp_path / 'clips')
+    assert len(open_frames(str(tmp_path / 'clips/*F.avi')).warnings) == 1
 
 
 def test_the_order_of_the_command_line_counts(tmp_path):
@@ -68,7 +113,7 @@ def test_a_folder_with_thumbnails_beside_its_videos(tmp_path):
         cv2.imwrite(str(tmp_path / f'clips/{name}.jpg'), np.zeros((4, 4), np.uint8))
     source = open_frames(tmp_path / 'clips')
     assert source.count == 36 and 'left out 2 other files' in source.warnings[0]
-    assert len(open_frames(str(tmp_path / 'clips/clip*')).warnings) == 1
+    assert len(open_frames(str(tmp_path / 'clips/clip*')).warnings) == 2
     for index in range(9):
         cv2.imwrite(str(tmp_path / f'clips/{index}.jpg'), np.zeros((4, 4), np.uint8))
     assert open_frames(tmp_path / 'clips', fps=10).count == 11  # as before there were several
@@ -116,8 +161,8 @@ def test_one_that_cannot_be_read_is_left_out(tmp_path):
     source = open_frames(tmp_path / 'clips')
     assert [frame.index for frame in source] == list(range(24))
     assert [frame.perhaps_after_gap for frame in source].index(True) == 12
-    assert len(source.warnings) == 2
-    assert str(paths[0]) in source.warnings[0] and 'clip99.mp4 is empty' in source.warnings[1]
+    assert 'clip10.avi, clip11.avi' in source.warnings[0] and len(source.warnings) == 3
+    assert str(paths[0]) in source.warnings[1] and 'clip99.mp4 is empty' in source.warnings[2]
     source = open_frames([tmp_path / 'missing.mp4', paths[1]])
     assert len(list(source)) == 12 and 'missing.mp4 does not exist' in source.warnings[0]
 

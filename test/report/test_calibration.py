@@ -2,13 +2,22 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import cv2
 import numpy as np
 import pytest
-from made_calibration import EACH_MODEL, calibration_of, make_calibration
+from made_calibration import EACH_MODEL, TRUTH, calibration_of, make_calibration
 
 from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.lines import Bend
+from dashcalib_ros.report import load_camera, result_dict
+from dashcalib_ros.report.export import exported
+from dashcalib_ros.solve.opinions import HeldOut
+from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.turns import TurnId
 
 
 @pytest.fixture(params=EACH_MODEL)
@@ -18,11 +27,22 @@ def calibration(request):
 
 def test_it_is_one_line(calibration):
     text = repr(calibration)
-    assert '\n' not in text and len(text) < 300
+    assert '\n' not in text and len(text) < 340
     assert 'accepted' in text and calibration.camera.model in text
-    assert f'fx {calibration.camera.fx:.6g} ± 4' in text
+    assert f'fx {calibration.camera.fx:.1f} ± 3.5' in text
+    lone = dataclasses.replace(calibration, turns=calibration.turns[:1])
+    assert repr(lone).endswith('; from one turn alone, which nothing confirms)')
     refused = repr(make_calibration('refused'))
     assert 'refused' in refused and 'only 1 of 5 turns' in refused
+
+
+@pytest.mark.parametrize(('sigma', 'text'), [
+    (12.34, 'fx 722 ± 12,'), (0.96, 'fx 721.54 ± 0.96,'), (0.0997, 'fx 721.538 ± 0.100,'),
+    (1234.0, 'fx 722 ± 1234,'), (0.0, 'fx 721.538,'), (float('nan'), 'fx 721.538,')])
+def test_values_are_printed_to_the_digits_of_their_sigmas(sigma, text):
+    calibration = make_calibration()
+    known = dataclasses.replace(calibration, sigma={**calibration.sigma, 'fx': sigma})
+    assert text in repr(known) and 'e+' not in repr(known)
 
 
 def test_k_and_d_are_opencv_s(calibration):
@@ -84,3 +104,43 @@ def test_a_calibration_writes_what_the_command_writes(calibration, tmp_path):
     assert [file.name for file in refused] == ['result.json', 'report.html']
     with pytest.raises(OutputError, match='choose another output folder'):
         calibration.save(files[0])
+
+
+def test_it_is_read_back(calibration, tmp_path):
+    correlation = np.eye(len(calibration.camera.names())).tolist()
+    stored = StoredTurnSummary(TurnId.stored(0), 1.7e9, 0.05, 88.0, 20, True, 0.9)
+    full = dataclasses.replace(
+        calibration, mask=None, stored_turns=(stored,), details={'correlation': correlation},
+        rolling_shutter=Shutter(21.0, 0.3), stabiliser=Stabiliser(30.0), warnings=('dark',),
+        sigma_px=PictureSigma(0.5, 1.5), straight_lines=Bend(9, 3, 0.2, 0.01, 0.02, None, 0.5),
+        held_out=(HeldOut(TurnId.at(88), 0.5, 0.7, 0.8), HeldOut(TurnId.stored(1), 1.0, 2.0, 3.0)))
+    full.save(tmp_path)
+    for path in (tmp_path, tmp_path / 'result.json'):
+        read = Calibration.load(path)
+        assert result_dict(read) == result_dict(full)
+        np.testing.assert_array_equal(read.covariance, full.covariance)
+        assert repr(read) == repr(full) and read.used_turns == full.used_turns
+        read.save(tmp_path / 'again')
+        assert load_camera(tmp_path / 'again').camera == full.camera
+    short = Calibration.load(tmp_path / 'calibration.yaml')
+    assert (short.camera, short.sigma, short.verdict.level, short.versions) == (
+        full.camera, full.sigma, 'accepted', full.versions)
+
+
+def test_only_a_calibration_of_this_package_is_one(tmp_path):
+    refused = make_calibration('refused', mask=None)
+    refused.save(tmp_path)
+    assert result_dict(Calibration.load(tmp_path)) == result_dict(refused)
+    data = result_dict(make_calibration())
+    data['config']['setting.of.another.version'] = 1
+    for key, value, complaint in (('turns', [{}], 'damaged'), ('config', [], 'damaged'),
+                                  ('sigma', 3, 'damaged'), ('verdict', 'weak', '')):
+        (tmp_path / 'result.json').write_text(json.dumps({**data, key: value}))
+        if not complaint:
+            assert Calibration.load(tmp_path).verdict.level == 'weak'
+            continue
+        with pytest.raises(InputError, match=complaint):
+            Calibration.load(tmp_path)
+    (tmp_path / 'ost.yaml').write_text(exported(TRUTH, 'ros'))
+    with pytest.raises(InputError, match='load_camera'):
+        Calibration.load(tmp_path / 'ost.yaml')

@@ -4,6 +4,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ from dashcalib_ros.report import (
     mapping_error,
     result_json,
 )
+from dashcalib_ros.report.difference_page import difference_html
+from dashcalib_ros.solve.picture import PictureSigma
 
 SIZE = (1242, 375)
 REFERENCE = NamedCamera('truth', TRUTH)
@@ -213,8 +216,10 @@ def test_a_truth_may_name_its_model(tmp_path, model, expected):
 @pytest.mark.parametrize(('change', 'complaint'), [
     ({'model': 'mirror'}, "the camera model 'mirror'; there are radial, brown, fisheye"),
     ({'model': ['fisheye']}, 'there are radial'),
-    ({'k4': 0.01}, 'has k1, k2, k4, and no plumb_bob model here has all'),
-    ({'model': 'fisheye', 'p1': 0.01}, 'has k1, k2, p1, and no equidistant model here')])
+    ({'k4': 0.01}, 'add "model": "fisheye"'),
+    ({'model': 'plumb_bob', 'k4': 0.01}, 'has k1, k2, k4, and a plumb_bob model here has no k4'),
+    ({'skew': 0.5}, 'has no skew'),
+    ({'model': 'fisheye', 'p1': 0.01}, 'an? equidistant model here has no p1')])
 def test_a_truth_of_no_model_here_is_refused(tmp_path, change, complaint):
     data = {**TRUTH.named, 'width': 1242, 'height': 375, **change}
     (tmp_path / 'truth.json').write_text(json.dumps(data))
@@ -262,8 +267,8 @@ def test_a_refused_result_cannot_be_compared(tmp_path):
         calibrated_camera(make_calibration('refused'))
 
 
-def test_a_bag_given_by_mistake_is_not_read_whole(tmp_path):
-    path = tmp_path / 'drive.mcap'
+def test_a_drive_given_by_mistake_is_not_read_whole(tmp_path):
+    path = tmp_path / 'drive.mp4'
     with path.open('wb') as stream:
         stream.truncate(2**40)  # sparse; reading it all would be noticed
     with pytest.raises(InputError, match='too large'):
@@ -279,3 +284,58 @@ def test_the_comparison_is_strict_json():
     assert data['parameters']['fx'] == {
         'a': TRUTH.fx, 'b': TRUTH.fx, 'difference': 0.0, 'percent': 0.0, 'sigma': SIGMA['fx'],
         'z': 0.0}
+
+
+def test_the_page_of_a_difference_has_maps_in_px_and_in_sigmas():
+    covariance = np.diag([0.4, 0.4, 0.3, 0.3, 1e-4, 1e-4])**2
+    known = NamedCamera('<b>', TRUTH, covariance=covariance, sigma_px=PictureSigma(0.3, 0.9))
+    moved = shifted(fx=7.0)
+    page = difference_html(compare(moved, known))
+    assert page.count('<svg') == 3 and '<b>' not in page and 'http' not in page
+    numbers = [float(each) for each in re.findall(r'<text[^>]*>([\d.e+-]+)</text>', page)]
+    found = compare(moved, known).whole
+    # the first map's corner, its last, is what apart() says; the third is the first by the second
+    assert numbers[14] == pytest.approx(found.apart.lengths[-1], rel=0.05)
+    assert numbers[29] == pytest.approx(found.sigma_map.sigma[-1], rel=0.05)
+    assert numbers[44] == pytest.approx(numbers[14] / numbers[29], rel=0.15)
+    # without a sigma there is one map, and none where a lens folds over
+    assert difference_html(compare(moved, REFERENCE)).count('<svg') == 1
+    folding = NamedCamera('f', dataclasses.replace(TRUTH, fx=300, fy=300, k1=-0.6, k2=0))
+    assert '<svg' not in difference_html(compare(moved, folding))
+
+
+def test_cameras_of_two_models_are_compared_with_what_either_knows():
+    brown = Brown.of(SIZE, [*TRUTH.params, 0.0, 0.0, 0.0])
+    small = np.diag([0.4, 0.4, 0.3, 0.3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-3])**2
+    sigma = PictureSigma(0.3, 0.9)
+    wide = NamedCamera('brown', brown, covariance=small, sigma_px=sigma)
+    narrow = NamedCamera('radial', TRUTH, covariance=small[:6, :6], sigma_px=sigma)
+    plain = NamedCamera('file', TRUTH)
+    for a, b in ((wide, narrow), (narrow, wide), (wide, plain), (plain, wide)):
+        found = compare(a, b).whole
+        assert (found.told_apart, found.matters) == (False, False)
+        far = compare(dataclasses.replace(a, camera=dataclasses.replace(
+            a.camera, fx=1.02 * TRUTH.fx)), b).whole
+        assert (far.told_apart, far.matters) == (True, True)
+    # both know something: together less than either alone
+    assert compare(wide, narrow).whole.sigma_px.rms == pytest.approx(0.3 * math.sqrt(2))
+    assert np.all(compare(wide, narrow).whole.sigma_map.sigma
+                  > compare(plain, narrow).whole.sigma_map.sigma)
+
+
+def test_result_json_keeps_the_covariance_of_the_picture(tmp_path):
+    covariance = np.diag([0.4, 0.4, 0.3, 0.3, 1e-3, 1e-3])**2
+    calibration = dataclasses.replace(
+        make_calibration(), sigma_px=PictureSigma(0.3, 0.9),
+        details={'picture_covariance': covariance.tolist()})
+    (tmp_path / 'result.json').write_text(result_json(calibration))
+    for camera in (load_camera(tmp_path), calibrated_camera(calibration)):
+        np.testing.assert_array_equal(camera.covariance, covariance)
+        assert camera.sigma_px == PictureSigma(0.3, 0.9)
+    for broken in ([[1.0]], (-covariance).tolist(), 'x', [[None] * 6] * 6, None):
+        data = json.loads(result_json(calibration))
+        data['details']['picture_covariance'] = broken
+        data['sigma_px'] = {'rms': None, 'worst': 1.0}
+        (tmp_path / 'result.json').write_text(json.dumps(data))
+        camera = load_camera(tmp_path)
+        assert camera.covariance is None and camera.sigma_px is None

@@ -1,6 +1,7 @@
 """What the page draws: turns with their reasons, maps, plots, and lines that work when copied."""
 from __future__ import annotations
 
+import base64
 import dataclasses
 import html
 import re
@@ -18,9 +19,14 @@ from drawn import START_S, drawn_calibration, solution
 from made_calibration import EACH_MODEL, calibration_of, make_calibration
 from page_reader import Page
 
+from dashcalib_ros.camera.mapping import mapping_error
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.frames.scale import Scale
+from dashcalib_ros.inputs import open_frames
 from dashcalib_ros.judgement import Verdict
 from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.judgement.focal_by_turn import focal_alone, sigma_by_count
+from dashcalib_ros.recorded import with_source
 from dashcalib_ros.report import NamedCamera, report_html, write_results
 from dashcalib_ros.report.lens_figures import undistorted
 from dashcalib_ros.report.usage import field_of_view
@@ -44,18 +50,38 @@ def copied(text, name):
 
 def test_each_turn_is_drawn_with_tracks_residuals_path_and_what_it_says_of_fx(drawn, text):
     page = Page(text)
-    for kind in ('track', 'residual', 'point', 'path'):
-        assert text.count(f'<path class="{kind}"') + text.count(f'<polyline class="{kind}"') == 3
+    for kind in ('track', 'residual', 'point', 'path', 'camera'):
+        assert text.count(f'<path class="{kind}"') == 3
+    assert text.count('aria-label="fx by turn"') == 1  # the turns' plot would be the same
     assert text.count('class="picture"') == 5 + 1  # all five turns, and the slider's second one
-    assert re.search(r'residuals , from the point .* \d+ times as long', page.text)
+    assert re.search(r'residuals \d+ times as long', page.text)
     assert page.text.count('Alone it says fx') == 3
     assert len(text) < 3_000_000
-    assert all(link.startswith(('data:', '#mask')) for link in page.links)
+    assert all(link.startswith('data:') or f'id="{link[1:]}"' in text for link in page.links)
+    assert page.links.count('#turn-by-turn') == 1
+
+
+def test_the_view_in_space_is_the_scene_s(text):
+    def in_space(kind):
+        part = re.search(f'<path class="{kind}" data-run="\\d+" data-xyz="([^"]*)"', text)[1]
+        return np.array(part.split(), float).reshape(-1, 3)
+
+    scene = solution().scenes[0]
+    structure = scene.structure
+    path = in_space('path')
+    centres = -np.einsum('kji,kj->ki', structure.rotations, structure.translations)
+    steps, drawn = (np.linalg.norm(np.diff(each, axis=0), axis=1) for each in (centres, path))
+    np.testing.assert_allclose(drawn / drawn.mean(), steps / steps.mean(), atol=0.05)
+    # a camera's pyramid begins at its place on the path, and the scene is ahead of the first one
+    np.testing.assert_allclose(in_space('camera').reshape(len(path), -1, 3)[:, 0], path, atol=0.11)
+    assert in_space('point')[:, 1].mean() > path[0, 1]
 
 
 def test_every_unused_turn_has_its_reason(drawn, text):
     assert [turn.unused_because for turn in drawn.turns] == [
         None, None, None, 'it was too dark', 'more prominent turns were enough']
+    held_out = re.findall(r'data-name="held out"[^>]*>([^<]*)<', text)
+    assert [each != '-' for each in held_out] == [True] * 3 + [False] * 2
     assert text.count('no: it was too dark') == text.count('not used: it was too dark') == 1
 
 
@@ -75,19 +101,35 @@ def test_where_no_report_is_wanted_nothing_is_kept_for_it():
     assert drawn_calibration(solution(), pictures=None).material is None
 
 
+def test_pictures_have_the_input_s_colours(drawn, tmp_path):
+    for n in range(30):
+        image = np.full((90, 160, 3), (250, 120, 10 + n), np.uint8)
+        cv2.imwrite(str(tmp_path / f'{n}.png'), image)
+    grey = {turn: dataclasses.replace(each, stamp_ns=each.frame * 100_000_000)
+            for turn, each in drawn.material.pictures.items()}
+    found = with_source(dataclasses.replace(drawn, material=dataclasses.replace(
+        drawn.material, pictures=grey)), open_frames(tmp_path, fps=10.0))
+    for turn, each in found.material.pictures.items():
+        assert each.image.shape == (*grey[turn].image.shape, 3)
+        assert (each.image == (250, 120, 10 + each.frame)).all()
+    data = re.search(r'jpeg;base64,([^"]*)"', report_html(found))[1]
+    shown = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(shown[5, 5].astype(int) - (250, 120, 20)).max() < 25
+
+
 def test_times_count_from_the_drive_s_start(drawn, text):
     assert drawn.start_s == START_S
     assert 'at 5.0 s' in Page(text).text and f'{START_S:.0f}' not in text
 
 
 def test_what_turns_say_alone_scatters_about_the_common_result(drawn):
-    found, config = solution(), drawn.config
-    alone = focal_alone(found, config)
+    found = solution()
+    alone = focal_alone(found)
     assert set(alone) == {scene.turn for scene in found.scenes}
     for each in alone.values():
         assert abs(each.fx - found.camera.fx) < 5 * each.sigma
         assert 0 < each.sigma < 0.1 * found.camera.fx
-    sigmas = sigma_by_count(found, config)
+    sigmas = sigma_by_count(found)
     assert len(sigmas) == 3 and sigmas[-1] == pytest.approx(found.sigma[0])
 
 
@@ -108,7 +150,7 @@ def test_stored_turns_have_plots_and_no_picture(drawn):
     material = dataclasses.replace(drawn.material, scenes={scene.turn: scene}, pictures={})
     text = report_html(dataclasses.replace(drawn, turns=(), stored_turns=(summary,),
                                            material=material))
-    assert 'Stored turn s1' in text and '<svg class="above"' in text and 'jpeg' not in text
+    assert 'Stored turn s1' in text and '<svg class="space"' in text and 'jpeg' not in text
 
 
 def test_what_was_removed_is_told():
@@ -120,7 +162,35 @@ def test_what_was_removed_is_told():
 def test_the_truth_is_compared_where_it_is_known(drawn):
     moved = dataclasses.replace(drawn.camera, fx=drawn.camera.fx + 3)
     page = Page(report_html(drawn, NamedCamera('truth', moved)))
-    assert 'Against the truth' in page.text and re.search(r'fx [\d. px]+ -3\.00', page.text)
+    assert 'Against the truth' in page.text and re.search(r'fx [\d.]+ px -3\.00', page.text)
+
+
+# what is not known of the lens, in a program's hands
+
+def test_sigma_at_pixels_is_the_map_s_and_samples_scatter_by_it(drawn):
+    found = drawn.material.solution.sigma_map
+    np.testing.assert_allclose(drawn.sigma_at(found.pixels), found.sigma, rtol=1e-9)
+    one = drawn.sigma_at((10.0, 20.0))
+    assert one.shape == (1,) and 0 < one[0] < 2 * drawn.sigma_px.worst
+    cameras = drawn.samples(60, seed=3)
+    off = [mapping_error(each, drawn.camera) for each in cameras]
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(drawn.sigma_px.rms, rel=0.3)
+    assert [each.fx for each in drawn.samples(60, seed=3)] == [each.fx for each in cameras]
+
+
+def test_sigma_at_pixels_is_in_those_of_the_input(drawn):
+    half = drawn_calibration(solution(), scale=Scale(shrink=2), image_size=(1600, 900))
+    at = drawn.material.solution.sigma_map.pixels
+    np.testing.assert_allclose(half.sigma_at(2 * at + 0.5), 2 * drawn.sigma_at(at), rtol=0.01)
+    assert half.samples(1)[0].image_size == (1600, 900)
+
+
+def test_a_calibration_without_its_covariance_has_no_samples(drawn):
+    for ask in (lambda c: c.samples(2), lambda c: c.sigma_at((0, 0))):
+        with pytest.raises(InputError, match='refused'):
+            ask(make_calibration('refused'))
+        with pytest.raises(InputError, match='calibrate the drive again'):
+            ask(dataclasses.replace(drawn, details={}))
 
 
 # the lines to copy

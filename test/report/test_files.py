@@ -17,7 +17,7 @@ from made_calibration import TRUTH, make_calibration
 from dashcalib_ros.errors import OutputError
 from dashcalib_ros.report import (
     check_writable,
-    load_calibration_yaml,
+    load_camera,
     output_folder,
     set_aside,
     write_results,
@@ -82,7 +82,7 @@ def test_a_calibration_of_another_program_is_never_overwritten(tmp_path, theirs)
     written = write_results(make_calibration(), tmp_path)
     assert written.set_aside == tmp_path / 'calibration.previous.yaml'
     assert written.set_aside.read_bytes() == theirs
-    assert load_calibration_yaml(tmp_path / 'calibration.yaml').verdict == 'accepted'
+    assert load_camera(tmp_path / 'calibration.yaml').verdict == 'accepted'
     assert write_results(make_calibration(), tmp_path).set_aside is None
 
 
@@ -117,7 +117,9 @@ files.write_text(sys.argv[1], 'half')
 '''
 
 
-def test_the_next_run_removes_what_a_killed_one_left_and_nothing_else(tmp_path):
+@pytest.mark.parametrize('begin', [check_writable, lambda folder: write_results(
+    make_calibration(), folder)], ids=['run', 'batch'])
+def test_the_next_run_removes_what_a_killed_one_left_and_nothing_else(tmp_path, begin):
     killed = subprocess.run([sys.executable, '-c', KILLED, tmp_path / 'result.json'])
     assert killed.returncode == 9
     left, = names(tmp_path)
@@ -125,8 +127,8 @@ def test_the_next_run_removes_what_a_killed_one_left_and_nothing_else(tmp_path):
     others = ['.other.json.0123abcd.tmp', '.result.json.tmp', '.result.json.0123abcz.tmp']
     for name in others:
         (tmp_path / name).touch()
-    check_writable(tmp_path)
-    assert names(tmp_path) == sorted(others)
+    begin(tmp_path)
+    assert [name for name in names(tmp_path) if name[0] == '.'] == sorted(others)
 
 
 def test_temporary_files_of_a_process_that_lives_are_kept(tmp_path, monkeypatch):

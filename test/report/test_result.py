@@ -17,14 +17,16 @@ from dashcalib_ros.turns import TurnId
 
 
 def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
-    stored = StoredTurnSummary(TurnId.stored(0), 1.7e9, 0.05, 88.0, 20, True, 0.9)
+    stored = StoredTurnSummary(TurnId.stored(0), 1.7e9, 0.05, 88.0, 20, True, 0.9,
+                               reprojection_error_px=0.37)
     calibration = make_calibration(stored_turns=(stored,))
     result = strict(result_json(calibration))
     assert result['stored_turns'] == [{
         'stamp': 1.7e9, 'prominence': 0.05, 'yaw_deg': 88.0, 'images': 20, 'used': True,
-        'misfit': 0.9, 'unused_because': None}]
+        'misfit': 0.9, 'unused_because': None, 'reprojection_error_px': 0.37}]
     assert len(result['turns']) == 2 and calibration.turns_used == 2
-    assert '1 of 1 stored turn used' in report_html(calibration)
+    page = report_html(calibration)
+    assert '1 of 1 stored turn used' in page and '0.37 px' in page
     assert result_dict(make_calibration())['stored_turns'] == []
 
 

@@ -13,13 +13,13 @@ from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.judgement import Verdict
 from dashcalib_ros.judgement.calibration import Shutter, Stabiliser
 from dashcalib_ros.report import NamedCamera, compare
-from dashcalib_ros.report.tables import against_truth, comparison, conclusion, summary
+from dashcalib_ros.report.tables import against_truth, comparison, conclusion, next_step, summary
 from dashcalib_ros.solve.picture import PictureSigma
 
 
-def terminal(renderable, **options):
+def terminal(renderable, width=80, **options):
     stream = io.StringIO()
-    Console(file=stream, width=80, **options).print(renderable)
+    Console(file=stream, width=width, **options).print(renderable)
     return '\n'.join(line.rstrip() for line in stream.getvalue().splitlines())
 
 
@@ -32,6 +32,7 @@ def test_the_terminal_shows_estimate_sigma_and_turns():
     assert any(re.search(r'8\.8\s+58 to 118\s+91\.5\s+30 of 31\s+0\.46\s+yes', line)
                for line in lines)
     assert '300 frames, 1 of 2 turns used' in text
+    assert 'from one turn alone, which nothing confirms' in text
     assert '20 % masked' in ' '.join(text.split())
     assert '\x1b' not in text
     # a bag's stamps are times of day; those of turns are told from the start on
@@ -45,14 +46,16 @@ def test_a_refused_summary_has_no_numbers_of_a_camera():
 
 
 def test_the_conclusion_is_verdict_reasons_and_what_to_do():
-    assert terminal(conclusion(Verdict('weak', (
+    verdict = Verdict('weak', (
         '28° of yaw in all turns; at least 60° needed: drive sharper turns',
         'the zoom changes: fix the zoom', 'without cure'),
-        ('drive sharper turns', 'fix the zoom')))).splitlines() == [
-            'weak', '  28° of yaw in all turns; at least 60° needed', '  the zoom changes',
-            '  without cure', 'next: drive sharper turns']
-    last = terminal(conclusion(Verdict('accepted'))).splitlines()[-1]
+        ('drive sharper turns', 'fix the zoom'))
+    assert terminal(conclusion(verdict)).splitlines() == [
+            'verdict: weak', '  28° of yaw in all turns; at least 60° needed',
+            '  the zoom changes', '  without cure']
+    last = terminal(next_step(Verdict('accepted')))
     assert last.startswith('next: ') and 'calibration.yaml' in last
+    assert terminal(next_step(verdict)) == 'next: drive sharper turns'
 
 
 @pytest.mark.parametrize(('level', 'colour'), [('accepted', '32'), ('weak', '33'),
@@ -61,7 +64,7 @@ def test_the_verdict_is_coloured_on_a_terminal(level, colour, monkeypatch):
     monkeypatch.delenv('NO_COLOR', raising=False)
     options = {'force_terminal': True, 'color_system': 'standard'}
     text = terminal(conclusion(Verdict(level)), **options)
-    assert text.startswith(f'\x1b[1;{colour}m{level}\x1b[0m')
+    assert text.startswith(f'verdict: \x1b[1;{colour}m{level}\x1b[0m')
     monkeypatch.setenv('NO_COLOR', '1')
     assert f'{colour}m' not in terminal(conclusion(Verdict(level)), **options)
 
@@ -71,8 +74,9 @@ def test_brackets_in_a_reason_are_text_and_no_markup():
         conclusion(Verdict('weak', ('[red]x[/] [/nonsense]',))))
 
 
+@pytest.mark.parametrize('width', [40, 80])
 @pytest.mark.parametrize('model', EACH_MODEL)
-def test_nothing_is_cut_within_80_columns(model):
+def test_nothing_is_cut_on_a_narrow_terminal(model, width):
     calibration = calibration_of(EACH_MODEL[model], sigma_px=PictureSigma(10.41, 101.37),
                                  rolling_shutter=Shutter(-20.1, 10.44),
                                  stabiliser=Stabiliser(123.4))
@@ -86,9 +90,12 @@ def test_nothing_is_cut_within_80_columns(model):
     other = NamedCamera('truth', dataclasses.replace(calibration.camera, fx=1234.5))
     for shown in (summary(calibration), comparison(compare(lens, other)),
                   against_truth(compare(lens, other))):
-        text = terminal(shown)
-        assert '…' not in text and max(map(len, text.splitlines())) <= 80
-    assert '1234500 to 1234600' in terminal(summary(calibration))
+        text = terminal(shown, width)
+        assert '…' not in text and max(map(len, text.splitlines())) <= width
+    text = terminal(summary(calibration), width)
+    assert '1234500 to 1234600' in text
+    assert all(f' {title}' in text for title in ('relative', 'error px', 'used', 'yaw °'))
+    assert text.count('at s') == (1 if width == 80 else 2)
 
 
 def test_comparisons_show_sigmas_only_where_known():
@@ -96,7 +103,7 @@ def test_comparisons_show_sigmas_only_where_known():
     a, b = NamedCamera('mine', moved, SIGMA, 'weak'), NamedCamera('truth', TRUTH)
     text = terminal(comparison(compare(a, b)))
     assert re.search(r'fx\s+728\.54 px\s+721\.54 px\s+\+7\.0000\s+\+0\.970 %\s+2\.0', text)
-    assert 'A: mine (weak)' in text and re.search(r'mapping error: \d+\.\d\d px', text)
+    assert 'A: mine (weak)' in text and re.search(r'apart: \d+\.\d\d px over', text)
     assert 'sigmas' not in terminal(comparison(compare(b, b)))
 
 
@@ -111,7 +118,8 @@ def test_what_one_of_two_models_cannot_see_is_told():
     wide = Fisheye((1280, 720), 390.0, 391.0, 630.0, 365.0)
     pinhole = NamedCamera('pinhole', Radial((1280, 720), 390.0, 391.0, 630.0, 365.0))
     text = terminal(comparison(compare(pinhole, NamedCamera('truth', wide))))
-    assert re.search(r'px, without the \d+ % of the picture that the radial model\scannot', text)
+    assert re.search(r'removed, without the\s\d+\s% of the picture that the\sradial\smodel\s'
+                     r'cannot', text)
     assert 'k1' not in text and 'cy' in text
     assert 'without' not in terminal(comparison(compare(NamedCamera('truth', wide), pinhole)))
 
@@ -126,4 +134,4 @@ def test_small_coefficients_differ_visibly():
 def test_an_unknown_mapping_error_is_said_to_be_unknown():
     folding = NamedCamera('f', dataclasses.replace(TRUTH, fx=300, fy=300, k1=-0.6, k2=0))
     text = terminal(comparison(compare(NamedCamera('a', TRUTH), folding)))
-    assert 'mapping error: unknown' in text
+    assert 'apart: unknown' in text and 'matters: yes' in text

@@ -2,17 +2,23 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import shutil
+import subprocess
 
 import cv2
-import numpy as np
 import pytest
 import yaml
 from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
 
-from dashcalib_ros.camera import Brown, Fisheye
+from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError
-from dashcalib_ros.report import calibration_yaml, load_calibration_yaml
+from dashcalib_ros.report import calibration_yaml, load_camera
+from dashcalib_ros.report.camera_file import load_with_faults
+from dashcalib_ros.report.camera_yaml import camera_info_yaml
+from dashcalib_ros.report.export import exported
+from dashcalib_ros.ros.kept import Kept, Whose
 
 PARSERS_KEYS = ['image_width', 'image_height', 'camera_name', 'camera_matrix',
                 'distortion_model', 'distortion_coefficients', 'rectification_matrix',
@@ -87,7 +93,7 @@ def test_p_is_what_the_setting_wants(tmp_path, model):
         assert document['camera_matrix']['data'][0] == lens.fx
         # what is read is the camera, whatever P is
         (tmp_path / 'calibration.yaml').write_text(text)
-        assert load_calibration_yaml(tmp_path / 'calibration.yaml').camera == lens
+        assert load_camera(tmp_path / 'calibration.yaml').camera == lens
     assert shown['same'][0] == lens.fx
     assert shown['all'][0] < shown['crop'][0] and shown['all'][0] == shown['all'][5]
 
@@ -95,6 +101,7 @@ def test_p_is_what_the_setting_wants(tmp_path, model):
 def test_layout_is_one_flow_list_a_matrix():
     text = calibration_yaml(make_calibration())
     assert text.startswith(
+        '%YAML 1.2\n---\n'
         'image_width: 1242\nimage_height: 375\ncamera_name: dashcam\ncamera_matrix:\n  rows: 3\n'
         '  cols: 3\n  dt: d\n'
         '  data: [721.5377, 0.0, 609.5593, 0.0, 724.25, 172.854, 0.0, 0.0, 1.0]\n'
@@ -117,7 +124,7 @@ def test_full_precision_survives_the_round_trip(tmp_path):
     odd = dataclasses.replace(TRUTH, fx=2 / 3 * 1000, k1=-1e-17 / 3, k2=1e300 / 7)
     path = tmp_path / 'calibration.yaml'
     path.write_text(calibration_yaml(make_calibration(camera=odd)), encoding='utf-8')
-    camera = load_calibration_yaml(path)
+    camera = load_with_faults(path)
     assert camera.camera == odd
     assert camera.sigma == SIGMA
     assert camera.verdict == 'accepted'
@@ -128,19 +135,119 @@ def test_the_same_calibration_gives_the_same_text():
     assert calibration_yaml(make_calibration()) == calibration_yaml(make_calibration())
 
 
-@pytest.mark.parametrize('name', EACH_MODEL)
-def test_opencv_opens_it(tmp_path, name):
-    lens, odd = EACH_MODEL[name], 'a: "b" \\ #c ü %, {[ 4.2.1'
-    path = tmp_path / 'calibration.yaml'
-    path.write_text(calibration_yaml(calibration_of(lens, input_name=odd), created='2026-11-22'),
-                    encoding='utf-8')
-    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    assert file.isOpened() and file.getNode('image_width').real() == lens.image_size[0]
-    np.testing.assert_array_equal(file.getNode('camera_matrix').mat(), lens.matrix)
-    np.testing.assert_array_equal(file.getNode('distortion_coefficients').mat(),
-                                  [lens.ros_distortion()])
-    assert file.getNode('dashcalib').getNode('input').string() == odd
-    file.release()
+# what breaks OpenCV's parser, and names that are numbers nearly
+ODD = 'a: "b" \\ #c ü %, {[ 4.2.1'
+
+
+@pytest.fixture(scope='module')
+def each_file(tmp_path_factory):
+    """One file of each kind that this package writes, by name."""
+    folder = tmp_path_factory.mktemp('calibrations')
+    texts = {name: calibration_yaml(calibration_of(lens, input_name=ODD), created='2026-11-22')
+             for name, lens in EACH_MODEL.items()}
+    texts['weak'] = calibration_yaml(make_calibration('weak', input_name='x' * 5000), '4k_front')
+    texts['alone'] = exported(TRUTH, 'ros')
+    kept = Kept.of(make_calibration(input_name=ODD), Whose('360cam', '/image_raw'), 'front: #1')
+    texts['kept'], texts['kept_with_p'] = kept.text, kept.rectified('all').text
+    assert texts['kept'] != texts['kept_with_p']
+    for name, text in texts.items():
+        (folder / f'{name}.yaml').write_text(text, encoding='utf-8')
+    return {path.stem: path for path in sorted(folder.iterdir())}
+
+
+def lens_of(name):
+    return EACH_MODEL.get(name, TRUTH)
+
+
+def values_of(path):
+    """Return what each reader must find: size, K, D, and the text of our own block."""
+    lens = lens_of(path.stem)
+    own = yaml.safe_load(path.read_text()).get('dashcalib', {})
+    return [lens.image_size[0], *lens.matrix.ravel(), *lens.ros_distortion()], own.get('input', '')
+
+
+def test_opencv_opens_each(each_file):
+    for path in each_file.values():
+        numbers, text = values_of(path)
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        assert file.isOpened(), path
+        k, d = (file.getNode(key).mat() for key in ('camera_matrix', 'distortion_coefficients'))
+        assert [file.getNode('image_width').real(), *k.ravel(), *d.ravel()] == numbers
+        assert file.getNode('dashcalib').getNode('input').string() == text
+        file.release()
+
+
+# opens each file named by its arguments, and writes what it has as one line of JSON
+OTHER_OPENCV = '''
+import cv2, json, sys
+for path in sys.argv[1:]:
+    file = cv2.FileStorage(path, cv2.FILE_STORAGE_READ)
+    k, d = (file.getNode(n).mat() for n in ('camera_matrix', 'distortion_coefficients'))
+    print(json.dumps([[file.getNode('image_width').real(), *k.ravel(), *d.ravel()],
+                      file.getNode('dashcalib').getNode('input').string()]))
+'''
+ROS_1 = '''
+import camera_calibration_parsers, json, sys, yaml
+for path in sys.argv[1:]:
+    _, info = camera_calibration_parsers.readCalibration(path)
+    own = yaml.safe_load(open(path)).get('dashcalib', {})
+    print(json.dumps([[info.width, *info.K, *info.D], own.get('input', '')]))
+'''
+
+
+@pytest.mark.parametrize(('module', 'program'), [
+    ('cv2', OTHER_OPENCV), ('camera_calibration_parsers', ROS_1)])
+def test_the_distribution_s_readers_open_each(each_file, module, program):
+    """OpenCV 4, and ROS 1's parsers: Debian's and Ubuntu's packages, where they are installed."""
+    python = '/usr/bin/python3'
+    try:
+        subprocess.run([python, '-c', f'import {module}'], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip(f'{python} has no {module}')
+    told = subprocess.run([python, '-c', program, *map(str, each_file.values())], check=True,
+                          capture_output=True, text=True).stdout.splitlines()
+    for path, line in zip(each_file.values(), told, strict=True):
+        assert json.loads(line) == list(values_of(path)), path
+
+
+# as ROS 2's camera_calibration_parsers asks yaml-cpp
+YAML_CPP = r'''
+#include <iostream>
+#include <yaml-cpp/yaml.h>
+int main(int count, char ** paths) {
+  std::cout.precision(17);
+  for (int i = 1; i < count; ++i) {
+    YAML::Node doc = YAML::LoadFile(paths[i]);
+    std::cout << "[[" << doc["image_width"].as<int>();
+    for (auto key : {"camera_matrix", "distortion_coefficients"})
+      for (auto value : doc[key]["data"]) std::cout << ", " << value.as<double>();
+    YAML::Node own = doc["dashcalib"];
+    std::cout << "], " << (own ? own["verdict"].as<std::string>().size() : 0) << "]" << std::endl;
+  }
+}
+'''
+
+
+def test_yaml_cpp_opens_each(each_file, tmp_path):
+    source = tmp_path / 'reads.cpp'
+    source.write_text(YAML_CPP)
+    made = shutil.which('g++') and subprocess.run(
+        ['g++', str(source), '-o', str(tmp_path / 'reads'), '-lyaml-cpp'], capture_output=True)
+    if not made or made.returncode:
+        pytest.skip('there is no g++, or no libyaml-cpp-dev')
+    told = subprocess.run([tmp_path / 'reads', *each_file.values()], check=True,
+                          capture_output=True, text=True).stdout.splitlines()
+    for path, line in zip(each_file.values(), told, strict=True):
+        numbers, length = json.loads(line)
+        verdict = yaml.safe_load(path.read_text()).get('dashcalib', {}).get('verdict', '')
+        assert (numbers, length) == (values_of(path)[0], len(verdict)), path
+
+
+def test_a_file_of_an_older_version_loads(tmp_path):
+    """It has no line %YAML."""
+    text = calibration_yaml(make_calibration())
+    (tmp_path / 'old.yaml').write_text(text.partition('---\n')[2])
+    assert load_camera(tmp_path / 'old.yaml').camera == TRUTH
 
 
 def test_names_from_outside_cannot_break_the_file():
@@ -169,7 +276,7 @@ def test_without_intrinsics_there_is_no_yaml():
 def test_another_tool_s_file_loads(tmp_path):
     path = tmp_path / 'ost.yaml'
     path.write_text(FOREIGN)
-    camera = load_calibration_yaml(path)
+    camera = load_camera(path)
     assert camera.camera == Brown((640, 480), 500, 501.5, 320, 240, -0.1, 1e-5, 0.001, -0.002,
                                   0.003)
     assert camera.sigma is None and camera.verdict is None
@@ -180,7 +287,7 @@ def test_another_tool_s_fisheye_loads(tmp_path, name):
     path = tmp_path / 'ost.yaml'
     path.write_text(FOREIGN.replace('plumb_bob', name).replace('cols: 5', 'cols: 4').replace(
         '-0.1, 1e-05, 0.001, -0.002, 0.003', '-0.1, 1e-05, 0.001, -0.002'))
-    assert load_calibration_yaml(path).camera == Fisheye(
+    assert load_camera(path).camera == Fisheye(
         (640, 480), 500, 501.5, 320, 240, -0.1, 1e-5, 0.001, -0.002)
 
 
@@ -198,11 +305,28 @@ def test_another_tool_s_fisheye_loads(tmp_path, name):
     ('data: [500, 0, 320', f'data: [{"5" * 400}, 0, 320', 'more than 300 digits'),
     ('data: [500, 0, 320', f'data: [0x{"f" * 290}, 0, 320', 'finite numbers'),
     ('camera_matrix:', f'laughs: {"[" * 5000}\ncamera_matrix:', 'more than 30 levels'),
-    ('camera_matrix:', f'large: [{"1, " * 2**20}]\ncamera_matrix:', 'too large'),
+    ('camera_matrix:', f'large: [{"1, " * 2**20}]\ncamera_matrix:', 'more than 1 MB'),
 ])
 def test_broken_files_are_refused_with_what_is_wrong(tmp_path, old, new, complaint):
     assert old in FOREIGN
     path = tmp_path / 'ost.yaml'
     path.write_text(FOREIGN.replace(old, new))
     with pytest.raises(InputError, match=complaint):
-        load_calibration_yaml(path)
+        load_camera(path)
+
+
+@pytest.mark.parametrize(('key', 'place', 'words'), [
+    ('camera_matrix', 1, 'K[1] is 50'), ('rectification_matrix', 1, 'R is no rotation'),
+    ('projection_matrix', 2, 'P does not show the picture')])
+def test_faults_beside_the_camera_are_read(tmp_path, key, place, words):
+    path = tmp_path / 'calibration.yaml'
+    data = yaml.safe_load(camera_info_yaml(Radial((100, 60), 80.0, 80.0, 49.5, 29.5)))
+    path.write_text(yaml.safe_dump(data))
+    assert load_camera(path).faults == ()
+    data[key]['data'][place] += 50.0
+    path.write_text(yaml.safe_dump(data))
+    [fault] = load_with_faults(path).faults
+    assert words in fault
+    # what would be lost in another format
+    with pytest.raises(InputError, match=r'no model here has that'):
+        load_camera(path)

@@ -63,7 +63,7 @@ def test_an_override_that_there_is_not_ends_it(start_node, override, words):
 def test_it_says_which_images_there_are(start_node, make_bench):
     make_bench(topic='front/image_raw', listen=False)
     make_bench(topic='rear/image/compressed', image_type=CompressedImage, listen=False)
-    raw, compressed = start_node(), start_node(image_transport='compressed')
+    raw, compressed = start_node(), start_node(image_transport='compressed', camera_name='rear')
     raw.wait_for('no images on /image_raw yet; publishers of sensor_msgs/Image: '
                  '/front/image_raw; remap with -r image_raw:=/front/image_raw')
     compressed.wait_for('no images on /image_raw/compressed yet; publishers of '
@@ -118,6 +118,21 @@ def test_a_managed_node_listens_only_while_it_is_active(managed):
     stream(camera, 3, 10)
     camera.until(lambda: len(camera.infos) == 6, node=node)
     assert node.stop() == 0 and 'Traceback' not in node.text
+
+
+def test_an_invalid_transition_is_answered(managed):
+    """rclpy raises for it, and a client would wait for ever."""
+    node, camera = managed
+    client = camera.node.create_client(ChangeState, 'calibrator/change_state')
+    camera.until(client.service_is_ready, node=node)
+    answers = [client.call_async(ChangeState.Request(transition=Transition(id=number)))
+               for number in (Transition.TRANSITION_ACTIVATE, 11, 99, 255)]
+    camera.until(lambda: all(each.done() for each in answers), node=node)
+    assert not any(each.result().success for each in answers)
+    good = client.call_async(ChangeState.Request(
+        transition=Transition(id=Transition.TRANSITION_CONFIGURE)))
+    camera.until(good.done, node=node)
+    assert good.result().success
 
 
 # viewers -------------------------------------------------------------------------------------

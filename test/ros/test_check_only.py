@@ -5,6 +5,7 @@ The real node in this process, between real publishers; turns, and what they say
 from __future__ import annotations
 
 import json
+import re
 from typing import ClassVar
 
 import numpy as np
@@ -16,7 +17,7 @@ pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_desk import FIRST, SIGMA
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from std_msgs.msg import Header, String
 
 from dashcalib_ros.calibrator import Calibrator
@@ -24,8 +25,9 @@ from dashcalib_ros.checking import Check, Reading, watch
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros import learner, node
-from dashcalib_ros.ros.messages import camera_info, given_camera
+from dashcalib_ros.ros.messages import camera_info
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.stream import LASTING
 from dashcalib_ros.status import Status
@@ -44,6 +46,7 @@ class Core:
     """In the Calibrator's place: its turns are made by command, and show a focal length of 400."""
 
     newest: ClassVar[Core]
+    dark: ClassVar[bool] = False
 
     def __init__(self, config=None, mask=None, verbose=False, live=False, use_stored=True,
                  warn=None, inline=False, on_trouble=None):
@@ -65,13 +68,18 @@ class Core:
 
     def check(self, given, calibration, progress=None):
         right = given.fx == calibration.camera.fx
+        if self.dark:
+            return Check('cannot tell', ('too dark',))
         return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
 
     def watch(self, camera, sigma=None):
         return watch((Reading(turn, KNOWS, ZERO, None, turn not in self.strangers)
                       for turn in self.ready), camera, sigma, Config().monitor)
 
-    def want(self, turns):
+    def forget_stored(self, but=frozenset()):
+        pass
+
+    def want(self, turns, more=0):
         pass
 
     def reject(self, turns):
@@ -178,6 +186,60 @@ def test_a_wrong_one_warns_until_the_driver_has_another(desk, capfd):
     desk.until(lambda: heard[-1]['answer'] == 'right')
 
 
+def test_it_answers_as_soon_as_the_turns_can_tell(desk, monkeypatch):
+    desk = desk(check_only='true', **{'turns.wanted': 4})
+    heard = answers(desk)
+    monkeypatch.setattr(Core, 'dark', True)
+    Core.newest.ready = turns(10, 20)
+    drive(desk, info_of(), lambda: heard and heard[-1]['reasons'] == ['too dark'])
+    monkeypatch.setattr(Core, 'dark', False)
+    Core.newest.ready = turns(10, 20, 30)
+    desk.until(lambda: heard[-1]['answer'] == 'right')
+    bank = desk.node._learner.bank
+    Core.newest.ready = turns(10, 20, 30, 40)
+    desk.until(lambda: desk.node._learner.bank > bank)
+    # few turns that cannot tell do not take back what more could
+    heard.clear()
+    monkeypatch.setattr(Core, 'dark', True)
+    Core.newest.ready = turns(50, 60)
+    desk.until(lambda: desk.node._learner._bank.tried == set(turns(50, 60)))
+    monkeypatch.setattr(Core, 'dark', False)
+    Core.newest.ready = turns(50, 60, 70)
+    desk.until(lambda: heard)
+    assert heard[0]['answer'] == 'right'
+
+
+SAME_K, SAME_P = list(info_of().k), list(info_of().p)
+FAULTS = [
+    ({'k': [*SAME_K[:1], 50.0, *SAME_K[2:]]}, r'K\[1\] is 50, not 0'),
+    ({'k': [*SAME_K[:8], 0.0]}, r'K\[8\] is 0, not 1'),
+    ({'r': [0.985, 0.0, 0.174, 0.0, 1.0, 0.0, -0.174, 0.0, 0.985]}, 'R turns .* 9.9 degrees'),
+    ({'r': [0.0] * 9}, 'R is no rotation'),
+    ({'p': [0.0] * 12}, r'P\[10\] is 0'),
+    ({'p': [*SAME_P[:3], -40.0, *SAME_P[4:]]}, r'P\[3\] is -40'),
+    *(({'p': [scale * value for value in SAME_P[:8]] + SAME_P[8:]}, 'P .* another size')
+      for scale in (0.5, 2.0))]
+
+
+@pytest.mark.parametrize(('changes', 'words'), FAULTS)
+def test_what_stands_beside_the_camera_is_checked_too(changes, words):
+    [fault] = camera_of_message(info_of(**changes), TOPIC).faults
+    assert re.search(words, fault)
+
+
+def test_a_fault_beside_a_right_camera_is_wrong_before_and_after_the_turns(desk, capfd):
+    desk = desk(check_only='true')
+    heard = answers(desk)
+    drive(desk, info_of(r=FAULTS[2][0]['r']), lambda: heard)
+    assert heard[-1]['answer'] == 'wrong' and 'R turns' in heard[-1]['reasons'][0]
+    assert 'is wrong: R turns' in capfd.readouterr().err
+    Core.newest.ready = turns(10, 20)
+    desk.until(lambda: 'fx 400' in heard[-1]['reasons'])
+    assert heard[-1]['answer'] == 'wrong' and 'R turns' in heard[-1]['reasons'][0]
+    # each field counts as a change
+    drive(desk, info_of(), lambda: heard[-1]['answer'] == 'cannot tell')
+
+
 def test_a_calibration_for_other_images_is_told_and_checked(desk, capfd):
     desk = desk(check_only='true')
     drive(desk, info_of(width=640, height=480),
@@ -233,12 +295,14 @@ def test_a_change_of_an_own_calibration_is_told_until_another_is_adopted(desk, c
     ({'k': [0.0] * 9}, 'uncalibrated'),
     ({'d': [float('nan')] * 5}, 'not finite'),
     ({'binning_x': 2}, 'binning'),
+    ({'roi': RegionOfInterest(x_offset=8, width=320, height=240)}, 'region of interest'),
+    ({'p': [float('nan')] * 12}, 'not finite'),
     ({'width': 0}, 'width'),
-    ({'distortion_model': 'rational_polynomial', 'd': [0.1] * 8}, 'rational_polynomial'),
+    ({'distortion_model': 'rational_polynomial', 'd': [0.1] * 12}, 'rational_polynomial'),
     ({'k': [400.0, 0.0, 160.0, 0.0, -1.0, 120.0, 0.0, 0.0, 1.0]}, 'focal length')])
 def test_a_calibration_that_cannot_be_used_is_refused_in_one_line(changes, words):
     with pytest.raises(InputError, match=words) as raised:
-        given_camera(info_of(**changes), TOPIC)
+        camera_of_message(info_of(**changes), TOPIC)
     assert TOPIC in str(raised.value) and '\n' not in str(raised.value)
 
 

@@ -21,9 +21,11 @@ from synthetic import synthetic_turn
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.frames.scale import Scale
-from dashcalib_ros.judgement import Calibration, Verdict
-from dashcalib_ros.report import load_calibration_yaml
+from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+from dashcalib_ros.report import load_camera
+from dashcalib_ros.ros.kept import Whose
 from dashcalib_ros.ros.news import Result
+from dashcalib_ros.ros.store import Store
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.turns import TurnId
 
@@ -35,7 +37,7 @@ def test_its_life_with_a_camera_that_is_bumped(make_desk):
     assert desk.bench.values['reasons'] == 'few turns'
     desk.give()
     assert desk.show() == 400.0
-    assert load_calibration_yaml(desk.file).camera.fx == 400.0
+    assert load_camera(desk.file).camera.fx == 400.0
     assert desk.bench.values['state'] == 'calibrated'
     # confirmed, but no better
     desk.give(fx=401.0)
@@ -43,7 +45,7 @@ def test_its_life_with_a_camera_that_is_bumped(make_desk):
     # clearly better
     desk.give(fx=402.0, sigma={**SIGMA, 'fx': 1.0})
     assert desk.show() == 402.0
-    assert load_calibration_yaml(desk.file).camera.fx == 402.0
+    assert load_camera(desk.file).camera.fx == 402.0
     # bumped
     for count in (1, 2):
         desk.give(complete=False, cx=350.0)
@@ -118,7 +120,7 @@ def test_a_file_of_another_tool_is_set_aside(make_desk, tmp_path):
     (tmp_path / 'camera.yaml').write_text('camera_matrix: theirs\n')
     desk = make_desk()
     desk.give()
-    assert load_calibration_yaml(desk.file).camera.fx == 400.0
+    assert load_camera(desk.file).camera.fx == 400.0
     assert (tmp_path / 'camera.previous.yaml').read_text() == 'camera_matrix: theirs\n'
 
 
@@ -179,7 +181,7 @@ def test_what_was_set_aside_before_is_never_overwritten(make_desk, tmp_path):
     assert [(tmp_path / f'camera.previous{number}.yaml').read_text()
             for number in ('', '.2', '.3')] == [
                 'camera_matrix: theirs\n', first, 'camera_matrix: theirs too\n']
-    assert load_calibration_yaml(desk.file).camera.fx == 400.0
+    assert load_camera(desk.file).camera.fx == 400.0
     assert desk.call('save').success
     assert not (tmp_path / 'camera.previous.4.yaml').exists()
 
@@ -256,6 +258,106 @@ dashcalib:
   sigma: {fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0, k1: 0.01, k2: 0.01}
   frame_id: camera
 """
+
+
+def test_contradictions_are_counted_over_short_trips(make_desk):
+    desk = make_desk()
+    desk.give()
+    for trip in (1, 2):
+        desk.close()
+        desk = make_desk()
+        assert desk.show() == 400.0 and desk.bench.values['contradictions'] == str(trip - 1)
+        desk.give('weak', complete=False)
+        desk.give(complete=False, fx=420.0)
+        desk.until(lambda desk=desk, trip=trip: desk.bench.count('contradictions') == trip)
+        assert desk.bench.status.level == b'\x01'
+        assert f'{trip} of 3' in desk.bench.status.message
+    desk.close()
+    desk = make_desk()
+    # it warns from the start
+    desk.until(lambda: desk.bench.status.level == b'\x01')
+    desk.give(complete=False, fx=420.0)
+    assert desk.show() is None and not desk.file.exists()
+
+
+def test_a_confirmation_is_kept_on_disk_too(make_desk):
+    desk = make_desk()
+    desk.give()
+    desk.give(complete=False, fx=420.0)
+    desk.give(complete=False)
+    desk.close()
+    desk = make_desk()
+    desk.show()
+    assert desk.bench.values['contradictions'] == '0' and desk.bench.status.level == b'\x00'
+
+
+def test_complete_turns_that_contradict_it_are_kept_and_counted_on(make_desk):
+    desk = make_desk()
+    desk.give()
+    bank = desk.node._learner.bank
+    for _ in range(2):
+        desk.give(fx=420.0)
+        assert desk.node._learner.bank == bank and desk.show() == 400.0
+    desk.give(fx=420.0)
+    assert desk.node._learner.bank == bank + 1 and desk.show() == 420.0
+
+
+def test_the_same_turns_count_once(make_desk):
+    desk = make_desk()
+    desk.give()
+    turns = tuple(TurnSummary(n, n, n, 0.0, 0.1, 1, 1, True, misfit=1.0) for n in (1, 2, 3))
+    for count, used in ((1, turns[:2]), (1, turns[:2]), (2, turns)):
+        desk.give(complete=False, fx=420.0, turns=used)
+        desk.until(lambda count=count: desk.bench.values['contradictions'] == str(count))
+
+
+def test_a_loaded_calibration_is_unconfirmed_until_turns_agree(make_desk):
+    desk = make_desk()
+    desk.give()
+    desk.until(lambda: desk.bench.values['calibration'] == 'confirmed')
+    desk.close()
+    desk = make_desk()
+    assert desk.show() == 400.0
+    desk.until(lambda: desk.bench.values['calibration'] == 'unconfirmed')
+    assert desk.bench.status.level == b'\x00' and 'unconfirmed' in desk.bench.status.message
+    desk.give(complete=False)
+    desk.until(lambda: desk.bench.values['calibration'] == 'confirmed')
+
+
+def test_an_edited_file_warns_until_turns_agree_and_is_replaced_then(make_desk):
+    desk = make_desk()
+    desk.give()
+    desk.close()
+    text = desk.file.read_text()
+    desk.file.write_text(text.replace('fx: 2.0', 'fx: 0.001').replace('400.0', '404.0'))
+    desk = make_desk()
+    assert desk.show() == 404.0
+    desk.until(lambda: desk.bench.status.level == b'\x01')
+    assert 'was edited' in desk.bench.status.message and desk.bench.values['sigma fx (px)'] == ''
+    desk.give(complete=False)
+    desk.until(lambda: desk.bench.status.level == b'\x00')
+    # no sigma is better than one that somebody wrote
+    desk.give()
+    assert desk.show() == 400.0 and load_camera(desk.file).sigma['fx'] == 2.0
+
+
+def test_a_file_that_another_node_has_is_neither_published_nor_written(make_desk, tmp_path):
+    desk = make_desk()
+    desk.give()
+    desk.close()
+    text = desk.file.read_text()
+    other = Store(desk.file, Whose('dashcam', '/image_raw'))
+    assert other.claim()
+    desk = make_desk()
+    desk.until(lambda: 'another node uses' in desk.bench.status.message)
+    assert desk.show() is None and desk.bench.status.level == b'\x01'
+    # its own is published, and kept nowhere
+    desk.give(fx=420.0)
+    assert desk.show() == 420.0 and desk.file.read_text() == text
+    assert desk.call('reset').success and desk.file.read_text() == text
+    other.close()
+    desk.give(fx=420.0)
+    assert load_camera(desk.file).camera.fx == 420.0
 
 
 def test_a_camera_that_changed_does_not_learn_from_the_turns_of_earlier_drives(

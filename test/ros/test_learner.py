@@ -91,8 +91,8 @@ class Core:
         self.checked.append(given)
         return Check('right', ('it fits',), 0.5, 1.0)
 
-    def want(self, turns):
-        self.wanted = turns
+    def want(self, turns, more=0):
+        self.wanted = turns + more
 
     def view(self):
         return View(TrackedPoints(None, None), None)
@@ -107,7 +107,7 @@ class Core:
     def clear_store(self):
         self.done.append('clear')
 
-    def forget_stored(self):
+    def forget_stored(self, but=frozenset()):
         self.done.append('forget')
 
 
@@ -207,6 +207,16 @@ def test_other_numbers_of_turns_can_be_wanted_while_it_runs(desk):
     until(lambda: getattr(Core.made[-1], 'wanted', None) == 1)
 
 
+def test_a_bank_is_extended_turn_by_turn_as_far_as_turns_are_kept(desk):
+    desk.learner.want(9)
+    assert desk.learner.extend()
+    until(lambda: getattr(Core.made[0], 'wanted', None) == 10)
+    assert not desk.learner.extend()
+    # the next bank begins as usual
+    desk.learner.restart()
+    until(lambda: getattr(Core.made[1], 'wanted', None) == 9)
+
+
 def test_pictures_are_handed_on_only_while_someone_watches(desk):
     message = image()
     desk.learner.offer(0, 0, message, (64, 48))
@@ -282,7 +292,7 @@ def test_a_restart_empties_the_store_unless_another_camera_comes(desk):
     desk.learner.restart(keep_stored=True)
     until(lambda: second.done == ['close'])
     assert Core.made[2].options['use_stored']
-    desk.learner.forget_stored()
+    desk.learner.forget_stored(set())
     until(lambda: Core.made[2].done == ['forget'])
 
 
@@ -380,6 +390,8 @@ def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
     Core.made[0].strangers = Core.made[0].ready = at(10, 20)
     until(lambda: desk.watched)
     assert desk.watched[-1].monitor.lens.confirmed
+    # the turns of earlier drives are of the camera before
+    assert Core.made[0].done == ['forget']
     desk.learner.restart()
     Core.made[1].ready = at(30)
     until(lambda: len(desk.watched) == 2)

@@ -35,7 +35,7 @@ from ros_bench import (
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from dashcalib_ros.camera import Fisheye, ros_camera
-from dashcalib_ros.report import load_calibration_yaml
+from dashcalib_ros.report import load_camera
 
 # -- the end ----------------------------------------------------------------------------------
 
@@ -101,7 +101,7 @@ def test_a_kept_fisheye_is_published_with_the_view_that_is_wanted_now(start_node
     assert camera.call('save', node).success
     saved = yaml.safe_load(path.read_text())
     assert saved['projection_matrix']['data'] == ros_camera(lens, 'all').p
-    assert load_calibration_yaml(path).camera == lens
+    assert load_camera(path).camera == lens
     assert saved['dashcalib']['sigma'] == yaml.safe_load(OUR_FISHEYE)['dashcalib']['sigma']
     assert node.stop() == 0
     # it fits now: there is nothing to tell
@@ -111,7 +111,7 @@ def test_a_kept_fisheye_is_published_with_the_view_that_is_wanted_now(start_node
 
 
 @pytest.mark.parametrize(('text', 'words'), [
-    ('{{{ no yaml', 'is not valid YAML'),
+    ('{{{ no yaml', 'dashcam.yaml is ignored'),
     ('', 'is no camera calibration'),
     (CAMERA_FILE.format(width=320), 'no accepted calibration of this node'),
     (CAMERA_FILE.format(width=640) + OURS, 'it is for 640x240'),
@@ -141,10 +141,22 @@ def test_a_namespace_names_the_camera(start_node, make_bench, tmp_path):
     assert camera.status.hardware_id == 'front'
 
 
+def test_another_cameras_calibration_is_not_published(start_node, make_bench, tmp_path):
+    """Two cameras of one size and frame; the files of both would have one name."""
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS + '  topic: /a/image\n', 'a')
+    node = start_node('-r', 'image_raw:=/a/image_raw', '-r', 'camera_info:=/a/camera_info')
+    camera = make_bench(namespace='/a')
+    camera.connect(node)
+    stream(camera, 3)
+    camera.counted('received', 3, node)
+    node.wait_for('is ignored: it is of the images on /a/image, this node has /a/image_raw')
+    assert camera.infos == [] and camera.status.hardware_id == 'a'
+
+
 # -- input ------------------------------------------------------------------------------------
 
 def test_compressed_images_get_their_camera_info(start_node, make_bench, tmp_path):
-    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS)
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS + '  topic: /dashcam/image\n')
     node = start_node('-r', 'image_raw:=dashcam/image', image_transport='compressed')
     camera = make_bench(image_type=CompressedImage, topic='dashcam/image/compressed')
     camera.connect(node)
@@ -372,7 +384,10 @@ def test_a_parameter_of_no_type_is_logged_once_and_the_node_goes_on(start_node, 
     odd = SetParameters.Request(parameters=[
         Parameter(name='commit', value=ParameterValue(type=99))])
     for count in (1, 2, 3):
-        client.call_async(odd)
+        answer = client.call_async(odd)
+        camera.until(answer.done, node=node)
+        [result] = answer.result().results
+        assert not result.successful and '99' in result.reason
         camera.counted('failed_callbacks', count, node)
     stream(camera, 3)
     camera.counted('received', 3, node)

@@ -2,9 +2,13 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
+
+from fakes import compressed_message
 
 from dashcalib_ros.ros.backlog import Backlog
 from dashcalib_ros.ros.complaints import Complaints
+from dashcalib_ros.ros.intake import Intake
 from dashcalib_ros.ros.stream import LASTING, Source, SourceWatch
 
 SMALL, LARGE, REAR = (Source((320, 240), 'camera'), Source((640, 480), 'camera'),
@@ -76,3 +80,29 @@ def test_what_lasts_is_said_once():
         for text in ('full', 'odd', 'no mask'):
             complaints.once(text)
     assert said == ['full', 'odd', 'no mask'] and complaints.counts == {'store': 2}
+
+
+def test_damaged_images_are_no_sign_of_another_camera():
+    """Of a PGM of ten bytes, the header says its size, and there are no pixels."""
+    changes, complaints = [], Complaints(lambda text: None)
+    intake = Intake(10.0, complaints, lambda before, source: changes.append(source))
+
+    def sent(data, times=1):
+        header = SimpleNamespace(frame_id='camera')
+        message = compressed_message(format='pgm', data=data)
+        message.header = header
+        return [intake.take(message) for _ in range(times)]
+
+    def whole(width):
+        return b'P5 %d 8 255\n' % width + bytes(8 * width)
+
+    cut = b'P5 64 8 9\n'
+    assert sent(cut, 3) == [None] * 3 and intake.source is None
+    sent(whole(32))
+    assert sent(cut, 3 * LASTING) == [None] * 3 * LASTING
+    sent(whole(64), LASTING - 1)
+    sent(cut)
+    sent(whole(64), LASTING - 1)
+    assert [source.size for source in changes] == [(32, 8)] and complaints.counts['undecodable']
+    sent(whole(64))
+    assert [source.size for source in changes] == [(32, 8), (64, 8)]

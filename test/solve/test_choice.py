@@ -13,7 +13,7 @@ from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.judgement.verdict import judge
 from dashcalib_ros.reconstruction.scene import Profile, Start
 from dashcalib_ros.solve.choice import Candidate, gain_of_wider_model, is_clear
-from dashcalib_ros.solve.information import information
+from dashcalib_ros.solve.information import Pooled, information
 from dashcalib_ros.solve.picture import scatter_between_turns
 
 WIDE = Fisheye(SIZE, 300.0, 300.6, 404.0, 221.0, 0.02, -0.008, 0.003, -0.0005)
@@ -159,11 +159,14 @@ def test_turns_that_agree_scatter_as_their_noise():
     count, size = 200, 6
     roots = rng.normal(size=(count, size, size))
     hessians = roots @ roots.transpose(0, 2, 1)
-    whole = np.linalg.cholesky(np.linalg.inv(hessians.sum(axis=0)))
-    hessians = whole.T @ hessians @ whole
-    scores = np.array([rng.multivariate_normal(np.zeros(size), h - h @ h) for h in hessians])
-    assert scatter_between_turns(hessians, scores) == pytest.approx(1.0, abs=0.15)
-    assert scatter_between_turns(hessians, 3 * scores) == pytest.approx(9.0, rel=0.15)
+    inverse = np.linalg.inv(hessians.sum(axis=0))
+    whole = np.linalg.cholesky(inverse)
+    scores = np.array([rng.multivariate_normal(np.zeros(size), h - h @ inverse @ h)
+                       for h in hessians])
+    nothing = np.zeros((size, size)), np.zeros(size)
+    for times in (1, 3):
+        together = Pooled(hessians, times * scores, inverse, *nothing)
+        assert scatter_between_turns(together, whole) == pytest.approx(times**2, rel=0.15)
 
 
 @pytest.mark.parametrize('seed', range(4))

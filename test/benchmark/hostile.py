@@ -1,0 +1,571 @@
+#!/usr/bin/env python3
+"""What an attacker, a broken driver or a power cut can do: everything must go on, and be answered.
+
+    python test/benchmark/hostile.py [ATTACK ...] [--quick] [--out DIR] [--docs] [--again] [--list]
+
+Each attack is tried many times, each try in its own way. A line goes to DIR/hostile.jsonl after
+each try, and one that is there is not tried again; DIR/hostile.md counts them. All of it takes
+half an hour, and --quick two minutes; ROS is needed.
+"""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import cv2
+import numpy as np
+import rclpy
+from documents import write_table
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from measure import commit, parser_with, table
+from node_latency import resident_mb
+from processes import processes_of
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
+from ros_bench import (
+    CAMERA_FILE,
+    COMMAND,
+    OURS,
+    SECOND,
+    START,
+    Bench,
+    NodeProcess,
+    compressed_message,
+    image_message,
+    keep_file,
+    noise,
+    ros_environment,
+)
+from sensor_msgs.msg import CompressedImage, Image
+from std_srvs.srv import Trigger
+
+from dashcalib_ros.camera import Radial, ros_camera
+from dashcalib_ros.demo import Drive, DriveSpec, Lens
+from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.frames import Frame
+from dashcalib_ros.report import load_camera
+from dashcalib_ros.report.camera_file import camera_of_message
+from dashcalib_ros.ros.messages import camera_info
+from dashcalib_ros.ros.store import Store
+from dashcalib_ros.ros.stream import LASTING
+
+KEPT = CAMERA_FILE.format(width=320) + OURS
+FX = 200.0
+# s of the soak; quick
+SOAK_S, SHORT_SOAK_S = 900.0, 60.0
+# the memory of a soak's end, of that after its first quarter
+FLAT = 1.1
+
+
+@dataclass(frozen=True)
+class Attack:
+    """tries, quick: how often. run: called with a folder and the numbers of the tries that lack.
+
+    It yields once for each when that held, and raises where it did not.
+    """
+
+    name: str
+    tries: int
+    quick: int
+    run: Callable[[Path, Sequence[int]], Iterator[None]]
+
+
+# the node ------------------------------------------------------------------------------------
+
+@contextlib.contextmanager
+def running(home: Path, kind: type = Image, command: Sequence[str] = COMMAND, kept: str = KEPT,
+            **parameters: Any) -> Iterator[tuple[NodeProcess, Bench]]:
+    """Run the node, with a calibration on disk, beside a camera that it hears."""
+    home.mkdir(parents=True, exist_ok=True)
+    keep_file(home, kept)
+    os.environ.update(ros_environment(home))
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    camera = Bench(context, image_type=kind,
+                   topic='image_raw' if kind is Image else 'image_raw/compressed')
+    node = NodeProcess(home, command=command, image_transport='raw' if kind is Image
+                       else 'compressed', **parameters)
+    try:
+        camera.until(lambda: camera.latched, node=node)
+        yield node, camera  # killed afterwards, with its children
+        assert node.process.poll() is None, f'the node ended: {node.text[-500:]}'
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(node.process.pid, signal.SIGKILL)
+        node.kill()
+        camera.close()
+        rclpy.shutdown(context=context)
+
+
+def call(node: NodeProcess, camera: Bench, kind: Any, name: str, **fields: Any) -> Any:
+    """Call a service of the node; raises AssertionError where no answer comes."""
+    client = camera.node.create_client(kind, f'calibrator/{name}')
+    camera.until(client.service_is_ready, node=node)
+    future = client.call_async(kind.Request(**fields))
+    camera.until(future.done, what=f'the answer of {name}', node=node)
+    camera.node.destroy_client(client)
+    return future.result()
+
+
+def still_calibrated(node: NodeProcess, camera: Bench, number: int) -> None:
+    """Publish a good image until it has its camera_info."""
+    camera.infos.clear()
+    make = image_message if camera.images.msg_type is Image else compressed_message
+    stamps = iter(range(START + 1000 * number * SECOND, START + 10**6 * SECOND, SECOND))
+
+    def answered() -> bool:
+        camera.publish(make(noise(number), next(stamps)))
+        camera.spin(0.1)
+        return any(info.k[0] == FX for info in camera.infos)
+    camera.until(answered, what='the camera_info', node=node)
+
+
+def kills_while_saving(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGKILL of the node and its children while it writes its file again and again."""
+    for n in tries:
+        home = folder / str(n)
+        path = home / '.ros' / 'camera_info' / 'dashcam.yaml'
+        with running(home) as (node, camera):
+            client = camera.node.create_client(Trigger, 'calibrator/save')
+            camera.until(client.service_is_ready, node=node)
+            end = time.monotonic() + np.random.default_rng(n).uniform(0.1, 1.0)
+            while time.monotonic() < end:
+                client.call_async(Trigger.Request())
+                camera.executor.spin_once(timeout_sec=0.0)
+        found = load_camera(path)
+        assert (found.verdict, found.camera.fx) == ('accepted', FX), path.read_text()
+        assert not processes_of(node.process.pid), 'a child lives on'
+        with running(home, kept=path.read_text()) as (node, camera):
+            still_calibrated(node, camera, n)
+        left = [each.name for each in path.parent.iterdir()]
+        assert left == [path.name], left
+        yield
+
+
+def service_calls(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Calls of every kind, with odd names: each is answered."""
+    odd = ('', 'turns.wanted', 'x' * 10_000, 'é\n', '/..', 'commit')
+    with running(folder) as (node, camera):
+        for n in tries:
+            name = odd[n % len(odd)]
+            kind, service, fields = [
+                (Trigger, ('calibrate', 'reset', 'save')[n % 3], {}),
+                (GetParameters, 'get_parameters', {'names': [name]}),
+                (DescribeParameters, 'describe_parameters', {'names': [name]}),
+                (ListParameters, 'list_parameters', {'prefixes': [name], 'depth': n}),
+                (SetParameters, 'set_parameters', {'parameters': [Parameter(name=name)]}),
+            ][n % 5]
+            assert call(node, camera, kind, service, **fields) is not None
+            yield
+
+
+def parameter_types(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Parameters of each type that a byte can name."""
+    with running(folder) as (node, camera):
+        for n in tries:
+            given = [Parameter(name='turns.wanted', value=ParameterValue(type=n % 256))]
+            if n < 256:
+                [result] = call(node, camera, SetParameters, 'set_parameters',
+                                parameters=given).results
+            else:
+                result = call(node, camera, SetParametersAtomically, 'set_parameters_atomically',
+                              parameters=given).result
+            # 0 turns are too few
+            assert not result.successful and result.reason
+            yield
+
+
+def transitions(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Lifecycle transitions that there are not, in this state or at all."""
+    valid = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+    with running(folder, command=[*COMMAND, '--lifecycle']) as (node, camera):
+        for n in tries:
+            wrong = Transition(id=n) if n not in valid else Transition(label='nothing')
+            assert not call(node, camera, ChangeState, 'change_state', transition=wrong).success
+            yield
+
+
+def odd_image(n: int) -> Image:
+    """Return a raw image that no camera should send; some may be of use."""
+    rng = np.random.default_rng(n)
+    message = image_message(noise(n), START + n * SECOND)
+    message.encoding = str(rng.choice(['mono8', 'bgr8', 'mono16', '32FC1', 'yuv422', 'bayer_rggb8',
+                                       'nv12', '', 'é' * 500, 'rgba8']))
+    field = rng.choice(['step', 'width', 'height', 'data', 'is_bigendian', 'encoding'])
+    if field in ('step', 'width', 'height'):
+        setattr(message, field, int(rng.choice([0, 1, 17, 319, 65_535, 2**32 - 1])))
+    elif field == 'data':
+        del message.data[int(rng.integers(len(message.data))):]
+    elif field == 'is_bigendian':
+        message.is_bigendian = 255
+    return message
+
+
+def odd_bytes(n: int) -> bytes:
+    """Return a damaged file, or the head of one that claims to be large."""
+    rng = np.random.default_rng(n)
+    kind = ('.jpg', '.png', '.bmp', '.webp', '.tiff', '.pgm')[n % 6]
+    whole = cv2.imencode(kind, noise(n))[1].tobytes()
+    match n // 6 % 4:
+        case 0:
+            return whole[:int(rng.integers(len(whole)))]
+        case 1:
+            data = np.frombuffer(whole, np.uint8).copy()
+            data[rng.integers(len(data), size=20)] = rng.integers(256, size=20)
+            return data.tobytes()
+        case 2:
+            return whole[:12] + bytes(rng.integers(256, size=200, dtype=np.uint8))
+    return rng.choice([b'', b'\xff\xd8', b'GIF89a', b'P5 65535 65535 255\n', b'\0' * 10**6])
+
+
+def odd_images(kind: type, make: Callable[[int], Any]
+               ) -> Callable[[Path, Sequence[int]], Iterator[None]]:
+    def run(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+        with running(folder, kind) as (node, camera):
+            still_calibrated(node, camera, 0)
+            for n in tries:
+                camera.publish(make(n))
+                still_calibrated(node, camera, n + 1)
+                yield
+    return run
+
+
+def compressed_odd(n: int) -> CompressedImage:
+    message = CompressedImage(format=('jpeg', 'png', '', 'h264', 'compressedDepth')[n % 5])
+    message.data.frombytes(odd_bytes(n))
+    message.header.frame_id = 'camera'
+    message.header.stamp.sec = START // SECOND + n
+    return message
+
+
+def other_sizes(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Damaged messages that claim another size, for longer than a true change needs."""
+    with running(folder, CompressedImage) as (node, camera):
+        still_calibrated(node, camera, 0)
+        for n in tries:
+            whole = cv2.imencode(('.jpg', '.png', '.bmp', '.webp')[n % 4],
+                                 noise(n, (640, 480)))[1].tobytes()
+            data = b'P5 64 8 9\n' if n % 5 == 0 else whole[:max(64, len(whole) // 2)]
+            for _ in range(3 * LASTING):
+                message = compressed_odd(n)
+                message.format, message.data = 'jpeg', list(data)
+                camera.publish(message)
+            still_calibrated(node, camera, n + 1)
+            assert 'the camera changes' not in node.text
+            yield
+
+
+def camera_infos(_: Path, tries: Sequence[int]) -> Iterator[None]:
+    """With check_only, fields of a right camera_info that make its users see wrong."""
+    lens = Radial((320, 240), 300.0, 301.0, 161.0, 118.0, -0.1)
+    c = ros_camera(lens)
+    for n in tries:
+        message = camera_info(lens, image_message(noise(0), START).header, 'same')
+        assert not camera_of_message(message, '/camera_info').faults
+        match n:
+            case 0 | 1 | 2 | 3 | 4:
+                place = (1, 3, 6, 7, 8)[n]
+                message.k = [*c.k[:place], c.k[place] + 50.0, *c.k[place + 1:]]
+            case 5 | 6 | 7:
+                turned = cv2.Rodrigues(np.radians(10.0) * np.eye(3)[n - 5])[0]
+                message.r = turned.ravel().tolist()
+            case 8 | 9 | 10:
+                scale = (0.5, 1.5, 2.0)[n - 8]
+                message.p = [scale * value for value in c.p[:8]] + c.p[8:]
+            case 11 | 12:
+                setattr(message, 'rp'[n - 11], [0.0] * (9, 12)[n - 11])
+            case 13 | 14:
+                setattr(message, ('binning_x', 'binning_y')[n - 13], 2)
+            case 15:
+                message.roi.x_offset, message.roi.width, message.roi.height = 8, 320, 240
+            case _:
+                message.p = [float('nan'), *c.p[1:]]
+        with contextlib.suppress(DashcalibError):
+            assert camera_of_message(message, '/camera_info').faults, message
+        yield
+
+
+def frames(_: Path, tries: Sequence[int]) -> Iterator[None]:
+    for n in tries:
+        stamp: Any = (float('nan'), float('inf'), -float('inf'), 10**400, None, 'x', [1], 1j)[n]
+        try:
+            Frame(0, stamp, noise(0))
+        except DashcalibError:
+            yield
+        else:
+            raise AssertionError(f'a stamp of {stamp} is taken')
+
+
+def soak(seconds: float, folder: Path) -> None:
+    """A looped drive with its true calibration, images lost: flat memory, and no false alarm."""
+    lens = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
+    pictures = [frame.image for frame in Drive(lens, DriveSpec(seed=0, turns=2)).frames()]
+    text = (KEPT.replace('width: 320', 'width: 640').replace('height: 240', 'height: 360')
+            .replace('200.0, 0.0, 160.0, 0.0, 201.0, 120.0',
+                     f'{lens.fx}, 0.0, {lens.cx}, 0.0, {lens.fy}, {lens.cy}')
+            .replace('-0.1, 0.01', f'{lens.k1}, {lens.k2}'))
+    rng = np.random.default_rng(0)
+    memory: list[float] = []
+    with running(folder, kept=text) as (node, camera):
+        started = looked = time.monotonic()
+        silent_until = n = 0
+        while (passed := time.monotonic() - started) < seconds:
+            n += 1
+            # thrice as fast as it was driven
+            camera.spin(max(0.0, n / 30 - passed))
+            if rng.random() < 0.01:
+                silent_until = n + int(rng.integers(3, 30))
+            if n > silent_until and rng.random() > 0.3:
+                camera.images.publish(image_message(pictures[n % len(pictures)],
+                                                    START + n * SECOND // 10))
+            if time.monotonic() > looked + 1:
+                looked = time.monotonic()
+                memory.append(resident_mb(node.process.pid))
+        camera.spin(2.0)
+        values = camera.values
+        quarter = len(memory) // 4
+        before, after = (float(np.median(memory[part])) for part in (
+            slice(quarter, 2 * quarter), slice(-quarter, None)))
+        print(f'soak: {values["received"]} images, {values["lost"]} lost, {before:.0f} to '
+              f'{after:.0f} MB, change {values["change"]!r}, contradictions '
+              f'{values["contradictions"]}', flush=True)
+        assert after <= FLAT * before, f'memory grew from {before:.0f} to {after:.0f} MB'
+        assert not values['change'], values['change']
+        assert 'Traceback' not in node.text
+
+
+def soaks(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    for n in tries:
+        soak(SOAK_S if n else SHORT_SOAK_S, folder / str(n))
+        yield
+
+
+# files and fleets ----------------------------------------------------------------------------
+
+def damaged(text: str, n: int) -> bytes:
+    """Return a text with something odd in it, in place of a number, a line, or some bytes."""
+    rng = np.random.default_rng(n)
+    odd = ['.nan', '1e999', '-5', '"x"', '[]', '{}', '9' * 400, '~', '*a', '1:20:30', 'null',
+           '!!python/object/apply:os.system ["true"]', '[' * 50 + ']' * 50, '\0', '0x10', 'é']
+    lines = text.splitlines()
+    line = int(rng.integers(len(lines)))
+    match n % 5:
+        case 0:
+            numbers = list(re.finditer(r'-?\d+(\.\d+)?', text))
+            place = numbers[rng.integers(len(numbers))]
+            return (text[:place.start()] + odd[n // 5 % len(odd)] + text[place.end():]).encode()
+        case 1:
+            return '\n'.join(lines[:line] + lines[line + 1:]).encode()
+        case 2:
+            return text.encode()[:int(rng.integers(len(text)))]
+        case 3:
+            key = lines[line].partition(':')[0]
+            lines[line] = f'{key}: {odd[n // 5 % len(odd)]}'
+            return '\n'.join(lines).encode()
+    data = np.frombuffer(text.encode(), np.uint8).copy()
+    data[rng.integers(len(data), size=5)] = rng.integers(256, size=5)
+    return data.tobytes()
+
+
+def calibration_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Each is read as a camera with finite numbers, or refused with one line."""
+    for n in tries:
+        path = folder / f'{n}.yaml'
+        path.write_bytes(damaged(KEPT, n))
+        for read in (load_camera, lambda path: Store(path).load()):
+            try:
+                found = read(path)
+            except DashcalibError as error:
+                assert '\n' not in str(error)
+            else:
+                camera = getattr(found.camera, 'camera', found.camera)
+                assert np.isfinite(camera.params).all() and camera.fx > 0
+        yield
+
+
+def stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """A damaged turn costs one warning, and the others stay."""
+    from test_turn_store import CAMERA, SPOILED, TurnStore, hold, stored
+    for n in tries:
+        said: list[str] = []
+        store = TurnStore(str(folder / str(n)), 10, 3.0, said.append)
+        store.load(CAMERA)
+        hold(store, stored(0), stored(1))
+        list(SPOILED.values())[n % len(SPOILED)](sorted((folder / str(n)).iterdir())[0])
+        again = TurnStore(str(folder / str(n)), 10, 3.0, said.append)
+        again.load(CAMERA)
+        assert len(again.turns) == 1 and len(said) == 1, said
+        yield
+
+
+def dashcalib(*arguments: object) -> list[str]:
+    return [sys.executable, '-m', 'dashcalib_ros.cli', *map(str, arguments)]
+
+
+def manifests(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Each is told in lines without a traceback, and writes nothing elsewhere."""
+    text = 'clip,camera,make,fps,topic,time\n' + 'a.mp4,one,acme,10,/image,2026-01-31\n' * 3
+    for n in tries:
+        place = folder / str(n)
+        place.mkdir()
+        names = ['m.csv', 'm.jsonl', 'm.parquet']
+        path = place / names[n % 3]
+        path.write_bytes(damaged(text if n % 3 != 1 else '{"clip": "../a.mp4", "fps": 10}\n', n))
+        done = subprocess.run(dashcalib('batch', path, '--out', place / 'out', '--workers', 1),
+                              capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode in (2, 3) and 'Traceback' not in done.stderr, done.stderr
+        assert {each.name for each in place.iterdir()} <= {path.name, 'out'}
+        yield
+
+
+def batch_kills(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGKILL of a batch again and again: what comes out in the end is the same to the byte."""
+    from fleet_made import YAWS, clip_of, lens_of, written
+    rows = ['clip,camera,make']
+    for n in range(4):
+        written(clip_of(lens_of(1 + 0.004 * n), YAWS[n:n + 1], world=n, tracks=60, keyframes=7),
+                folder / f'{n}.npz')
+        rows.append(f'{n}.npz,cam {n},acme')
+    (folder / 'm.csv').write_text('\n'.join(rows) + '\n')
+
+    # the pages name the folder
+    out = folder / 'out'
+
+    def start() -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            dashcalib('batch', folder / 'm.csv', '--out', out, '--workers', 1, '--set',
+                      'intrinsics.profile_tracks=60'), start_new_session=True,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def written_files() -> dict[str, bytes]:
+        # the effort is of the last run alone
+        found = {str(path.relative_to(out)): path.read_bytes() for path in out.rglob('*')
+                 if path.is_file() and path.name != 'effort.json'}
+        shutil.rmtree(out)
+        return found
+
+    started = time.monotonic()
+    start().wait()
+    took = time.monotonic() - started
+    wanted = written_files()
+    for n in tries:
+        rng = np.random.default_rng(n)
+        for kill in range(4):
+            process = start()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(None if kill == 3 else rng.uniform(0.3, 1.0) * took)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        found = written_files()
+        assert found == wanted, sorted(name for name in {*found, *wanted}
+                                       if found.get(name) != wanted.get(name))
+        yield
+
+
+ATTACKS = [
+    Attack('SIGKILL while it saves', 20, 1, kills_while_saving),
+    Attack('service calls', 500, 25, service_calls),
+    Attack('types of parameters', 512, 16, parameter_types),
+    Attack('invalid transitions', 256, 16, transitions),
+    Attack('odd raw images', 41, 8, odd_images(Image, odd_image)),
+    Attack('odd compressed images', 48, 12, odd_images(CompressedImage, compressed_odd)),
+    Attack('damaged images of another size', 20, 3, other_sizes),
+    Attack('camera_info with check_only', 17, 17, camera_infos),
+    Attack('stamps of frames', 8, 8, frames),
+    Attack('calibration files', 127, 127, calibration_files),
+    Attack('stored turns', 25, 25, stores),
+    Attack('manifests', 40, 5, manifests),
+    Attack('SIGKILL of a batch', 10, 1, batch_kills),
+    Attack('soak with lost images', 2, 1, soaks)]
+
+
+def tried(attack: Attack, lacking: Sequence[int]) -> Iterator[tuple[int, str]]:
+    """Try an attack; yield each number with why it did not hold, '' where it did."""
+    rest = list(lacking)
+    while rest:
+        with TemporaryDirectory(prefix='hostile-', ignore_cleanup_errors=True) as folder:
+            try:
+                for _ in attack.run(Path(folder), list(rest)):
+                    yield rest.pop(0), ''
+                return
+            except Exception as error:
+                said = f'{type(error).__name__}: {error}'[:500]
+            if rest:
+                yield rest.pop(0), said
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> str:
+    """Return a line for each attack."""
+    lines = []
+    for attack in ATTACKS:
+        own = [row for row in rows if row['attack'] == attack.name]
+        bad = [row for row in own if row['said']]
+        if own:
+            lines.append([attack.name, f'{len(own) - len(bad)} of {len(own)}', ' '.join(
+                f'try {bad[0]["try"]}: {bad[0]["said"]}'.split())[:200] if bad else ''])
+    return table(['attack', 'held', 'the first that did not'], lines)
+
+
+def main() -> None:
+    parser = parser_with(__doc__ or '', 'out', 'docs', 'again')
+    parser.add_argument('attacks', nargs='*', help='parts of names; default: all')
+    parser.add_argument('--quick', action='store_true', help='a few tries of each')
+    parser.add_argument('--list', action='store_true', help='name the attacks, and end')
+    options = parser.parse_args()
+    if options.list:
+        print('\n'.join(attack.name for attack in ATTACKS))
+        return
+    path = options.out / 'hostile.jsonl'
+    path.parent.mkdir(parents=True, exist_ok=True)
+    chosen = [attack for attack in ATTACKS
+              if not options.attacks or any(part in attack.name for part in options.attacks)]
+    anew = {attack.name for attack in chosen} if options.again else set()
+    rows = {(row['attack'], row['try']): row for row in map(json.loads, (
+        path.read_text().splitlines() if path.exists() else ())) if row['attack'] not in anew}
+    with path.open('w') as stream:
+        stream.writelines(json.dumps(row) + '\n' for row in rows.values())
+        stream.flush()
+        for attack in chosen:
+            count = attack.quick if options.quick else attack.tries
+            # one that did not hold is tried again
+            lacking = [n for n in range(count)
+                       if rows.get((attack.name, n), {'said': 'never tried'})['said']]
+            for n, said in tried(attack, lacking):
+                row = {'attack': attack.name, 'try': n, 'said': said, 'commit': commit()}
+                rows[attack.name, n] = row
+                stream.write(json.dumps(row) + '\n')
+                stream.flush()
+                if said:
+                    print(f'{attack.name}, try {n}: {said}', file=sys.stderr, flush=True)
+            print(f'{attack.name}: {count}', flush=True)
+    text = summary(list(rows.values()))
+    (options.out / 'hostile.md').write_text(text + '\n')
+    if options.docs:
+        write_table('hostile', text, {row['commit'] for row in rows.values()})
+    print(text)
+
+
+if __name__ == '__main__':
+    main()

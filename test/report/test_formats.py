@@ -1,0 +1,233 @@
+"""load_camera(): other programs' files, which camera is meant, and what is refused."""
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+from made_calibration import EACH_MODEL, SIZE, TRUTH
+from made_drives import ROS1, START, drive, images, info_of, write_bag
+from rosbags.rosbag1 import Writer as Writer1
+
+from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.report import load_camera
+
+BROWN, FISHEYE = EACH_MODEL['brown'], EACH_MODEL['fisheye']
+SMALL = (640, 480)
+
+# of cv2.FileStorage, versions 2 to 5
+OPENCV = """%YAML:1.0
+---
+calibration_time: "Sun Nov 22 10:00:00 2026"
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 5.0000000000000000e+02, 0., 320., 0., 501.5, 240., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ -1.0000000000000001e-01, 1e-05, 1.0000000000000000e-03,
+       -2.0000000000000000e-03, .3 ]
+"""
+OPENCV_XML = """<?xml version="1.0"?>
+<opencv_storage>
+<image_Width>640</image_Width><image_Height>480</image_Height>
+<Camera_Matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+  <data>500. 0. 320. 0. 501.5 240. 0. 0. 1.</data></Camera_Matrix>
+<Distortion_Coefficients type_id="opencv-matrix"><rows>5</rows><cols>1</cols><dt>d</dt>
+  <data>-0.1 1e-05 1e-03 -2e-3 .3</data></Distortion_Coefficients>
+</opencv_storage>
+"""
+KALIBR = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.1, 1.0e-05, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [500, 501.5, 320, 240]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  camera_model: pinhole
+  distortion_coeffs: [-0.1, 0.01, 0.001, -0.002]
+  distortion_model: equidistant
+  intrinsics: [500, 501.5, 320, 240]
+  resolution: [640, 480]
+cam2:
+  camera_model: omni
+  distortion_coeffs: [0, 0, 0, 0]
+  distortion_model: radtan
+  intrinsics: [1.1, 500, 501.5, 320, 240]
+  resolution: [640, 480]
+"""
+MRCAL = """# generated on 2026-11-22 with mrcal-calibrate-cameras
+{
+    'lensmodel':  'LENSMODEL_OPENCV8',
+
+    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....
+    'intrinsics': [ 500, 501.5, 320, 240, -0.1, 1e-05, 0.001, -0.002, 0.3, 0.01, 0.02, 0.03,],
+    'extrinsics': [ 0, 0, 0, 0, 0, 0,],
+    'imagersize': [ 640, 480,],
+    'icam_intrinsics': 0,
+    'optimization_inputs': b'VGhpcyBpcyBub3QgcmVhZA==',
+}
+"""
+PLAIN = {'fx': 500, 'fy': 501.5, 'cx': 320, 'cy': 240, 'k1': -0.1, 'k2': 1e-5, 'width': 640,
+         'height': 480}
+FULL = Brown(SMALL, 500.0, 501.5, 320.0, 240.0, -0.1, 1e-5, 1e-3, -2e-3, 0.3)
+NO_K3 = Brown(SMALL, *FULL.params[:8])
+MATRIX = {'K': [[500, 0, 320], [0, 501.5, 240], [0, 0, 1]], 'image_size': SMALL}
+NERF = {'w': 640, 'h': 480.0, 'fl_x': 500, 'fl_y': 501.5, 'cx': 320.5, 'cy': 240.5}
+SFM = {'projection_type': 'perspective', 'width': 640, 'height': 480, 'focal': 0.8, 'k1': -0.1,
+       'k2': 0.01}
+
+
+@pytest.mark.parametrize(('content', 'name', 'wanted'), [
+    (OPENCV, None, FULL),
+    (OPENCV_XML, None, FULL),
+    (KALIBR, 'cam0', NO_K3),
+    (KALIBR, 'cam1', Fisheye(SMALL, 500.0, 501.5, 320.0, 240.0, -0.1, 0.01, 0.001, -0.002)),
+    (MRCAL, None, Rational(SMALL, *FULL.params, 0.01, 0.02, 0.03)),
+    ('# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n3 SIMPLE_RADIAL 640 480 500 320.5 240.5 -0.1\n',
+     None, Radial(SMALL, 500.0, 500.0, 320.0, 240.0, -0.1)),
+    (PLAIN, None, Radial(SMALL, 500.0, 501.5, 320.0, 240.0, -0.1, 1e-5)),
+    ({**PLAIN, 'p1': 1e-3, 'p2': -2e-3, 'k3': 0.3}, None, FULL),
+    ({**PLAIN, 'model': 'fisheye', 'k4': 0.1}, None,
+     Fisheye(SMALL, 500.0, 501.5, 320.0, 240.0, -0.1, 1e-5, 0.0, 0.1)),
+    ({**PLAIN, 'k4': 0.1, 'k5': 0.0, 'k6': 0.0}, None,
+     Rational(SMALL, 500.0, 501.5, 320.0, 240.0, -0.1, 1e-5, k4=0.1)),
+    ({**MATRIX, 'D': [-0.1, 1e-5, 1e-3, -2e-3, 0.3]}, None, FULL),
+    ({**MATRIX, 'dist': [[-0.1, 1e-5, 1e-3, -2e-3, 0.3, 0.0, 0.0, 0.0]]}, None, FULL),
+    ({**NERF, 'camera_model': 'OPENCV', 'k1': -0.1, 'k2': 1e-5, 'p1': 1e-3, 'p2': -2e-3,
+      'frames': []}, None, NO_K3),
+    ({'camera_angle_x': 2 * np.arctan(0.64), 'w': 640, 'h': 480, 'frames': [{}]}, None,
+     Radial(SMALL, 500.0, 500.0, 319.5, 239.5)),
+    ({'frames': [{'file_path': 'a.png', **NERF}, {'file_path': 'b.png', **NERF}]}, 'b.png',
+     Radial(SMALL, 500.0, 501.5, 320.0, 240.0)),
+    ([{'cameras': {'v2 x 640': SFM}, 'shots': {}}], None,
+     Radial(SMALL, 512.0, 512.0, 319.5, 239.5, -0.1, 0.01)),
+    ({'v2 x 640': {**SFM, 'projection_type': 'fisheye'}}, None,
+     Fisheye(SMALL, 512.0, 512.0, 319.5, 239.5, -0.1, 0.01)),
+])
+def test_a_file_of_another_program(tmp_path, content, name, wanted):
+    path = tmp_path / 'calibration.txt'
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    read = load_camera(path, name)
+    assert read.camera == type(wanted)(*[
+        wanted.image_size, *(pytest.approx(value, rel=1e-12) for value in wanted.params)])
+    if name is not None:  # FILE:NAME says the same
+        assert load_camera(f'{path}:{name}') == read and read.name == f'{path}:{name}'
+
+
+@pytest.mark.parametrize(('content', 'complaint'), [
+    (KALIBR, r'3 cameras; name one, as in .*:cam0; there are cam0, cam1, cam2'),
+    (KALIBR.replace('radtan', 'fov', 1).partition('cam1')[0], "'fov', which is none"),
+    (KALIBR.partition('cam2:')[2].replace('\n  ', '\n'), "'omni'; calibrate with --models"),
+    (OPENCV.replace('0., 320.', '.25, 320.'), r'K\[1\] is 0.25, not 0'),
+    (OPENCV.replace('.3 ]', '.3, 0, 0, 0, .1 ]'), 'none of the models here; calibrate it as'),
+    (OPENCV.replace('image_width: 640\n', ''), 'add image_width'),
+    (OPENCV.replace('-2.0000000000000000e-03, .3', '1.'), 'add a line distortion_model'),
+    (OPENCV_XML.replace('<opencv', '<!DOCTYPE a [<!ENTITY a "b">]><opencv', 1), 'no XML'),
+    (OPENCV_XML.replace('</data></Camera', '</Camera'), 'no XML'),
+    (MRCAL.replace('LENSMODEL_OPENCV8', 'LENSMODEL_SPLINED_STEREOGRAPHIC_order=3'),
+     'convert it as one of .*LENSMODEL_OPENCV8'),
+    (MRCAL.replace('0.03,]', '0.03, 0, 0, 0, 0.1]').replace('V8', 'V12'), 'none of the models'),
+    (MRCAL.replace('640', 'open("x")'), 'can be read'),
+    ('1 FOV 640 480 500 500 320 240 0.9', "'FOV', which is none"),
+    ('1 PINHOLE 640 480 500 500 320', 'has 4 parameters, not 3'),
+    ('1 PINHOLE 640 480 500 500 320 240\n2 PINHOLE', '2 cameras'),
+    ({**NERF, 'k4': 0.1}, 'has no k4'),
+    ({**NERF, 'camera_model': 'EQUIRECTANGULAR'}, "'EQUIRECTANGULAR', which is none"),
+    ({'a': {**SFM, 'projection_type': 'spherical'}}, "'spherical', which is none"),
+    ({**PLAIN, 'k4': 0.1}, 'may be a fisheye'),
+    ({**PLAIN, 'xi': 1.1}, 'no xi'),
+    ({'images': []}, 'no camera calibration known here'),
+    ([], 'no camera calibration known here'),
+    ('hello\n', 'no camera calibration known here'),
+    ('', 'no camera calibration known here'),
+])
+def test_what_is_not_said_or_not_known_is_refused_in_one_line(tmp_path, content, complaint):
+    path = tmp_path / 'calibration.txt'
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(InputError, match=complaint) as raised:
+        load_camera(path)
+    assert '\n' not in str(raised.value) and len(str(raised.value)) < 500 + len(str(path))
+
+
+def test_a_model_that_colmap_wrote(tmp_path):
+    model = pycolmap.Reconstruction()
+    for number, lens in enumerate((BROWN, FISHEYE), 1):
+        model.add_camera(pycolmap.Camera(
+            camera_id=number, model=lens.step2.name, width=SIZE[0], height=SIZE[1],
+            params=lens.step2.values(lens.params)))
+    for name, write in (('text', model.write_text), ('binary', model.write_binary)):
+        folder = tmp_path / name
+        folder.mkdir()
+        write(str(folder))
+        with pytest.raises(InputError, match='2 cameras; name one'):
+            load_camera(folder)
+        for number, lens in ((1, BROWN), (2, FISHEYE)):
+            read = load_camera(f'{folder}:{number}').camera
+            assert type(read) is type(lens)
+            np.testing.assert_allclose(read.params, lens.params, rtol=1e-12)
+    path = tmp_path / 'binary' / 'cameras.bin'
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(InputError, match='model_converter'):
+        load_camera(path)
+
+
+def test_a_folder_without_a_calibration_says_what_to_give(tmp_path):
+    with pytest.raises(InputError, match=r'without a calibration; give a result\.json'):
+        load_camera(tmp_path)
+    (tmp_path / 'calibration.yaml').write_text(OPENCV)
+    assert load_camera(tmp_path).camera == FULL
+    np.savez(tmp_path / 'a.npz', mtx=FULL.matrix, dist=np.array([FULL.ros_distortion()]),
+             size=np.zeros(9999))
+    with pytest.raises(InputError, match='add image_width'):
+        load_camera(tmp_path / 'a.npz')
+    (tmp_path / 'b.npz').write_bytes((tmp_path / 'a.npz').read_bytes()[:900])
+    with pytest.raises(InputError, match=r'no \.npz'):
+        load_camera(tmp_path / 'b.npz')
+
+
+@pytest.mark.parametrize('model', EACH_MODEL)
+def test_camera_info_beside_a_bag_s_pictures(tmp_path, model):
+    lens = EACH_MODEL[model]
+    path = write_bag(tmp_path / 'bag', [*images(drive(3), '/front/image_raw'),
+                                        ('/front/camera_info', START, info_of(lens)),
+                                        ('/depth/camera_info', START, info_of(TRUTH))])
+    read = load_camera(path)
+    assert read.camera == lens and read.name == f'{path}:/front/camera_info'
+    for name in ('/front/image_raw', '/front/camera_info', 'front/image_raw'):
+        assert load_camera(path, name) == load_camera(f'{path}:{name}') == read
+    assert load_camera(next(path.glob('*.mcap'))).camera == lens
+    assert load_camera(path, '/depth/camera_info').camera == TRUTH
+
+
+def test_camera_info_of_ros_1(tmp_path):
+    path = tmp_path / 'drive.bag'
+    message = info_of(BROWN, ROS1)
+    with Writer1(path) as writer:
+        topic = writer.add_connection('/camera_info', message.__msgtype__, typestore=ROS1)
+        writer.write(topic, START, ROS1.serialize_ros1(message, message.__msgtype__))
+    assert load_camera(path).camera == BROWN
+
+
+@pytest.mark.parametrize(('infos', 'complaint'), [
+    ({}, 'there is none; .* or give a file'),
+    ({'/a/camera_info': {}, '/b/camera_info': {}}, 'it has /a/camera_info, /b/camera_info; name'),
+    ({'/a/camera_info': {'binning_x': 2}}, 'binning'),
+    ({'/a/camera_info': {'k': np.zeros(9)}}, 'uncalibrated'),
+    ({'/a/camera_info': {'d': np.array([0.1] * 12)}}, 'none of the models'),
+])
+def test_a_bag_whose_camera_info_is_not_clear_is_refused(tmp_path, infos, complaint):
+    path = write_bag(tmp_path / 'bag', [
+        *images(drive(2)), *((topic, START, info_of(TRUTH, **changes))
+                             for topic, changes in infos.items())])
+    with pytest.raises(InputError, match=complaint):
+        load_camera(path)
