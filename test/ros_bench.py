@@ -40,7 +40,8 @@ def ros_environment(home):
     """Return what keeps a process on this machine, in this run, and strict."""
     return {
         'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        'ROS_PYTHON_CHECK_FIELDS': '1', 'HOME': str(home), 'ROS_LOG_DIR': str(Path(home) / 'log'),
+        'ROS_PYTHON_CHECK_FIELDS': '1', 'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
+        'HOME': str(home), 'ROS_LOG_DIR': str(Path(home) / 'log'),
         'PYTHONPATH': os.pathsep.join([str(REPOSITORY), os.environ.get('PYTHONPATH', '')])}
 
 
