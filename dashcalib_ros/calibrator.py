@@ -13,18 +13,26 @@ from types import TracebackType
 from dashcalib_ros import stages
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.camera import Camera, searched
-from dashcalib_ros.checking import Check, Monitor, Odometry, Poses, Reading, watch, with_lines
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import Turn, TurnId
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.judgement.agreement import evidence_of
-from dashcalib_ros.judgement.conclude import CONTRADICTS, Evidence, evidence_of_detection
+from dashcalib_ros.input import Frame
+from dashcalib_ros.judge import (
+    Calibration,
+    Check,
+    Monitor,
+    Odometry,
+    Poses,
+    Reading,
+    watch,
+    with_lines,
+)
+from dashcalib_ros.judge.agreement import evidence_of
+from dashcalib_ros.judge.conclude import CONTRADICTS, Evidence, evidence_of_detection
 from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.status import Status, View
-from dashcalib_ros.turns import Turn, TurnId
-from dashcalib_ros.turns.detection import Detection
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,12 @@ import numpy.typing as npt
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.checking import Check
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames import FrameSource
-from dashcalib_ros.frames.mask_file import check_mask, read_mask
-from dashcalib_ros.inputs import Paths, open_frames
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.input import FrameSource
+from dashcalib_ros.input.inputs import Paths, open_frames
+from dashcalib_ros.input.mask_file import check_mask, read_mask
+from dashcalib_ros.judge import Calibration, Check
 from dashcalib_ros.selection import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None

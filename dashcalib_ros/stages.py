@@ -14,17 +14,16 @@ import numpy as np
 
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.checking import Check, Odometry, Poses, Reading
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import Turn
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.scale import Scale
-from dashcalib_ros.judgement import Calibration, Verdict
-from dashcalib_ros.judgement.conclude import Evidence, conclude
-from dashcalib_ros.reconstruction.scene import Draft, Scene
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.judge import Calibration, Check, Odometry, Poses, Reading, Verdict
+from dashcalib_ros.judge.conclude import Evidence, conclude
+from dashcalib_ros.reconstruct.scene import Draft, Scene
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.turns import Turn
-from dashcalib_ros.turns.detection import Detection
 
 Progress = Callable[[str, float], None]
 
@@ -52,7 +51,7 @@ def reconstruct(turn: Turn, config: Config, valid: Mask | None = None) -> Scene 
 
 def draft(turn: Turn, config: Config, valid: Mask | None = None) -> Draft | None:
     """Do the first half of reconstruct(): the tracks, and the focal length to start from."""
-    from dashcalib_ros.reconstruction.build import draft_scene
+    from dashcalib_ros.reconstruct.build import draft_scene
     with _numerical_failures(turn):
         return draft_scene(turn, config, valid)
     return None
@@ -60,7 +59,7 @@ def draft(turn: Turn, config: Config, valid: Mask | None = None) -> Draft | None
 
 def finish(turn: Turn, config: Config, begun: Draft) -> Scene | None:
     """Do the second half of reconstruct(); the turn needs the images of begun's keyframes only."""
-    from dashcalib_ros.reconstruction.build import finish_scene
+    from dashcalib_ros.reconstruct.build import finish_scene
     with _numerical_failures(turn):
         return finish_scene(turn, begun, config)
     return None
@@ -79,7 +78,7 @@ def _numerical_failures(turn: Turn) -> Iterator[None]:
 
 def load() -> None:
     """Import all that reconstruct() and solve() need, such as COLMAP."""
-    import dashcalib_ros.reconstruction.build
+    import dashcalib_ros.reconstruct.build
     import dashcalib_ros.solve.joint  # noqa: F401
 
 
@@ -104,9 +103,9 @@ def check(given: Camera, image_size: tuple[int, int], solution: Solution | None,
 
     image_size: (width, height) of the drive's pictures.
     """
-    from dashcalib_ros import checking
+    from dashcalib_ros import judge
     progress('the turns with the given camera', 0.0)
-    return checking.check(given, image_size, solution, verdict, config)
+    return judge.check(given, image_size, solution, verdict, config)
 
 
 def odometry(given: Camera, image_size: tuple[int, int], solution: Solution, poses: Poses,
@@ -115,7 +114,7 @@ def odometry(given: Camera, image_size: tuple[int, int], solution: Solution, pos
 
     Raises InputError where given is for pictures of another size, or no turn has poses.
     """
-    from dashcalib_ros import checking
+    from dashcalib_ros import judge
     if given.image_size != image_size:
         raise InputError(
             f'the calibration is for {given.image_size[0]}x{given.image_size[1]} pictures, and '
@@ -123,8 +122,8 @@ def odometry(given: Camera, image_size: tuple[int, int], solution: Solution, pos
     progress('the turns beside the poses', 0.0)
     own = solution.camera
     small = given.resized(1 / Scale.of(image_size, config).px, own.image_size)
-    cameras = {'given': small, 'ours': own, 'guess': checking.trivial_guess(own.image_size)}
-    return checking.odometry(solution.scenes, cameras, poses, config)
+    cameras = {'given': small, 'ours': own, 'guess': judge.trivial_guess(own.image_size)}
+    return judge.odometry(solution.scenes, cameras, poses, config)
 
 
 def read(scenes: Sequence[Scene], camera: Camera, config: Config,
@@ -133,6 +132,6 @@ def read(scenes: Sequence[Scene], camera: Camera, config: Config,
 
     camera: of the scenes' pictures.
     """
-    from dashcalib_ros.checking.reading import reading_of
+    from dashcalib_ros.judge.reading import reading_of
     progress('the turns with the camera in use', 0.0)
     return tuple(reading_of(scene, camera, config) for scene in scenes)

@@ -4,8 +4,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dashcalib_ros.arrays import Mask
-from dashcalib_ros.motion.motion import TrackedPoints
-from dashcalib_ros.turns import TurnId
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.detect.motion import TrackedPoints
 
 
 @dataclass(frozen=True)

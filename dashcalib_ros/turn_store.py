@@ -17,10 +17,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError, one_line
 from dashcalib_ros.limits import read_file
-from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.scene_file import (
+from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.reconstruct.scene_file import (
     LARGEST,
     SUFFIX,
     Origin,
@@ -29,7 +30,6 @@ from dashcalib_ros.scene_file import (
     decoded,
     encoded,
 )
-from dashcalib_ros.turns.turn import TurnId
 
 # s; temporary files older than this are left over from a killed process
 ABANDONED_S = 3600.0

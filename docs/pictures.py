@@ -23,10 +23,10 @@ from dashcalib_ros.arrays import Floats, GreyImage
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.demo import demo_drive
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.judgement.conclude import evidence_of_detection
-from dashcalib_ros.motion.epipoles import epipoles_of
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.detect.epipoles import epipoles_of
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.conclude import evidence_of_detection
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.focal import summed
 from dashcalib_ros.solve.solution import Solution
 

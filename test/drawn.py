@@ -7,12 +7,12 @@ import numpy as np
 from solving import CONFIG, scenes_of, solved
 from synthetic import SIZE
 
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.scale import FULL_SIZE
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.judgement.conclude import Evidence, conclude
+from dashcalib_ros.detect import Turn
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.turns import Turn
 
 START_S = 1.7e9
 # frames at the centres of the turns: three with a scene, one that failed, one that nobody tried

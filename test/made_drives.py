@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.camera import ros_camera
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.inputs import open_frames
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.inputs import open_frames
 
 START = 1_700_000_000_000_000_000
 STEP = 100_000_000

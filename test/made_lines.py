@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dashcalib_ros.lines import Lines
-from dashcalib_ros.lines.edges import KNOTS
+from dashcalib_ros.detect import Lines
+from dashcalib_ros.detect.edges import KNOTS
 
 
 def made_lines(camera, count=600, noise_px=0.1, curved=0.0, lean_deg=3.0, seed=0):

@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
-from dashcalib_ros.judgement import Calibration, Verdict
+from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.ros import node as node_module
 from dashcalib_ros.ros.news import Result
 from dashcalib_ros.ros.node import CalibratorNode

@@ -9,8 +9,8 @@ from synthetic import LENS, SIZE, synthetic_turn
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.camera.prior import Prior
 from dashcalib_ros.config import Config
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_step2
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.reconstruct.adjust import Solver, adjust_step2
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.joint import solve
 from dashcalib_ros.solve.prior import extra_sigma_of
 from dashcalib_ros.solve.solution import Solution

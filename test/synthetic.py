@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.camera import Camera, Fisheye, Radial
-from dashcalib_ros.reconstruction.scene import Profile, Scene, retriangulated
-from dashcalib_ros.reconstruction.structure import Structure
-from dashcalib_ros.reconstruction.tracks import Tracks
-from dashcalib_ros.turns import TurnId
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.reconstruct.scene import Profile, Scene, retriangulated
+from dashcalib_ros.reconstruct.structure import Structure
+from dashcalib_ros.reconstruct.tracks import Tracks
 
 SIZE = (800, 450)
 LENS = Radial(SIZE, 520.0, 521.0, 407.0, 219.0, -0.28, 0.09)

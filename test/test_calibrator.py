@@ -23,15 +23,15 @@ from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, WorkerError
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.input import Frame
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.recorded import calibrate
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
-from dashcalib_ros.turns import TurnId
-from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 LENS = Lens.of(640, 360, 80.0, -0.25, 0.06, offset=(6.0, -4.0))

@@ -8,30 +8,32 @@ import pytest
 from messages import PACKAGE, messages_in
 
 DOCUMENT = Path(__file__).parents[1] / 'docs' / 'troubleshooting.md'
-EXPLAINED = ('judgement', 'selection.py', 'inputs.py', 'frames', 'bags', 'motion', 'turns',
-             'scene_file.py', 'turn_store.py', 'workers', 'cli/run.py')
+EXPLAINED = ('judge/agreement.py', 'judge/calibration.py', 'judge/conclude.py',
+             'judge/focal_by_turn.py', 'judge/next_turn.py', 'judge/verdict.py',
+             'selection.py', 'input', 'input/bags', 'detect',
+             'reconstruct/scene_file.py', 'turn_store.py', 'workers', 'cli/run.py')
 # texts that are no messages: parts of others that are shown with them, SQL, code
 PARTS = {
-    'judgement/calibration.py': {'from one turn alone, which nothing confirms'},
-    'judgement/conclude.py': {'…, with … times the error of a camera of its own'},
-    'judgement/next_turn.py': {'…: fx to about … %'},
-    'judgement/verdict.py': {
+    'judge/calibration.py': {'from one turn alone, which nothing confirms'},
+    'judge/conclude.py': {'…, with … times the error of a camera of its own'},
+    'judge/next_turn.py': {'…: fx to about … %'},
+    'judge/verdict.py': {
         'the turn… at frame …', '… turn… of earlier drives',
         ', so that nothing confirms the numbers and their sigma'},
-    'inputs.py': {' (and … more like it)', 'the time of recording'},
-    'frames/joined.py': {' (and … more like it)'},
-    'bags/camera_info.py': {
+    'input/inputs.py': {' (and … more like it)', 'the time of recording'},
+    'input/joined.py': {' (and … more like it)'},
+    'input/bags/camera_info.py': {
         "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"},
-    'bags/salvage.py': {'… does not start like a bag', '… has a broken chunk (…)'},
-    'bags/source.py': {'… images; how many are lost is not known', '… (…, … images…)',
+    'input/bags/salvage.py': {'… does not start like a bag', '… has a broken chunk (…)'},
+    'input/bags/source.py': {'… images; how many are lost is not known', '… (…, … images…)',
                        '… of … images; … are lost', '… of … images; none is lost'},
-    'bags/storage.py': {
+    'input/bags/storage.py': {
         "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again or record it again', 'the index does not lead to all messages'},
-    'bags/unpack.py': {'a part of the bag', 'a packed part is cut off'},
-    'bags/write.py': {'compressed must be jpeg, png or None, not …'},
-    'turns/turn.py': {'the turn at frame …'},
-    'scene_file.py': {
+    'input/bags/unpack.py': {'a part of the bag', 'a packed part is cut off'},
+    'input/bags/write.py': {'compressed must be jpeg, png or None, not …'},
+    'detect/turn.py': {'the turn at frame …'},
+    'reconstruct/scene_file.py': {
         'it is too large when unpacked', 'it is too large', 'it has too many parts',
         'it has format …, this version has …', 'its numbers are no valid scene',
         'it is no file of turns, or one of an older version', '… is not finite, or too large',

@@ -19,10 +19,10 @@ from dashcalib_ros.camera import (
 )
 from dashcalib_ros.camera.camera import ColmapModel
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import ConfigError
-from dashcalib_ros.judgement.conclude import evidence_of_detection
+from dashcalib_ros.judge.conclude import evidence_of_detection
 from dashcalib_ros.report import calibration_yaml, load_camera, result_dict
-from dashcalib_ros.turns.detection import Detection
 
 # one term is all that this lens has
 LENS = Lens.of(640, 360, 70.0, -0.18, 0.0, offset=(5.0, -3.0))

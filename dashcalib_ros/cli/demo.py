@@ -20,8 +20,8 @@ from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.errors import OutputError
-from dashcalib_ros.inputs import open_frames
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report import (
     NamedCamera,
     calibrated_camera,

@@ -12,13 +12,13 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import Turn
 from dashcalib_ros.errors import counted
-from dashcalib_ros.frames import Frame, FrameSource
-from dashcalib_ros.frames.mask_file import check_mask
-from dashcalib_ros.inputs import open_frames
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.input import Frame, FrameSource
+from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.input.mask_file import check_mask
+from dashcalib_ros.judge import Calibration
 from dashcalib_ros.recorded import with_source
-from dashcalib_ros.turns import Turn
 
 
 def open_drive(args: argparse.Namespace) -> FrameSource:

@@ -11,12 +11,12 @@ from dashcalib_ros.cli import exit_codes
 from dashcalib_ros.cli.drive import feed, open_drive
 from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
+from dashcalib_ros.detect import Turn
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import counted
-from dashcalib_ros.frames.mask_file import read_mask
+from dashcalib_ros.input.mask_file import read_mask
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.tables import TextTable
-from dashcalib_ros.turns import Turn
-from dashcalib_ros.turns.detection import Detection
 
 COLUMNS = ('at s', 'frame', 'from', 'to', 'images', 'prominence')
 PROMINENCE = ('prominence: how far a turn stands out from the driving before and after it, as a '

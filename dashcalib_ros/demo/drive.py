@@ -19,7 +19,7 @@ from dashcalib_ros.demo.spec import DriveSpec
 from dashcalib_ros.demo.town import Town, build_town
 from dashcalib_ros.demo.traffic import Traffic
 from dashcalib_ros.demo.vehicle import MARGIN_S, Ride, ride_of
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 # 2026-01-05 12:00:00 UTC; the first frame's stamp
 START_NS = 1_767_614_400 * 10**9

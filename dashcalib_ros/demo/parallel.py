@@ -16,7 +16,7 @@ from typing import Protocol
 import cv2
 
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 CHUNK = 4
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.config import VerdictConfig
-from dashcalib_ros.judgement.agreement import turns_of_another_camera
-from dashcalib_ros.scene_file import StoredTurn
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.judge.agreement import turns_of_another_camera
+from dashcalib_ros.reconstruct.scene_file import StoredTurn
 from dashcalib_ros.solve.information import noise_of
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.turns.turn import TurnId
 
 # a clip whose own fx is farther off that of most, in sigmas and in shares of it, is of another
 # camera; on one real drive gentle bends differ by 3 % from the sharp turn

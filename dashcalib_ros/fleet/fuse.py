@@ -12,16 +12,16 @@ import numpy as np
 
 from dashcalib_ros import stages
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.fleet.clip_shares import ClipShare, ClipTurn, contradicting, shares_of
-from dashcalib_ros.frames.scale import FULL_SIZE, Scale
-from dashcalib_ros.judgement import Calibration, Verdict
-from dashcalib_ros.judgement.conclude import Evidence
-from dashcalib_ros.judgement.verdict import lacks_knowledge_only
-from dashcalib_ros.reconstruction.repeated import without_repeated
-from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.scene_file import Origin, SceneFile, StoredTurn
+from dashcalib_ros.input.scale import FULL_SIZE, Scale
+from dashcalib_ros.judge import Calibration, Verdict
+from dashcalib_ros.judge.conclude import Evidence
+from dashcalib_ros.judge.verdict import lacks_knowledge_only
+from dashcalib_ros.reconstruct.repeated import without_repeated
+from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.reconstruct.scene_file import Origin, SceneFile, StoredTurn
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.turns.turn import TurnId
 
 # solutions at the most; each leaves out the clips that contradict the one before
 ROUNDS = 3

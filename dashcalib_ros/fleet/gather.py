@@ -15,9 +15,9 @@ from dashcalib_ros import stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.fleet.storage import clip_files
-from dashcalib_ros.frames import Frame, FrameSource
-from dashcalib_ros.inputs import open_frames
-from dashcalib_ros.scene_file import FORMAT, Origin, SceneFile, StoredTurn
+from dashcalib_ros.input import Frame, FrameSource
+from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.reconstruct.scene_file import FORMAT, Origin, SceneFile, StoredTurn
 
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.')

@@ -16,7 +16,7 @@ from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.fleet.lens_prior import LensPrior, Unit, curvature, focal_length
 from dashcalib_ros.fleet.lens_prior import Verdict as PriorVerdict
 from dashcalib_ros.fleet.solved import Estimate, Solved, sigmas
-from dashcalib_ros.judgement import Calibration, Verdict
+from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.solve.picture import PictureSigma
 
 # of the information about fx; with more the prior decided, not the camera's own turns

@@ -20,7 +20,7 @@ from typing import Any
 
 from dashcalib_ros.errors import InputError, OutputError, one_line
 from dashcalib_ros.fleet.extra import needs
-from dashcalib_ros.inputs import named_like
+from dashcalib_ros.input.inputs import named_like
 from dashcalib_ros.limits import CLIP_BYTES, CLIP_FILES, check_file, read_file
 from dashcalib_ros.report import write_whole
 

@@ -19,8 +19,8 @@ from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.posterior import Final
 from dashcalib_ros.fleet.storage import Folder
 from dashcalib_ros.fleet.tasks import ClipResult, camera_folder
+from dashcalib_ros.reconstruct.scene_file import DATES_S
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.scene_file import DATES_S
 
 CAMERAS, CLIPS = 'cameras', 'clips'
 PARAMETERS = tuple(dict.fromkeys(name for model in calibrated_models() for name in model.names()))

@@ -25,9 +25,9 @@ from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.posterior import Final, final_of
 from dashcalib_ros.fleet.storage import Folder, is_url, local_copy, stamp
 from dashcalib_ros.limits import read_file
+from dashcalib_ros.reconstruct.scene_file import LARGEST, SUFFIX, SceneFile, decoded, encoded
 from dashcalib_ros.report import write_results
 from dashcalib_ros.report.files import ACCEPTED, NAMES, WEAK
-from dashcalib_ros.scene_file import LARGEST, SUFFIX, SceneFile, decoded, encoded
 
 T = TypeVar('T')
 # names of gathered turns: nothing from inside a file becomes a path

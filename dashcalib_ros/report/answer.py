@@ -4,7 +4,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from dashcalib_ros.checking import Check, Odometry
+from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.report.result import plain_values
 
 

@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from dashcalib_ros.bags.camera_info import first_camera_info
 from dashcalib_ros.camera import FISHEYE, MODELS, Camera, Radial, camera_from_ros, ros_faults
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.errors import InputError, shortened
-from dashcalib_ros.frames.source import os_error
-from dashcalib_ros.inputs import fits_bag
+from dashcalib_ros.input.bags.camera_info import first_camera_info
+from dashcalib_ros.input.inputs import fits_bag
+from dashcalib_ros.input.source import os_error
 from dashcalib_ros.limits import (
     JSON_BYTES,
     check_file,

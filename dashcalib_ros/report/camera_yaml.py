@@ -18,7 +18,7 @@ import yaml
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.rectified import SAME
 from dashcalib_ros.errors import ConfigError, shortened
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report.result import plain_values
 
 CAMERA_NAME = 'dashcam'

@@ -4,9 +4,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dashcalib_ros.config import VerdictConfig
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.judgement.agreement import focal_disagreement, leverages
-from dashcalib_ros.judgement.verdict import profile_contrast
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.agreement import focal_disagreement, leverages
+from dashcalib_ros.judge.verdict import profile_contrast
 from dashcalib_ros.solve.solution import Solution
 
 

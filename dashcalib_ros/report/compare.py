@@ -8,9 +8,9 @@ from typing import Any
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import unseen_share
-from dashcalib_ros.checking.difference import Difference as WholeDifference
-from dashcalib_ros.checking.difference import difference_between
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.judge.difference import Difference as WholeDifference
+from dashcalib_ros.judge.difference import difference_between
 from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.result import plain_values
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.judgement import TurnSummary
+from dashcalib_ros.judge import TurnSummary
 from dashcalib_ros.report.charts import Axes, line, polyline, svg, text, ticks
 
 WIDTH, HEIGHT = 900, 250  # px of the plot

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report.camera_file import load_camera
 from dashcalib_ros.report.camera_yaml import CAMERA_NAME, calibration_yaml
 from dashcalib_ros.report.named_camera import NamedCamera

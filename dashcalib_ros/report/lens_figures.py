@@ -8,7 +8,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Ints, Pixels
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.rectified import WIDEST, rectified_matrix
-from dashcalib_ros.reconstruction.scene import Profile, Scene, residuals_px
+from dashcalib_ros.reconstruct.scene import Profile, Scene, residuals_px
 from dashcalib_ros.report.charts import (
     Axes,
     dots,

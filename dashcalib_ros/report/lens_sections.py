@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.judgement.calibration import Material
-from dashcalib_ros.judgement.focal_by_turn import sigma_by_count
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.calibration import Material
+from dashcalib_ros.judge.focal_by_turn import sigma_by_count
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report.figures import jpeg_data_uri
 from dashcalib_ros.report.lens_figures import (
     coverage_svg,

@@ -14,7 +14,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.errors import InputError, shortened
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judge import Calibration
 from dashcalib_ros.limits import SIDE
 from dashcalib_ros.solve.picture import PictureSigma
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report.checks import checks
 from dashcalib_ros.report.compare import compare
 from dashcalib_ros.report.figures import magnitude_svg, mask_data_uri

@@ -14,16 +14,15 @@ import numpy as np
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import BASIS, Field
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
-from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
-from dashcalib_ros.judgement.calibration import LensField, Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.limits import JSON_BYTES, parse_yaml, read_text
 from dashcalib_ros.limits import parse_json as parse_any_json
-from dashcalib_ros.lines import Bend
 from dashcalib_ros.report.camera_file import parse_camera
 from dashcalib_ros.solve.opinions import HeldOut
 from dashcalib_ros.solve.picture import PictureSigma
-from dashcalib_ros.turns import TurnId
 
 
 def result_dict(calibration: Calibration) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from dashcalib_ros.checking.wording import answers_of
 from dashcalib_ros.errors import counted
-from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge.wording import answers_of
 from dashcalib_ros.report.compare import Comparison, Difference
 from dashcalib_ros.report.wording import (
     digits_of,

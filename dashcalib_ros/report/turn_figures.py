@@ -7,8 +7,8 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruction.picture import TurnPicture
-from dashcalib_ros.reconstruction.scene import Scene, residuals_px
+from dashcalib_ros.reconstruct.picture import TurnPicture
+from dashcalib_ros.reconstruct.scene import Scene, residuals_px
 from dashcalib_ros.report.charts import dots, line, segments, svg, text
 from dashcalib_ros.report.figures import jpeg_data_uri
 

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dashcalib_ros.judgement import Calibration, TurnSummary
-from dashcalib_ros.judgement.agreement import leverages
-from dashcalib_ros.judgement.calibration import Material, StoredTurnSummary
-from dashcalib_ros.judgement.focal_by_turn import focal_alone
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.judge import Calibration, TurnSummary
+from dashcalib_ros.judge.agreement import leverages
+from dashcalib_ros.judge.calibration import Material, StoredTurnSummary
+from dashcalib_ros.judge.focal_by_turn import focal_alone
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report.turn_figures import (
     direction,
     estimates_svg,
@@ -19,7 +20,6 @@ from dashcalib_ros.report.turn_figures import (
     with_sigma,
 )
 from dashcalib_ros.report.wording import optional, since_start
-from dashcalib_ros.turns.turn import TurnId
 
 AnySummary = TurnSummary | StoredTurnSummary
 

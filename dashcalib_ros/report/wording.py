@@ -4,10 +4,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from dashcalib_ros.detect import Bend
 from dashcalib_ros.errors import counted
-from dashcalib_ros.judgement import Calibration, TurnSummary
-from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.lines import Bend
+from dashcalib_ros.judge import Calibration, TurnSummary
+from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report.usage import FieldOfView
 from dashcalib_ros.solve.picture import PictureSigma
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from dashcalib_ros.calibrator import Calibrator
-from dashcalib_ros.frames.decode import BitDepth
-from dashcalib_ros.turns import TurnId
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.input.decode import BitDepth
 
 
 class Bank:

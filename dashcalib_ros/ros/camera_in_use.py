@@ -6,9 +6,8 @@ from abc import ABC, abstractmethod
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from dashcalib_ros.checking import Check
 from dashcalib_ros.config import Config
-from dashcalib_ros.judgement import Verdict
+from dashcalib_ros.judge import Check, Verdict
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.changes import Changes
 from dashcalib_ros.ros.news import Result, Watched

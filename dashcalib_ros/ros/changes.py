@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
-from dashcalib_ros.checking import Change, Monitor
+from dashcalib_ros.judge import Change, Monitor
 
 
 class Changes:

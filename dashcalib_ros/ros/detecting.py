@@ -5,8 +5,8 @@ from typing import Any
 
 from dashcalib_ros.arrays import GreyImage
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.decode import BitDepth, decode
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.ros.bank import Job
 from dashcalib_ros.ros.news import Listener, Picture, call, named
 from dashcalib_ros.status import Status

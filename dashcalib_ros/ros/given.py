@@ -10,9 +10,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header, String
 
-from dashcalib_ros.checking import Check, with_faults
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.judge import Check, with_faults
 from dashcalib_ros.report import NamedCamera, answer_dict
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.camera_in_use import CameraInUse

@@ -6,6 +6,7 @@ from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.camera_in_use import CameraInUse
@@ -17,7 +18,6 @@ from dashcalib_ros.ros.state import Action, Rules, judge, sigma_text
 from dashcalib_ros.ros.store import Store
 from dashcalib_ros.ros.stream import Source
 from dashcalib_ros.ros.wording import outcome_text
-from dashcalib_ros.turns import TurnId
 
 
 class CalibrationInUse(CameraInUse):

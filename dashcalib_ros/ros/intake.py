@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames.decode import message_size
-from dashcalib_ros.frames.stamps import StampGate, live
+from dashcalib_ros.input.decode import message_size
+from dashcalib_ros.input.stamps import StampGate, live
 from dashcalib_ros.ros.complaints import Complaints
 from dashcalib_ros.ros.detecting import whole
 from dashcalib_ros.ros.stream import Source, SourceWatch

@@ -13,7 +13,7 @@ import yaml
 
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judge import Calibration
 from dashcalib_ros.limits import parse_yaml
 from dashcalib_ros.report import NamedCamera, calibrated_camera, calibration_yaml
 from dashcalib_ros.report.camera_file import parse_camera

@@ -10,7 +10,8 @@ from typing import Any
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.config import Config
-from dashcalib_ros.judgement.agreement import outdated, turns_of_another_camera
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.judge.agreement import outdated, turns_of_another_camera
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.backlog import Backlog
 from dashcalib_ros.ros.bank import Bank, Job
@@ -18,7 +19,6 @@ from dashcalib_ros.ros.detecting import detect
 from dashcalib_ros.ros.news import NOTHING, Activity, Listener, Result, call, named, new_turns
 from dashcalib_ros.ros.watch import Watch
 from dashcalib_ros.status import Status
-from dashcalib_ros.turns import TurnId
 
 # s between two checks whether enough turns are built: scenes are finished without a push
 LOOK_S = 0.25

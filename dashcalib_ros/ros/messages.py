@@ -9,7 +9,7 @@ from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from dashcalib_ros.camera import Camera, ros_camera
-from dashcalib_ros.checking import Check
+from dashcalib_ros.judge import Check
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.news import NOTHING
 from dashcalib_ros.ros.state import State, sigma_text

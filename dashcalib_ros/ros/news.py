@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from dashcalib_ros.arrays import GreyImage
-from dashcalib_ros.checking import Check, Monitor
+from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import DashcalibError, one_line
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judge import Calibration, Check, Monitor
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.status import Status, View
-from dashcalib_ros.turns import TurnId
 
 LOG = logging.getLogger(__name__)
 NOTHING = Status(0, 0, 0, 0.0, 0.0, False)

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from dashcalib_ros.checking.contradiction import contradicted
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.contradiction import contradicted
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.wording import digits_of
 

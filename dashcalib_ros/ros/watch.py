@@ -1,12 +1,12 @@
 """Watches a camera in use over all banks of turns: each new turn is read once."""
 from __future__ import annotations
 
-from dashcalib_ros.checking import Monitor
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.judge import Monitor
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.bank import Bank
 from dashcalib_ros.ros.news import Watched
 from dashcalib_ros.status import Status
-from dashcalib_ros.turns import TurnId
 
 
 class Watch:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from dashcalib_ros.errors import counted
-from dashcalib_ros.judgement import Calibration
+from dashcalib_ros.judge import Calibration
 from dashcalib_ros.ros.news import NewTurn
 from dashcalib_ros.status import Status
 

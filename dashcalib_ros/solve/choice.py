@@ -14,9 +14,9 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruction.scene import Scene, errors_px
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.scene import Scene, errors_px
 from dashcalib_ros.solve.information import Information, Pooled, noise_of, pooled
-from dashcalib_ros.turns.turn import TurnId
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import IntrinsicsConfig
-from dashcalib_ros.reconstruction.scene import Scene, residuals_px
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.scene import Scene, residuals_px
 from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.normal import (
     IMAGE,
@@ -28,7 +29,6 @@ from dashcalib_ros.solve.normal import (
 )
 from dashcalib_ros.solve.prior import extra_sigma_of, prior_information, prior_of
 from dashcalib_ros.solve.shutter import row_shift
-from dashcalib_ros.turns.turn import TurnId
 
 Kind = Literal['shift', 'zoom', 'bend']
 

@@ -16,7 +16,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import TERMS, Field, field_terms
 from dashcalib_ros.camera.mapping import grid_of, sensitivity
-from dashcalib_ros.reconstruction.scene import Scene, residuals_px
+from dashcalib_ros.reconstruct.scene import Scene, residuals_px
 
 # px of 1000 px of width: sizes of the field among which the evidence chooses
 SIZES = tuple(0.0125 * 2.0**n for n in range(9))

@@ -8,8 +8,8 @@ import numpy as np
 
 from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.config import Config
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_step2
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.reconstruct.adjust import Solver, adjust_step2
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.choice import is_clear
 from dashcalib_ros.solve.field import FieldProblem, FoundField, field_basis, without_field
 from dashcalib_ros.solve.fitting import retriangulate_all

@@ -8,11 +8,11 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_distortion
-from dashcalib_ros.reconstruction.build import chain_scene
-from dashcalib_ros.reconstruction.scene import Scene, retriangulated, truncated_cost
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.adjust import Solver, adjust_distortion
+from dashcalib_ros.reconstruct.build import chain_scene
+from dashcalib_ros.reconstruct.scene import Scene, retriangulated, truncated_cost
 from dashcalib_ros.solve.misfit import misfits
-from dashcalib_ros.turns.turn import TurnId
 
 
 def retriangulate(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:

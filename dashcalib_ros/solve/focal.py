@@ -8,8 +8,8 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_distortion
-from dashcalib_ros.reconstruction.scene import Profile, Scene, truncated_cost
+from dashcalib_ros.reconstruct.adjust import Solver, adjust_distortion
+from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
 from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
 
 # factors of the resulting focal length at which the profile is evaluated

@@ -8,8 +8,8 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_poses
-from dashcalib_ros.reconstruction.scene import Scene, errors_px, truncated_cost
+from dashcalib_ros.reconstruct.adjust import Solver, adjust_poses
+from dashcalib_ros.reconstruct.scene import Scene, errors_px, truncated_cost
 from dashcalib_ros.solve.fitting import is_far, rechain, retriangulate
 from dashcalib_ros.solve.prior import loss_px_of
 

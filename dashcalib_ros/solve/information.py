@@ -15,7 +15,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruction.scene import Scene, residuals_px
+from dashcalib_ros.reconstruct.scene import Scene, residuals_px
 from dashcalib_ros.solve.normal import (
     ImagePrior,
     normal_equations,

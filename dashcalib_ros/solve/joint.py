@@ -10,7 +10,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import AUTO
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.config import Config
-from dashcalib_ros.reconstruction.scene import Profile, Scene
+from dashcalib_ros.reconstruct.scene import Profile, Scene
 from dashcalib_ros.solve.choice import Candidate
 from dashcalib_ros.solve.departures import Departure
 from dashcalib_ros.solve.field import without_field

@@ -4,8 +4,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruction.scene import Scene, truncated_cost
-from dashcalib_ros.turns.turn import TurnId
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.scene import Scene, truncated_cost
 
 # px^2; lower costs count as this, so that the ratio of two tiny costs is near 1
 LEAST_COST = 0.01

@@ -10,7 +10,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera, calibrated_models, larger_models
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.config import Config
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.choice import (
     Candidate,
     gain_of_wider_model,

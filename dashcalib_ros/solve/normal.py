@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.reconstruction.structure import Structure
+from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.reconstruct.structure import Structure
 
 # parameters of a pose, and of an image: its shift in x and y (px), its zoom (1 = 100 %)
 POSE = 6

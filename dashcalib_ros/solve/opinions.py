@@ -8,11 +8,11 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import sensitivity
+from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.solve.information import Information, noise_of, step_to_wider_model
 from dashcalib_ros.solve.picture import picture_covariance, sigma_over
 from dashcalib_ros.solve.prior import extra_sigma_of
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.turns.turn import TurnId
 
 # fewer turns are not held out: one of two says little of the other
 LEAST_TURNS = 3

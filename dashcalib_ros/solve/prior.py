@@ -10,7 +10,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.prior import Prior
 from dashcalib_ros.config import IntrinsicsConfig
-from dashcalib_ros.reconstruction.scene import Scene, errors_px
+from dashcalib_ros.reconstruct.scene import Scene, errors_px
 
 # rendered images without noise would make the loss cut off everything
 LEAST_LOSS_PX = 0.05

@@ -15,7 +15,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.information import Information, Pooled, information, pooled
 
 # s; step of the central difference for a point's speed in the picture

@@ -10,14 +10,14 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.reconstruction.scene import Profile, Scene, rms_px
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.scene import Profile, Scene, rms_px
 from dashcalib_ros.solve.choice import Candidate
 from dashcalib_ros.solve.departures import Crops, Departure
 from dashcalib_ros.solve.field import FoundField, displacements
 from dashcalib_ros.solve.information import Information, pooled, step_to_wider_model
 from dashcalib_ros.solve.picture import PictureSigma, SigmaMap, picture_covariance, sigma_over
 from dashcalib_ros.solve.prior import extra_sigma_of
-from dashcalib_ros.turns.turn import TurnId
 
 
 @dataclass(frozen=True)

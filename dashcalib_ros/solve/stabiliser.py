@@ -15,8 +15,8 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_step2
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.reconstruct.adjust import Solver, adjust_step2
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.departures import READOUT_S, Crops, Problem, problem_of, shift_priors
 from dashcalib_ros.solve.fitting import retriangulate_all
 from dashcalib_ros.solve.normal import IMAGE

@@ -12,8 +12,9 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.config import Config, IntrinsicsConfig
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1, adjust_step2
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.adjust import Solver, adjust_step1, adjust_step2
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.departures import Crops, Departure, departures, shift_prior
 from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.fitting import (
@@ -34,7 +35,6 @@ from dashcalib_ros.solve.prior import (
     prior_of,
 )
 from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shift
-from dashcalib_ros.turns.turn import TurnId
 
 ByTurn = Mapping[TurnId, Scene]
 Progress = Callable[[str, float], None]

@@ -6,8 +6,8 @@ from collections.abc import Set
 from dataclasses import dataclass, replace
 
 from dashcalib_ros.arrays import Mask
-from dashcalib_ros.reconstruction.scene import Draft
-from dashcalib_ros.turns.turn import Turn, TurnId
+from dashcalib_ros.detect.turn import Turn, TurnId
+from dashcalib_ros.reconstruct.scene import Draft
 
 # s; before the second attempt, doubled before each further one
 BACK_OFF_S = 1.0

@@ -9,10 +9,10 @@ from typing import Any
 from dashcalib_ros import stages
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import DashcalibError, WorkerError
-from dashcalib_ros.reconstruction.picture import TurnPicture, picture_of
-from dashcalib_ros.reconstruction.scene import Draft, Scene
-from dashcalib_ros.turns.turn import Turn, TurnId
+from dashcalib_ros.reconstruct.picture import TurnPicture, picture_of
+from dashcalib_ros.reconstruct.scene import Draft, Scene
 from dashcalib_ros.workers.jobs import Job, Jobs, back_off_s
 from dashcalib_ros.workers.worker import Progress, Worker, WorkerDiedError
 

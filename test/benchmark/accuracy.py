@@ -47,7 +47,7 @@ from views import BY_VIEW, INEXACT, SMALL, Viewed, inexact_view, recorded_view, 
 from wide import WIDE, wide_drive_of
 
 from dashcalib_ros import Config, open_frames
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 RECORDED = {'kitti03': 'bag', 'carnd': 'drive.mp4', 'ntu_campus': 'images'}
 # images per second, of folders

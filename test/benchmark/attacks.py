@@ -40,7 +40,7 @@ from views import INEXACT, inexact_view
 from wide import WIDE, wide_drive_of
 
 from dashcalib_ros import Config, open_frames
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]

@@ -29,8 +29,8 @@ from wide import WIDE
 
 from dashcalib_ros import Config, stages
 from dashcalib_ros.camera import MODELS, Camera
-from dashcalib_ros.checking.difference import difference_of
-from dashcalib_ros.frames.scale import Scale
+from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.judge.difference import difference_of
 
 # of a normal distribution: 95 % lie above minus this
 POWER = 1.64

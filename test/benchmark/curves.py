@@ -40,7 +40,7 @@ from measure import (
 )
 
 from dashcalib_ros import Config, open_frames, stages
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 TURNS = Setting('curve over turns', DEMO, replace(STREET, turns=10))
 RATES = Setting('curve over rates', DEMO, STREET)

@@ -17,7 +17,7 @@ import numpy as np
 import dashcalib_ros.demo
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Stop, Turn
 from dashcalib_ros.errors import ConfigError
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 # what must become of a drive: 'judge' is anything but accepted and wrong
 Must = Literal['accept', 'judge', 'refuse']

@@ -22,7 +22,7 @@ from measure import KEYS, commit, error_cells, load, parser_with, save, summaris
 
 from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 Mask = npt.NDArray[np.bool_]
 

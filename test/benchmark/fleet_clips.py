@@ -14,7 +14,7 @@ from drives import pictures_of
 from views import View, Viewed
 
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 # what the tests make their turns with
 sys.path.append(str(Path(__file__).parents[1]))

@@ -20,7 +20,7 @@ from solutions import RECORDED, Solved
 from dashcalib_ros import Config
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import mapping_error
-from dashcalib_ros.reconstruction.adjust import Solver
+from dashcalib_ros.reconstruct.adjust import Solver
 from dashcalib_ros.solve.information import noise_of
 from dashcalib_ros.solve.opinions import held_out
 from dashcalib_ros.solve.prior import loss_px_of

@@ -63,7 +63,7 @@ from std_srvs.srv import Trigger
 from dashcalib_ros.camera import Radial, ros_camera
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.errors import DashcalibError
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.messages import camera_info

@@ -44,8 +44,8 @@ from measure import (
 )
 
 from dashcalib_ros import Config, open_frames
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.motion import MotionEstimator
+from dashcalib_ros.detect import MotionEstimator
+from dashcalib_ros.input import Frame
 
 FILES = 5
 # where it is cut, s lost at each cut, and whether the files tell that something may be missing

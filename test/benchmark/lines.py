@@ -27,9 +27,9 @@ from wide import WIDE, wide_drive_of
 from dashcalib_ros import Calibrator, Config, open_frames
 from dashcalib_ros.camera import Brown, Camera, Radial, camera_of
 from dashcalib_ros.demo import Drive
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.scale import Scale
-from dashcalib_ros.lines import Bend, LineCollector, Lines, bend
+from dashcalib_ros.detect import Bend, LineCollector, Lines, bend
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.scale import Scale
 
 SPOILED = 0.03
 OTHERS = (('carnd', 'drive.mp4', None), ('ntu_campus', 'images', 3.0))

@@ -20,14 +20,14 @@ from typing import Any
 from mapping import is_fisheye, mapping_error, model_of
 
 from dashcalib_ros import Calibrator, Config, stages
+from dashcalib_ros.detect import Turn
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import DashcalibError
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.judgement.conclude import evidence_of_detection
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.input import Frame
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.conclude import evidence_of_detection
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.turns import Turn
-from dashcalib_ros.turns.detection import Detection
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ScenePool
 

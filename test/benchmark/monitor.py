@@ -27,9 +27,9 @@ from solutions import Solved
 
 from dashcalib_ros import Config, stages
 from dashcalib_ros.camera import Camera, Radial
-from dashcalib_ros.checking import Change, Reading, watch
-from dashcalib_ros.reconstruction.scene import Scene
-from dashcalib_ros.turns.turn import TurnId
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.judge import Change, Reading, watch
+from dashcalib_ros.reconstruct.scene import Scene
 
 CONFIG = Config()
 # turns after the change, and turns of a drive without one

@@ -31,8 +31,8 @@ from sensor_msgs.msg import Image
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import demo_drive
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.inputs import open_frames
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.inputs import open_frames
 
 # s; how long to wait for a calibration after the last image
 PATIENCE_S = 180.0

@@ -27,18 +27,18 @@ from measure import commit, complain, load, save, table
 
 from dashcalib_ros import Calibrator, Config, open_frames
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.checking import Poses, read_poses, trivial_guess
-from dashcalib_ros.checking.odometry import Path as TruePath
-from dashcalib_ros.checking.odometry import angle_deg, length, odometry
-from dashcalib_ros.checking.paths import COLOURS, path_files
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.reconstruction.build import chain_scene
-from dashcalib_ros.reconstruction.scene import Profile, Scene
-from dashcalib_ros.reconstruction.structure import Structure
-from dashcalib_ros.reconstruction.tracks import Tracks, track_turn
+from dashcalib_ros.detect import Turn, TurnId
+from dashcalib_ros.input import Frame
+from dashcalib_ros.judge import Poses, read_poses, trivial_guess
+from dashcalib_ros.judge.odometry import Path as TruePath
+from dashcalib_ros.judge.odometry import angle_deg, length, odometry
+from dashcalib_ros.judge.paths import COLOURS, path_files
+from dashcalib_ros.reconstruct.build import chain_scene
+from dashcalib_ros.reconstruct.scene import Profile, Scene
+from dashcalib_ros.reconstruct.structure import Structure
+from dashcalib_ros.reconstruct.tracks import Tracks, track_turn
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.solve.held import scene_with
-from dashcalib_ros.turns import Turn, TurnId
 
 # frames of a window, from one to the next, and between two keyframes
 WINDOW, STEP, STRIDE = 43, 30, 3

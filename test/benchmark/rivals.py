@@ -45,10 +45,10 @@ from measure import (
 )
 
 from dashcalib_ros import Config, open_frames, stages
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.scale import Scale
-from dashcalib_ros.turns import Turn
-from dashcalib_ros.turns.detection import Detection
+from dashcalib_ros.detect import Turn
+from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.scale import Scale
 
 # straights as long as the turns, so that random windows are not turns by necessity
 LONG = replace(STREET, straight_m=75.0, lead_m=50.0)

@@ -15,7 +15,7 @@ from measure import commit
 from wide import WIDE, wide_drive_of
 
 from dashcalib_ros import Calibration, Calibrator, Config, open_frames
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 from dashcalib_ros.solve.solution import Solution
 
 RECORDED = {'kitti03': 'bag', 'carnd': 'drive.mp4', 'ntu_campus': 'images'}

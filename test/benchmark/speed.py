@@ -43,11 +43,10 @@ from measure import (
 )
 
 from dashcalib_ros import Config
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.frames.scale import Scale
-from dashcalib_ros.motion import MotionEstimator, estimator
-from dashcalib_ros.turns import TurnDetector
-from dashcalib_ros.turns.detection import Detection
+from dashcalib_ros.detect import MotionEstimator, TurnDetector, estimator
+from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.scale import Scale
 
 ONE_TURN = replace(STREET, turns=1)
 SIZES = tuple(Setting(f'{lens.width}x{lens.height}', lens, ONE_TURN)

@@ -20,7 +20,7 @@ from drives import BY_NAME, drive_of, pictures_of
 
 from dashcalib_ros import open_frames
 from dashcalib_ros.demo import Lens
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 Grey = npt.NDArray[np.uint8]
 

@@ -28,7 +28,7 @@ from dashcalib_ros.demo.parallel import render_parallel
 from dashcalib_ros.demo.quads import Quads
 from dashcalib_ros.demo.raycast import Raycaster
 from dashcalib_ros.errors import ConfigError
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
 
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]

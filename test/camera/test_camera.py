@@ -268,7 +268,7 @@ def test_parameters_go_to_colmap_and_back(model):
 
 @pytest.mark.parametrize('name', CAMERAS)
 def test_colmap_projects_as_we_do(name):
-    pycolmap = pytest.importorskip('dashcalib_ros.reconstruction.colmap').pycolmap
+    pycolmap = pytest.importorskip('dashcalib_ros.reconstruct.colmap').pycolmap
     camera = CAMERAS[name]
     colmap = pycolmap.Camera(camera_id=1, model=camera.step2.name, width=SIZE[0], height=SIZE[1],
                              params=camera.step2.values(camera.params))

@@ -11,12 +11,12 @@ from made_calibration import TRUTH, make_calibration
 from made_drives import START, drive, images, info_of, write_bag
 
 from dashcalib_ros.calibrator import Calibrator
-from dashcalib_ros.checking import Check, Odometry, Reading, watch
-from dashcalib_ros.checking.odometry import Path, TurnOdometry
 from dashcalib_ros.cli import main
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.judge import Check, Odometry, Reading, watch
+from dashcalib_ros.judge.odometry import Path, TurnOdometry
 from dashcalib_ros.solve.picture import PictureSigma
-from dashcalib_ros.turns import TurnId
 
 
 @stands_in_for(Calibrator)

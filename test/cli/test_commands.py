@@ -21,7 +21,6 @@ from made_calibration import TRUTH, make_calibration
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from dashcalib_ros.bags.write import BagWriter
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import AUTO, calibrated_models, ros_camera
 from dashcalib_ros.cli import main
@@ -29,12 +28,13 @@ from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.demo.drive import Drive
+from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import ConfigError, WorkerError
-from dashcalib_ros.frames import Frame
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.bags.write import BagWriter
 from dashcalib_ros.standard_streams import folded
 from dashcalib_ros.status import Status
-from dashcalib_ros.turns.detection import Detection
-from dashcalib_ros.turns.turn import Turn
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
 

@@ -13,7 +13,7 @@ from dashcalib_ros.fleet import tasks
 from dashcalib_ros.fleet.gather import content_hash, gather, settings_hash
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.tasks import gather_clip, gathered_file
-from dashcalib_ros.scene_file import decoded, encoded
+from dashcalib_ros.reconstruct.scene_file import decoded, encoded
 
 
 def test_the_content_and_the_settings_are_the_identity(tmp_path):

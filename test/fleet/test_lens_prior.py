@@ -20,8 +20,8 @@ from dashcalib_ros.fleet.lens_prior import (
 )
 from dashcalib_ros.fleet.posterior import conditioned, final_of, unit_of
 from dashcalib_ros.fleet.solved import Estimate, Solved
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.judgement import Verdict as OwnVerdict
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge import Verdict as OwnVerdict
 from dashcalib_ros.solve.picture import PictureSigma
 
 CONFIG = FleetConfig()

@@ -10,7 +10,7 @@ from dashcalib_ros.errors import ConfigError, InputError, OutputError
 from dashcalib_ros.fleet import storage
 from dashcalib_ros.fleet.manifest import read_manifest
 from dashcalib_ros.fleet.storage import Folder
-from dashcalib_ros.inputs import named_like, open_frames
+from dashcalib_ros.input.inputs import named_like, open_frames
 
 
 @pytest.fixture(params=['path', 'memory'])

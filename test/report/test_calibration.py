@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from made_calibration import EACH_MODEL, TRUTH, calibration_of, make_calibration
 
+from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.judgement import Calibration
-from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.lines import Bend
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report import load_camera, result_dict
 from dashcalib_ros.report.export import exported
 from dashcalib_ros.solve.opinions import HeldOut
 from dashcalib_ros.solve.picture import PictureSigma
-from dashcalib_ros.turns import TurnId
 
 
 @pytest.fixture(params=EACH_MODEL)

@@ -20,17 +20,17 @@ from made_calibration import EACH_MODEL, calibration_of, make_calibration
 from page_reader import Page
 
 from dashcalib_ros.camera.mapping import mapping_error
+from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.frames.scale import Scale
-from dashcalib_ros.inputs import open_frames
-from dashcalib_ros.judgement import Verdict
-from dashcalib_ros.judgement.calibration import Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.judgement.focal_by_turn import focal_alone, sigma_by_count
+from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.judge import Verdict
+from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.judge.focal_by_turn import focal_alone, sigma_by_count
 from dashcalib_ros.recorded import with_source
 from dashcalib_ros.report import NamedCamera, report_html, write_results
 from dashcalib_ros.report.lens_figures import undistorted
 from dashcalib_ros.report.usage import field_of_view
-from dashcalib_ros.turns import TurnId
 
 
 @pytest.fixture(scope='module')

@@ -9,11 +9,11 @@ import pytest
 from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
 
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.judgement.calibration import StoredTurnSummary
+from dashcalib_ros.judge.calibration import StoredTurnSummary
 from dashcalib_ros.report import load_result, result_dict, result_json
 from dashcalib_ros.report.page import report_html
-from dashcalib_ros.turns import TurnId
 
 
 def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():

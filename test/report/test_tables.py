@@ -10,8 +10,8 @@ from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_cali
 from rich.console import Console
 
 from dashcalib_ros.camera import Fisheye, Radial
-from dashcalib_ros.judgement import Verdict
-from dashcalib_ros.judgement.calibration import Shutter, Stabiliser
+from dashcalib_ros.judge import Verdict
+from dashcalib_ros.judge.calibration import Shutter, Stabiliser
 from dashcalib_ros.report import NamedCamera, compare
 from dashcalib_ros.report.tables import against_truth, comparison, conclusion, next_step, summary
 from dashcalib_ros.solve.picture import PictureSigma

@@ -21,17 +21,16 @@ from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from std_msgs.msg import Header, String
 
 from dashcalib_ros.calibrator import Calibrator
-from dashcalib_ros.checking import Check, Reading, watch
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import ConfigError, InputError
-from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros import learner, node
 from dashcalib_ros.ros.messages import camera_info
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.stream import LASTING
 from dashcalib_ros.status import Status
-from dashcalib_ros.turns import TurnId
 
 TOPIC = '/camera_info'
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,

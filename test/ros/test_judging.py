@@ -20,14 +20,14 @@ from synthetic import synthetic_turn
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
-from dashcalib_ros.frames.scale import Scale
-from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.ros.kept import Whose
 from dashcalib_ros.ros.news import Result
 from dashcalib_ros.ros.store import Store
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
-from dashcalib_ros.turns import TurnId
 
 
 def test_its_life_with_a_camera_that_is_bumped(make_desk):

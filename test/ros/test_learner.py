@@ -13,18 +13,17 @@ from fakes import image_message, stands_in_for
 
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
-from dashcalib_ros.checking import Check, Reading, watch
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.detect.motion import TrackedPoints
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
-from dashcalib_ros.judgement.calibration import StoredTurnSummary
-from dashcalib_ros.motion.motion import TrackedPoints
+from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
+from dashcalib_ros.judge.calibration import StoredTurnSummary
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros import learner as room
 from dashcalib_ros.ros.learner import Learner
 from dashcalib_ros.ros.news import Listener
 from dashcalib_ros.status import Status, View
-from dashcalib_ros.turns import TurnId
 
 LIMIT = 20.0
 CONFIG = Config().replace({'turns.wanted': 2})

@@ -10,8 +10,8 @@ import pytest
 from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.camera.rectified import rectified_matrix
 from dashcalib_ros.config import Config
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.motion.motion import TrackedPoints
+from dashcalib_ros.detect.motion import TrackedPoints
+from dashcalib_ros.input import Frame
 from dashcalib_ros.ros.pictures import TRACK, Rectifier, overlay
 from dashcalib_ros.status import View
 

@@ -7,9 +7,9 @@ import pytest
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model
-from dashcalib_ros.checking.contradiction import contradicted
 from dashcalib_ros.config import Config
-from dashcalib_ros.judgement import Calibration, Verdict
+from dashcalib_ros.judge import Calibration, Verdict
+from dashcalib_ros.judge.contradiction import contradicted
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.state import Rules, judge, sigma_text, state_of
 

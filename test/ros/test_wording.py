@@ -2,11 +2,11 @@
 from __future__ import annotations
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.judgement import Calibration, TurnSummary, Verdict
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
 from dashcalib_ros.ros.news import new_turns
 from dashcalib_ros.ros.wording import outcome_text, started_text, turn_text
 from dashcalib_ros.status import Status
-from dashcalib_ros.turns import TurnId
 
 
 def status(*turns):

@@ -10,8 +10,8 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model, mapping_error
-from dashcalib_ros.judgement.verdict import judge
-from dashcalib_ros.reconstruction.scene import Profile, Start
+from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.reconstruct.scene import Profile, Start
 from dashcalib_ros.solve.choice import Candidate, gain_of_wider_model, is_clear
 from dashcalib_ros.solve.information import Pooled, information
 from dashcalib_ros.solve.picture import scatter_between_turns

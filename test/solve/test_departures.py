@@ -10,10 +10,10 @@ from solving import CONFIG, START, scenes_of, solved, z_of
 from synthetic import LENS, SIZE
 
 from dashcalib_ros.camera.mapping import mapping_error
-from dashcalib_ros.frames.scale import FULL_SIZE
-from dashcalib_ros.judgement.conclude import Evidence, conclude
-from dashcalib_ros.judgement.verdict import judge
-from dashcalib_ros.reconstruction.scene import Scene
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge.conclude import Evidence, conclude
+from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve import focal
 from dashcalib_ros.solve.departures import departures
 from dashcalib_ros.solve.normal import normal_equations

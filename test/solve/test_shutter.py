@@ -8,7 +8,7 @@ import pytest
 from solving import CONFIG, NOTHING, adjusted, scenes_of, solved, z_of
 from synthetic import LENS
 
-from dashcalib_ros.judgement.verdict import judge
+from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.solve import focal
 from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shift
 

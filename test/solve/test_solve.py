@@ -12,18 +12,19 @@ from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 from dashcalib_ros import stages
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
-from dashcalib_ros.frames.scale import FULL_SIZE, Scale
-from dashcalib_ros.judgement.agreement import (
+from dashcalib_ros.detect.turn import Turn, TurnId
+from dashcalib_ros.input.scale import FULL_SIZE, Scale
+from dashcalib_ros.judge.agreement import (
     focal_disagreement,
     leverages,
     outdated,
     turns_of_another_camera,
 )
-from dashcalib_ros.judgement.conclude import Evidence, conclude
-from dashcalib_ros.judgement.verdict import judge, profile_contrast
-from dashcalib_ros.reconstruction import adjust
-from dashcalib_ros.reconstruction.adjust import Solver, adjust_step1, adjust_step2
-from dashcalib_ros.reconstruction.scene import (
+from dashcalib_ros.judge.conclude import Evidence, conclude
+from dashcalib_ros.judge.verdict import judge, profile_contrast
+from dashcalib_ros.reconstruct import adjust
+from dashcalib_ros.reconstruct.adjust import Solver, adjust_step1, adjust_step2
+from dashcalib_ros.reconstruct.scene import (
     Profile,
     Scene,
     residuals_px,
@@ -44,7 +45,6 @@ from dashcalib_ros.solve.joint import solve
 from dashcalib_ros.solve.misfit import misfits
 from dashcalib_ros.solve.picture import picture_covariance, scatter_between_turns
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.turns.turn import Turn, TurnId
 
 at, stored = TurnId.at, TurnId.stored
 

@@ -18,10 +18,10 @@ from waiting import LIMIT_S, background, is_running, wait_for
 
 from dashcalib_ros import stages
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.frames import Frame
-from dashcalib_ros.reconstruction import build
-from dashcalib_ros.turns.turn import Turn, TurnId
+from dashcalib_ros.input import Frame
+from dashcalib_ros.reconstruct import build
 from dashcalib_ros.workers import child as child_module
 from dashcalib_ros.workers import jobs
 from dashcalib_ros.workers import pool as pool_module

@@ -1,0 +1,233 @@
+"""How a camera bends the upright lines of the world: lines + camera -> Bend.
+
+A straight line in the world and the camera's centre lie in a plane. Its picture is known when the
+plane is: what is left between it and the points found is the bend. It owes nothing to motion, and
+no camera's rotation or focal length can hide it. One number is asked: which k1, all else as it is,
+would make the lines straight. (Straight lines have to be straight: Devernay and Faugeras 2001;
+Santana-Cedres et al. 2017 calibrate dashcams by it alone.)
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Ints
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.mapping import sensitivity
+from dashcalib_ros.config import LinesConfig
+from dashcalib_ros.detect.edges import Lines
+
+# place of k1 among the parameters, in every model
+K1 = 4
+# sine of 15 degrees; a line leaning more, with the camera's own lean, is not upright
+UPRIGHT = 0.26
+# px; the bend of the straightest line is no better known: pixels, and blur
+LEAST_NOISE_PX = 0.03
+# px; by so much all lines may be bent alike for other reasons: what is beside them, and the filter
+SYSTEMATIC_PX = 0.01
+# of the larger of both ways in which a ray moves a pixel, squared; less is next to the fold
+LEAST_SPREAD = 1e-4
+# fewer lines, or groups of images, tell nothing about their own scatter
+LEAST_LINES, LEAST_GROUPS = 20, 4
+# each is left out in turn; more cost time and change nothing
+MOST_GROUPS = 40
+# of what the most sensitive line tells
+LEAST_TOLD = 1e-9
+# of the plane through a line's points, and of the weights
+PLANE_STEPS, WEIGHT_STEPS = 3, 30
+
+
+@dataclass(frozen=True)
+class Bend:
+    """What straight lines say of a camera's distortion.
+
+    lines: how many were measured; groups: of images that share none. bend_px: root mean square
+    distance of their points from straight, by the lines' weights, px. k1: what must be added to
+    the camera's k1, all else as it is, to make them straight; sigma: its standard deviation.
+    camera_sigma: that of the same number by the camera's own covariance; None where it has none.
+    picture_px: by how many pixels that k1 moves the picture, RMS, the best rotation removed.
+    """
+
+    lines: int
+    groups: int
+    bend_px: float
+    k1: float
+    sigma: float
+    camera_sigma: float | None
+    picture_px: float
+
+    def resized(self, px: float) -> Bend:
+        """Return the same for pictures in which a pixel of these is px pixels wide."""
+        return replace(self, bend_px=self.bend_px * px, picture_px=self.picture_px * px)
+
+    @property
+    def sigmas(self) -> float:
+        """Return how far lines and camera are apart, in standard deviations of both together."""
+        return abs(self.k1) / float(np.hypot(self.sigma, self.camera_sigma or 0.0))
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Lines against a camera: residual (n, k) px across each, and its derivatives (n, k, p).
+
+    The residual is what is left of the points after the best straight line; its derivatives are
+    those by the camera's parameters. group: (n,) of images, from 0.
+    """
+
+    residual: Floats
+    derivatives: Floats
+    group: Ints
+
+    @property
+    def along(self) -> Floats:
+        """Return the derivative by k1 (n, k)."""
+        return np.asarray(self.derivatives[:, :, K1])
+
+
+def bend(lines: Lines, camera: Camera, config: LinesConfig | None = None,
+         covariance: Floats | None = None) -> Bend | None:
+    """Return how the camera bends the lines; None where they are too few to tell.
+
+    lines: in pixels of the camera's pictures. covariance: (p, p) of the camera's parameters.
+    """
+    measured = _telling(_measured(lines, camera, (config or LinesConfig()).group_s))
+    groups = int(measured.group.max(initial=-1)) + 1
+    if len(measured.group) < LEAST_LINES or groups < LEAST_GROUPS:
+        return None
+    along = measured.along
+    squares = np.sum(along**2, axis=1)
+    asked = np.sum(along * measured.residual, axis=1) / squares
+    rest = measured.residual - asked[:, None] * along
+    # a line that wavers is bent by as much for other reasons than the lens
+    noise = np.hypot(LEAST_NOISE_PX, _rms(rest))
+    information = squares / along.shape[1] / noise**2
+    k1, weight = _location(asked, information)
+    px_by_k1 = float(np.sqrt(np.average(squares / along.shape[1], weights=weight)))
+    sigma = float(np.hypot(_sigma(asked, information, measured.group, groups),
+                           SYSTEMATIC_PX / px_by_k1))
+    return Bend(
+        len(asked), groups,
+        float(np.sqrt(np.average(_rms(measured.residual)**2, weights=weight))), k1, sigma,
+        _camera_sigma(measured, weight / squares, covariance), _picture_px(camera, k1))
+
+
+def _measured(lines: Lines, camera: Camera, group_s: float) -> _Measured:
+    """Return the upright lines that the camera sees all of, against it."""
+    count = lines.points.shape[1]
+    points = lines.points.astype(np.float64)
+    rays = camera.rays(points)
+    seen = np.isfinite(rays).all(axis=(1, 2))
+    points, rays, stamps_s = points[seen], rays[seen], lines.stamps_s[seen]
+    _, across, _ = camera.derivatives(rays.reshape(-1, 3))
+    across = across.reshape(-1, count, 2, 3)
+    least, most = np.moveaxis(np.linalg.eigvalsh(across @ across.transpose(0, 1, 3, 2)), 2, 0)
+    clear = (least > LEAST_SPREAD * most).all(axis=1)
+    points, rays, stamps_s = points[clear], rays[clear], stamps_s[clear]
+    normal, tangents = _planes(rays, across[clear])
+    # a plane through the vertical has a level normal
+    upright = np.abs(normal[:, 1]) < UPRIGHT
+    points, rays, stamps_s = points[upright], rays[upright], stamps_s[upright]
+    normal, tangents = normal[upright], tangents[upright]
+    # at the line itself: at the points, the derivatives would follow the residual
+    rays = rays - np.sum(rays * normal[:, None], axis=2, keepdims=True) * normal[:, None]
+    by_params, across, pixels = camera.derivatives(rays.reshape(-1, 3))
+    slope = _slope(across.reshape(-1, count, 2, 3), normal)
+    steep = np.linalg.norm(slope, axis=2)
+    unit = slope / steep[:, :, None]
+    residual = np.sum((points - pixels.reshape(points.shape)) * unit, axis=2)
+    by_params = by_params.reshape(*points.shape, len(camera.names()))
+    derivatives = np.einsum('nkc,nkcp->nkp', unit, by_params)
+    lines_moves = (rays @ tangents) / steep[:, :, None]
+    together = np.concatenate([residual[:, :, None], derivatives], axis=2)
+    basis, _ = np.linalg.qr(lines_moves)
+    together = together - basis @ (basis.transpose(0, 2, 1) @ together)
+    return _Measured(together[:, :, 0], together[:, :, 1:], _groups(stamps_s, group_s))
+
+
+def _telling(measured: _Measured) -> _Measured:
+    """Leave out the lines that no k1 bends: those through the middle of the distortion."""
+    squares = np.sum(measured.along**2, axis=1)
+    tell = squares > LEAST_TOLD * squares.max(initial=0.0)
+    return _Measured(measured.residual[tell], measured.derivatives[tell], measured.group[tell])
+
+
+def _planes(rays: Floats, across: Floats) -> tuple[Floats, Floats]:
+    """Return planes through rays (n, k, 3): normals (n, 3), and two directions (n, 3, 2) in each.
+
+    across: (n, k, 2, 3) derivatives of the pixels by the rays. Distances count in pixels.
+    """
+    weight = np.ones(rays.shape[:2])
+    for _ in range(PLANE_STEPS):
+        moments = np.einsum('nk,nki,nkj->nij', weight, rays, rays)
+        _, axes = np.linalg.eigh(moments)
+        normal = axes[:, :, 0]
+        weight = 1 / np.maximum(np.sum(_slope(across, normal)**2, axis=2), 1e-12)
+    return normal, axes[:, :, 1:]
+
+
+def _slope(across: Floats, normal: Floats) -> Floats:
+    """Return (n, k, 2) by how much a ray leaves its plane for each pixel to the right and down.
+
+    across: (n, k, 2, 3) derivatives of the pixels by the rays; normal: (n, 3).
+    """
+    both = across @ across.transpose(0, 1, 3, 2)
+    moved = across @ normal[:, None, :, None]
+    return np.asarray(np.linalg.solve(both, moved)[..., 0])
+
+
+def _groups(stamps_s: Floats, group_s: float) -> Ints:
+    """Return the group (n,) of each line's image, from 0: images of so long a time are one.
+
+    In a long drive several such times are joined.
+    """
+    times, group = np.unique(stamps_s // group_s, return_inverse=True)
+    group = group.reshape(-1).astype(np.int64)
+    return np.asarray(group * min(MOST_GROUPS, len(times)) // max(len(times), 1))
+
+
+def _rms(values: Floats) -> Floats:
+    """Return the root mean square (n,) of the rows of values (n, k)."""
+    return np.asarray(np.sqrt(np.mean(values**2, axis=1)))
+
+
+def _location(asked: Floats, information: Floats) -> tuple[float, Floats]:
+    """Return what most lines ask for, and the lines' weights (n,), for a Cauchy distribution.
+
+    asked: (n,) by each line; information: (n,) inverse variances. What is curved in the world
+    asks for anything, and hardly counts.
+    """
+    order = np.argsort(asked)
+    share = np.cumsum(np.sqrt(information[order]))
+    place = float(asked[order][np.searchsorted(share, share[-1] / 2)])
+    for _ in range(WEIGHT_STEPS):
+        weight = information / (1 + information * (asked - place)**2)
+        place = float(np.average(asked, weights=weight))
+    return place, np.asarray(weight)
+
+
+def _sigma(asked: Floats, information: Floats, group: Ints, groups: int) -> float:
+    """Return the standard deviation by leaving out each group of images in turn (jackknife)."""
+    without = [_location(asked[keep], information[keep])[0]
+               for keep in (group != left for left in range(groups))]
+    # of few groups it is uncertain itself: the wider t distribution, for as many
+    return float(np.sqrt((groups - 1) * np.var(without) * (groups - 1) / (groups - 3)))
+
+
+def _camera_sigma(measured: _Measured, weight: Floats, covariance: Floats | None
+                  ) -> float | None:
+    """Return the standard deviation of the lines' k1 by the camera's covariance alone.
+
+    weight: (n,) of the lines. An error of any parameter bends lines a little as k1 does.
+    """
+    if covariance is None:
+        return None
+    moved = np.einsum('n,nk,nkp->p', weight, measured.along, measured.derivatives)
+    share = moved / moved[K1]
+    return float(np.sqrt(max(share @ covariance @ share, 0.0)))
+
+
+def _picture_px(camera: Camera, k1: float) -> float:
+    """Return by how much (px, root mean square) another k1 moves the picture."""
+    moves, _ = sensitivity(camera)
+    return float(abs(k1) * np.sqrt(np.mean(np.sum(moves[:, :, K1]**2, axis=1))))

@@ -1,0 +1,159 @@
+"""Frames -> turns: the first stage, as a stream."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.config import Config
+from dashcalib_ros.detect.collector import LineCollector
+from dashcalib_ros.detect.detector import TurnDetector
+from dashcalib_ros.detect.edges import Lines
+from dashcalib_ros.detect.estimator import MotionEstimator
+from dashcalib_ros.detect.motion import TrackedPoints
+from dashcalib_ros.detect.turn import Turn
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.mask_file import check_mask
+from dashcalib_ros.input.scale import FULL_SIZE, Scale
+
+# images after which the stamps' unit is checked; ns between images of a camera of 2 kHz: in
+# microseconds, any camera above 2 Hz seems to be faster
+FIRST_FRAMES = 10
+SHORTEST_NS = 500_000
+
+
+class Detection:
+    """Takes the images of one camera; keeps the best turns, with their images.
+
+    size: (width, height) of the images, None before the first. scale: how they are resized
+    first. frames: how many there were. standing: the car stands now.
+    """
+
+    def __init__(self, config: Config, mask: Mask | None = None) -> None:
+        """mask: (h, w), False where the ego vehicle is."""
+        self._mask = mask
+        if mask is not None:
+            mask = Scale.of((mask.shape[1], mask.shape[0]), config).mask(mask)
+        self.size: tuple[int, int] | None = None
+        self.scale = FULL_SIZE
+        self.frames = 0
+        self._first_ns = self._last_ns = 0
+        self._rises = 0
+        self.standing = False
+        self._config = config
+        self._motion = MotionEstimator(config.motion, config.mask, mask)
+        self._lines = LineCollector(config.lines)
+        # more turns than wanted replace those without a scene; --turns may be above the capacity
+        self._turns = TurnDetector(replace(
+            config.turns, capacity=max(config.turns.capacity, config.turns.wanted)))
+
+    @property
+    def start_s(self) -> float:
+        """Return the stamp of the first image, s."""
+        return self._first_ns / 1e9
+
+    @property
+    def magnitude(self) -> float:
+        """Return the newest filtered turning magnitude, of the image width."""
+        return self._turns.magnitude
+
+    def push(self, frame: Frame) -> list[Turn]:
+        """Take the next frame; return the turns that it completes or changes.
+
+        Raises InputError when its size differs from the first one's, or from the mask's, when it
+        is no grey picture of bytes, and when the stamps cannot be nanoseconds.
+        """
+        _check_image(frame)
+        self._check_size(frame)
+        self._check_stamps(frame)
+        self.frames += 1
+        frame = self.scale.frame(frame)
+        motion = self._motion.push(frame)
+        if motion is None:
+            return []
+        self.standing = motion.standing
+        if not motion.standing:
+            self._lines.push(frame.image, frame.stamp_ns)
+        return self._fixed(self._turns.push(frame, motion))
+
+    def finish(self) -> list[Turn]:
+        """End the drive; return the turns that this completes or changes."""
+        return self._fixed(self._turns.finish())
+
+    def turns(self) -> tuple[Turn, ...]:
+        """Return the turns found so far, the most prominent first."""
+        return self._turns.turns()
+
+    def release(self, center: int) -> None:
+        """Drop a turn's frames, once they are handed over."""
+        self._turns.release(center)
+
+    def magnitudes(self) -> Floats:
+        """Return (n, 2): stamp in s and filtered turning magnitude, decimated."""
+        return self._turns.magnitudes()
+
+    def valid(self) -> Mask | None:
+        """Return (h, w) of the resized images, False where the ego vehicle is; None: nowhere."""
+        return self._motion.valid()
+
+    def points(self) -> TrackedPoints:
+        """Return the points tracked in the newest image, in px of the input."""
+        points, px = self._motion.points(), np.float32(self.scale.px)
+        return TrackedPoints(*((xy + 0.5) * px - 0.5 for xy in (points.before, points.now)))
+
+    def lines(self) -> Lines:
+        """Return the upright lines of the drive so far, in the resized images."""
+        return self._lines.lines().within(self.valid())
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return warnings for the user, one line each."""
+        return tuple(self._motion.warnings())
+
+    def _fixed(self, new: list[Turn]) -> list[Turn]:
+        """Fix the frames of all turns: a later turn that overlaps one of them is trimmed.
+
+        This is done when a turn is confirmed, not when it is reconstructed: the result must not
+        depend on the speed of the workers.
+        """
+        if new:
+            for turn in self.turns():
+                self._turns.fix(turn.center)
+        return new
+
+    def _check_size(self, frame: Frame) -> None:
+        if self.size is None:
+            check_mask(self._mask, frame.size)
+            self.scale = Scale.of(frame.size, self._config)
+            self.size = frame.size
+        elif frame.size != self.size:
+            raise InputError(
+                f'the image size changes from {self.size[0]}x{self.size[1]} to '
+                f'{frame.size[0]}x{frame.size[1]} at frame {frame.index}: calibrate each size '
+                f'on its own')
+
+    def _check_stamps(self, frame: Frame) -> None:
+        """Check once that time passes between the first images, in the right unit."""
+        if self.frames == 0:
+            self._first_ns = self._last_ns = frame.stamp_ns
+        if self.frames > FIRST_FRAMES:
+            return
+        # a clock may be set back once, but then it goes on
+        self._rises += frame.stamp_ns > self._last_ns
+        self._last_ns = frame.stamp_ns
+        passed = frame.stamp_ns - self._first_ns
+        too_short = 0 <= passed < FIRST_FRAMES * SHORTEST_NS
+        if self.frames == FIRST_FRAMES and (too_short or self._rises < FIRST_FRAMES // 2):
+            raise InputError(
+                f'{FIRST_FRAMES} images pass in {passed} ns: Frame.stamp_ns must rise, and count '
+                f'nanoseconds, not seconds, milliseconds or images')
+
+
+def _check_image(frame: Frame) -> None:
+    if frame.image.ndim != 2 or frame.image.dtype != np.uint8:
+        shape = 'x'.join(map(str, frame.image.shape))
+        raise InputError(
+            f'Frame.image must be grey, (height, width) of uint8, and frame {frame.index} has '
+            f'{shape} of {frame.image.dtype}: convert it, with '
+            f'cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if it is in colour')

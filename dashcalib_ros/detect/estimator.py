@@ -1,0 +1,297 @@
+"""Images -> tracked points -> epipoles -> turning magnitude, at a constant cost per image."""
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
+from dashcalib_ros.config import MaskConfig, MotionConfig
+from dashcalib_ros.detect.continuity import goes_on
+from dashcalib_ros.detect.epipoles import epipoles_of, turning
+from dashcalib_ros.detect.mask import EgoMask
+from dashcalib_ros.detect.motion import Motion, TrackedPoints
+from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
+from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.frame import Frame
+from dashcalib_ros.input.shrink import shrink_image
+from dashcalib_ros.input.stamps import EARLY, least_step_ns
+
+# px; smaller pictures have no room for points
+LEAST_SIDE = 20
+# times standing_px; a standing car's points move at most so far over a triplet, at night
+JITTER = 6.0
+# times the step from image to image; jitter does not add up over a triplet, motion does
+JITTER_GROWTH = 1.5
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The points in one processed image: ids (n,) ascending, xy (n, 2) px.
+
+    followed: the share of the last image's points that were found; NaN where there were none.
+    """
+
+    index: int
+    stamp_ns: int
+    ids: Ints
+    xy: Floats32
+    followed: float
+
+
+class MotionEstimator:
+    """Tracks points through the drive and measures how much the car turns."""
+
+    _seen: deque[_Seen]
+    _pairs: dict[tuple[int, int], Floats | None]
+    _last: GreyImage | None
+    _ids: Ints
+    _xy: Floats32
+    _ego: EgoMask | None = None
+    _segmented: SegmentationMask | None = None
+    _valid: Mask | None = None
+    _factor: int = 1
+    _perhaps_gap: bool = False
+
+    def __init__(self, config: MotionConfig, mask: MaskConfig | None = None,
+                 valid: Mask | None = None) -> None:
+        """valid: (height, width) of the full image, False where the user masks; None: nowhere.
+
+        Raises ConfigError for a segmentation model that cannot be used.
+        """
+        self.config = config
+        self.mask_config = mask or MaskConfig()
+        self._model = open_segmentation(self.mask_config)
+        self._user = valid
+        self._period_ns = 1e9 / config.rate
+        # a small window, as this runs on every image; one pixel of the coarsest level is 8 px of
+        # the picture, enough for the motion in a sharp turn
+        self._tracking = Tracking(config.forward_backward_px, window=9, levels=3, steps=12,
+                                  step_px=0.02, border=5)
+        self._shape: tuple[int, int] | None = None
+        self._reset()
+
+    def push(self, frame: Frame) -> Motion | None:
+        """Take the next image; None if it is skipped, as the camera is faster than config.rate."""
+        if frame.image.shape != self._shape:
+            self._start(frame.image.shape)
+        # a skipped image leaves the question to the next one
+        self._perhaps_gap |= frame.perhaps_after_gap
+        after_gap = False
+        if self._seen:
+            step = frame.stamp_ns - self._seen[-1].stamp_ns
+            after_gap = step < 0 or frame.after_gap
+            if after_gap:
+                self._reset()
+            elif step < least_step_ns(self.config.rate):
+                return None
+        image = shrink_image(frame.image, self._factor)
+        followed = self._follow(image)
+        if self._perhaps_gap and self._seen and not self._goes_on(followed):
+            after_gap, followed = True, math.nan
+            self._reset()
+        self._perhaps_gap = False
+        before = self._seen[-1] if self._seen else None
+        now = _Seen(frame.index, frame.stamp_ns, self._ids, self._xy, followed)
+        moved = math.nan if before is None else _median_shift(*_common(before, now))
+        self._seen.append(now)
+        first, middle = self._triplet()
+        standing = moved < self.config.standing_px
+        if first is not None:
+            # in the dark, points of a standing car jitter by more, but do not move away
+            over_triplet = _median_shift(*_common(first, now))
+            standing |= over_triplet < min(JITTER * self.config.standing_px, JITTER_GROWTH * moved)
+        magnitude = 0.0 if standing else self._magnitude(first, middle)
+        if middle is not None and not standing:
+            self._look_for_ego(image, middle, now)
+            if self._segmented is not None and self._segmented.push(frame.image, frame.stamp_ns):
+                self._exclude(self.valid())
+        self._replenish(image)
+        self._last = image
+        return Motion(
+            frame.index, frame.stamp_ns, magnitude, standing,
+            moved * self._factor, len(now.ids), middle.index if middle else None,
+            middle.stamp_ns if middle else None, after_gap)
+
+    def valid(self) -> Mask | None:
+        """Return (height, width) of the full image: False on the ego vehicle and the user's mask.
+
+        The vehicle is found by both the automatic mask and the segmentation model. None while
+        nothing is masked.
+        """
+        valid = self._user
+        if self._shape is None:
+            return valid
+        found = [self._ego.hidden(self._shape, self._factor) if self._ego else None,
+                 self._segmented.hidden(self._shape) if self._segmented else None]
+        for hidden in found:
+            if hidden is not None:
+                valid = ~hidden if valid is None else valid & ~hidden
+        return valid
+
+    def points(self) -> TrackedPoints:
+        """Return the points in the newest image, and where they were one spacing before."""
+        now = self._xy.copy()
+        before = now.copy()
+        earlier = self._earlier(self._seen[-1]) if self._seen else None
+        if earlier is not None:
+            _, here, there = np.intersect1d(self._ids, earlier.ids, assume_unique=True,
+                                            return_indices=True)
+            before[here] = earlier.xy[there]
+        factor = np.float32(self._factor)
+        return TrackedPoints(*((xy + 0.5) * factor - 0.5 for xy in (before, now)))
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return warnings about the masks for the user, one line each."""
+        warning = self._segmented and self._segmented.warning()
+        return (warning,) if warning else ()
+
+    def _reset(self) -> None:
+        """Drop all points: the next image does not continue the last one."""
+        keep = math.ceil(2 * self.config.spacing_s * self.config.rate / (1 - EARLY)) + 3
+        self._seen = deque(maxlen=keep)
+        self._pairs = {}
+        self._last = None
+        self._ids = np.zeros(0, np.int64)
+        self._xy = np.zeros((0, 2), np.float32)
+        self._born = 0
+        self._perhaps_gap = False
+
+    def _start(self, shape: tuple[int, ...]) -> None:
+        """Begin with images of this shape."""
+        if self._user is not None and self._user.shape != shape[:2]:
+            raise InputError(
+                f'the mask is {self._user.shape[1]}x{self._user.shape[0]}, the images are '
+                f'{shape[1]}x{shape[0]}: give a mask of the images\' size')
+        self._reset()
+        self._shape = (shape[0], shape[1])
+        self._factor = -(-shape[1] // self.config.width)
+        self._ego = None
+        # smaller pictures are too small for the mask's cells
+        if self.mask_config.enabled and min(self._size) >= 4 * self.mask_config.cell:
+            self._ego = EgoMask(self.mask_config, self._size)
+        self._segmented = SegmentationMask(self._model, self.mask_config) if self._model else None
+        self._ego_ns = self._masked_ns = -math.inf
+        self._exclude(self._user)
+
+    def _exclude(self, valid: Mask | None) -> None:
+        """Track only where the full image is valid."""
+        self._valid = None
+        if valid is not None:
+            small = cv2.resize(valid.astype(np.uint8), self._size, interpolation=cv2.INTER_NEAREST)
+            self._valid = small > 0
+
+    def _look_for_ego(self, image: GreyImage, middle: _Seen, now: _Seen) -> None:
+        epipoles = self._pairs.get((middle.index, now.index))
+        early = abs(now.stamp_ns - self._ego_ns) < 0.9e9 * self.config.spacing_s
+        if self._ego is None or epipoles is None or early:
+            return
+        self._ego_ns = now.stamp_ns
+        self._ego.push(image, *_common(middle, now), epipoles)
+        if abs(now.stamp_ns - self._masked_ns) > 1e9 * self.mask_config.period_s:
+            self._masked_ns = now.stamp_ns
+            self._exclude(self.valid())
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        assert self._shape is not None
+        return max(1, self._shape[1] // self._factor), max(1, self._shape[0] // self._factor)
+
+    def _follow(self, image: GreyImage) -> float:
+        """Move the points on to this image; drop those that do not track back.
+
+        Returns the share of them that is left, NaN if there were none.
+        """
+        if self._last is None or len(self._ids) == 0:
+            return math.nan
+        moved, trusted = follow_points(self._last, image, self._xy, self._tracking)
+        if self._valid is not None:
+            height, width = image.shape
+            column = np.clip(np.rint(moved[:, 0]), 0, width - 1).astype(int)
+            row = np.clip(np.rint(moved[:, 1]), 0, height - 1).astype(int)
+            trusted &= self._valid[row, column]
+        self._ids, self._xy = self._ids[trusted], moved[trusted]
+        return float(np.mean(trusted))
+
+    def _goes_on(self, followed: float) -> bool:
+        """Return whether the points tell that the image they are in now follows the last one.
+
+        followed: the share of the last image's points that is left.
+        """
+        usual = [seen.followed for seen in self._seen if not math.isnan(seen.followed)]
+        if not usual:
+            return False
+        before, last = self._seen[-2], self._seen[-1]
+        ids = np.intersect1d(before.ids, self._ids, assume_unique=True)
+        first, middle, now = (xy[np.searchsorted(own, ids)] for own, xy in (
+            (before.ids, before.xy), (last.ids, last.xy), (self._ids, self._xy)))
+        return goes_on(first, middle, now, followed, min(usual))
+
+    def _replenish(self, image: GreyImage) -> None:
+        """Add points where there are few; they are found at half resolution, which is enough."""
+        enough = len(self._ids) >= self.config.replenish * self.config.points
+        if enough or min(image.shape) < LEAST_SIDE:
+            return
+        half = np.asarray(
+            cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+        valid = None
+        if self._valid is not None:
+            valid = cv2.resize(self._valid.astype(np.uint8), half.shape[::-1],
+                               interpolation=cv2.INTER_NEAREST) > 0
+        corners = find_corners(half, self._xy / np.float32(2), self.config.points, valid) * 2 + 0.5
+        self._ids = np.concatenate([self._ids, self._born + np.arange(len(corners))])
+        self._xy = np.concatenate([self._xy, corners.astype(np.float32)])
+        self._born += len(corners)
+
+    def _triplet(self) -> tuple[_Seen | None, _Seen | None]:
+        """Return the first and the middle image of the triplet that ends now; None without one."""
+        middle = self._earlier(self._seen[-1])
+        first = self._earlier(middle) if middle else None
+        return (first, middle) if first else (None, None)
+
+    def _magnitude(self, first: _Seen | None, middle: _Seen | None) -> float:
+        """Return the triplet's turning magnitude; NaN without a triplet, or without epipoles."""
+        if first is None or middle is None:
+            return math.nan
+        last = self._seen[-1]
+        pairs = ((first, middle), (middle, last), (first, last))
+        found = {(a.index, b.index): self._epipoles(a, b) for a, b in pairs}
+        # the next triplets need only pairs that begin within this one
+        self._pairs = {key: value for key, value in {**self._pairs, **found}.items()
+                       if key[0] >= first.index}
+        values = [turning(epipoles) for epipoles in found.values() if epipoles is not None]
+        return float(np.mean(values)) if values else math.nan
+
+    def _earlier(self, seen: _Seen) -> _Seen | None:
+        """Return the image that is nearest to one spacing earlier, None if there is none."""
+        target = seen.stamp_ns - self.config.spacing_s * 1e9
+        before = [other for other in self._seen if other.stamp_ns < seen.stamp_ns]
+        if not before or before[0].stamp_ns > target + 0.5 * self._period_ns:
+            return None
+        return min(before, key=lambda other: abs(other.stamp_ns - target))
+
+    def _epipoles(self, a: _Seen, b: _Seen) -> Floats | None:
+        """Return a pair's epipoles (2, 2); both at the centre if nothing moved."""
+        if (a.index, b.index) in self._pairs:
+            return self._pairs[a.index, b.index]
+        before, after = _common(a, b)
+        if _median_shift(before, after) < self.config.standing_px:
+            return np.zeros((2, 2))
+        return epipoles_of(before, after, self._size, self.config.epipolar_px)
+
+
+def _common(a: _Seen, b: _Seen) -> tuple[Floats32, Floats32]:
+    """Return the positions of the points seen in both images, (n, 2) in each."""
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    return a.xy[in_a], b.xy[in_b]
+
+
+def _median_shift(before: Floats32, after: Floats32) -> float:
+    """Return how far the median point moved in px; NaN without points."""
+    if len(before) == 0:
+        return math.nan
+    return float(np.median(np.linalg.norm(after - before, axis=1)))

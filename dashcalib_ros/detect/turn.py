@@ -1,0 +1,61 @@
+"""A turn: a stretch of the drive that the calibration uses."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dashcalib_ros.input.frame import Frame
+
+
+@dataclass(frozen=True, order=True)
+class TurnId:
+    """Identifies a turn in one run. Turns of earlier drives sort before those of this one.
+
+    of_this_drive: False for a stored turn of an earlier drive. number: for a turn of this drive,
+    the index of its centre's frame; for a stored one, its place among the stored turns.
+    """
+
+    of_this_drive: bool
+    number: int
+
+    @classmethod
+    def at(cls, center: int) -> TurnId:
+        """Return the turn of this drive at this frame."""
+        return cls(True, center)
+
+    @classmethod
+    def stored(cls, place: int) -> TurnId:
+        """Return the turn of an earlier drive at this place among the stored ones."""
+        return cls(False, place)
+
+    def __str__(self) -> str:
+        return (f'the turn at frame {self.number}' if self.of_this_drive
+                else f'stored turn {self.number}')
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One turn and its images (paper, 3.1: the 2k + 1 images around a peak).
+
+    center, first, last: indices of input frames; stamp_s: time of the centre in seconds.
+    prominence: topographic prominence of the filtered turning magnitude, of the image width.
+    frames: the images from first to last, thinned to the detector's rate, in order; empty after
+    the turn is released: then only their number is left, released_images.
+    """
+
+    center: int
+    first: int
+    last: int
+    stamp_s: float
+    prominence: float
+    frames: tuple[Frame, ...] = ()
+    released_images: int = 0
+
+    @property
+    def images(self) -> int:
+        """Return how many images the turn has."""
+        return len(self.frames) or self.released_images
+
+    @property
+    def id(self) -> TurnId:
+        """Return the turn's identity."""
+        return TurnId.at(self.center)

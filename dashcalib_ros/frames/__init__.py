@@ -1,8 +1,0 @@
-"""Images in: videos and folders as iterables of Frame.
-
-Nothing here imports OpenCV or rosbags before a drive is opened: `--help` stays quick.
-"""
-from dashcalib_ros.frames.frame import Frame
-from dashcalib_ros.frames.source import FrameSource
-
-__all__ = ['Frame', 'FrameSource']

@@ -1,0 +1,8 @@
+"""Images in: videos and folders as iterables of Frame.
+
+Nothing here imports OpenCV or rosbags before a drive is opened: `--help` stays quick.
+"""
+from dashcalib_ros.input.frame import Frame
+from dashcalib_ros.input.source import FrameSource
+
+__all__ = ['Frame', 'FrameSource']

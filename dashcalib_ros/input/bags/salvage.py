@@ -1,0 +1,158 @@
+"""Damaged bags are read from the start, without their index, as far as possible.
+
+Each scanner yields messages in the order in which they were written, up to the end of the file.
+It reports what it leaves out by calling `damage` with a short phrase.
+"""
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote
+
+from mcap.exceptions import McapError
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.input.bags.record import Record, ros2_type
+from dashcalib_ros.input.bags.unpack import unpack_bz2, unpack_lz4, unpack_zstd
+
+Damage = Callable[[str], None]
+
+UNPACK_MCAP: dict[str, Callable[[bytes], bytes]] = {'zstd': unpack_zstd, 'lz4': unpack_lz4}
+UNPACK_BAG: dict[bytes, Callable[[bytes], bytes]] = {
+    b'none': bytes, b'bz2': unpack_bz2, b'lz4': unpack_lz4}
+
+
+def scan(path: Path, damage: Damage) -> Iterator[Record]:
+    """Yield all messages of a storage file; its first bytes tell its kind. Raises only OSError."""
+    with path.open('rb') as file:
+        magic = file.read(16)
+    if magic.startswith(b'\x89MCAP0\r\n'):
+        yield from scan_mcap(path, damage)
+    elif magic.startswith(b'SQLite format 3\0'):
+        yield from scan_db3(path, damage)
+    elif magic.startswith(b'#ROSBAG V2.0\n'):
+        yield from scan_bag(path, damage)
+    else:
+        damage(f'{path.name} does not start like a bag')
+
+
+def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
+    """Yield the messages of an MCAP file; a damaged chunk is left out, the next is tried."""
+    schemas: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
+    with path.open('rb') as file:
+        limit = path.stat().st_size
+        reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
+        for record in _mcap_records(reader, path.name, damage):
+            if isinstance(record, Schema):
+                schemas[record.id] = ros2_type(record.name)
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message) and record.channel_id in channels:
+                channel = channels[record.channel_id]
+                yield Record(channel.topic, schemas.get(channel.schema_id, ''), record.log_time,
+                             record.data, ros1=channel.message_encoding == 'ros1')
+
+
+def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[McapRecord]:
+    records = reader.records
+    while True:
+        # damaged lengths and texts come out as any of these: the library does not wrap them
+        try:
+            record = next(records, None)
+        except (McapError, struct.error, ValueError, MemoryError, OverflowError):
+            damage(f'{name} is cut off')
+            return
+        if record is None:
+            return
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        try:
+            unpack = UNPACK_MCAP.get(record.compression, bytes)
+            plain = replace(record, compression='', data=unpack(record.data))
+            inner = breakup_chunk(plain, validate_crc=True)
+        except Exception as error:  # also zstandard's and lz4's own errors
+            damage(f'{name} has a broken chunk ({one_line(error)})')
+            continue
+        yield from inner
+
+
+_ROWS = '''
+    SELECT topic_id, timestamp, data FROM messages
+    WHERE typeof(timestamp) = 'integer' AND typeof(data) = 'blob' ORDER BY id'''
+
+
+def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
+    """Yield the messages of an SQLite bag, by row."""
+    uri = f'file:{quote(str(path.absolute()))}?mode=ro&immutable=1'
+    database = sqlite3.connect(uri, uri=True)
+    try:
+        # else SQLite refuses a file that is shorter than its header says
+        database.execute('PRAGMA writable_schema = ON')
+        topics = {key: (name, kind) for key, name, kind in
+                  database.execute('SELECT id, name, type FROM topics')}
+        for topic, receive_ns, data in database.execute(_ROWS):
+            if topic in topics:
+                yield Record(*topics[topic], receive_ns, data)
+    except sqlite3.DatabaseError as error:
+        damage(f'{path.name}: {one_line(error)}')
+    finally:
+        database.close()
+
+
+def scan_bag(path: Path, damage: Damage) -> Iterator[Record]:
+    """Yield the messages of a ROS 1 bag."""
+    connections: dict[int, tuple[str, str]] = {}
+    with path.open('rb') as file:
+        file.readline()
+        try:
+            yield from _bag_messages(file, connections)
+        except (InputError, EOFError, struct.error, KeyError, ValueError, OSError, RuntimeError,
+                MemoryError) as error:
+            damage(f'{path.name} is cut off ({one_line(error)})')
+
+
+def _bag_messages(file: BinaryIO, connections: dict[int, tuple[str, str]]) -> Iterator[Record]:
+    while head := file.read(4):
+        fields = _bag_fields(_exactly(file, *struct.unpack('<I', head)))
+        size, = struct.unpack('<I', _exactly(file, 4))
+        kind = fields['op'][0]
+        data = file.read(size)
+        if kind == 5:
+            # a chunk that is cut off may have complete messages at its start
+            yield from _bag_messages(BytesIO(UNPACK_BAG[fields['compression']](data)), connections)
+        if len(data) < size:
+            raise EOFError(f'{size - len(data)} bytes are missing')
+        if kind == 7:
+            number, = struct.unpack('<I', fields['conn'])
+            connections[number] = (fields['topic'].decode(),
+                                   ros2_type(_bag_fields(data)['type'].decode()))
+        elif kind == 2:
+            number, seconds, nanoseconds = struct.unpack('<III', fields['conn'] + fields['time'])
+            yield Record(*connections[number], seconds * 10**9 + nanoseconds, data, ros1=True)
+
+
+def _bag_fields(data: bytes) -> dict[str, bytes]:
+    fields: dict[str, bytes] = {}
+    position = 0
+    while position < len(data):
+        size, = struct.unpack_from('<I', data, position)
+        name, _, value = data[position + 4:position + 4 + size].partition(b'=')
+        fields[name.decode()] = value
+        position += 4 + size
+    return fields
+
+
+def _exactly(file: BinaryIO, size: int) -> bytes:
+    data = file.read(size)
+    if len(data) < size:
+        raise EOFError(f'{size - len(data)} bytes are missing')
+    return data

@@ -1,0 +1,233 @@
+"""Image messages and image files -> images of 8 bits: grey, or as they are for people to look at.
+
+Works on anything with the fields of sensor_msgs/Image or sensor_msgs/CompressedImage: messages of
+rclpy and of rosbags alike. Needs neither ROS nor cv_bridge.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+import dashcalib_ros.input.quiet  # noqa: F401
+from dashcalib_ros.arrays import GreyImage, Pixels
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.header import encoded_size
+from dashcalib_ros.limits import check_pixels
+
+_DEPTHS = (8, 10, 12, 14, 16)
+_JPEG_START, _JPEG_END = b'\xff\xd8', b'\xff\xd9'
+_VIDEO_FORMATS = ('h264', 'h265', 'hevc', 'av1', 'vp9', 'theora')
+
+
+class BitDepth:
+    """How many bits of a stream's 16-bit images are used: one object per stream.
+
+    Cameras of 10, 12 or 14 bits fill only the lower bits of a 16-bit image, and nothing in the
+    message says so. The depth is the smallest of 8, 10, 12, 14, 16 that holds every value seen so
+    far. It never shrinks: the brightness changes at most four times in a drive, each time because
+    a pixel did not fit the old depth.
+    """
+
+    def __init__(self) -> None:
+        self.bits = _DEPTHS[0]
+
+    def to_8_bits(self, pixels: npt.NDArray[np.uint16]) -> GreyImage:
+        """Return the upper 8 bits in use, same shape."""
+        needed = int(pixels.max()).bit_length()
+        self.bits = max(self.bits, next(depth for depth in _DEPTHS if depth >= needed))
+        return (pixels >> (self.bits - 8)).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How an encoding stores a pixel.
+
+    channels, bits: of one pixel in a row of the message.
+    conversion: OpenCV's, with GRAY or BGR for its star. luma: the channel that is the grey value;
+    None: the conversion gives it.
+    planar: all pixels' brightness comes first, then their colours.
+    """
+
+    channels: int
+    bits: int = 8
+    conversion: str = ''
+    luma: int | None = 0
+    planar: bool = False
+
+
+_LAYOUTS = {
+    'mono8': _Layout(1), '8uc1': _Layout(1),
+    'mono16': _Layout(1, 16), '16uc1': _Layout(1, 16),
+    'bgr8': _Layout(3, 8, 'BGR2*', None), '8uc3': _Layout(3, 8, 'BGR2*', None),
+    'rgb8': _Layout(3, 8, 'RGB2*', None),
+    'bgra8': _Layout(4, 8, 'BGRA2*', None), '8uc4': _Layout(4, 8, 'BGRA2*', None),
+    'rgba8': _Layout(4, 8, 'RGBA2*', None),
+    'bgr16': _Layout(3, 16, 'BGR2*', None), '16uc3': _Layout(3, 16, 'BGR2*', None),
+    'rgb16': _Layout(3, 16, 'RGB2*', None),
+    'bgra16': _Layout(4, 16, 'BGRA2*', None), '16uc4': _Layout(4, 16, 'BGRA2*', None),
+    'rgba16': _Layout(4, 16, 'RGBA2*', None),
+    # ROS: yuv422 is U Y V Y, yuv422_yuy2 is Y U Y V; every second byte is a pixel's brightness
+    'yuv422': _Layout(2, 8, 'YUV2*_UYVY', 1), 'uyvy': _Layout(2, 8, 'YUV2*_UYVY', 1),
+    **{name: _Layout(2, 8, 'YUV2*_YUY2') for name in ('yuv422_yuy2', 'yuyv', 'yuy2')},
+    **{name: _Layout(1, 8, f'YUV2*_{name.upper()}', planar=True)
+       for name in ('nv12', 'nv21', 'i420')},
+    'nv24': _Layout(1, planar=True),  # OpenCV does not know its colours
+    # ROS and OpenCV name the colours of the first two rows so, from the corner on (OpenCV's older
+    # names, BayerBG for rggb, start one pixel further down the diagonal)
+    **{f'bayer_{name}{bits}': _Layout(1, bits, f'Bayer{name.upper()}2*', None)
+       for bits in (8, 16) for name in ('rggb', 'bggr', 'gbrg', 'grbg')},
+}
+
+
+def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) -> Pixels:
+    """Decode an Image or a CompressedImage message, whichever it is; see the two below."""
+    if hasattr(message, 'encoding'):
+        return decode_image(message, depth, colour)
+    return decode_compressed(message, depth, colour)
+
+
+def decode_image(message: Any, depth: BitDepth | None = None, colour: bool = False) -> Pixels:
+    """Decode a sensor_msgs/Image: (height, width) uint8, a copy.
+
+    message: has encoding, height, width, step, is_bigendian and data.
+    depth: the stream's bit depth, for 16-bit encodings; without it, only this image counts.
+    colour: (height, width, 3) BGR uint8, unless the image is grey.
+
+    Raises InputError for an unknown encoding, or a size that does not fit the data.
+    """
+    layout = _LAYOUTS.get(str(message.encoding).lower())
+    if layout is None:
+        raise InputError(f'encoding {message.encoding!r} is not supported: '
+                         f'publish mono8, bgr8, rgb8, yuv422 or a bayer encoding')
+    colour = colour and bool(layout.conversion)
+    pixels = _pixels(message, layout, colour)
+    if colour or layout.luma is None:
+        image = _convert(pixels, layout.conversion.replace('*', 'BGR' if colour else 'GRAY'))
+    else:
+        image = np.array(pixels[..., layout.luma], order='C')
+    return _to_8_bits(image, depth)
+
+
+def decode_compressed(message: Any, depth: BitDepth | None = None, colour: bool = False
+                      ) -> Pixels:
+    """Decode a sensor_msgs/CompressedImage: (height, width) uint8.
+
+    message: has format and data: a JPEG, PNG, TIFF, WebP, BMP, PGM or PPM.
+    depth, colour: as for decode_image.
+
+    Raises InputError for depth images, video streams, data that is cut off or damaged, and for
+    more pixels than limits allow.
+    """
+    return decode_file(memoryview(message.data), depth, _name(message), colour)
+
+
+def message_size(message: Any) -> tuple[int, int]:
+    """Return (width, height) of an Image or CompressedImage message, without decoding it.
+
+    Raises InputError where there is no size in it, or one beyond the limits.
+    """
+    if hasattr(message, 'encoding'):
+        width, height = int(message.width), int(message.height)
+        check_pixels(width, height)
+        return width, height
+    return _encoded_size(memoryview(message.data), _name(message))
+
+
+def _name(message: Any) -> str:
+    """Return a name for messages about a CompressedImage; raises InputError for other formats."""
+    name = ' '.join(str(message.format).split())
+    if 'compresseddepth' in name.lower():
+        raise InputError(f'format {name!r} is a depth image: choose the topic of a camera image')
+    if any(video in name.lower() for video in _VIDEO_FORMATS):
+        raise InputError(f'format {name!r} is a video stream: republish it as jpeg '
+                         f'(image_transport republish)')
+    return f'{name or "compressed"} image'
+
+
+def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
+                what: str = 'image', colour: bool = False) -> Pixels:
+    """Decode the bytes of an image file: (height, width) uint8; an EXIF orientation is applied.
+
+    colour: as for decode_image. Raises InputError as decode_pixels does.
+    """
+    return _to_8_bits(decode_pixels(data, what, colour), depth)
+
+
+def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = False) -> Pixels:
+    """Decode the bytes of an image file: (height, width) of 8 or 16 bits.
+
+    colour: as for decode_image. what: the image's name in errors. Raises InputError when the bytes
+    are cut off or no image, or have more pixels than limits allow.
+    """
+    _encoded_size(memoryview(data), what)  # check the size before memory is used
+    buffer = np.frombuffer(data, np.uint8)
+    head, tail = buffer[:2].tobytes(), buffer[-4096:].tobytes()
+    if head == _JPEG_START and _JPEG_END not in tail:
+        # OpenCV would fill the rest with grey
+        raise InputError(f'{what} is cut off: record or copy it again')
+    try:
+        image = cv2.imdecode(buffer, cv2.IMREAD_ANYDEPTH | (
+            cv2.IMREAD_ANYCOLOR if colour else cv2.IMREAD_GRAYSCALE))
+    except cv2.error:
+        image = None
+    if image is None:
+        raise _damaged(what, buffer.size)
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f'{what} has {image.dtype} pixels: save it with 8 or 16 bits')
+    return np.asarray(image)
+
+
+def _encoded_size(data: memoryview, what: str) -> tuple[int, int]:
+    size = encoded_size(data)
+    if size is None:
+        raise _damaged(what, len(data))
+    check_pixels(*size, what)
+    return size
+
+
+def _damaged(what: str, size: int) -> InputError:
+    return InputError(f'{what} is damaged or of an unknown kind ({size} bytes): record it again, '
+                      f'as jpeg or png')
+
+
+def _pixels(message: Any, layout: _Layout, colour: bool) -> Pixels:
+    """Return (height, width, channels), a view of the message where its bytes allow.
+
+    colour: of planar ones all the rows, those of the colours last.
+    """
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    data = np.frombuffer(message.data, np.uint8)
+    check_pixels(width, height)
+    row = width * layout.channels * layout.bits // 8
+    fits = data.size >= step * height if layout.planar else data.size == step * height
+    if step < row or not fits:
+        raise InputError(
+            f'an image says {width}x{height} {message.encoding} with step {step} but has '
+            f'{data.size} bytes: the camera driver or the recording is broken')
+    height = min(height * 3 // 2, data.size // step) if layout.planar and colour else height
+    rows = data[:step * height].reshape(height, step)[:, :row]
+    if layout.bits == 16:
+        kind = '>u2' if message.is_bigendian else '<u2'
+        rows = np.ascontiguousarray(rows).view(kind).astype(np.uint16)
+    return rows.reshape(height, width, layout.channels)
+
+
+def _convert(pixels: Pixels, conversion: str) -> Pixels:
+    plain = np.ascontiguousarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels)
+    if conversion == 'BGR2BGR':
+        return plain
+    try:
+        return np.asarray(cv2.cvtColor(plain, getattr(cv2, f'COLOR_{conversion}')))
+    except cv2.error as error:
+        raise InputError(f'an image of {plain.shape[1]}x{plain.shape[0]} cannot be converted: '
+                         f'publish mono8 or bgr8 ({error.err})') from error
+
+
+def _to_8_bits(image: Pixels, depth: BitDepth | None) -> Pixels:
+    if image.dtype == np.uint16:
+        return (depth or BitDepth()).to_8_bits(image)
+    return image

@@ -1,0 +1,286 @@
+"""The table of input kinds; open_frames() finds what its paths are.
+
+Nothing here loads OpenCV or rosbags before a drive is opened: `--help` stays quick.
+"""
+from __future__ import annotations
+
+import glob
+import math
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.bags.names import METADATA, is_bag_file
+from dashcalib_ros.input.source import IMAGE_SUFFIXES, FrameSource, by_name, os_error
+from dashcalib_ros.limits import check_file, irregular_entry
+
+# not whatever FFmpeg takes: it would play a text file
+VIDEO_SUFFIXES = frozenset(
+    ('.mp4', '.m4v', '.mov', '.avi', '.mkv', '.webm', '.ts', '.mts', '.m2ts', '.mpg', '.mpeg',
+     '.wmv', '.flv', '.3gp', '.ogv', '.mjpg', '.mjpeg', '.h264', '.264', '.h265', '.265', '.hevc'))
+
+# how makers name what one camera records, without the ending: t is the time or the number of a
+# recording, n of its part, c which camera of several it is; GX010001, GX020001, GX010002
+MAKERS = {maker: re.compile(name, re.IGNORECASE) for maker, name in (
+    ('GoPro names', r'G(?:OPR|[HXSP](?P<n>\d\d))(?P<t>\d{4})(?P<c>)'),
+    ('DJI names', r'DJI_(?P<t>(?:\d{14})?)_?(?P<n>\d{4})(?P<c>).*'),
+    ('Garmin names', r'GRMN(?P<t>)(?P<n>\d+)(?P<c>)'),
+    ('Viofo names', r'(?P<t>\d{4}_?\d{4}_?\d{6})_(?P<n>\d{3,6})P?(?P<c>[A-Z]?)'),
+    ('BlackVue names', r'(?P<t>\d{8}_\d{6})(?P<n>)_[A-Z](?P<c>[A-Z])[LS]?'),
+    ('Insta360 names', r'(?:PRO_)?VID_(?P<t>\d{8}_\d{6})_(?P<c>\d\d)_(?P<n>\d+)(?:_\d+)?'))}
+# names of files in a message; of more only the first and the last are told
+TOLD = 12
+
+
+Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
+
+def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
+                start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
+    """Open a drive; its path tells the kind of input.
+
+    path: a ROS 2 bag (folder, .mcap, .db3, zstd or not), a ROS 1 .bag, a video file, or a folder
+    of images, which are taken in the order of their names (2.png before 10.png). Also several of
+    these, of one camera: a sequence, taken in its order; a folder of videos or bags, or a pattern
+    (drives/*.mp4): in the order that the camera's maker gives their names, else of the times at
+    which they were recorded, else of their names; a warning says which. No turn spans two of them
+    unless they go on; one that cannot be read is left out, with a warning.
+    topic: the image topic of a bag; needed only when it has several.
+    fps: images per second of a folder (default 10), or instead of what a video says (Hz).
+    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
+
+    Raises InputError when there is nothing to read, or several topics and no choice among them.
+    """
+    _check_numbers(fps, start_s, duration_s)
+    given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
+    groups = [_expanded(os.fspath(each)) for each in given]
+    if not groups:
+        raise InputError('no input was given: name a bag, a video or a folder of images')
+    if len(groups) == 1 and len(groups[0].paths) == 1:
+        source = _open_one(groups[0].paths[0], topic, fps)
+    else:
+        source = _joined(groups, topic, fps)
+    return source if not start_s and duration_s is None else source.excerpt(start_s, duration_s)
+
+
+def _check_numbers(fps: float | None, start_s: float, duration_s: float | None) -> None:
+    if fps is not None and not (math.isfinite(fps) and 0 < fps <= 1000):
+        raise InputError(f'fps must be above 0 and at most 1000, not {fps!r}')
+    if not (math.isfinite(start_s) and start_s >= 0):
+        raise InputError(f'the start must be 0 s or later, not {start_s!r}')
+    if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
+        raise InputError(f'the duration must be above 0 s, not {duration_s!r}')
+
+
+@dataclass(frozen=True)
+class _Group:
+    """The recordings that one argument names, by name. where: the argument."""
+
+    where: str
+    paths: tuple[Path, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def _expanded(text: str) -> _Group:
+    """Return the recordings that an argument names: itself, those in a folder, or a pattern's."""
+    _check_recorded(text)
+    path = Path(text)
+    try:
+        if path.is_dir():
+            return _in_folder(path)
+    except OSError as error:
+        raise InputError(os_error(path, error)) from error
+    if path.exists() or not glob.has_magic(text):
+        return _Group(text, (path,))
+    found = sorted(named_like(text), key=lambda each: by_name(str(each)))
+    known = tuple(each for each in found if _kind_of(each) is not None)
+    if not known:
+        raise InputError(_unknown(found[0]) if found else
+                         f'no file is named like {text}: check the pattern')
+    return _Group(text, known, _left_out(text, len(found) - len(known)))
+
+
+def named_like(pattern: str) -> Iterator[Path]:
+    """Yield what a pattern names, nothing hidden. ** follows no links: some lead upwards."""
+    path = Path(pattern)
+    try:
+        for found in Path(path.anchor or '.').glob(str(path.relative_to(path.anchor))):
+            if not any(map(_is_hidden, found.parts)) or any(map(_is_hidden, path.parts)):
+                yield found
+    except ValueError as error:
+        raise InputError(f'{pattern} is no pattern ({error})') from error
+
+
+def _is_hidden(part: str) -> bool:
+    return part.startswith('.') and part not in ('.', '..')
+
+
+def _in_folder(folder: Path) -> _Group:
+    """Return a bag or a folder of images itself, or else the videos and bags that are in it."""
+    if fits_bag(folder):
+        return _Group(str(folder), (folder,))
+    entries = sorted(folder.iterdir(), key=lambda each: by_name(each.name))
+    found = tuple(each for each in entries if not each.name.startswith('.')
+                  and (_is_video(each) or (each.is_dir() and fits_bag(each))))
+    images = sum(each.suffix.lower() in IMAGE_SUFFIXES for each in entries)
+    # cameras leave thumbnails beside their videos
+    if not found or images > len(found):
+        return _Group(str(folder), (folder,))
+    return _Group(str(folder), found, _left_out(str(folder), images))
+
+
+def _left_out(where: str, count: int) -> tuple[str, ...]:
+    return (f'{where}: left out {count} other file{"s" * (count > 1)}',) if count else ()
+
+
+def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> FrameSource:
+    """Open all recordings of all groups as one drive; those that cannot be read are left out."""
+    from dashcalib_ros.input.joined import JoinedSource
+    parts: list[FrameSource] = []
+    warnings = [line for group in groups for line in group.warnings]
+    failures: list[str] = []
+    for group in groups:
+        opened = []
+        for path in group.paths:
+            try:
+                opened.append(_open_one(path, topic, fps))
+            except InputError as error:
+                failures.append(str(error))
+        if len(opened) > 1:
+            opened, by = _ordered(opened)
+            if len(cameras := {camera for *_, camera in map(_numbered, opened)}) > 1:
+                raise InputError(f'{group.where} has recordings of {len(cameras)} cameras '
+                                 f'({_listed(opened)}): give a pattern that names one')
+            warnings.append(f'{group.where}: {len(opened)} files by {by}: {_listed(opened)}')
+        parts += opened
+    if len(parts) == len(groups):
+        ordered, by = _ordered(parts)
+        if by in MAKERS and ordered != parts:
+            warnings.append(f'the files are taken in the order in which they were given; by {by} '
+                            f'it is {_listed(ordered)}: give their folder for that')
+    if not parts:
+        more = f' (and {len(failures) - 1} more like it)' if len(failures) > 1 else ''
+        raise InputError(f'none of the files can be read: {failures[0]}{more}')
+    return JoinedSource(parts, (*warnings, *(f'one of the files is left out: {each}'
+                                             for each in failures)))
+
+
+def _ordered(sources: list[FrameSource]) -> tuple[list[FrameSource], str]:
+    """Return recordings, which come by name, in their order, and what tells it."""
+    maker, *others = {_numbered(source)[0] for source in sources}
+    if maker and not others:
+        return sorted(sources, key=_numbered), maker
+    begins = {source.name: source.begin_ns or 0 for source in sources}
+    if 0 not in begins.values() and len(set(begins.values())) == len(sources):
+        return sorted(sources, key=lambda each: begins[each.name]), 'the time of recording'
+    return sources, 'name'
+
+
+def _numbered(source: FrameSource) -> tuple[str, str, int, str]:
+    """Return the maker by whose rule a recording is named, and its t, n and c."""
+    for maker, name in MAKERS.items():
+        if found := name.fullmatch(Path(source.name).stem):
+            return (maker, found['t'].replace('_', ''), int(found['n'] or 0), found['c'].upper())
+    return '', '', 0, ''
+
+
+def _listed(sources: Sequence[FrameSource]) -> str:
+    names = [Path(source.name).name for source in sources]
+    return ', '.join(names if len(names) <= TOLD else [*names[:TOLD - 2], '...', names[-1]])
+
+
+def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
+    try:
+        if not place.is_dir():
+            _check_readable(place)
+        kind = _kind_of(place)
+        if kind is None:
+            raise InputError(_unknown(place))
+        return kind.open(place, topic, fps)
+    except OSError as error:
+        raise InputError(os_error(place, error)) from error
+
+
+@dataclass(frozen=True)
+class InputKind:
+    """A kind of input: fits() decides by the path, open() returns the images.
+
+    open: takes the path, the topic and the rate, as open_frames() does; loads its libraries.
+    """
+
+    name: str
+    fits: Callable[[Path], bool]
+    open: Callable[[Path, str | None, float | None], FrameSource]
+
+
+def fits_bag(path: Path) -> bool:
+    """Return whether a path is a bag, by its name or by what is in the folder."""
+    if path.is_dir():
+        return any(entry.name == METADATA
+                   or (is_bag_file(entry.name) and not irregular_entry(entry))
+                   for entry in path.iterdir())
+    return is_bag_file(path.name)
+
+
+def _open_bag(path: Path, topic: str | None, fps: float | None) -> FrameSource:
+    from dashcalib_ros.input.bags.source import BagSource
+    return BagSource(path, topic, fps)
+
+
+def _open_video(path: Path, topic: str | None, fps: float | None) -> FrameSource:
+    from dashcalib_ros.input.video import VideoSource
+    return VideoSource(path, topic, fps)
+
+
+def _open_folder(path: Path, topic: str | None, fps: float | None) -> FrameSource:
+    from dashcalib_ros.input.folder import FolderSource
+    return FolderSource(path, topic, fps)
+
+
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
+
+
+#: the first that fits is taken: a folder with a bag in it is no folder of images
+KINDS = (
+    InputKind('bag', fits_bag, _open_bag),
+    InputKind('video', _is_video, _open_video),
+    InputKind('folder of images', Path.is_dir, _open_folder),
+)
+
+
+def _kind_of(path: Path) -> InputKind | None:
+    return next((kind for kind in KINDS if kind.fits(path)), None)
+
+
+def _check_recorded(text: str) -> None:
+    """Raise InputError for a live stream: a drive is read from its beginning to its end."""
+    if re.match(r'[a-z][a-z0-9+.-]+://', text, re.IGNORECASE):
+        raise InputError(
+            f'{text} is a stream: record it first (ffmpeg -i {text} -c copy -t 900 drive.mp4) and '
+            f'give that file, or publish it in ROS and run the node (ros2 run dashcalib_ros '
+            f'calibrator)')
+    if re.match(r'/dev/video\d', text):
+        raise InputError(
+            f'{text} is a live camera: record it first (ffmpeg -f v4l2 -i {text} -t 900 '
+            f'drive.mp4) and give that file, or run v4l2_camera and the node (ros2 run '
+            f'dashcalib_ros calibrator)')
+
+
+def _check_readable(path: Path) -> None:
+    """Raise InputError or OSError for a file that no reader can open, with our own message."""
+    check_file(path)
+    if path.stat().st_size == 0:
+        raise InputError(f'{path} is empty: the recording or the copy failed; make it again')
+    with path.open('rb'):
+        pass
+
+
+def _unknown(path: Path) -> str:
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        return f'{path} is a single image: give the folder of all images of the drive'
+    return (f'{path} is no kind of drive known here: give a bag (.mcap, .db3, .bag), '
+            f'a video (.mp4, .avi, .mkv ...) or a folder of images')

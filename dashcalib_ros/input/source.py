@@ -1,0 +1,222 @@
+"""What every kind of input has in common."""
+from __future__ import annotations
+
+import copy
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dashcalib_ros.arrays import Pixels
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.frame import Frame
+
+IMAGE_SUFFIXES = frozenset(
+    ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'))
+
+# images are further apart; stamps are rounded
+CLOSE_NS = 1_000_000
+
+
+def by_name(name: str) -> tuple[list[tuple[int, str]], str]:
+    """Return a sort key for names in which numbers count as numbers: 2.png before 10.png."""
+    parts = re.findall(r'[0-9]+|[^0-9]+', name)
+    return [(int(part), '') if part[0] in '0123456789' else (-1, part) for part in parts], name
+
+
+def os_error(path: Path, error: OSError) -> str:
+    """Return a message for an input that cannot be read, with the cure."""
+    if isinstance(error, FileNotFoundError):
+        return f'{path} does not exist: check the path'
+    if isinstance(error, PermissionError):
+        where = error.filename or path
+        return f'{where} may not be read: change its permissions (chmod a+rX) or its owner'
+    return f'{path} cannot be read ({error.strerror}): check the disk or copy it again'
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One image of the drive that is not decoded yet; index, stamp_ns and others as a Frame's.
+
+    decode: returns the image, grey; with colour=True (h, w, 3) BGR where it has colours. Raises
+    InputError where that is not possible. file: that it is in, where the drive has several.
+    """
+
+    index: int
+    stamp_ns: int
+    decode: Callable[..., Pixels]
+    frame_id: str = ''
+    after_gap: bool = False
+    perhaps_after_gap: bool = False
+    file: str = ''
+
+
+@dataclass
+class Reading:
+    """What happened in one pass over the images.
+
+    images: how many there were, also those that are no frames; complete after the last one.
+    """
+
+    warnings: list[str] = field(default_factory=list)
+    images: int = 0
+    decoded: int = 0
+    undecodable: int = 0
+    first_failure: str = ''
+
+    def failed(self, index: int, error: InputError, file: str = '') -> None:
+        """Count an image that cannot be decoded."""
+        self.undecodable += 1
+        where = f'{file}: image {index}' if file else f'image {index}'
+        self.first_failure = self.first_failure or f'{where}: {error}'
+
+    def summary(self) -> tuple[str, ...]:
+        """Return all warnings, one line each."""
+        skipped = ([f'{self.undecodable} undecodable images were skipped ({self.first_failure})']
+                   if self.undecodable else [])
+        return (*self.warnings, *skipped)
+
+
+class FrameSource(ABC):
+    """The images of one drive: iterate over it, as often as you like, to get each Frame in turn.
+
+    name: of the drive, for messages.
+    count: how many images to expect (for a progress bar), None if unknown.
+    topic: the bag's image topic; None for videos and folders.
+    size: (width, height) where it is known before the first image, else None.
+    length_ns: how long the drive is where its stamps are counted from 0, else None.
+    recorded: its stamps are times of recording, as a bag has them. begin_ns: when it began, None
+    where that is not known.
+    warnings: what the user should know about the input; complete after the last frame.
+    contradictions: those of them that may be why a drive teaches too little, with the cure.
+
+    Frames are read one by one; no memory grows with the drive. Their stamps always increase.
+    Frame.index counts all images of the input, also those that were skipped.
+    Iterating raises InputError when no image can be decoded or when their size changes.
+    """
+
+    size: tuple[int, int] | None = None
+    length_ns: int | None = None
+    recorded = False
+    contradictions: tuple[str, ...] = ()
+    _cure = 'check that it plays in another program, or record it again'
+    _start_ns = 0
+    _duration_ns: int | None = None
+
+    def __init__(self, name: str, count: int | None, topic: str | None = None,
+                 warnings: tuple[str, ...] = ()) -> None:
+        self.name = name
+        self.count = self._promised = count
+        self.topic = topic
+        self._opening_warnings = warnings
+        self._reading_warnings: tuple[str, ...] = ()
+
+    @property
+    def begin_ns(self) -> int | None:
+        """Return when the recording began, None where that is not known."""
+        return None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what the user should know, one line each; complete after the last frame."""
+        return self.contradictions + self._opening_warnings + self._reading_warnings
+
+    def excerpt(self, start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
+        """Return the part of the drive from start_s on, duration_s long; None: to its end."""
+        part = copy.copy(self)
+        part._start_ns = round(start_s * 1e9)
+        part._duration_ns = None if duration_s is None else round(duration_s * 1e9)
+        if self.count and self.length_ns:
+            left = max(0, self.length_ns - part._start_ns)
+            used = left if part._duration_ns is None else min(left, part._duration_ns)
+            part.count = round(self.count * used / self.length_ns) or None
+        else:
+            part.count = None
+        return part
+
+    def __iter__(self) -> Iterator[Frame]:
+        reading = Reading()
+        try:
+            yield from self._frames(reading)
+        except OSError as error:
+            raise InputError(os_error(Path(self.name), error)) from error
+        finally:
+            self._reading_warnings = reading.summary()
+
+    def in_colour(self, stamps_ns: Mapping[int, int]) -> dict[int, Pixels]:
+        """Return images by their index, read again: (h, w, 3) BGR uint8, (h, w) of grey ones.
+
+        stamps_ns: theirs, by index. What cannot be read again is left out.
+        """
+        found: dict[int, Pixels] = {}
+        wanted = sorted(stamps_ns)
+        # where stamps are counted from 0, the way to an image is short
+        starts = ([(stamps_ns[index] - CLOSE_NS, index) for index in wanted]
+                  if self.length_ns is not None else [(0, index) for index in wanted[-1:]])
+        for start_ns, last in starts:
+            with suppress(InputError, OSError), closing(
+                    self._pictures(Reading(), max(0, start_ns))) as pictures:
+                for picture in pictures:
+                    if picture.index in stamps_ns:
+                        found[picture.index] = picture.decode(colour=True)
+                    if picture.index >= last:
+                        break
+        return found
+
+    def _frames(self, reading: Reading) -> Iterator[Frame]:
+        size: tuple[int, int] | None = None
+        after_gap = perhaps = False
+        with closing(self._excerpted(reading)) as pictures:
+            for picture in pictures:
+                after_gap |= picture.after_gap
+                perhaps |= picture.perhaps_after_gap
+                try:
+                    image = picture.decode()
+                except InputError as error:
+                    reading.failed(picture.index, error, picture.file)
+                    continue
+                frame = Frame(picture.index, picture.stamp_ns, image, picture.frame_id, after_gap,
+                              perhaps)
+                size = size or frame.size
+                if frame.size != size:
+                    raise InputError(
+                        f'{picture.file or self.name}: image {frame.index} is {_by(frame.size)}, '
+                        f'those before are {_by(size)}: a calibration holds for one size; '
+                        f'split the drive there')
+                reading.decoded += 1
+                after_gap = perhaps = False
+                yield frame
+        if not reading.decoded:
+            raise InputError(self._no_image(reading))
+
+    def _excerpted(self, reading: Reading) -> Generator[Picture, None, None]:
+        """Yield the pictures from the excerpt's start to its end."""
+        first_ns: int | None = None
+        with closing(self._pictures(reading, self._start_ns)) as pictures:
+            for picture in pictures:
+                first_ns = picture.stamp_ns if first_ns is None else first_ns
+                passed = picture.stamp_ns - first_ns
+                if self._duration_ns is not None and passed >= self._duration_ns:
+                    return
+                yield picture
+
+    def _no_image(self, reading: Reading) -> str:
+        if self._start_ns and not reading.undecodable and not reading.warnings:
+            return (f'{self.name} has no image from {self._start_ns / 1e9:g} s on: '
+                    f'give a smaller --start')
+        reasons = [reading.first_failure] if reading.first_failure else reading.warnings
+        why = '; '.join(reasons) or 'it has none'
+        return f'{self.name} gave no image ({why}): {self._cure}'
+
+    @abstractmethod
+    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
+        """Yield every image once, in order; add warnings and the number of images to reading.
+
+        start_ns: what is earlier, counted from the drive's first image, is left out.
+        """
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f'{size[0]}x{size[1]}'

@@ -1,0 +1,230 @@
+"""A video file as a drive."""
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from av.container import InputContainer
+from av.video.reformatter import ColorRange, VideoReformatter
+
+from dashcalib_ros.arrays import Pixels
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.source import FrameSource, Picture, Reading
+from dashcalib_ros.input.stamps import RECORDED, SECOND_NS, StampGate
+from dashcalib_ros.limits import check_pixels
+
+# FFmpeg's names; it would also play text, and scripts that name other files
+FORMATS = 'mov,matroska,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,mjpeg,h264,hevc,m4v'
+# FFmpeg's flag of files that have no clock: the times that it gives are made up
+NO_TIMES = 0x80
+# what follows the decoder is slower than four of its threads; each holds pictures
+THREADS = min(4, os.cpu_count() or 1)
+# pictures at the beginning whose times tell the rate; one of them can be decoded
+LOOKED_AT = 100
+# of the rate that the video says, by which --fps may be off
+ALIKE = 0.02
+# of the pictures that a video promises, by its length and its rate or by their number
+COMPLETE = 0.9, 0.99
+
+# luma of television's range, 16 to 235 -> 0 to 255
+FULL = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
+
+
+class VideoSource(FrameSource):
+    """The pictures of a video file, as a player shows them: turned as its metadata says.
+
+    Stamps are the pictures' own times, counted from the first one; with fps they are index / fps.
+    Raises InputError for a file that is no video, and without fps for one that knows no times.
+    """
+
+    def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:
+        self._path, self._fps = path, fps
+        warnings = [f'{path} is a video: topic {topic} is ignored'] if topic is not None else []
+        with _opened(path) as (container, stream):
+            timed = not container.format.flags & NO_TIMES
+            if not (fps or timed):
+                raise InputError(f'{path} does not say when its pictures were taken: give their '
+                                 f'rate with --fps')
+            first, times = None, []
+            for packet in islice(_packets(container, stream), LOOKED_AT):
+                times.append(_time_ns(packet))
+                first = first or next(filter(None, _decoded(packet)), None)
+            if first is None:
+                raise _unplayable(path)
+            turn = -first.rotation % 360
+            self.size = ((first.height, first.width) if turn % 180 else
+                         (first.width, first.height))
+            self._first_ns = _time_ns(first) or 0
+            rate = _rate([time for time in times if time is not None]) if timed else 0.0
+            length_s = _length_s(container, stream) if timed else 0.0
+            count = stream.frames or round(length_s * rate) or None
+            self._complete = COMPLETE[bool(stream.frames)]
+            self._created = container.metadata.get('creation_time', '')
+        if turn:
+            warnings.append(f'{path} says to turn its pictures by {turn} degrees: '
+                            f'the calibration is for the turned pictures')
+        super().__init__(str(path), count, warnings=tuple(warnings))
+        if fps and rate and abs(fps / rate - 1) > ALIKE:
+            self.contradictions = (
+                f'{path} says {rate:.4g} images per second, and --fps {fps:g} replaces its times: '
+                f'leave --fps away unless you know that they are wrong',)
+        self.length_ns = round(((count or 0) / fps if fps else length_s) * 1e9) or None
+
+    @property
+    def begin_ns(self) -> int | None:
+        """Return when the file says that it was recorded, None where it does not."""
+        try:
+            created = datetime.fromisoformat(self._created.replace('Z', '+00:00'))
+        except ValueError:
+            return None
+        # a camera whose clock was never set begins in 1904, 1970 or 2000
+        return None if created.year <= 2000 else round(created.timestamp()) * SECOND_NS
+
+    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
+        gate, picture = StampGate(RECORDED), _Picture()
+        read, index = self._before(start_ns) if start_ns else (0, 0)
+        reading.images = index
+        with _opened(self._path) as (container, stream):
+            for packet in islice(_packets(container, stream), read, None):
+                read += packet.size > 0  # the last one has nothing in it
+                for frame in _decoded(packet):
+                    stamp_ns = self._stamp_ns(_time_ns(frame), index) if frame else None
+                    index += 1
+                    reading.images = index
+                    if frame is None or stamp_ns is None:
+                        reading.failed(index - 1, _undecodable())
+                        continue
+                    # later by a second, as the gate takes 0 for no stamp
+                    stamp_ns = gate.take(stamp_ns + SECOND_NS, 0)
+                    if stamp_ns is not None and stamp_ns - SECOND_NS >= start_ns:
+                        yield Picture(index - 1, stamp_ns - SECOND_NS, partial(picture, frame))
+        reading.warnings += gate.warnings()
+        promised = self._promised or 0
+        if read < self._complete * promised - 1:
+            reading.warnings.append(f'the video is cut off or damaged: read {read} of {promised} '
+                                    f'images; {promised - read} are lost')
+
+    def _stamp_ns(self, time_ns: int | None, index: int) -> int | None:
+        if self._fps:
+            return round(index * 1e9 / self._fps)
+        return None if time_ns is None else time_ns - self._first_ns
+
+    def _before(self, start_ns: int) -> tuple[int, int]:
+        """Return how many packets, and how many pictures, may be skipped: nothing is decoded.
+
+        They end at a picture that needs none before it. A seek would not tell the index.
+        """
+        skipped = index = shown = 0
+        key_ns = 0
+        with _opened(self._path) as (container, stream):
+            for place, packet in enumerate(_packets(container, stream)):
+                time_ns = _time_ns(packet)
+                if time_ns is None or packet.is_discard:
+                    continue
+                if packet.is_keyframe:
+                    if (self._stamp_ns(time_ns, shown) or 0) > start_ns:
+                        break
+                    skipped, index, key_ns = place, shown, time_ns
+                elif time_ns < key_ns:
+                    index += 1  # it comes after the key picture, and is shown before it
+                shown += 1
+        return skipped, index
+
+
+class _Picture:
+    """Frame -> picture, as a player shows it; BGR where colour is asked for. Raises InputError."""
+
+    def __init__(self) -> None:
+        self._reformatter = VideoReformatter()
+
+    def __call__(self, frame: av.VideoFrame, colour: bool = False) -> Pixels:
+        check_pixels(frame.width, frame.height)
+        kind = frame.format
+        image: Pixels
+        try:
+            if colour:
+                image = self._reformatter.reformat(frame, format='bgr24', threads=1).to_ndarray()
+            elif kind.is_planar and not kind.is_rgb and kind.components[0].bits == 8:
+                # quicker, to the same values
+                luma = frame.planes[0]
+                rows = np.frombuffer(memoryview(luma), np.uint8).reshape(-1, luma.line_size)
+                image = rows[:frame.height, :frame.width]
+                full = frame.color_range == ColorRange.JPEG
+                image = image.copy() if full else cv2.LUT(image, FULL)
+            else:
+                # one thread: by default each frame has as many as the machine has cores
+                image = self._reformatter.reformat(frame, format='gray', threads=1).to_ndarray()
+        except (av.FFmpegError, ValueError) as error:
+            raise _undecodable() from error
+        return np.ascontiguousarray(np.rot90(image, frame.rotation // 90), np.uint8)
+
+
+def _packets(container: InputContainer, stream: av.VideoStream
+             ) -> Iterator[av.Packet[av.VideoStream]]:
+    """Yield the coded pictures up to where the file is damaged, and an empty packet at its end."""
+    with suppress(av.FFmpegError):
+        yield from container.demux(stream)
+
+
+def _decoded(packet: av.Packet[av.VideoStream]) -> Sequence[av.VideoFrame | None]:
+    """Return the pictures that a packet completes; None is one that cannot be decoded."""
+    try:
+        return packet.decode()
+    except av.FFmpegError:
+        return [None]
+
+
+def _time_ns(of: av.VideoFrame | av.Packet[av.VideoStream]) -> int | None:
+    """Return when a picture is shown on the file's clock."""
+    time = of.pts if of.pts is not None else of.dts
+    return round(time * of.time_base * SECOND_NS) if time is not None and of.time_base else None
+
+
+def _rate(times_ns: Sequence[int]) -> float:
+    """Return the mean rate of pictures at these times, Hz; 0 where it is not known."""
+    span_ns = max(times_ns, default=0) - min(times_ns, default=0)
+    return (len(times_ns) - 1) * 1e9 / span_ns if span_ns else 0.0
+
+
+def _length_s(container: InputContainer, stream: av.VideoStream) -> float:
+    if stream.duration and stream.time_base:
+        return float(stream.duration * stream.time_base)
+    # a Matroska file's is counted from 0, wherever its first picture is
+    return max(0, (container.duration or 0) - max(0, container.start_time or 0)) / av.time_base
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[InputContainer, av.VideoStream]]:
+    try:
+        container = av.open(f'file:{path}', options={'format_whitelist': FORMATS})
+    except (av.FFmpegError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.EACCES):
+            raise
+        raise _unplayable(path) from error
+    with container:
+        stream = container.streams.best('video')
+        if not isinstance(stream, av.VideoStream):
+            raise _unplayable(path)
+        stream.codec_context.thread_type = 'AUTO'
+        stream.codec_context.thread_count = THREADS
+        check_pixels(stream.codec_context.width, stream.codec_context.height, str(path))
+        yield container, stream
+
+
+def _unplayable(path: Path) -> InputError:
+    return InputError(f'{path} is no video that can be played, or it is cut off: copy it again, '
+                      f'or convert it (ffmpeg -i IN -c:v libx264 OUT.mp4)')
+
+
+def _undecodable() -> InputError:
+    return InputError('the picture cannot be decoded: convert the video '
+                      '(ffmpeg -i IN -c:v libx264 OUT.mp4)')

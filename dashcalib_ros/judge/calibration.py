@@ -1,0 +1,364 @@
+"""The result of a calibration: a camera, a sigma for each parameter, a verdict with reasons."""
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from dataclasses import field as default
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera import FISHEYE, Camera
+from dashcalib_ros.camera.field import Field
+from dashcalib_ros.camera.mapping import sensitivity
+from dashcalib_ros.config import Config
+from dashcalib_ros.detect import Bend
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.reconstruct.picture import TurnPicture
+from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.solve.opinions import HeldOut
+from dashcalib_ros.solve.picture import PictureSigma, sigma_over
+from dashcalib_ros.solve.solution import Solution
+
+UNKNOWN_COVARIANCE = ('this calibration does not know how its parameters are correlated: '
+                      'calibrate the drive again')
+# after the point, in one line of text
+MOST_DIGITS = 9
+Level = Literal['accepted', 'weak', 'refused']
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """accepted: use it. weak: look at the sigmas before using it. refused: there is no result.
+
+    reasons: one line each, what is wrong: what to do. cures: what to do, the gravest first.
+    """
+
+    level: Level
+    reasons: tuple[str, ...] = ()
+    cures: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class TurnSummary:
+    """How one turn was used. center, first, last count the input's frames from 0.
+
+    misfit: its cost with the shared camera, divided by that with its own: about 1, or less.
+    unused_because: why it is not used, in words.
+    """
+
+    center: int
+    first: int
+    last: int
+    stamp_s: float
+    prominence: float
+    images: int
+    registered: int
+    used: bool
+    yaw_deg: float | None = None
+    reprojection_error_px: float | None = None
+    misfit: float | None = None
+    unused_because: str | None = None
+
+    @property
+    def id(self) -> TurnId:
+        """Return the turn's identity."""
+        return TurnId.at(self.center)
+
+
+@dataclass(frozen=True)
+class StoredTurnSummary:
+    """How a turn of an earlier drive was used. misfit: as for TurnSummary."""
+
+    id: TurnId
+    stamp_s: float
+    prominence: float
+    yaw_deg: float
+    images: int
+    used: bool
+    misfit: float | None = None
+    unused_because: str | None = None
+    reprojection_error_px: float | None = None
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """A rolling shutter: ms from the first row to the last, and its standard deviation."""
+
+    readout_ms: float
+    sigma_ms: float
+
+
+@dataclass(frozen=True)
+class Stabiliser:
+    """A stabilised video, its movement taken out. largest_px: how far its crop moved."""
+
+    largest_px: float
+
+
+@dataclass(frozen=True)
+class LensField:
+    """The smooth displacements over the picture that no lens model has, as of a windscreen.
+
+    field: zero where it is not used. used: whether turns that did not make it are predicted better
+    with it; where not, it is in the sigmas only. sigma_px: how far rays with the camera and the
+    field may be off over the picture, RMS.
+    """
+
+    field: Field
+    used: bool
+    rms_px: float
+    worst_px: float
+    sigma_px: float
+
+
+@dataclass(frozen=True)
+class Material:
+    """What the report draws. px: of the input, in one pixel of the scenes.
+
+    scenes: of all turns that were reconstructed, adjusted where the solution uses them. pictures:
+    of turns of this drive.
+    """
+
+    px: float = 1.0
+    solution: Solution | None = None
+    scenes: Mapping[TurnId, Scene] = default(default_factory=dict)
+    pictures: Mapping[TurnId, TurnPicture] = default(default_factory=dict)
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """Return a value and its sigma, both to the second digit of the sigma."""
+    if not (math.isfinite(sigma) and sigma > 0):
+        return f'{value:.6g}'
+    digits = min(max(1 - math.floor(math.log10(sigma)), 0), MOST_DIGITS)
+    return f'{value:.{digits}f} ± {sigma:.{digits}f}'
+
+
+@dataclass(frozen=True, repr=False)
+class Calibration:
+    """The complete result. camera and sigma are None when the verdict is refused.
+
+    camera: of the full-size images. sigma: by the parameters' names.
+    turns: of this drive; stored_turns: of earlier ones, see config turns.store.
+    timing: seconds, keys detect, calibrate, total. versions: package name -> version.
+    magnitudes: (n, 2) float64, columns stamp [s] and filtered turning magnitude [of the width].
+    mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
+    rolling_shutter: the one that was found, and whose effect was removed; None for a global one.
+    stabiliser: the one that was found, and whose effect was removed; None for a fixed picture.
+    field: what the camera leaves over; None: nothing speaks for one. camera is the best without.
+    sigma_px: how far the whole camera may be off over the picture. held_out: what each turn says
+    of the calibration without it, in the full-size images' pixels; () for fewer than three turns.
+    straight_lines: what upright lines of the world say of the distortion; None: too few of them.
+    start_s: stamp of the first image. material: what the report draws, None in a live drive.
+    """
+
+    verdict: Verdict
+    image_size: tuple[int, int]
+    camera: Camera | None
+    sigma: Mapping[str, float] | None
+    turns: tuple[TurnSummary, ...]
+    frames: int
+    reprojection_error_px: float | None
+    timing: dict[str, float]
+    versions: dict[str, str]
+    config: Config
+    input_name: str = ''
+    warnings: tuple[str, ...] = ()
+    magnitudes: Floats | None = None
+    mask: Mask | None = None
+    details: dict[str, Any] = default(default_factory=dict)
+    stored_turns: tuple[StoredTurnSummary, ...] = ()
+    rolling_shutter: Shutter | None = None
+    sigma_px: PictureSigma | None = None
+    stabiliser: Stabiliser | None = None
+    field: LensField | None = None
+    held_out: tuple[HeldOut, ...] = ()
+    straight_lines: Bend | None = None
+    start_s: float = 0.0
+    material: Material | None = default(default=None, compare=False)
+
+    def __repr__(self) -> str:
+        """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
+        if self.camera is None:
+            return f'Calibration({self.verdict.level}: {"; ".join(self.verdict.reasons[:1])})'
+        sigma = self.sigma or {}
+        found = [f'{name} {_with_sigma(value, sigma.get(name, math.nan))}'
+                 for name, value in self.camera.named.items()]
+        text = f'{self.verdict.level}, {self.camera.model}, {", ".join(found)}'
+        return f'Calibration({"; ".join(part for part in (text, self.caveat) if part)})'
+
+    @property
+    def caveat(self) -> str:
+        """Return what must stand wherever the numbers stand; '' where nothing must."""
+        lone = self.camera is not None and self.turns_used == 1
+        return 'from one turn alone, which nothing confirms' if lone else ''
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Calibration:
+        """Read what save() and `dashcalib run` write: a result.json, its folder, calibration.yaml.
+
+        A result.json has everything but the mask, the turning magnitudes and what the report
+        draws; a calibration.yaml has camera, sigma, verdict and versions. Settings that this
+        version does not know are left out. Raises InputError; load_camera() reads other files.
+        """
+        loaded: Calibration = import_module('dashcalib_ros.report').load_calibration(path)
+        return loaded
+
+    @property
+    def K(self) -> Floats:  # noqa: N802, the field's name for it
+        """Return the camera matrix (3, 3). Raises InputError where there is no camera."""
+        return self._camera.matrix
+
+    @property
+    def D(self) -> Floats:  # noqa: N802
+        """Return OpenCV's distortion coefficients, (5,), of a fisheye (4,). Raises InputError.
+
+        Those of a fisheye are for cv2.fisheye.
+        """
+        return np.array(self._camera.ros_distortion())
+
+    @property
+    def covariance(self) -> Floats:
+        """Return the covariance of the n parameters (n, n), in the order of camera.named.
+
+        Its diagonal is sigma squared. Raises InputError where there is no camera, or where the
+        correlations are not known.
+        """
+        names = self._camera.names()
+        correlation = np.array(self.details.get('correlation', ()), np.float64)
+        if self.sigma is None or correlation.shape != (len(names), len(names)):
+            raise InputError(UNKNOWN_COVARIANCE)
+        sigma = np.array([self.sigma[name] for name in names])
+        return np.asarray(correlation * np.outer(sigma, sigma))
+
+    def sigma_at(self, pixels: npt.ArrayLike) -> Floats:
+        """Return (n,) how far the camera may be off at pixels (n, 2), one sigma, px.
+
+        The best common rotation is removed, as in sigma_px, which is the mean over the picture.
+        NaN where the camera has no viewing ray. Raises InputError as samples() does.
+        """
+        camera, covariance = self._posterior
+        at = np.asarray(pixels, np.float64).reshape(-1, 2)
+        found = np.full(len(at), np.nan)
+        known = np.isfinite(camera.rays(at)[:, 0])
+        found[known] = sigma_over(sensitivity(camera, at[known])[0], covariance)
+        return found
+
+    def samples(self, count: int, seed: int = 0) -> tuple[Camera, ...]:
+        """Return cameras as likely as this one: draws from the normal distribution around it.
+
+        They carry on through any pipeline what is not known of the lens. They are of the next
+        larger lens model, for what this one leaves out counts, too. The same seed gives the same
+        cameras. Raises InputError where there is no camera, or its covariance is not known.
+        """
+        camera, covariance = self._posterior
+        drawn = np.random.default_rng(seed).multivariate_normal(
+            camera.params, covariance, count, method='eigh')
+        return tuple(type(camera).of(camera.image_size, params) for params in drawn)
+
+    @property
+    def _posterior(self) -> tuple[Camera, Floats]:
+        """Return the camera in the wider model, and the covariance (n, n) of its parameters."""
+        camera = self._camera.widened()
+        covariance = np.array(self.details.get('picture_covariance', ()), np.float64)
+        if covariance.shape != (len(camera.params),) * 2:
+            raise InputError(UNKNOWN_COVARIANCE)
+        return camera, covariance
+
+    def save(self, folder: str | os.PathLike[str] = 'calibration') -> tuple[Path, ...]:
+        """Write what `dashcalib run` writes into a folder, and return the files' paths.
+
+        These are result.json, report.html and calibration.yaml (calibration.weak.yaml where it is
+        weak, none where it is refused). Raises OutputError, which tells what to do.
+        """
+        # report/ is built on this room: it is loaded at the first use, as the package's names are
+        write_results = import_module('dashcalib_ros.report').write_results
+        files: tuple[Path, ...] = write_results(self, folder).files
+        return files
+
+    def rays(self, pixels: npt.ArrayLike) -> Floats:
+        """Return the unit viewing rays (..., 3) of pixels (..., 2); x right, y down, z forward.
+
+        With the field, where one is used. NaN where the lens has no ray. Raises InputError where
+        there is no camera.
+        """
+        found = np.asarray(pixels, np.float64)
+        return self._camera.rays(found if self._used_field is None
+                                 else self._used_field.ideal(found))
+
+    def project(self, points: npt.ArrayLike) -> Floats:
+        """Return the pixels (..., 2) of points (..., 3) in the camera's frame.
+
+        With the field, where one is used. NaN where the lens does not see a point. Raises
+        InputError where there is no camera.
+        """
+        found = self._camera.project(np.asarray(points, np.float64))
+        return found if self._used_field is None else self._used_field.observed(found)
+
+    @property
+    def _used_field(self) -> Field | None:
+        return self.field.field if self.field is not None and self.field.used else None
+
+    def undistort(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return an image without distortion, as a camera with the matrix K sees it.
+
+        The field is taken out, too, where one is used. Raises InputError for an image of another
+        size, and where there is no camera.
+        """
+        import cv2
+        camera = self._camera
+        if image.shape[1::-1] != camera.image_size:
+            raise InputError(f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
+                             f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}')
+        if self._used_field is not None:
+            y, x = np.indices(image.shape[:2])
+            ahead = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy,
+                              np.ones(x.shape)], axis=-1)
+            x, y = np.moveaxis(self.project(ahead).astype(np.float32), -1, 0)
+            return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR))
+        if camera.family == FISHEYE:
+            return np.asarray(cv2.fisheye.undistortImage(image, self.K, self.D, Knew=self.K))
+        return np.asarray(cv2.undistort(image, self.K, self.D))
+
+    @property
+    def _camera(self) -> Camera:
+        if self.camera is None:
+            raise InputError(f'the calibration was refused: {"; ".join(self.verdict.reasons)}')
+        return self.camera
+
+    @property
+    def intrinsics(self) -> dict[str, float] | None:
+        """Return the camera's parameters by name."""
+        return None if self.camera is None else self.camera.named
+
+    @property
+    def misfits(self) -> dict[TurnId, float]:
+        """Return the misfits of all turns that were in the adjustment, by turn."""
+        return {turn.id: turn.misfit for turn in self.all_turns if turn.misfit is not None}
+
+    @property
+    def used_turns(self) -> set[TurnId]:
+        """Return the turns that the result is based on, including those of earlier drives."""
+        return {turn.id for turn in self.all_turns if turn.used}
+
+    @property
+    def yaw_deg(self) -> float:
+        """Return the yaw of the used turns together, degrees."""
+        return sum(turn.yaw_deg or 0.0 for turn in self.all_turns if turn.used)
+
+    @property
+    def all_turns(self) -> tuple[TurnSummary | StoredTurnSummary, ...]:
+        """Return the turns of this drive, then the stored ones."""
+        return (*self.turns, *self.stored_turns)
+
+    @property
+    def turns_used(self) -> int:
+        """Return how many turns the result is based on, including those of earlier drives."""
+        return len(self.used_turns)

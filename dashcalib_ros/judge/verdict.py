@@ -1,0 +1,349 @@
+"""Solution -> verdict: every rule by which a result is refused or called weak.
+
+Registered images and residuals do not separate good solutions from bad ones; the focal profile,
+the yaw, the agreement of the turns and the sigmas do. A new rule is a function here and a row in
+RULES.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from dashcalib_ros.camera import MODELS
+from dashcalib_ros.config import VerdictConfig
+from dashcalib_ros.detect import Bend
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.judge.agreement import (
+    focal_disagreement,
+    leverages,
+    turns_of_another_camera,
+)
+from dashcalib_ros.judge.calibration import Verdict
+from dashcalib_ros.judge.next_turn import next_turn
+from dashcalib_ros.reconstruct.heading import roll_deg
+from dashcalib_ros.solve.departures import Departure, largest_crop
+from dashcalib_ros.solve.solution import Solution
+
+# of the range between its bounds; a parameter nearer to one of them counts as lying on it
+ON_BOUND = 0.01
+STEADY = 'switch the stabiliser off'
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A rule's objection to a solution: the verdict it leads to, what is wrong, and what to do.
+
+    Both are in the words of the driver, with the figures; docs/troubleshooting.md explains each.
+    cause: whether the other findings may come from it; then it is the first one.
+    """
+
+    level: Literal['weak', 'refused']
+    what: str
+    cure: str
+    cause: bool = False
+
+
+def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
+          outlook: bool = False) -> Verdict:
+    """Return the verdict on a solution, its reasons sorted: causes, then those that refuse it.
+
+    lines: what straight lines say of it, if there are enough of them. outlook: to tell what one
+    more turn would bring, where only knowledge is missing.
+    """
+    findings = [found for rule in RULES if (found := rule(solution, config)) is not None]
+    against = None if lines is None else _lines_disagree(lines, solution, config)
+    findings += [against] if against is not None else []
+    findings.sort(key=lambda found: (not found.cause, found.level != 'refused'))
+    if findings and outlook and against is None and lacks_knowledge_only(solution, config):
+        more = next_turn(solution)
+        findings[0] = replace(findings[0], cure=findings[0].cure + (more and f' ({more})'))
+    return verdict_of(findings)
+
+
+def verdict_of(findings: Sequence[Finding]) -> Verdict:
+    """Return the verdict that findings lead to, in their order; without any it is accepted."""
+    if not findings:
+        return Verdict('accepted')
+    refused = any(found.level == 'refused' for found in findings)
+    return Verdict('refused' if refused else 'weak',
+                   tuple(f'{found.what}: {found.cure}' for found in findings),
+                   tuple(dict.fromkeys(found.cure for found in findings)))
+
+
+def lacks_knowledge_only(solution: Solution, config: VerdictConfig) -> bool:
+    """Return whether nothing contradicts a solution: where it is weak, its turns know too little.
+
+    Another focal length may explain them as well, but not clearly better.
+    """
+    return (profile_contrast(solution) > -config.min_contrast
+            and not any(rule(solution, config) for rule in SOUND))
+
+
+def _too_few_turns(solution: Solution, config: VerdictConfig) -> Finding | None:
+    count = len(solution.scenes)
+    if count >= config.min_turns:
+        return None
+    lone = ', so that nothing confirms the numbers and their sigma' if count == 1 else ''
+    return Finding('weak', f'only {count} of at least {config.min_turns} turns could be used'
+                           f'{lone}', 'drive more turns, as at crossings')
+
+
+def _too_little_yaw(solution: Solution, config: VerdictConfig) -> Finding | None:
+    yaw = sum(scene.yaw_deg for scene in solution.scenes)
+    return _graded(
+        yaw < config.refused_yaw_deg, yaw < config.min_yaw_deg,
+        f'{yaw:.0f}° of yaw in all turns; at least {config.min_yaw_deg:.0f}° needed',
+        'drive sharper turns, as at crossings')
+
+
+def _flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """The cost must rise on both sides of its minimum, or the focal length is not observable."""
+    contrast = profile_contrast(solution)
+    return _graded(
+        # written with not: a contrast of NaN is refused, too
+        not contrast >= config.refused_contrast, contrast < config.min_contrast,
+        f'a focal length 20 % off would explain the pictures almost as well (the error rises by '
+        f'{100 * max(contrast, 0.0):.1f} %; at least {100 * config.min_contrast:.0f} % needed)',
+        'drive sharper turns, in daylight')
+
+
+def profile_contrast(solution: Solution) -> float:
+    """Return the relative rise of the cost from the result to the lowest of the other probes.
+
+    Negative when another focal length explains the observations better than the result.
+    """
+    at = _index_of_result(solution)
+    costs = solution.around.costs
+    return float(np.delete(costs, at).min() / costs[at] - 1)
+
+
+def _index_of_result(solution: Solution) -> int:
+    """Return the index of the profile's probe at the resulting focal length."""
+    ratio = solution.camera.fx / solution.camera.image_size[0]
+    return int(np.argmin(np.abs(solution.around.ratios - ratio)))
+
+
+def _far_from_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
+    best = solution.around.best * solution.camera.image_size[0]
+    if np.isclose(best, solution.camera.fx):
+        return None
+    return Finding('refused', f'two ways to find the focal length contradict each other, with '
+                              f'{solution.px * solution.camera.fx:.0f} px and about '
+                              f'{solution.px * best:.0f} px, so that neither can be trusted',
+                   'record another drive, with sharper turns and less traffic')
+
+
+def _sigma_too_large(solution: Solution, config: VerdictConfig) -> Finding | None:
+    relative = float(solution.sigma[0] / solution.camera.fx)
+    known = f'to {100 * relative:.1f} % only' if np.isfinite(relative) else 'not at all'
+    return _graded(
+        not np.isfinite(relative) or relative > config.refused_sigma, relative > config.max_sigma,
+        f'the focal length is known {known}; {100 * config.max_sigma:.1f} % or better needed',
+        'drive more turns, or sharper ones')
+
+
+def _one_turn_dominates(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """If one turn gives nearly all information about fx, the others cannot confirm it."""
+    shares = leverages(solution)
+    turn = max(shares, key=lambda turn: shares[turn])
+    if len(shares) < 2 or shares[turn] <= config.max_leverage:
+        return None
+    return Finding('weak', f'no other turn confirms {_turns([turn])}, which gives '
+                           f'{100 * min(shares[turn], 1.0):.0f} % of what is known about the '
+                           f'focal length', 'drive another turn that is as sharp')
+
+
+def _turns_disagree(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Compare the values of fx that the turns would give separately."""
+    spread = focal_disagreement(solution)
+    if spread <= config.max_disagreement:
+        return None
+    return Finding('weak', f'the turns disagree about the focal length by {100 * spread:.1f} %; '
+                           f'at most {100 * config.max_disagreement:.0f} % is usual',
+                   'check that nobody moved or zoomed the camera, and avoid heavy traffic')
+
+
+def _other_camera(solution: Solution, config: VerdictConfig) -> Finding | None:
+    turns = sorted(turns_of_another_camera(solution.misfits, config))
+    if not turns:
+        return None
+    fit = f'{_turns(turns)} fit{"s" * (len(turns) == 1)}'
+    return Finding('weak', f'{fit} another camera far better than the one of the other turns, as '
+                           f'if it was zoomed, exchanged or cropped in between',
+                   'calibrate what was recorded before and after that apart')
+
+
+def _turns(turns: list[TurnId]) -> str:
+    """Return the turns' names, for messages."""
+    own = [str(turn.number) for turn in turns if turn.of_this_drive]
+    stored = len(turns) - len(own)
+    names = []
+    if own:
+        names.append(f'the turn{"s" * (len(own) > 1)} at frame {", ".join(own)}')
+    if stored:
+        names.append(f'{stored} turn{"s" * (stored > 1)} of earlier drives')
+    return ' and '.join(names)
+
+
+def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Name what no fixed camera does.
+
+    A stabilised video's movement may have been taken out. The lens is right then, but no
+    camera_info holds for pictures that move.
+    """
+    clear = [each for each in solution.departures if each.clear]
+    crop = largest_crop(solution.crops) if solution.crops else 0.0
+    if crop > config.max_crop_sigmas * solution.picture.rms:
+        return _moving('up to', crop, solution)
+    if not clear:
+        return None
+    if clear[0].kind == 'shift':
+        return _moving('about', clear[0].size, solution)
+    return Finding('weak', *_departure_texts(clear[0], solution))
+
+
+def _moving(how: str, px: float, solution: Solution) -> Finding:
+    share = 100 * px / solution.camera.image_size[0]
+    return Finding('weak', f'the picture moves against the lens by {how} {share:.1f} % of its '
+                           f'width, as that of a stabilised video does: no camera_info holds for '
+                           f'all pictures', STEADY, cause=True)
+
+
+def _departure_texts(departure: Departure, solution: Solution) -> tuple[str, str]:
+    """Return what is wrong, and what to do."""
+    if departure.kind == 'bend':
+        return (f'the picture is bent in places, as no lens of the model {solution.camera.model} '
+                f'bends it', 'take away the windscreen or cover that does so, or try another '
+                             '--model')
+    zooms = departure.by_turn
+    larger = sorted(turn for turn, zoom in zooms.items() if zoom > np.mean(list(zooms.values())))
+    apart = max(zooms.values()) - min(zooms.values())
+    cure = 'fix the zoom and the focus'
+    if apart < departure.size:
+        return (f'the zoom changes from image to image, by about {100 * departure.size:.1f} %',
+                cure)
+    return (f'the zoom changes by about {100 * apart:.1f} %, it is larger in {_turns(larger)} '
+            f'than in the others', cure)
+
+
+def _turned_pictures(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """A car turns about the vertical, and the road is below it."""
+    turned = abs(roll_deg(solution.scenes))
+    if turned <= config.max_roll_deg:
+        return None
+    return Finding('weak', f'the pictures are turned by about {90 * round(turned / 90)}°, as the '
+                           f'axis about which the car turns and the road under it say',
+                   'mend what the video says of it (ffmpeg -display_rotation 0 -i IN -c copy '
+                   'OUT.mp4), or --set verdict.max_roll_deg=180 for a camera mounted so',
+                   cause=True)
+
+
+def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """A rolling shutter that was not removed changes fy first."""
+    aspect = solution.camera.fy / solution.camera.fx
+    if abs(aspect - 1) <= config.max_aspect:
+        return None
+    return Finding('weak', f'the pixels seem to be out of square (fy is {100 * (aspect - 1):+.1f} '
+                           f'% off fx), as a decentred lens or a strong rolling shutter makes '
+                           f'them look',
+                   'check the stamps (--fps), which a rolling shutter is found by, or try '
+                   '--model brown')
+
+
+def _strange_shutter(solution: Solution, config: VerdictConfig) -> Finding | None:
+    readout_ms = 1e3 * abs(solution.readout_s)
+    if readout_ms <= config.max_readout_ms:
+        return None
+    return Finding('weak', f'the rows of a picture seem to be exposed over {readout_ms:.0f} ms, '
+                           f'longer than rolling shutters take',
+                   'check that the stamps, or --fps, are right')
+
+
+def _on_bound(solution: Solution, config: VerdictConfig) -> Finding | None:
+    low, high = solution.bounds
+    share = (solution.camera.params - low) / (high - low)
+    names = [name for name, value in zip(solution.camera.names(), share, strict=True)
+             if not ON_BOUND < value < 1 - ON_BOUND]
+    if not names:
+        return None
+    return Finding('weak', f'the search for {", ".join(names)} ended at the limit of what lenses '
+                           f'have', 'record another drive; mirrors and lenses of more than 190° '
+                                    'cannot be calibrated')
+
+
+def _folds_over(solution: Solution, config: VerdictConfig) -> Finding | None:
+    if solution.camera.covers_picture():
+        return None
+    return Finding('weak', 'the distortion near the corners of the picture is no real one (it '
+                           'folds over), as nothing was seen there',
+                   'drive where there is something to see up to the corners, or try --model '
+                   'fisheye for a wide lens')
+
+
+def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Compare a model that was asked for with the one that the turns would have chosen.
+
+    Where nothing was seen, as near the corners, only the model says how the lens goes on there:
+    the sigma over the picture knows nothing of that.
+    """
+    own = next((each for each in solution.tried if each.model == solution.camera.model), None)
+    chosen = next((each for each in solution.tried if each.chosen), None)
+    # a model that has the chosen one in it is as right, and its sigma knows what it asks more
+    if own is None or chosen is None or isinstance(solution.camera, MODELS[chosen.model]):
+        return None
+    apart = own.apart_px
+    if apart is not None and apart <= config.max_model_sigmas * solution.picture.rms:
+        return None
+    far = f'{solution.px * apart:.1f} px' if apart is not None else 'far'
+    return Finding('weak', f'the turns ask for a lens of the model {chosen.model}, not '
+                           f'{own.model}, and that one is {far} away', 'leave --model away')
+
+
+def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Doubt a fisheye that explains the turns hardly better than a pinhole far from it."""
+    camera = solution.camera
+    for each in solution.tried:
+        model = MODELS[each.model]
+        if model.family == camera.family or len(model.names()) >= len(camera.names()):
+            continue
+        alike_px = config.max_kind_sigmas * solution.picture.rms
+        far = each.apart_px is None or each.apart_px > alike_px
+        if far and each.cost_ratio < config.min_kind_ratio:
+            return Finding('weak', f'the turns do not tell whether the lens is {camera.model} or '
+                                   f'{each.model}, and near the corners these differ',
+                           'drive where there is something to see up to the corners')
+    return None
+
+
+def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Poles and the edges of houses must be straight: nothing of this comes from motion."""
+    moved = lines.picture_px / solution.camera.image_size[0]
+    if not (lines.sigmas > config.max_line_sigmas and moved > config.max_line_move):
+        return None
+    return Finding('weak', f'poles and the edges of houses are not straight with this distortion '
+                           f'({lines.lines} upright lines ask for k1 {lines.k1:+.3f}, '
+                           f'{lines.sigmas:.0f} times what both may be off)',
+                   'look for a curved windscreen or cover before the lens, try another --model, '
+                   'or drive more turns')
+
+
+def _graded(refused: bool, weak: bool, what: str, cure: str) -> Finding | None:
+    """Return a finding of the graver condition that holds, None if neither does."""
+    if refused:
+        return Finding('refused', what, cure)
+    return Finding('weak', what, cure) if weak else None
+
+
+Rule = Callable[[Solution, VerdictConfig], Finding | None]
+# whether the turns know enough: where they do not, a fleet's prior may help
+ENOUGH: tuple[Rule, ...] = (
+    _too_few_turns, _too_little_yaw, _flat_profile, _far_from_profile, _sigma_too_large,
+    _one_turn_dominates)
+# whether anything contradicts the result
+SOUND: tuple[Rule, ...] = (
+    _turns_disagree, _other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,
+    _folds_over, _other_model, _other_kind, _turned_pictures)
+RULES = (*ENOUGH, *SOUND)

@@ -1,0 +1,229 @@
+"""Bundle adjustment of scenes that share one camera, by COLMAP and Ceres.
+
+COLMAP counts pixels from (0.5, 0.5); everything that enters or leaves here counts from (0, 0).
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel
+from dashcalib_ros.camera.prior import Prior
+from dashcalib_ros.reconstruct.colmap import pyceres, pycolmap
+from dashcalib_ros.reconstruct.scene import Scene
+
+# no lens has a coefficient beyond this: the scene has diverged
+MAX_DISTORTION = 1.0
+# cosine (88 degrees): COLMAP's fisheye models project nothing from beside or behind the camera
+IN_FRONT = 0.035
+
+
+@dataclass(frozen=True)
+class Solver:
+    """Options of Ceres. loss_px: scale of the Cauchy loss, about twice the noise of a track."""
+
+    loss_px: float = 1.0
+    iterations: int = 30
+    tolerance: float = 1e-5
+    threads: int = 1
+
+
+def adjust_step1(scenes: Sequence[Scene], camera: Camera, solver: Solver,
+                 focal_range: tuple[float, float] | None) -> tuple[list[Scene], Camera]:
+    """Adjust with one focal length and the distortion, the centre fixed (paper, 3.2, step 1).
+
+    focal_range: px, lowest and highest focal length; None holds the focal length, for one point of
+    its profile. Coefficients that the model's step 1 does not have stay as they are, which is
+    right only where they are 0; adjust_distortion() is for the others.
+    """
+    model = camera.step1
+    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
+    reconstruction = _reconstruction(scenes, camera, model)
+    adjuster = _adjuster(reconstruction, solver, refine_focal=focal_range is not None,
+                         refine_centre=False)
+    values = reconstruction.cameras[1].params
+    if not adjuster.problem.has_parameter_block(values):
+        return _with_used(scenes, all_used), camera  # there are no observations
+    if focal_range is not None:
+        _bound(adjuster.problem, values, model.places[0], *focal_range)
+    for place in model.places[4:]:
+        _bound(adjuster.problem, values, place, -MAX_DISTORTION, MAX_DISTORTION)
+    adjuster.solve()
+    found = model.params(reconstruction.cameras[1].params)
+    # the conversion from COLMAP's pixels rounds: keep the centre exact
+    found[2:4] = camera.params[2:4]
+    return _with_used(_updated(scenes, reconstruction), all_used), _completed(camera, found)
+
+
+def adjust_distortion(scenes: Sequence[Scene], camera: Camera, solver: Solver
+                      ) -> tuple[list[Scene], Camera]:
+    """Adjust the distortion, with all coefficients; the focal lengths and the centre are held."""
+    if len(camera.step1.places) == len(camera.names()):
+        return adjust_step1(scenes, camera, solver, None)
+    model = camera.step2
+    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
+    reconstruction = _reconstruction(scenes, camera, model)
+    adjuster = _adjuster(reconstruction, solver, refine_focal=False, refine_centre=False)
+    values, problem = reconstruction.cameras[1].params, adjuster.problem
+    if not problem.has_parameter_block(values):
+        return _with_used(scenes, all_used), camera
+    problem.set_manifold(values, pyceres.SubsetManifold(
+        model.size, sorted({*model.held, *model.places[:4]})))
+    for place in model.places[4:]:
+        _bound(problem, values, place, -MAX_DISTORTION, MAX_DISTORTION)
+    adjuster.solve()
+    found = model.params(reconstruction.cameras[1].params)
+    found[:4] = camera.params[:4]
+    return _with_used(_updated(scenes, reconstruction), all_used), camera.with_params(found)
+
+
+def adjust_step2(scenes: Sequence[Scene], camera: Camera, solver: Solver, prior: Prior,
+                 bounds: tuple[Floats, Floats]) -> tuple[list[Scene], Camera]:
+    """Adjust all n parameters within bounds and under a prior (paper, 3.2, step 2).
+
+    bounds: lowest and highest values, (n,) each, in the order of camera.names().
+    """
+    model = camera.step2
+    places = list(model.places)
+    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
+    reconstruction = _reconstruction(scenes, camera, model)
+    adjuster = _adjuster(reconstruction, solver, refine_focal=True, refine_centre=True)
+    values = reconstruction.cameras[1].params
+    problem = adjuster.problem
+    if not problem.has_parameter_block(values):
+        return _with_used(scenes, all_used), camera
+    if model.held:
+        problem.set_manifold(values, pyceres.SubsetManifold(model.size, model.held))
+    low, high = (model.values(bound) for bound in bounds)
+    for place in places:
+        _bound(problem, values, place, low[place], high[place])
+    covariance = np.eye(model.size)
+    covariance[np.ix_(places, places)] = prior.covariance
+    problem.add_residual_block(
+        pyceres.factors.NormalPrior(model.values(prior.mean), covariance),
+        pyceres.TrivialLoss(), [values])
+    adjuster.solve()
+    return (_with_used(_updated(scenes, reconstruction), all_used),
+            camera.with_params(model.params(reconstruction.cameras[1].params)))
+
+
+def adjust_poses(scenes: Sequence[Scene], camera: Camera, solver: Solver) -> list[Scene]:
+    """Adjust poses and points with the camera held as it is."""
+    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
+    reconstruction = _reconstruction(scenes, camera, camera.step2)
+    adjuster = _adjuster(reconstruction, solver, refine_focal=False, refine_centre=False)
+    values = reconstruction.cameras[1].params
+    if adjuster.problem.has_parameter_block(values):
+        adjuster.problem.set_parameter_block_constant(values)
+        adjuster.solve()
+    return _with_used(_updated(scenes, reconstruction), all_used)
+
+
+def _in_front(scenes: Sequence[Scene]) -> list[Scene]:
+    """Return the scenes with those observations only that COLMAP can adjust.
+
+    Points that are left with fewer than two do not move; they are triangulated anew afterwards.
+    """
+    found = []
+    for scene in scenes:
+        structure = scene.structure
+        local = (structure.points @ structure.rotations.transpose(0, 2, 1)
+                 + structure.translations[:, None])
+        ahead = local[:, :, 2] > IN_FRONT * np.linalg.norm(local, axis=2)
+        used = structure.used & ahead
+        used &= used.sum(axis=0) >= 2
+        found.append(replace(scene, structure=replace(structure, used=used)))
+    return found
+
+
+def _with_used(scenes: Sequence[Scene], all_used: Sequence[Mask]) -> list[Scene]:
+    """Return the scenes with their observations as they were before _in_front()."""
+    return [replace(scene, structure=replace(scene.structure, used=used))
+            for scene, used in zip(scenes, all_used, strict=True)]
+
+
+def _completed(camera: Camera, found: Floats) -> Camera:
+    """Return the camera with the parameters found; those that were not adjusted stay."""
+    return camera.with_params([*found, *camera.params[len(found):]])
+
+
+def _reconstruction(scenes: Sequence[Scene], camera: Camera, model: ColmapModel
+                    ) -> pycolmap.Reconstruction:
+    """Return the scenes, side by side, as one COLMAP reconstruction with one camera."""
+    width, height = camera.image_size
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.add_camera_with_trivial_rig(pycolmap.Camera(
+        camera_id=1, model=model.name, width=width, height=height,
+        params=model.values(camera.params[:len(model.places)])))
+    for scene, first_id in zip(scenes, _first_ids(scenes), strict=True):
+        structure = scene.structure
+        rank = np.cumsum(structure.used, axis=1) - 1
+        for k in np.flatnonzero(structure.registered):
+            image = pycolmap.Image(
+                name=str(first_id + k), camera_id=1, image_id=int(first_id + k),
+                keypoints=scene.tracks.xy[k, structure.used[k]] + HALF_PIXEL)
+            pose = pycolmap.Rigid3d(
+                pycolmap.Rotation3d(structure.rotations[k]), structure.translations[k])
+            reconstruction.add_image_with_trivial_frame(image, pose)
+        tracks, keyframes = np.nonzero(structure.used.T)
+        names, places = (first_id + keyframes).tolist(), rank[keyframes, tracks].tolist()
+        points, starts = np.unique(tracks, return_index=True)
+        ends = np.append(starts, len(tracks))[1:].tolist()
+        for t, start, end in zip(points.tolist(), starts.tolist(), ends, strict=True):
+            track = pycolmap.Track()
+            for name, place in zip(names[start:end], places[start:end], strict=True):
+                track.add_element(name, place)
+            reconstruction.add_point3D(structure.points[t], track)
+    return reconstruction
+
+
+def _first_ids(scenes: Sequence[Scene]) -> list[int]:
+    counts = [len(scene.tracks.frames) for scene in scenes]
+    return [1 + sum(counts[:n]) for n in range(len(counts))]
+
+
+def _adjuster(reconstruction: pycolmap.Reconstruction, solver: Solver, refine_focal: bool,
+              refine_centre: bool) -> pycolmap.CeresBundleAdjuster:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = refine_focal
+    options.refine_principal_point = refine_centre
+    options.refine_extra_params = True
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = solver.loss_px
+    options.ceres.solver_options.max_num_iterations = solver.iterations
+    options.ceres.solver_options.function_tolerance = solver.tolerance
+    options.ceres.solver_options.num_threads = solver.threads
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
+
+
+def _bound(problem: pyceres.Problem, values: Floats, index: int, low: float, high: float) -> None:
+    # Ceres refuses a start outside its bounds
+    values[index] = min(max(values[index], low), high)
+    problem.set_parameter_lower_bound(values, index, low)
+    problem.set_parameter_upper_bound(values, index, high)
+
+
+def _updated(scenes: Sequence[Scene], reconstruction: pycolmap.Reconstruction) -> list[Scene]:
+    """Return the scenes with the poses and points that COLMAP has moved."""
+    updated = []
+    point_ids = iter(sorted(reconstruction.point3D_ids()))
+    for scene, first_id in zip(scenes, _first_ids(scenes), strict=True):
+        structure = scene.structure
+        rotations, translations = structure.rotations.copy(), structure.translations.copy()
+        for k in np.flatnonzero(structure.registered):
+            pose = reconstruction.image(int(first_id + k)).cam_from_world()
+            rotations[k], translations[k] = pose.rotation.matrix(), pose.translation
+        points = structure.points.copy()
+        for t in np.flatnonzero(structure.used.any(axis=0)):
+            points[t] = reconstruction.point3D(next(point_ids)).xyz
+        updated.append(replace(scene, structure=replace(
+            structure, rotations=rotations, translations=translations, points=points)))
+    return updated

@@ -1,0 +1,236 @@
+"""A turn becomes a scene: its focal profile first, then one scene from the best start.
+
+Incremental reconstruction with a free focal length often diverges, although it registers every
+image with small residuals (docs/lessons.md: f = 157 for 1353). With a wrong focal length held
+fixed it cannot diverge; it only explains fewer observations. So the turn is chained at several
+fixed focal lengths, and the one with the lowest cost over *all* observations is the start.
+"""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dashcalib_ros.arrays import Mask
+from dashcalib_ros.camera import Camera, searched
+from dashcalib_ros.config import Config, SceneConfig
+from dashcalib_ros.detect.turn import Turn, TurnId
+from dashcalib_ros.reconstruct.adjust import Solver, adjust_step1
+from dashcalib_ros.reconstruct.chain import chain
+from dashcalib_ros.reconstruct.register import register_tracks
+from dashcalib_ros.reconstruct.scene import (
+    Draft,
+    Profile,
+    Scene,
+    Start,
+    retriangulated,
+    truncated_cost,
+)
+from dashcalib_ros.reconstruct.tracks import Tracks, thinned, track_turn
+
+# focal length / width; a lens that seems longer is no fisheye: 90 degrees across, or less
+WIDE = 0.5
+# how often a chain that does not reach all images is built anew, at the most
+COMPLETIONS = 2
+# relative change of the cost that ends an adjustment, where another follows
+ROUGH = 1e-3
+# columns and rows in which tracks are to be seen in each keyframe
+GRID = (6, 3)
+
+
+def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft | None:
+    """Track a turn and find the focal length to start from; None when none gives a scene.
+
+    valid: (h, w), False where the ego vehicle is.
+    """
+    tracks, settings = track_turn(turn, config.tracks, valid), config.scene
+    if tracks.xy.shape[1] < settings.min_tracks or len(tracks.frames) < settings.min_images:
+        return None
+    found: list[Scene] = []
+    for model in searched(config.model):
+        if found and not _may_be_another(found[0].profile, settings):
+            break
+        trials = _trials(tracks, turn, config, model)
+        if trials:
+            profile = _profile_of(trials)
+            found.append(replace(trials[profile.best], profile=profile))
+    if not found:
+        return None
+    if len(found) > 1:
+        # at the focal lengths of the grid, the right kind may look worse
+        found = [_refined(scene, settings, _around(scene.camera)) for scene in found]
+    # min() returns the first one of equals: the simplest
+    best = min(found, key=lambda scene: truncated_cost(scene, scene.camera, settings.error_px))
+    return Draft(thinned(tracks, settings.keyframes), Start(best.profile, best.camera),
+                 tuple(Start(scene.profile, scene.camera) for scene in found if scene is not best))
+
+
+def _around(camera: Camera) -> tuple[float, float]:
+    """Return the focal lengths between which the minimum may lie: the profile's grid is coarse."""
+    return camera.fx / 1.3, camera.fx * 1.3
+
+
+def _may_be_another(profile: Profile, config: SceneConfig) -> bool:
+    """Return whether a pinhole's profile leaves it open that the lens is a fisheye."""
+    return profile.best < WIDE or float(profile.costs.min()) > config.good_cost
+
+
+def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
+    """Reconstruct a turn from its draft; None when that gives no scene.
+
+    turn: needs the images of the draft's keyframes only.
+    """
+    start, settings = draft.start.camera, config.scene
+    # with spread tracks there may be no pair of images that shares enough of them
+    scene = None
+    for choose in (_spread, _longest):
+        scene = scene or chain_scene(choose(draft.tracks, settings.tracks), turn.id, start,
+                                     draft.start.profile, settings, config.seed)
+    if scene is None:
+        return None
+    scene, reach = replace(scene, rivals=draft.rivals), _around(start)
+    scene = _refined(scene, settings, reach, tolerance=ROUGH)
+    by_index = {frame.index: frame.image for frame in turn.frames}
+    images = [by_index[int(index)] for index in scene.tracks.frames]
+    registered = register_tracks(scene.tracks, scene.structure, scene.camera, images,
+                                 settings.patch_half_window, settings.max_shift_px)
+    scene = retriangulated(replace(scene, tracks=registered), scene.camera,
+                           settings.error_px, settings.min_angle_deg)
+    scene = _refined(scene, settings, reach)
+    return scene if scene.structure.used.any() else None
+
+
+def chain_scene(tracks: Tracks, turn: TurnId, camera: Camera, profile: Profile,
+                config: SceneConfig, seed: int) -> Scene | None:
+    """Return a first scene with a camera that is known roughly; None if no pair starts a chain."""
+    generous = max(config.error_px, config.chain_error * tracks.image_size[0])
+    structure = chain(tracks, camera, generous, config.min_angle_deg, seed)
+    if structure is None:
+        return None
+    return Scene(turn, tracks, structure, camera, profile)
+
+
+def _refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | None,
+             rounds: int = 2, tolerance: float = Solver.tolerance) -> Scene:
+    """Return the scene after rounds of adjustment and triangulation."""
+    solver = Solver(config.loss_px, config.iterations, tolerance)
+    for _ in range(rounds):
+        [scene], camera = adjust_step1([scene], scene.camera, solver, reach)
+        scene = retriangulated(scene, camera, config.error_px, config.min_angle_deg)
+    return scene
+
+
+def _trials(tracks: Tracks, turn: Turn, config: Config, model: type[Camera]
+            ) -> dict[float, Scene]:
+    """Return the best scene for each focal length held fixed; none for one without a scene.
+
+    In most turns the longest tracks chain best. If no focal length explains much with them, tracks
+    spread over all keyframes are tried, too.
+    """
+    settings = config.scene
+    few = thinned(tracks, settings.profile_keyframes)
+    trials = _profile_trials(_longest(few, settings.profile_tracks), turn, config, model)
+    if not trials or min(map(_cost_of, trials.values())) > settings.good_cost:
+        others = _profile_trials(_spread(few, settings.profile_tracks), turn, config, model)
+        for ratio, scene in others.items():
+            trials[ratio] = min(trials.get(ratio, scene), scene, key=_cost_of)
+    return trials
+
+
+def _cost_of(scene: Scene) -> float:
+    return float(scene.profile.costs[0])
+
+
+def _profile_trials(tracks: Tracks, turn: Turn, config: Config, model: type[Camera]
+                    ) -> dict[float, Scene]:
+    """Return the scenes at focal lengths held fixed: every second one, then around the best."""
+    settings, seed, ratios = config.scene, config.seed, model.focal_ratios
+    trials: dict[float, Scene] = {}
+    tried: set[int] = set()
+
+    def attempt(n: int) -> None:
+        if n in tried or not 0 <= n < len(ratios):
+            return
+        tried.add(n)
+        camera = model.centred(tracks.image_size, ratios[n] * tracks.image_size[0])
+        scene = chain_scene(tracks, turn.id, camera, _NO_PROFILE, settings, seed)
+        if scene is not None:
+            scene = _completed(_refined(scene, settings, None, tolerance=ROUGH), settings, seed)
+            cost = truncated_cost(scene, scene.camera, settings.error_px)
+            trials[ratios[n]] = replace(scene, profile=Profile(
+                np.array([ratios[n]]), np.array([cost]), int(tracks.seen.sum())))
+
+    for n in range(1, len(ratios), 2):
+        attempt(n)
+    if trials:
+        best = ratios.index(_profile_of(trials).best)
+        attempt(best - 1)
+        attempt(best + 1)
+        # if one of them is the new best, its other neighbour is on the coarse grid
+    return trials
+
+
+def _completed(scene: Scene, config: SceneConfig, seed: int) -> Scene:
+    """Chain anew where images are missing, now that the distortion is known better.
+
+    With a wide lens, a chain without distortion breaks soon, even at the true focal length.
+    """
+    for _ in range(COMPLETIONS):
+        if scene.structure.registered.all():
+            break
+        other = chain_scene(scene.tracks, scene.turn, scene.camera, scene.profile, config, seed)
+        if other is None:
+            break
+        other = _refined(other, config, None, tolerance=ROUGH)
+        if (truncated_cost(other, other.camera, config.error_px)
+                >= truncated_cost(scene, scene.camera, config.error_px)):
+            break
+        scene = other
+    return scene
+
+
+_NO_PROFILE = Profile(np.zeros(0), np.zeros(0), 0)
+
+
+def _profile_of(trials: dict[float, Scene]) -> Profile:
+    ratios = sorted(trials)
+    costs = [_cost_of(trials[ratio]) for ratio in ratios]
+    return Profile(np.array(ratios), np.array(costs),
+                   next(iter(trials.values())).profile.observations)
+
+
+def _longest(tracks: Tracks, wanted: int) -> Tracks:
+    """Return the tracks that are seen in the most keyframes."""
+    length = tracks.seen.sum(axis=0)
+    chosen = np.sort(np.argsort(-length, kind='stable')[:wanted])
+    return replace(tracks, xy=tracks.xy[:, chosen])
+
+
+def _spread(tracks: Tracks, wanted: int) -> Tracks:
+    """Return long tracks that are spread evenly over the keyframes and the picture.
+
+    Keyframes lie closest in the middle of a turn, so the longest tracks do, too: with those alone,
+    the poses at the turn's ends would be determined by few points.
+    """
+    seen = tracks.seen
+    width, height = tracks.image_size
+    columns, rows = GRID
+    keyframe, track = np.nonzero(seen)
+    x, y = tracks.xy[keyframe, track].T
+    cell = (np.clip(x * columns / width, 0, columns - 1).astype(int)
+            + columns * np.clip(y * rows / height, 0, rows - 1).astype(int))
+    cells = keyframe * columns * rows + cell
+    length = seen.sum(axis=0)
+    order = np.argsort(-length, kind='stable')
+    by_track = np.split(cells[np.argsort(track, kind='stable')], np.cumsum(length)[:-1])
+    share = wanted * float(np.mean(length)) / (len(seen) * columns * rows)
+    count = np.zeros(len(seen) * columns * rows)
+    chosen: list[int] = []
+    for n in order:
+        if len(chosen) < wanted and np.mean(count[by_track[n]] < share) >= 0.5:
+            count[by_track[n]] += 1
+            chosen.append(int(n))
+    spare = np.setdiff1d(order, chosen, assume_unique=True)
+    spare = spare[np.argsort(-length[spare], kind='stable')]
+    kept = np.sort([*chosen, *spare[:wanted - len(chosen)]]).astype(int)
+    return replace(tracks, xy=tracks.xy[:, kept])

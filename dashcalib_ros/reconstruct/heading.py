@@ -1,0 +1,117 @@
+"""Where the camera points, against the car's direction of travel, from one turn's poses.
+
+A camera ahead of the rear axle moves sideways in a turn, by the path's curvature times its
+distance from the axle. So the sideways direction is fitted as a line over the curvature; its
+value at no curvature is how the camera is mounted. Up and down, the mean counts: a car dives when
+it brakes before the turn, and rises as much when it gathers speed after it.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.reconstruct.scene import Scene, main_axis
+
+# rounds of reweighting; ten drives changed by less than 0.01 degrees after the fifth
+ROUNDS = 10
+# of the scatter; errors beyond it lose weight (Cauchy)
+LOSS = 2.0
+# of a normal distribution: its standard deviation over its median absolute deviation
+MAD = 1.4826
+# degrees; less scatter than this is rounding
+LEAST_SCATTER = 1e-3
+# of the steps at either end, left out of a mean: bumps and bad poses
+TRIMMED = 0.1
+# points near the path; fewer do not tell how high the world is
+LEAST_POINTS = 30
+# of the logarithm; the turns of six upright drives have -4.9 to -0.7
+OPEN = 0.4
+# keyframes; a line needs more steps between them than it has parameters
+LEAST_KEYFRAMES = 6
+
+
+@dataclass(frozen=True)
+class Heading:
+    """The car's direction of travel, as the camera sees it, degrees, with standard deviations.
+
+    yaw_deg: positive where the car goes to the right of the optical axis. pitch_deg: positive
+    where it goes below the axis.
+    """
+
+    yaw_deg: float
+    pitch_deg: float
+    yaw_sigma_deg: float
+    pitch_sigma_deg: float
+
+
+def heading(scene: Scene) -> Heading | None:
+    """Return the heading in a turn, None where too few keyframes are registered."""
+    structure = scene.structure
+    rotations = structure.rotations[structure.registered]
+    if len(rotations) < LEAST_KEYFRAMES:
+        return None
+    from scipy import stats
+    from scipy.spatial.transform import Rotation
+    centres = -np.einsum('kji,kj->ki', rotations, structure.translations[structure.registered])
+    turned = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec()
+    # the direction of a step, in the camera's frame halfway through it
+    halfway = Rotation.from_rotvec(turned / 2).as_matrix() @ rotations[:-1]
+    steps = np.diff(centres, axis=0)
+    lengths = np.maximum(np.linalg.norm(steps, axis=1), np.finfo(float).tiny)
+    ahead = np.einsum('kij,kj->ki', halfway, steps) / lengths[:, None]
+    curvature = turned[:, 1] / lengths
+    curvature /= max(float(np.abs(curvature).max()), np.finfo(float).tiny)
+    yaw = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 2]))
+    pitch = np.degrees(np.arcsin(np.clip(ahead[:, 1], -1, 1)))
+    yaw_deg, yaw_sigma = _at_no_curvature(curvature, yaw)
+    return Heading(yaw_deg, float(stats.trim_mean(pitch, TRIMMED)), yaw_sigma,
+                   float(np.std(pitch) / np.sqrt(len(pitch))))
+
+
+def roll_deg(scenes: Sequence[Scene]) -> float:
+    """Return by how much the pictures of these turns are turned against the upright, degrees.
+
+    Of the axis about which the car turns, the end where the road is points downwards: points on
+    the road all lie as deep, those above the camera at any height.
+    """
+    down = main_axis(np.concatenate([scene.turned for scene in scenes]))
+    if np.median([_open_below(scene, down) for scene in scenes]) > OPEN:
+        down = -down
+    return float(np.degrees(np.arctan2(down[0], down[1])))
+
+
+def _open_below(scene: Scene, down: Floats) -> float:
+    """Return the log of how much farther the deepest points spread than the highest ones."""
+    structure = scene.structure
+    rotations = structure.rotations[structure.registered]
+    centres = -np.einsum('kji,kj->ki', rotations, structure.translations[structure.registered])
+    points = structure.points[structure.used.any(axis=0)]
+    offsets = points[:, None] - centres
+    far = np.linalg.norm(offsets, axis=2)
+    nearest = np.argmin(far, axis=1)
+    path_length = np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()
+    near = far.min(axis=1) < path_length
+    depth = offsets[np.arange(len(points)), nearest][near] @ (rotations.transpose(0, 2, 1)
+                                                            @ down).mean(axis=0)
+    if len(depth) < LEAST_POINTS:
+        return 0.0
+    highest, high, deep, deepest = np.percentile(depth, [2, 25, 75, 98])
+    tiny = np.finfo(float).tiny
+    return float(np.log((deepest - deep + tiny) / (high - highest + tiny)))
+
+
+def _at_no_curvature(curvature: Floats, angle: Floats) -> tuple[float, float]:
+    """Return the value of a robust line over the curvature at 0, and its standard deviation."""
+    columns = np.column_stack([np.ones(len(curvature)), curvature])
+    weights = np.ones(len(curvature))
+    for _ in range(ROUNDS):
+        information = columns.T * weights @ columns
+        line = np.linalg.lstsq(information, columns.T @ (weights * angle), rcond=None)[0]
+        errors = angle - columns @ line
+        scatter = max(MAD * float(np.median(np.abs(errors))), LEAST_SCATTER)
+        weights = 1 / (1 + (errors / (LOSS * scatter))**2)
+    variance = scatter**2 * np.linalg.pinv(information)[0, 0]
+    return float(line[0]), float(np.sqrt(variance))

@@ -1,0 +1,139 @@
+"""Track positions are registered again, against one reference patch each (affine Lucas-Kanade).
+
+Tracking from image to image drifts: small errors add up along a track, most where a surface comes
+closer and its picture grows. The first scene gives the scale of each patch relative to its
+reference image. From there an affine registration (Baker and Matthews 2004, inverse compositional)
+moves every observation back to the same world point.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.reconstruct.structure import Structure
+from dashcalib_ros.reconstruct.tracks import Tracks
+
+# affine steps converge slowly; a patch that has not converged by then is dropped
+ITERATIONS = 10
+# ratio of scales beyond which a patch and its reference look too different
+MAX_SCALE = 3.0
+# a patch with less correlation does not show its reference
+MIN_CORRELATION = 0.85
+# px; a step below this ends the registration of a patch
+SETTLED_PX = 0.01
+
+
+def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
+                    images: Sequence[GreyImage], half_window: int, max_shift_px: float
+                    ) -> Tracks:
+    """Return the tracks with every used observation registered against its track's reference.
+
+    images: the keyframes' pictures. half_window: px; patches are (2 half_window + 1) wide.
+    max_shift_px: an observation that moves farther than this, or whose patch does not look like
+    the reference, is dropped.
+    """
+    depth = _depths(structure, camera)
+    reference = _reference_rows(structure.used, depth)
+    smooth = [cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32) for image in images]
+    step = np.arange(-half_window, half_window + 1, dtype=np.float32)
+    grid = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
+    template, descent, inverse = _templates(tracks, reference, smooth, grid)
+    xy = np.full_like(tracks.xy, np.nan)
+    every = np.arange(tracks.xy.shape[1])
+    for k, image in enumerate(smooth):
+        scale = depth[reference, every] / np.where(depth[k] > 0, depth[k], 1.0)
+        wanted = np.flatnonzero(
+            structure.used[k] & (scale < MAX_SCALE) & (scale > 1 / MAX_SCALE))
+        if len(wanted) == 0:
+            continue
+        found, good = _align(image, tracks.xy[k, wanted], scale[wanted], template[wanted],
+                             descent[wanted], inverse[wanted], grid)
+        shift = np.linalg.norm(found - tracks.xy[k, wanted], axis=1)
+        good &= (shift < max_shift_px) | (reference[wanted] == k)
+        xy[k, wanted[good]] = found[good]
+    return replace(tracks, xy=xy)
+
+
+def _depths(structure: Structure, camera: Camera) -> Floats:
+    """Return (k, t) depths of the points in each image; 0 where not registered or behind."""
+    depth = camera.depths(structure.points @ structure.rotations.transpose(0, 2, 1)
+                          + structure.translations[:, None])
+    return np.asarray(np.where(structure.registered[:, None], np.maximum(depth, 0.0), 0.0))
+
+
+def _reference_rows(used: Mask, depth: Floats) -> Ints:
+    """Return (t,) the image of each track where its depth is the median of its observations."""
+    order = np.argsort(np.where(used, depth, np.inf), axis=0, kind='stable')
+    middle = np.maximum(used.sum(axis=0) - 1, 0) // 2
+    return np.asarray(order[middle, np.arange(used.shape[1])], np.int64)
+
+
+def _sample(image: Floats32, xy: Floats) -> Floats32:
+    """Return (n, p) intensities at (n, p, 2) positions.
+
+    Lanczos: OpenCV's cubic kernel shifts the picture by up to 0.05 px between the pixels.
+    """
+    where = xy.astype(np.float32)
+    return np.asarray(cv2.remap(image, where[:, :, 0], where[:, :, 1], cv2.INTER_LANCZOS4,
+                                borderMode=cv2.BORDER_REPLICATE), np.float32)
+
+
+def _templates(tracks: Tracks, reference: Ints,
+               images: list[Floats32], grid: Floats32
+               ) -> tuple[Floats32, Floats32, Floats32]:
+    """Return normalised patches (t, p), steepest descent (t, p, 6), inverse Hessians (t, 6, 6)."""
+    count, pixels = len(reference), len(grid)
+    template = np.zeros((count, pixels), np.float32)
+    gradient = np.zeros((count, pixels, 2), np.float32)
+    for k in np.unique(reference):
+        rows = np.flatnonzero((reference == k) & np.isfinite(tracks.xy[k, :, 0]))
+        if len(rows) == 0:
+            continue  # all of them are tracks that the structure does not use
+        centre = tracks.xy[k, rows][:, None] + grid
+        template[rows] = _sample(images[k], centre)
+        for axis, kernel in enumerate(((1, 0), (0, 1))):
+            slope = cv2.Sobel(images[k], cv2.CV_32F, *kernel, ksize=3, scale=1 / 8)
+            gradient[rows, :, axis] = _sample(slope, centre)
+    contrast = np.maximum(template.std(axis=1, keepdims=True), 1e-3)
+    template = (template - template.mean(axis=1, keepdims=True)) / contrast
+    gradient /= contrast[:, :, None]
+    # d/dp of T(W(d; p)) at the identity, p = a11 a12 a21 a22 tx ty
+    descent = np.concatenate([
+        gradient[:, :, :1] * grid, gradient[:, :, 1:] * grid, gradient], axis=2)
+    hessian = (descent.transpose(0, 2, 1) @ descent).astype(np.float64)
+    damping = 1e-3 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9
+    inverse = np.linalg.inv(hessian + damping * np.eye(6)).astype(np.float32)
+    return template, descent, inverse
+
+
+def _align(image: Floats32, start: Floats, scale: Floats, template: Floats32,
+           descent: Floats32, inverse: Floats32, grid: Floats32
+           ) -> tuple[Floats, Mask]:
+    """Return (n, 2) positions where the patches match their templates, and (n,) if they do."""
+    linear = scale[:, None, None] * np.eye(2)
+    centre = start.copy()
+    shift = np.full(len(start), np.inf)
+    correlation = np.zeros(len(start))
+    moving = np.arange(len(start))
+    for _ in range(ITERATIONS):
+        patch = _sample(image, grid @ linear[moving].transpose(0, 2, 1) + centre[moving, None])
+        patch -= patch.mean(axis=1, keepdims=True)
+        patch /= np.maximum(patch.std(axis=1, keepdims=True), 1e-3)
+        correlation[moving] = np.mean(patch * template[moving], axis=1)
+        error = (patch - template[moving])[:, None]
+        step = (inverse[moving] @ (error @ descent[moving]).transpose(0, 2, 1))[:, :, 0]
+        # keep single steps small: the patch is only a few pixels wide
+        warp = np.eye(2) + np.clip(step[:, :4], -0.2, 0.2).reshape(-1, 2, 2)
+        linear[moving] = linear[moving] @ np.linalg.inv(warp)
+        move = linear[moving] @ np.clip(step[:, 4:], -1.5, 1.5)[:, :, None]
+        centre[moving] -= move[:, :, 0]
+        shift[moving] = np.linalg.norm(move[:, :, 0], axis=1)
+        moving = moving[shift[moving] > SETTLED_PX]
+        if len(moving) == 0:
+            break
+    return centre, (shift < 10 * SETTLED_PX) & (correlation > MIN_CORRELATION)

@@ -1,0 +1,172 @@
+"""Turns that show the same pictures: what is played again, forwards or backwards, adds nothing.
+
+Two scenes are compared by what they are made of. Where their pictures are the same, tracks that
+are near each other in the picture move alike over the next keyframes, whichever corners were
+followed: they lie on the same surface, seen from the same places. Elsewhere hardly any do; nor on
+a second drive through the same bend, on another path at another speed. The yaw over time tells by
+how much one scene may be moved in time, forwards or backwards, to fit a part of the other.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Ints, Mask
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.scene import Scene
+
+# s between the offsets in time that are tried; neighbouring tracks forgive half of it
+OFFSET_S = 0.05
+# keyframes over which tracks are compared: they move by a tenth of the width
+SPAN = 3
+# how many such spans two scenes must have in common
+LEAST_SPANS = 2
+# degrees; a span that turns less fits everywhere. The yaw of the same turn in two reconstructions
+# differs by this factor, and by so many degrees, at the most
+LEAST_YAW_DEG, YAW_RATIO, SAME_YAW_DEG = 1.0, 1.2, 0.5
+# spans that tell whether an offset is worth comparing all
+PROBES = 3
+# px; tracks as near as that lie on one surface, and those that move alike differ by so much
+NEAR_PX, ALIKE_PX = 8.0, 1.5
+# the share of near tracks that move alike, the mean of three spans: 0.8 to 1 in the same pictures,
+# 0.33 at the most in 100 pairs of other real turns, 0.3 at 4 % another speed through the same bend
+LEAST_ALIKE = 0.5
+# tracks of a span that are compared at the most, and how many must be near another
+MOST_TRACKS, FEWEST_NEAR = 60, 8
+# of a turn's keyframes; with fewer new ones it is left out: one place counts once
+LEAST_NEW = 0.75
+
+
+def without_repeated(scenes: Sequence[Scene], min_images: int
+                     ) -> tuple[list[Scene], dict[TurnId, TurnId]]:
+    """Return the scenes without those that repeat an earlier one, and which turn each repeats.
+
+    A scene of which most is new is cut to that. min_images: least keyframes of a scene.
+    """
+    kept: list[Scene] = []
+    repeated: dict[TurnId, TurnId] = {}
+    for n, scene in enumerate(scenes):
+        whole = int(scene.structure.registered.sum())
+        # with those that were left out, too: backwards, a third turn may show it better
+        for other in scenes[:n]:
+            again = repeats(scene, other)
+            new = scene.structure.registered & ~again
+            if not again.any():
+                continue
+            if new.sum() < max(min_images, LEAST_NEW * whole):
+                repeated[scene.turn] = repeated.get(other.turn, other.turn)
+                break
+            scene = _cut(scene, new)
+        else:
+            kept.append(scene)
+    return kept, repeated
+
+
+def repeats(scene: Scene, other: Scene) -> Mask:
+    """Return (k,) which keyframes of a scene show pictures of the other one."""
+    again = np.zeros(len(scene.tracks.frames), bool)
+    if scene.tracks.image_size != other.tracks.image_size:
+        return again
+    rows = np.flatnonzero(scene.structure.registered)
+    for direction in (1.0, -1.0):
+        for offset, turning in _offsets(scene, other, direction):
+            times = direction * _seconds(scene) + offset
+            probes = turning[np.linspace(0, len(turning) - 1, PROBES).astype(int)]
+            if not (_alike(scene, other, rows, probes, times) > LEAST_ALIKE).any():
+                continue
+            starts = np.arange(len(rows) - SPAN)
+            share = _alike(scene, other, rows, starts, times)
+            # one span may agree by chance, not its neighbours, too
+            same = np.flatnonzero(np.convolve(share, np.ones(3) / 3, 'same') > LEAST_ALIKE)
+            if len(same) >= LEAST_SPANS:
+                again[rows[np.unique(same[:, None] + np.arange(SPAN + 1))]] = True
+    return again
+
+
+def _offsets(scene: Scene, other: Scene, direction: float) -> list[tuple[float, Ints]]:
+    """Return by how much the scene's time may be moved so that it fits the other's yaw, s.
+
+    direction: -1 turns its time round. Beside each stands which spans of the scene, (n,) by their
+    first registered keyframe, turn as much there.
+    """
+    times, yaw = _yaw_deg(scene)
+    other_times, other_yaw = _yaw_deg(other)
+    if len(times) <= SPAN or len(other_times) < 2:
+        return []
+    times = direction * times
+    offsets = np.arange(other_times[0] - times.max(), other_times[-1] - times.min(), OFFSET_S)
+    begin, end = times[:-SPAN] + offsets[:, None], times[SPAN:] + offsets[:, None]
+    inside = ((np.minimum(begin, end) >= other_times[0])
+              & (np.maximum(begin, end) <= other_times[-1]))
+    there = np.interp(end, other_times, other_yaw) - np.interp(begin, other_times, other_yaw)
+    own = yaw[SPAN:] - yaw[:-SPAN]
+    # the focal lengths that the turns were reconstructed with differ, and their yaw with them
+    fits = inside & (np.abs(own) > LEAST_YAW_DEG) & (
+        np.abs(there - own) < (YAW_RATIO - 1) * np.abs(own) + SAME_YAW_DEG)
+    return [(float(offset), np.flatnonzero(each))
+            for offset, each in zip(offsets, fits, strict=True) if each.sum() >= LEAST_SPANS]
+
+
+def _alike(scene: Scene, other: Scene, rows: Ints, starts: Ints, times: Floats) -> Floats:
+    """Return (n,) of the tracks near one of the other scene, the share that moves as that does.
+
+    rows: the registered keyframes. starts: (n,) with which of them spans begin. times: (k,) when
+    the other scene shows the keyframes. 0 where too few tracks are near one.
+    """
+    shares = np.zeros(len(starts))
+    for n, start in enumerate(starts):
+        ends = rows[[start, start + SPAN]]
+        own = scene.tracks.xy[ends]
+        there = np.array([_places_at(other, times[row]) for row in ends])
+        own, there = (each[:, np.isfinite(each).all(axis=(0, 2))] for each in (own, there))
+        own = own[:, ::max(1, own.shape[1] // MOST_TRACKS)]
+        if not own.shape[1] or not there.shape[1]:
+            continue
+        across, down = (own[0][:, None, axis] - there[0][:, axis] for axis in (0, 1))
+        apart = across**2 + down**2
+        nearest = apart.argmin(axis=1)
+        near = apart.min(axis=1) < NEAR_PX**2
+        if near.sum() >= FEWEST_NEAR:
+            moved = (own[1] - own[0]) - (there[1] - there[0])[nearest]
+            shares[n] = np.mean(np.linalg.norm(moved[near], axis=1) < ALIKE_PX)
+    return shares
+
+
+def _seconds(scene: Scene) -> Floats:
+    """Return (k,) the keyframes' times since the first."""
+    stamps = scene.tracks.stamps_ns
+    return np.asarray((stamps - stamps[0]) / 1e9)
+
+
+def _yaw_deg(scene: Scene) -> tuple[Floats, Floats]:
+    """Return the times of the registered keyframes and the yaw there, degrees."""
+    return _seconds(scene)[scene.structure.registered], scene.yaws_deg
+
+
+def _places_at(scene: Scene, time: float) -> Floats:
+    """Return (t, 2) where a scene's tracks are at a time, between two keyframes; NaN unseen."""
+    times = _seconds(scene)
+    # a keyframe that is as near as that counts as this picture
+    inside = float(np.clip(time, times[0], times[-1]))
+    if abs(time - inside) > OFFSET_S / 2:
+        return np.full((scene.tracks.xy.shape[1], 2), np.nan)
+    after = max(int(np.searchsorted(times, inside)), 1)
+    share = (inside - times[after - 1]) / max(times[after] - times[after - 1], 1e-9)
+    before, later = scene.tracks.xy[after - 1], scene.tracks.xy[after]
+    return np.asarray((1 - share) * before + share * later)
+
+
+def _cut(scene: Scene, rows: Mask) -> Scene:
+    """Return the scene with these keyframes only."""
+    tracks, structure = scene.tracks, scene.structure
+    used = structure.used[rows]
+    # a point needs two views
+    used = used & (used.sum(axis=0) >= 2)
+    return replace(
+        scene, tracks=replace(tracks, frames=tracks.frames[rows], xy=tracks.xy[rows],
+                              stamps_ns=tracks.stamps_ns[rows]),
+        structure=replace(structure, rotations=structure.rotations[rows],
+                          translations=structure.translations[rows],
+                          registered=structure.registered[rows], used=used))

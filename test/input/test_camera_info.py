@@ -1,0 +1,134 @@
+"""dashcalib run --write-bag: the bag again, with camera_info beside each image."""
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from dashcalib_ros.camera import Brown, Fisheye, Radial, ros_camera
+from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.bags.camera_info import camera_info_topic, check_bag, write_bag
+from dashcalib_ros.input.bags.write import BagWriter
+from dashcalib_ros.input.inputs import open_frames
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+CAMERA = Radial((64, 48), 400.0, 401.0, 31.0, 23.0, -0.3, 0.1)
+START = 1_767_614_400 * 10**9
+
+
+def header(n):
+    time = TYPES.types['builtin_interfaces/msg/Time'](sec=START // 10**9 + n, nanosec=7 * n)
+    return TYPES.types['std_msgs/msg/Header'](stamp=time, frame_id=f'camera {n}')
+
+
+@pytest.fixture(params=[StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=['mcap', 'db3'])
+def bag(request, tmp_path):
+    """A bag of a camera, its old camera_info, and something else."""
+    kinds = TYPES.types
+    path = tmp_path / 'drive'
+    with Writer(path, version=9, storage_plugin=request.param) as writer:
+        images = writer.add_connection('/cam/image_raw', 'sensor_msgs/msg/Image', typestore=TYPES)
+        old = writer.add_connection('/cam/camera_info', 'sensor_msgs/msg/CameraInfo',
+                                    typestore=TYPES)
+        words = writer.add_connection('/words', 'std_msgs/msg/String', typestore=TYPES)
+        roi = kinds['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
+        for n in range(5):
+            image = kinds['sensor_msgs/msg/Image'](
+                header(n), 48, 64, 'mono8', 0, 64, np.full(48 * 64, n, np.uint8))
+            info = kinds['sensor_msgs/msg/CameraInfo'](
+                header(n), 0, 0, '', np.zeros(0), np.zeros(9), np.zeros(9), np.zeros(12), 0, 0,
+                roi)
+            word = kinds['std_msgs/msg/String'](f'word {n}')
+            for connection, message in ((images, image), (old, info), (words, word)):
+                writer.write(connection, START + n * 10**8 + 3,
+                             TYPES.serialize_cdr(message, connection.msgtype))
+    return path
+
+
+def messages(path, topic):
+    with Reader(path) as reader:
+        chosen = [each for each in reader.connections if each.topic == topic]
+        return [(stamp, bytes(raw)) for _, stamp, raw in reader.messages(chosen)]
+
+
+def test_each_image_gets_its_camera_info_and_all_else_stays(bag, tmp_path):
+    out = tmp_path / 'out' / 'with_info'
+    assert write_bag(bag, '/cam/image_raw', CAMERA, out) == 5
+    for topic in ('/cam/image_raw', '/words'):
+        assert messages(out, topic) == messages(bag, topic)
+    infos = messages(out, '/cam/camera_info')
+    assert [stamp for stamp, _ in infos] == [
+        stamp for stamp, _ in messages(bag, '/cam/image_raw')]
+    for n, (_, raw) in enumerate(infos):
+        info = TYPES.deserialize_cdr(raw, 'sensor_msgs/msg/CameraInfo')
+        assert info.header == header(n)
+        assert (info.width, info.height, info.distortion_model) == (64, 48, 'plumb_bob')
+        assert info.k.tolist() == [400, 0, 31, 0, 401, 23, 0, 0, 1]
+        assert info.p.tolist() == [400, 0, 31, 0, 0, 401, 23, 0, 0, 0, 1, 0]
+        assert info.d.tolist() == [-0.3, 0.1, 0, 0, 0]
+    assert [path.name for path in out.parent.iterdir()] == ['with_info']
+
+
+@pytest.mark.parametrize('lens', [
+    Brown((64, 48), 40.0, 40.1, 31.0, 23.0, -0.3, 0.1, 0.001, -0.002, -0.01),
+    Fisheye((64, 48), 30.0, 30.1, 31.0, 23.0, -0.02, 0.003, -0.001, 0.0002)],
+    ids=['brown', 'fisheye'])
+@pytest.mark.parametrize('rectified', ['same', 'crop', 'all'])
+def test_other_models_and_their_rectified_view(bag, tmp_path, lens, rectified):
+    out = tmp_path / 'with_info'
+    assert write_bag(bag, '/cam/image_raw', lens, out, rectified) == 5
+    ros = ros_camera(lens, rectified)
+    for _, raw in messages(out, '/cam/camera_info'):
+        info = TYPES.deserialize_cdr(raw, 'sensor_msgs/msg/CameraInfo')
+        assert info.distortion_model == lens.ros_model and info.d.tolist() == ros.d
+        assert info.k.tolist() == ros.k and info.p.tolist() == ros.p
+        assert (info.p[0] == lens.fx) == (rectified == 'same')
+
+
+def test_compressed_images_and_the_other_reader(tmp_path):
+    source, out = tmp_path / 'drive', tmp_path / 'out'
+    with BagWriter(source, '/image_raw/compressed', compressed='jpeg') as writer:
+        for n in range(3):
+            writer.write(Frame(n, START + n, np.full((48, 64), n, np.uint8)))
+    assert write_bag(source, '/image_raw/compressed', CAMERA, out) == 3
+    assert len(messages(out, '/camera_info')) == 3
+    assert [frame.stamp_ns for frame in open_frames(out)] == [START, START + 1, START + 2]
+
+
+@pytest.mark.parametrize(('topic', 'expected'), [
+    ('/image_raw', '/camera_info'), ('/a/b/image', '/a/b/camera_info'),
+    ('/a/image/compressed', '/a/camera_info')])
+def test_camera_info_lies_beside_the_image(topic, expected):
+    assert camera_info_topic(topic) == expected
+
+
+def test_a_bag_cut_off_in_the_middle_gives_no_bag(bag, tmp_path):
+    file = next(path for path in bag.iterdir() if path.suffix in ('.mcap', '.db3'))
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    with pytest.raises(InputError, match='repair it first'):
+        write_bag(bag, '/cam/image_raw', CAMERA, tmp_path / 'out')
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['drive']
+
+
+def test_what_cannot_be_done_is_said_before_the_calibration(bag, tmp_path):
+    check_bag(bag, '/cam/image_raw', tmp_path / 'out')
+    with pytest.raises(InputError, match='is no bag'):
+        check_bag('drive.mp4', None, tmp_path / 'out')
+    with pytest.raises(InputError, match='ROS 1'):
+        check_bag('drive.bag', '/image', tmp_path / 'out')
+    with pytest.raises(OutputError, match='exists'):
+        check_bag(bag, '/cam/image_raw', bag)
+
+
+def test_the_command_says_why_there_is_no_bag(bag, tmp_path):
+    """Five grey images make no calibration, so there must be no bag."""
+    command = [sys.executable, '-m', 'dashcalib_ros.cli', 'run', str(bag), '--out',
+               str(tmp_path / 'result'), '--write-bag', str(tmp_path / 'new')]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 3 and 'no bag was written' in done.stderr, done.stderr
+    assert not (tmp_path / 'new').exists()

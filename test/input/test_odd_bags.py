@@ -1,0 +1,144 @@
+"""Bags that are bombs, and folders of bags with odd entries in them."""
+from __future__ import annotations
+
+import bz2
+import os
+
+import lz4.frame
+import pytest
+import zstandard
+from made_drives import ROS2, drive, fails, head, images, same, storage, write_bag, write_mcap
+from mcap.writer import CompressionType
+from rosbags.rosbag1.reader import decompressors
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+
+from dashcalib_ros import limits
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.bags import record, salvage, unpack
+from dashcalib_ros.input.bags.camera_info import check_bag
+from dashcalib_ros.input.inputs import open_frames
+
+LAUGHS = 'a0: &a0 [lol, lol]\n' + '\n'.join(
+    f'a{n}: &a{n} [{", ".join([f"*a{n - 1}"] * 10)}]' for n in range(1, 10))
+
+
+@pytest.mark.parametrize(('pack', 'unpacked'), [
+    (zstandard.compress, unpack.unpack_zstd), (lz4.frame.compress, unpack.unpack_lz4),
+    (bz2.compress, unpack.unpack_bz2)])
+def test_what_is_packed_is_unpacked_within_the_limit(pack, unpacked):
+    for content in (b'', b'content', os.urandom(3 * unpack.PIECE + 1)):
+        assert unpacked(pack(content)) == content
+    bomb = pack(bytes(2**24))
+    assert len(bomb) < 2**18
+    assert len(unpacked(bomb, 2**24)) == 2**24
+    with pytest.raises(InputError, match='unpacks to more than 8 MB'):
+        unpacked(bomb, 2**23)
+    with pytest.raises((EOFError, zstandard.ZstdError)):
+        if unpacked(bomb[:len(bomb) // 2]) != bytes(2**24):
+            raise EOFError
+
+
+def test_rosbags_unpacks_within_the_limit(monkeypatch):
+    """Its tables are where this package looks for them, and have our functions."""
+    small = 2**20
+    monkeypatch.setattr(unpack, 'unpack_zstd', lambda data: data[:small])
+    assert {'zstd', 'lz4'} <= set(DECOMPRESSORS) and {'bz2', 'lz4'} <= set(decompressors)
+    assert DECOMPRESSORS['zstd'](bytes(2 * small), 0) == bytes(small)
+    assert decompressors['bz2'] is unpack.unpack_bz2
+    assert decompressors['lz4'] is unpack.unpack_lz4
+
+
+@pytest.mark.parametrize('compression', [CompressionType.ZSTD, CompressionType.LZ4])
+def test_a_chunk_that_is_a_bomb_is_left_out(tmp_path, compression, monkeypatch):
+    frames = drive(5)
+    file = write_mcap(tmp_path / 'drive.mcap', frames, compression=compression, chunk_size=4000)
+    tight = lambda function: lambda data: function(data, 3000)  # noqa: E731
+    monkeypatch.setattr(salvage, 'UNPACK_MCAP', {
+        name: tight(function) for name, function in salvage.UNPACK_MCAP.items()})
+    for name, function in (('zstd', unpack.unpack_zstd), ('lz4', unpack.unpack_lz4)):
+        monkeypatch.setitem(DECOMPRESSORS, name, lambda data, _, f=function: f(data, 3000))
+    line = fails('broken chunk', file)
+    assert 'unpacks to more than 0 MB' in line
+
+
+def test_a_message_that_is_a_bomb_is_an_undecodable_one(tmp_path, monkeypatch):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)), mode=CompressionMode.MESSAGE)
+    same(list(open_frames(bag)), drive(3))
+    monkeypatch.setattr(record, 'MESSAGE_BYTES', 1000)
+    fails('a message on /camera: a part of the bag unpacks to more than', bag)
+
+
+@pytest.mark.parametrize('plugin', StoragePlugin)
+def test_a_file_that_is_a_bomb_ends_in_time(tmp_path, plugin, monkeypatch):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)), plugin)
+    plain = storage(bag)
+    packed = plain.with_name(f'{plain.name}.zstd')
+    packed.write_bytes(zstandard.compress(plain.read_bytes() + bytes(2**24)))
+    plain.unlink()
+    (bag / 'metadata.yaml').unlink()
+    monkeypatch.setattr(limits, 'UNPACKED_LEAST', 2**20)
+    monkeypatch.setattr(limits, 'UNPACKED_RATIO', 2)
+    for path in (bag, packed):
+        fails(r'unpacks to more than 1 MB, which is no recording; .* \(zstd -d\)', path)
+    with pytest.raises(InputError, match='which is no recording'):
+        check_bag(packed, '/camera', tmp_path / 'out')
+
+
+@pytest.mark.parametrize('metadata', [
+    LAUGHS, '[' * 5000, 'rosbag2_bagfile_information: *x', '- ' * 3000])
+def test_a_hostile_metadata_file_is_no_obstacle(tmp_path, metadata):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)))
+    (bag / 'metadata.yaml').write_text(metadata)
+    source = open_frames(bag)
+    same(list(source), drive(3))
+    assert 'no usable metadata.yaml' in source.warnings[0]
+    with pytest.raises(InputError, match='cannot be copied'):
+        check_bag(bag, '/camera', tmp_path / 'out')
+
+
+@pytest.mark.parametrize('count', ['.inf', '-.inf', '.nan', '9' * 400, 'many', '[]'])
+def test_a_count_that_is_none_is_no_obstacle(tmp_path, count):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)))
+    path = bag / 'metadata.yaml'
+    path.write_text(path.read_text().replace('message_count: 3', f'message_count: {count}'))
+    assert count in path.read_text()
+    source = open_frames(bag)
+    same(list(source), drive(3))
+    assert 'no usable metadata.yaml' in source.warnings[0]
+
+
+def test_a_metadata_file_that_is_a_pipe_is_no_obstacle(tmp_path):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)))
+    (bag / 'metadata.yaml').unlink()
+    os.mkfifo(bag / 'metadata.yaml')
+    same(list(open_frames(bag)), drive(3))
+
+
+def test_odd_entries_of_a_bag_are_skipped_and_named(tmp_path):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)))
+    os.mkfifo(bag / 'a.mcap')
+    (bag / 'b.db3').mkdir()
+    (bag / 'c.bag').symlink_to('nowhere')
+    source = open_frames(bag)
+    same(list(source), drive(3))
+    assert source.warnings == (
+        f'3 entries of {bag} were skipped: a.mcap is a named pipe, b.db3 is a folder, '
+        f'c.bag is a link to nothing',)
+    (bag / 'metadata.yaml').unlink()
+    same(list(open_frames(bag)), drive(3))
+
+
+def test_a_bag_of_odd_entries_alone_says_so(tmp_path):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)))
+    storage(bag).unlink()
+    os.mkfifo(bag / 'a.mcap')
+    fails('has no .mcap, .db3 or .bag file .1 entries of .* a.mcap is a named pipe', bag)
+
+
+def test_a_raw_message_of_an_absurd_size_is_an_undecodable_one(tmp_path):
+    message = ROS2.types['sensor_msgs/msg/Image'](
+        header=head(1), height=2**31, width=2**31, encoding='mono8', is_bigendian=0, step=0,
+        data=drive(1)[0].image.reshape(-1)[:0])
+    fails('says it is 2147483648x2147483648', write_bag(
+        tmp_path / 'bag', [('/camera', 1, message)]))

@@ -1,0 +1,97 @@
+"""The stamp gate, for recordings and for live streams: order, losses, set-backs, thinning."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dashcalib_ros.config import Config
+from dashcalib_ros.detect import MotionEstimator
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.stamps import RECORDED, StampGate, StampPolicy, live
+
+SECOND = 10**9
+START = 1_767_614_400 * SECOND
+
+
+def taken(*stamps):
+    watch = StampGate(StampPolicy(shift=False, skip_zero=True))
+    return watch, [watch.take(stamp, 77 + n) for n, stamp in enumerate(stamps)]
+
+
+def test_good_stamps_pass_and_gaps_are_counted():
+    steps = [0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 12, 15]
+    watch, got = taken(*(START + step * SECOND // 10 for step in steps))
+    assert got == [START + step * SECOND // 10 for step in steps]
+    assert watch.lost == 4
+
+
+def test_jitter_is_no_loss():
+    rng = np.random.default_rng(0)
+    watch, _ = taken(*(START + n * SECOND // 30 + int(rng.uniform(-6e6, 6e6)) for n in range(500)))
+    assert watch.lost == 0
+
+
+def test_a_pause_is_no_loss():
+    watch, _ = taken(*(START + n * SECOND // 10 for n in range(20)), START + 60 * SECOND)
+    assert watch.lost == 0
+
+
+def test_late_and_repeated_images_are_not_learned_from():
+    watch, got = taken(START, START, START - SECOND // 2, START + 1)
+    assert got == [START, None, None, START + 1] and watch.repeated == 2
+
+
+def test_a_clock_that_is_set_back_is_passed_on():
+    watch, got = taken(START, START - 100 * SECOND, START - 99 * SECOND)
+    assert got == [START, START - 100 * SECOND, START - 99 * SECOND]
+    assert (watch.set_back, watch.repeated) == (1, 0)
+
+
+def test_drivers_without_stamps_are_timed_by_arrival():
+    watch, got = taken(0, 0, 0)
+    assert got == [77, 78, 79] and watch.zero == 0
+    assert watch.take(START, 80) == START
+
+
+def test_one_zero_among_stamps_is_left_out():
+    watch, got = taken(START, 0, START + 1)
+    assert got == [START, None, START + 1] and watch.zero == 1
+
+
+@pytest.mark.parametrize('rate', [5.0, 9.9, 13.0, 15.0, 25.0, 29.97, 60.0])
+def test_thinning_takes_what_the_motion_estimator_takes(rate):
+    rng = np.random.default_rng(int(rate))
+    config = Config()
+    gate, estimator = StampGate(live(config.motion.rate)), MotionEstimator(config.motion)
+    image = np.zeros((48, 64), np.uint8)
+    stamps = [START + round(n * SECOND / rate + rng.uniform(-5e6, 5e6)) for n in range(60)]
+    stamps += [stamp - 3000 * SECOND for stamp in stamps]  # a bag that loops
+    mine = [gate.take(stamp, 0) is not None for stamp in stamps]
+    theirs = [estimator.push(Frame(n, stamp, image)) is not None
+              for n, stamp in enumerate(stamps)]
+    assert mine == theirs and any(mine)
+
+
+def test_a_recording_goes_on_where_its_clock_is_set_back():
+    gate = StampGate(RECORDED)
+    stamps = [gate.take(hour * 3600 * SECOND + tenth * SECOND // 10, 0)
+              for hour, tenth in ((5, 0), (5, 1), (4, 0), (4, 1), (4, 3))]
+    steps = np.diff(np.array(stamps, np.int64)) // (SECOND // 10)
+    assert steps.tolist() == [1, 1, 1, 2]
+    assert gate.warnings() == ['the clock was set back 1 times, by up to 3600.1 s: '
+                               'later stamps were shifted']
+
+
+def test_a_recording_without_stamps_keeps_to_the_times_of_reception():
+    gate = StampGate(RECORDED)
+    assert [gate.take(0, 5), gate.take(START, 6), gate.take(0, 7)] == [5, 6, 7]
+    assert gate.warnings() == [
+        'the image headers have no stamps: the times of reception were used']
+
+
+def test_a_live_stream_begins_anew_and_keeps_its_counts():
+    gate = StampGate(live(10.0))
+    assert [gate.take(START, 0), gate.take(START, 0), gate.take(0, 0)] == [START, None, None]
+    gate.forget()
+    assert gate.take(START - 10 * SECOND, 0) == START - 10 * SECOND
+    assert (gate.repeated, gate.zero, gate.set_back) == (1, 1, 0)

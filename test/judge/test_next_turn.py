@@ -1,0 +1,64 @@
+"""What one more turn would bring is what it brings."""
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import pytest
+from solving import CONFIG, scenes_of, solved
+
+from dashcalib_ros.judge.next_turn import next_turn, with_right_angles
+from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.solve.information import step_to_wider_model
+from dashcalib_ros.solve.picture import picture_covariance
+from dashcalib_ros.solve.prior import extra_sigma_of
+from dashcalib_ros.solve.solution import Solution
+
+NEEDS_MORE = CONFIG.replace({'verdict.min_turns': 9}).verdict
+
+
+@pytest.fixture(scope='module')
+def four():
+    return solved(scenes_of(4, tracks=110, keyframes=12))
+
+
+def first(solution: Solution, count: int) -> Solution:
+    """Return the solution as if only the first turns had been there."""
+    parts = solution.parts[:count]
+    step = step_to_wider_model(parts, solution.prior_information, extra_sigma_of(solution.camera))
+    found = picture_covariance(solution.camera, parts, solution.prior_information, solution.floor,
+                               step, solution.systematic)[:6, :6]
+    return dataclasses.replace(solution, scenes=solution.scenes[:count], parts=parts,
+                               covariance=found)
+
+
+@pytest.mark.parametrize(('count', 'more'), [(1, 2), (2, 1), (3, 1)])
+def test_it_is_what_the_next_turns_bring(four, count, more):
+    after = first(four, count + more)
+    told = with_right_angles(first(four, count), more)
+    assert 1 / 2 < told / float(after.sigma[0] / four.camera.fx) < 2
+
+
+def test_a_single_turn_is_told_what_two_more_bring(four):
+    assert re.fullmatch(r'two more right angles: fx to about [\d.]+ %',
+                        next_turn(first(four, 1)))
+
+
+def test_where_nothing_is_known_nothing_is_told(four):
+    blind = dataclasses.replace(four, parts=tuple(dataclasses.replace(
+        part, hessian=1e-9 * part.hessian, by_track=1e-9 * part.by_track) for part in four.parts))
+    assert next_turn(blind) == ''
+
+
+def test_a_verdict_tells_it_with_the_first_cure(four):
+    verdict = judge(four, NEEDS_MORE, outlook=True)
+    assert verdict.level == 'weak'
+    assert re.search(r'one more right angle: fx to about [\d.]+ %\)$', verdict.reasons[0])
+    assert verdict.reasons[0].endswith(': ' + verdict.cures[0])
+
+
+def test_where_something_contradicts_the_result_more_turns_are_no_cure(four):
+    strange = dataclasses.replace(NEEDS_MORE, max_aspect=0.0)
+    verdict = judge(four, strange, outlook=True)
+    assert len(verdict.reasons) == 2 and 'right angle' not in ' '.join(verdict.reasons)
+    assert judge(four, CONFIG.verdict, outlook=True).reasons == ()

@@ -1,0 +1,129 @@
+"""True poses from files, and how far cameras are from them."""
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from solving import CONFIG
+from synthetic import LENS, rotation, synthetic_turn
+
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.judge.odometry import odometry
+from dashcalib_ros.judge.paths import mounting, path_files
+from dashcalib_ros.judge.poses import Poses, read_poses
+
+STAMPS = np.array([10.0, 10.5, 11.0])
+
+
+def kitti(rotations, positions):
+    table = np.concatenate([rotations, positions[:, :, None]], axis=2).reshape(-1, 12)
+    return '\n'.join(' '.join(f'{value:.9e}' for value in row) for row in table)
+
+
+def three():
+    rotations = np.array([rotation(1, 0.2 * n) for n in range(3)])
+    return rotations, np.array([[n, 0.0, 2.0 * n] for n in range(3)])
+
+
+@pytest.mark.parametrize('before', ['', '0.1 '])
+def test_kittis_poses_are_those_of_the_frames(tmp_path, before):
+    rotations, positions = three()
+    path = tmp_path / 'poses.txt'
+    path.write_text('\n'.join(before + line for line in kitti(rotations, positions).split('\n')))
+    poses = read_poses(path)
+    found, places, known = poses.at(np.array([2, 0, 7]), np.zeros(3, np.int64))
+    assert known.tolist() == [True, True, False]
+    np.testing.assert_allclose(found[:2], rotations[[2, 0]], atol=1e-8)
+    np.testing.assert_allclose(places[:2], positions[[2, 0]])
+
+
+def test_tums_poses_are_interpolated_at_the_frames_stamps(tmp_path):
+    path = tmp_path / 'poses.tum'
+    path.write_text('# t x y z qx qy qz qw\n1700000010.0 0 0 0 0 0 0 1\n'
+                    '1700000010.4 4 0 0 0 0.7071067811865476 0 0.7071067811865476\n'
+                    '1700000020.0 5 0 0 0 0 0 1\n')
+    stamps = np.array([1700000009900000000, 1700000010100000000, 1700000015000000000])
+    found, places, known = read_poses(path).at(np.arange(3), stamps)
+    # before the first pose, and in a gap of 10 s, nothing is known
+    assert known.tolist() == [False, True, False]
+    np.testing.assert_allclose(places[1], [1.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(found[1], rotation(1, np.pi / 8), atol=1e-6)
+
+
+@pytest.mark.parametrize(('text', 'match'), [
+    ('', 'no poses'), ('1 2 3\n4 5 6\n', 'no poses'), ('1 2\n' + '0 ' * 12 + '\n', 'no poses'),
+    (f'{"1 " * 12}\n' * 2, 'no rotations'), (f'{"a " * 12}\n' * 2, 'not all numbers'),
+    (f'{"nan " * 8}\n' * 2, 'not finite'),
+    ('2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n', 'do not ascend'),
+    ('1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 0\n', 'no rotations')])
+def test_what_is_no_file_of_poses_is_named(tmp_path, text, match):
+    path = tmp_path / 'poses.txt'
+    path.write_text(text)
+    with pytest.raises(InputError, match=match) as caught:
+        read_poses(path)
+    assert str(path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
+
+
+MOUNT = rotation(0, 0.3) @ rotation(2, -0.2)
+
+
+@pytest.fixture(scope='module')
+def motion():
+    """Return two turns beside their truth, which is given in the frame of another sensor."""
+    turns = [synthetic_turn(yaw_deg=yaw, keyframes=14, tracks=150, world=world)
+             for world, yaw in enumerate((80.0, -70.0))]
+    rotations = np.zeros((2000, 3, 3))
+    rotations[:] = np.eye(3)
+    positions = np.zeros((2000, 3))
+    scenes = []
+    for turn, center in zip(turns, (0, 1000), strict=True):
+        structure = turn.structure
+        frames = turn.tracks.frames + center
+        turned = structure.rotations.transpose(0, 2, 1)
+        positions[frames] = -np.einsum('kij,kj->ki', turned, structure.translations)
+        rotations[frames] = turned @ MOUNT
+        scene = turn.scene(LENS, center)
+        object.__setattr__(scene.tracks, 'frames', frames)
+        scenes.append(scene)
+    cameras = {'given': LENS.with_focal(1.05 * LENS.fx), 'ours': LENS}
+    return odometry(scenes, cameras, Poses(rotations, positions), CONFIG)
+
+
+def test_the_camera_that_is_right_finds_the_rotation(motion):
+    medians = motion.medians()
+    assert len(motion.turns) == 2 and motion.turns[0].angle_deg == pytest.approx(80.0, abs=2.0)
+    assert medians['rotation_deg']['ours'] < 0.1 < 1.0 < medians['rotation_deg']['given']
+    assert medians['scale_drift']['ours'] < 0.01 < medians['scale_drift']['given']
+    length = motion.turns[0].length_m
+    assert length == pytest.approx(26.0, abs=1.0)
+    assert medians['rotation_deg_per_100m']['given'] > 2 * medians['rotation_deg']['given']
+
+
+def test_where_the_other_sensor_sits_is_found_from_the_turns(motion):
+    # the axis that all turns share leaves one angle open: what is turned is what counts
+    found = mounting(motion)
+    for turn in motion.turns:
+        seen = turn.paths['ours'].rotations
+        own = found @ (seen[0].T @ seen[-1]) @ found.T
+        true = turn.true.rotations[0].T @ turn.true.rotations[-1]
+        np.testing.assert_allclose(own, true, atol=5e-3)
+
+
+def test_the_paths_are_plotted_and_written_for_evo(motion):
+    files = path_files(motion)
+    assert set(files) == {'paths.svg', *(f'turn_{center:06}_{name}.tum' for center in (0, 1000)
+                                         for name in ('poses', 'given', 'ours'))}
+    root = ElementTree.fromstring(files['paths.svg'])
+    assert sum(each.tag.endswith('polyline') for each in root.iter()) == 6
+    table = np.array([line.split() for line in files['turn_000000_ours.tum'].splitlines()], float)
+    assert table.shape == (14, 8)
+    np.testing.assert_allclose(table[:, 0], 0.3 * np.arange(14))
+    np.testing.assert_allclose(np.linalg.norm(table[:, 4:], axis=1), 1.0, atol=1e-6)
+
+
+def test_poses_of_another_time_are_refused(motion):
+    scene = synthetic_turn(keyframes=8, tracks=100).scene(LENS)
+    rotations, positions = three()
+    with pytest.raises(InputError, match='none of the turns has poses'):
+        odometry([scene], {'ours': LENS}, Poses(rotations, positions, STAMPS + 1e9), CONFIG)
