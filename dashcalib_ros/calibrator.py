@@ -28,7 +28,7 @@ from dashcalib_ros.judge import (
     watch,
     with_lines,
 )
-from dashcalib_ros.judge.agreement import evidence_of
+from dashcalib_ros.judge.agreement import earlier_of_another_camera, evidence_of
 from dashcalib_ros.judge.conclude import CONTRADICTS, Evidence, evidence_of_detection
 from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve.solution import Solution
@@ -116,9 +116,11 @@ class Calibrator:
         solution: Solution | None = None
         if scenes:
             solution = self._scenes.run(stages.solve, scenes, self._config, progress=tell)
+            contradicted = earlier_of_another_camera(scenes, solution)
+            self._scenes.leave_out(contradicted)
             self._scenes.reject(dict.fromkeys(
-                {scene.turn for scene in scenes} - evidence_of(solution, self._config.verdict),
-                CONTRADICTS))
+                {scene.turn for scene in scenes} - evidence_of(solution, self._config.verdict)
+                - contradicted, CONTRADICTS))
         self._solution = solution
         return stages.judge(solution, self._evidence(started), self._config)
 

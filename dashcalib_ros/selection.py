@@ -25,6 +25,7 @@ Progress = Callable[[str, float], None]
 NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow enough points, or '
             'the car hardly moved')
 ALONE = 'this drive has no turn that could agree with it'
+OTHER_CAMERA = 'the turns of this drive are of another camera'
 
 
 class SceneSelection:
@@ -61,6 +62,8 @@ class SceneSelection:
         self._closed = False
         # why turns were taken out
         self._rejected: dict[TurnId, str] = {}
+        # turns of earlier drives that this drive contradicts; on disk they stay
+        self._contradicted: set[TurnId] = set()
         turns = config.turns
         self._kept = TurnStore(turns.store, max(turns.capacity, turns.wanted), turns.half_width,
                                self._store_failed)
@@ -131,7 +134,7 @@ class SceneSelection:
         built = self._pool.scenes()
         failed = {turn: NO_SCENE for turn, scene in built.items() if scene is None}
         alone = {} if len(failed) < len(built) else dict.fromkeys(self._kept.turns, ALONE)
-        return failed | alone | self._rejected
+        return failed | alone | dict.fromkeys(self._contradicted, OTHER_CAMERA) | self._rejected
 
     def stored_before(self) -> tuple[StoredTurn, ...]:
         """Return the turns of earlier drives that the last wanted() had to choose from."""
@@ -147,7 +150,8 @@ class SceneSelection:
         These may be another camera's, and must not crowd out those that tell.
         """
         found = [(False, -turn.prominence, turn.id) for turn in self._detection.turns()]
-        found += [(True, -turn.prominence, key) for key, turn in self._kept.turns.items()]
+        found += [(True, -turn.prominence, key) for key, turn in self._kept.turns.items()
+                  if key not in self._contradicted]
         return [key for *_, key in sorted(found)]
 
     def _best(self, among: Collection[TurnId]) -> list[TurnId]:
@@ -230,6 +234,11 @@ class SceneSelection:
                 if self._kept.turns.pop(key, None) is None:
                     self._pool.reject(key)
         self._store()
+
+    def leave_out(self, earlier: Set[TurnId]) -> None:
+        """Use these turns of earlier drives no more in this drive; on disk they stay."""
+        with self._lock:
+            self._contradicted |= earlier
 
     def run(self, function: Callable[..., Any], *arguments: Any, progress: Progress) -> Any:
         """Run a stage in a worker, as soon as one is free, and return what it returns."""

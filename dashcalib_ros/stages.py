@@ -86,10 +86,12 @@ def solve(scenes: Sequence[Scene], config: Config,
           progress: Progress = lambda stage, done: None) -> Solution | None:
     """Adjust all scenes with one camera (paper, 3.2); None where it explains none of them.
 
-    scenes: at least one, each as its turn was reconstructed.
+    scenes: at least one, each as its turn was reconstructed. Those of earlier drives are not in
+    the solution, nor in its misfits, where this drive's turns contradict them.
     """
-    from dashcalib_ros.solve import joint
-    return joint.solve(scenes, config, progress)
+    from dashcalib_ros.solve import earlier, joint
+    return earlier.solve_with_earlier(
+        scenes, lambda some: joint.solve(some, config, progress))
 
 
 def judge(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:

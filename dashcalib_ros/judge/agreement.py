@@ -1,12 +1,13 @@
 """Whether the turns agree on one camera, and how much each of them contributes to fx."""
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
 
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.information import noise_of
 from dashcalib_ros.solve.solution import Solution
 
@@ -31,6 +32,15 @@ def evidence_of(solution: Solution | None, config: VerdictConfig) -> set[TurnId]
         return set()
     of_another = turns_of_another_camera(solution.misfits, config)
     return {scene.turn for scene in solution.scenes} | of_another
+
+
+def earlier_of_another_camera(scenes: Sequence[Scene], solution: Solution | None
+                              ) -> set[TurnId]:
+    """Return the given turns of earlier drives that solve() left out, as this drive says."""
+    if solution is None:
+        return set()
+    return {scene.turn for scene in scenes
+            if not scene.turn.of_this_drive and scene.turn not in solution.misfits}
 
 
 def outdated(turns: Set[TurnId], of_another: Set[TurnId]) -> set[TurnId]:

@@ -23,9 +23,13 @@ def wider_covariance_of(solution: Solution) -> Floats:
 
     Of those that this model has not, the step is all that is known.
     """
-    return picture_covariance(
+    covariance = picture_covariance(
         solution.camera, solution.parts, solution.prior_information, solution.floor,
         solution.step_to_wider_model, solution.systematic, solution.one_turn_sigma)
+    if solution.doubt is not None:
+        count = len(solution.doubt)
+        covariance[:count, :count] += solution.doubt
+    return covariance
 
 
 def seen_by_turns(solution: Solution, given: Camera) -> Floats:

@@ -37,6 +37,8 @@ class Solution:
     camera, the strongest first. crops: of a stabilised video, taken out of the tracks. systematic:
     as for picture_covariance(). field: what no lens model has; None: nothing speaks for one.
     floor: (n,) sigmas of systematic errors. one_turn_sigma: of fx, px, where one turn is all.
+    doubt: (n, n) the part of covariance that says how little this drive's turns confirm those of
+    earlier drives; None where there are none.
     px: of the input's pictures, in one pixel of the scenes.
     """
 
@@ -60,6 +62,7 @@ class Solution:
     field: FoundField | None = None
     floor: Floats = default(default_factory=lambda: np.zeros(0))
     one_turn_sigma: float = 0.0
+    doubt: Floats | None = None
     px: float = 1.0
 
     @property
