@@ -194,8 +194,8 @@ class CalibrationInUse(CameraInUse):
         found = [self._store.taken] if self._store.taken else []
         if self.contradictions:
             found.append(f'{self.contradictions} of {self._rules.contradictions} calibrations in '
-                         f'a row contradict the published one: was the camera moved, or its lens '
-                         f'changed?')
+                         f'a row contradict the published one: was the camera moved, its lens '
+                         f'changed, or a stabiliser switched on?')
         if self._kept is not None and self._kept.edited and not self.confirmed:
             found.append(f'{self.file} was edited since a node wrote it: unconfirmed until turns '
                          f'agree with it')

@@ -12,6 +12,7 @@ from typing import Literal
 
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.contradiction import contradicted
+from dashcalib_ros.judge.verdict import STEADY
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.wording import digits_of
 
@@ -47,6 +48,9 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
     complete: it had all the turns wanted. published: what is published now, if anything;
     contradictions: how many in a row contradicted that.
     """
+    if published is not None and STEADY in new.verdict.cures:
+        return _contradicted(f'the published one, as the picture moves now: {STEADY}',
+                             contradictions, rules, 'give_up')
     if new.verdict.level != 'accepted' or new.camera is None or new.sigma is None:
         action: Action = 'wait' if published is None else 'keep'
         return Judgement(action, '; '.join(new.verdict.reasons), contradictions)
@@ -54,12 +58,9 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
         return Judgement('adopt')
     against = contradicted(published.camera, published.sigma, new.camera, new.sigma)
     if against:
-        count = contradictions + 1
-        why = (f'{count} of {rules.contradictions} calibrations in a row contradict the published '
-               f'one: {", ".join(against)}; was the camera moved, or its lens changed?')
-        if count < rules.contradictions:
-            return Judgement('keep', why, count)
-        return Judgement('replace' if complete else 'give_up', why)
+        return _contradicted(f'the published one: {", ".join(against)}; was the camera moved, or '
+                             f'its lens changed?', contradictions, rules,
+                             'replace' if complete else 'give_up')
     # the sigma of a file that was edited is not known
     before = 'not known' if published.sigma is None else f'± {published.sigma["fx"]:.2f} px'
     after = new.sigma['fx']
@@ -68,6 +69,13 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
         return Judgement('replace', f'it is more exact: fx is known to ± {after:.2f} px, it was '
                                     f'{before}')
     return Judgement('keep', 'it confirms the published one', confirmed=True)
+
+
+def _contradicted(what: str, contradictions: int, rules: Rules, last: Action) -> Judgement:
+    """Count one more contradiction. what: is contradicted, and why; last: done at the last one."""
+    count = contradictions + 1
+    why = f'{count} of {rules.contradictions} calibrations in a row contradict {what}'
+    return Judgement('keep', why, count) if count < rules.contradictions else Judgement(last, why)
 
 
 def state_of(published: bool, calibrating: bool, refused: bool) -> State:

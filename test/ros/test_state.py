@@ -10,6 +10,7 @@ from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.config import Config
 from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.judge.contradiction import contradicted
+from dashcalib_ros.judge.verdict import STEADY
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.state import Rules, judge, sigma_text, state_of
 
@@ -52,6 +53,18 @@ def test_contradictions_in_a_row_give_it_up():
         judged = judge(calibration(fx=440.0), False, OLD, count, RULES)
         count = judged.contradictions
         assert judged.action == expected and 'fx 440.0 instead of 400.0' in judged.why
+
+
+def test_a_stabiliser_that_is_switched_on_gives_it_up():
+    weak = calibration('weak')
+    verdict = Verdict('weak', (f'the picture moves: {STEADY}',), (STEADY,))
+    moving = dataclasses.replace(weak, verdict=verdict)
+    for count in (0, 1):
+        judged = judge(moving, True, OLD, count, RULES)
+        assert judged.action == 'keep' and judged.contradictions == count + 1
+        assert STEADY in judged.why
+    assert judge(moving, True, OLD, 2, RULES).action == 'give_up'
+    assert judge(moving, True, None, 0, RULES).action == 'wait'
 
 
 def test_a_confirmation_in_between_begins_the_count_anew():
