@@ -25,6 +25,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'reconstruct'))
 
 import cv2
 import numpy as np
@@ -484,6 +485,100 @@ def batch_kills(folder: Path, tries: Sequence[int]) -> Iterator[None]:
         yield
 
 
+def child_kills(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGKILL of children that calibrate: the result is the same, and no process is left."""
+    pictures = folder / 'pictures'
+    pictures.mkdir()
+    lens = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
+    for frame in Drive(lens, DriveSpec(seed=0, turns=2)).frames(processes=2):
+        cv2.imwrite(str(pictures / f'{frame.index:06}.png'), frame.image)
+
+    def calibrated(moments: Sequence[float]) -> tuple[dict[str, Any], str]:
+        out = folder / 'out'
+        process = subprocess.Popen(
+            dashcalib('run', pictures, '--fps', 10, '--out', out), start_new_session=True,
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        begun = time.monotonic()
+        for moment in moments:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(max(moment - (time.monotonic() - begun), 0.0))
+            children = set(processes_of(process.pid)) - {process.pid}
+            for child in children:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(child, signal.SIGKILL)
+        said = process.communicate(timeout=300)[1]
+        assert process.returncode in (0, 3), said
+        assert 'Traceback' not in said and not processes_of(process.pid)
+        found = json.loads((out / 'result.json').read_text())
+        shutil.rmtree(out)
+        return {key: found[key] for key in ('verdict', 'intrinsics', 'sigma', 'turns')}, said
+
+    begun = time.monotonic()
+    wanted, _ = calibrated(())
+    took = time.monotonic() - begun
+    for n in tries:
+        moments = np.sort(np.random.default_rng(n).uniform(0.2, 1.0, 1 + n % 2)) * took
+        found, said = calibrated(list(moments))
+        # a turn that ended its worker twice is left out, in so many words
+        assert found == wanted or 'tried again' in said, said
+        yield
+
+
+def pipes(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """A FIFO in the place of any file: one line at once, as nobody writes into it."""
+    pipe, text = folder / 'pipe', folder / 'm.csv'
+    os.mkfifo(pipe)
+    text.write_text('clip\npipe\n')
+    (folder / 'pictures').mkdir()
+    os.mkfifo(folder / 'pictures' / '0001.png')
+    kept, films = folder / 'kept.yaml', folder / 'films'
+    kept.write_text(KEPT)
+    films.mkdir()
+    for n in range(12):
+        cv2.imwrite(str(films / f'{n:04}.png'), noise(n))
+    given = [('run', pipe), ('run', folder / 'pictures', '--fps', 10),
+             ('run', films, '--fps', 10, '--mask', pipe),
+             ('run', films, '--fps', 10, '--config', pipe), ('check', pipe, films, '--fps', 10),
+             ('check', kept, pipe), ('compare', kept, pipe), ('export', pipe, '--to', 'rays'),
+             ('turns', pipe), ('batch', pipe), ('batch', text)]
+    for n in tries:
+        arguments = given[n % len(given)]
+        out = () if arguments[0] in ('compare', 'turns') else ('--out', folder / f'out{n}')
+        done = subprocess.run(dashcalib(*arguments, *out), capture_output=True, text=True,
+                              timeout=60, check=False)
+        assert done.returncode in (2, 3) and 'Traceback' not in done.stderr, done.stderr
+        yield
+
+
+def scene_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """A damaged clip of scenes costs its own row; nothing is written beside the output."""
+    from fleet_made import YAWS, clip_of, lens_of, written
+    from test_scene_file import ABOUTS, ARRAYS, damaged
+    from test_turn_store import SPOILED
+    contents = [damaged(about=about) for about in ABOUTS]
+    contents += [damaged(**{f'turn0.{name}': value for name, value in each.items()})
+                 for each in ARRAYS]
+    ways = [*SPOILED.values(), *(lambda path, data=data: path.write_bytes(data)
+                                 for data in contents)]
+    for n in tries:
+        place = folder / str(n)
+        for m in range(2):
+            written(clip_of(lens_of(), YAWS[m:m + 1], world=m, tracks=60, keyframes=7),
+                    place / f'{m}.npz')
+        ways[n % len(ways)](place / '1.npz')
+        (place / 'm.csv').write_text('clip,camera\n0.npz,one\n1.npz,one\n')
+        before = {path.name for path in place.iterdir()}
+        done = subprocess.run(
+            dashcalib('batch', place / 'm.csv', '--out', place / 'out', '--workers', 1, '--set',
+                      'intrinsics.profile_tracks=60'),
+            capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode in (0, 2, 3) and 'Traceback' not in done.stderr, done.stderr
+        assert {path.name for path in place.iterdir()} <= {*before, 'out'}
+        cameras = list((place / 'out').rglob('result.json'))
+        assert len(cameras) == 1, done.stderr
+        yield
+
+
 ATTACKS = [
     Attack('SIGKILL while it saves', 20, 1, kills_while_saving),
     Attack('service calls', 500, 25, service_calls),
@@ -498,6 +593,9 @@ ATTACKS = [
     Attack('stored turns', 25, 25, stores),
     Attack('manifests', 40, 5, manifests),
     Attack('SIGKILL of a batch', 10, 1, batch_kills),
+    Attack('SIGKILL of children that calibrate', 10, 1, child_kills),
+    Attack('a FIFO for a file', 11, 11, pipes),
+    Attack('clips of scenes', 88, 6, scene_files),
     Attack('soak with lost images', 2, 1, soaks)]
 
 
