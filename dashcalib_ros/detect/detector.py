@@ -11,9 +11,13 @@ from dashcalib_ros.detect.bank import TurnBank
 from dashcalib_ros.detect.history import History
 from dashcalib_ros.detect.median import StreamingMedian
 from dashcalib_ros.detect.motion import Motion
-from dashcalib_ros.detect.peaks import PeakFinder
+from dashcalib_ros.detect.peaks import Peak, PeakFinder
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input.frame import Frame
+
+# least prominences; at an edge of the drive a turn rises above this by one more, as nothing tells
+# how straight the car drove beyond. KITTI's raw drive begins in a turn of 46 degrees, with 24
+CUT_OFF = 3.0
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,9 @@ class TurnDetector:
     def _begin(self) -> None:
         """Begin a stretch without gaps."""
         self._median = StreamingMedian(self.config.half_width)
-        self._peaks = PeakFinder(self.config.min_prominence)
+        # a turn that the stretch cuts off counts as far as it goes
+        self._peaks = PeakFinder(self.config.min_prominence,
+                                 CUT_OFF * self.config.min_prominence)
         # _centers: frames whose magnitude waits for the median; _samples: those that may be peaks
         self._centers: deque[tuple[int, int]] = deque()
         self._samples: deque[_Sample] = deque()
@@ -91,6 +97,7 @@ class TurnDetector:
     def _end(self) -> list[Turn]:
         for stamp_ns, median in self._median.finish():
             self._filtered(stamp_ns, median)
+        self._found(self._peaks.end())
         for peak in self._peaks.finish():
             self.bank.rate(self._open[peak.position], peak.prominence)
         changed = self.bank.settle(None)
@@ -110,7 +117,16 @@ class TurnDetector:
         self._position += 1
         self.magnitude = value
         self._history.push(stamp_ns / 1e9, value)
-        reports = self._peaks.push(value)
+        self._found(self._peaks.push(value))
+        alive = self._peaks.alive()
+        self._open = {position: index for position, index in self._open.items()
+                      if position in alive}
+        self.bank.unpin(set(self._open.values()))
+        while self._samples and self._samples[0].position < self._peaks.needed_from:
+            self._samples.popleft()
+
+    def _found(self, reports: list[Peak]) -> None:
+        """Take the peaks that the last sample opened or changed."""
         new = self._peaks.newcomer
         if new is not None:
             sample = self._samples[new.position - self._samples[0].position]
@@ -118,9 +134,3 @@ class TurnDetector:
             self.bank.pin(sample.index, sample.stamp_ns, new.height, new.prominence)
         for peak in reports:
             self.bank.rate(self._open[peak.position], peak.prominence)
-        alive = self._peaks.alive()
-        self._open = {position: index for position, index in self._open.items()
-                      if position in alive}
-        self.bank.unpin(set(self._open.values()))
-        while self._samples and self._samples[0].position < self._peaks.needed_from:
-            self._samples.popleft()

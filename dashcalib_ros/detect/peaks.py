@@ -38,18 +38,21 @@ class _Open:
 class PeakFinder:
     """As scipy.signal.find_peaks(signal, prominence=min_prominence), for a stream.
 
+    rest: before the first sample and after the last the signal counts as this at the most: where
+    it is clearly higher, at an edge, there is a peak.
     Each peak is reported as soon as its prominence so far reaches the minimum, again whenever it
     has grown, and once more when it is settled; the last reports equal scipy's result.
     Open peaks are a stack of decreasing heights: memory and time per sample depend on its depth,
     not on the length of the signal.
     """
 
-    def __init__(self, min_prominence: float) -> None:
+    def __init__(self, min_prominence: float, rest: float = math.inf) -> None:
         self.min_prominence = min_prominence
         self._open: list[_Open] = []
         self._count = 0
-        self._last = math.inf
-        self._lowest = math.inf
+        self._rest = rest
+        self._last = rest
+        self._lowest = rest
         # where the current rise reached its present height; None while falling
         self._summit: int | None = None
         self._fresh = False
@@ -76,8 +79,6 @@ class PeakFinder:
         """Take the next sample (not NaN); return the peaks that appeared, grew or are settled."""
         reports: list[Peak] = []
         self._fresh = False
-        if self._count == 0:
-            self._last = value
         if value > self._last:
             self._summit = self._count
             while self._open and self._open[-1].height < value:
@@ -91,6 +92,10 @@ class PeakFinder:
         self._last = value
         self._count += 1
         return reports
+
+    def end(self) -> list[Peak]:
+        """Take the last edge; return the peaks that appeared or grew there."""
+        return self.push(min(self._last, self._rest))
 
     def finish(self) -> list[Peak]:
         """End the signal; return the peaks that this settles."""

@@ -236,5 +236,5 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[Any]], raw: bool = False
     body = ''.join(line('td', row, not raw) for row in rows)
     names = ''.join(f'<th title="{escape(TITLES.get(name, name))}"><button>{escape(name)}'
                     f'</button></th>' for name in head)
-    return (f'<div class="scroll"><table><thead><tr>{names}</tr></thead>'
+    return (f'<div class="scroll wide"><table><thead><tr>{names}</tr></thead>'
             f'<tbody>{body}</tbody></table></div>') if body else ''

@@ -51,6 +51,19 @@ def test_peaks_equal_scipy(signal, min_prominence):
     assert all(peak.settled and peak.height == signal[p] for p, peak in latest.items())
 
 
+@settings(max_examples=200, deadline=None)
+@given(SIGNALS.filter(len), st.sampled_from([0.1, 0.5, 1.0]), st.sampled_from([0.3, 1.5]))
+def test_with_a_rest_the_edges_are_as_low_as_that(signal, min_prominence, rest):
+    finder, found = PeakFinder(min_prominence, rest), {}
+    for value in signal:
+        found |= {peak.position: peak.prominence for peak in finder.push(value)}
+    for peak in [*finder.end(), *finder.finish()]:
+        found[peak.position] = peak.prominence
+    low = [min(rest, signal[0]), *signal, min(rest, signal[-1])]
+    positions, about = find_peaks(np.array(low, float), prominence=min_prominence)
+    assert found == dict(zip((positions - 1).tolist(), about['prominences'], strict=True))
+
+
 def test_peak_is_confirmed_as_soon_as_it_stands_out():
     finder = PeakFinder(1.0)
     reports = [finder.push(value) for value in (0.0, 3.0, 2.5, 2.0, 1.0, 1.5, 4.0)]
@@ -252,6 +265,17 @@ def test_end_of_drive_completes_a_turn_with_what_is_there():
     assert stream.detector.turns() == ()
     turn, = stream.finish()
     assert turn.last == stream.count - 1 < turn.center + 30
+
+
+def test_a_turn_that_an_edge_of_the_drive_cuts_counts_as_far_as_it_goes():
+    half = hump(6, 0.05)[30:]
+    stream = Stream().feed(half).feed(quiet(12)).feed(half[::-1])
+    later, first = sorted(stream.finish(), key=lambda turn: -turn.center)
+    assert first.first == 0 and first.center <= 5 and first.last >= first.center + 29
+    assert later.last == stream.count - 1 and later.center >= stream.count - 6
+    assert Stream().feed(quiet(12)).finish() == ()
+    # a swerve, as straight streets have them too
+    assert Stream().feed(half / 6).feed(quiet(12)).finish() == ()
 
 
 def test_memory_does_not_grow_with_the_drive():

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from browser import BROWSER, found_by_the_browser
 from page_reader import Page
 
 from dashcalib_ros.fleet import tables
@@ -68,7 +69,8 @@ def test_texts_that_are_no_unicode_and_numbers_that_are_none(tmp_path, monkeypat
     assert (read['camera'], read['fx'], read['reasons']) == ('b?<script>.mp4', '', 'why')
 
 
-def test_the_overview_draws_the_fleet():
+def drawn_fleet():
+    """Return the overview of three cameras that were calibrated and one that was not."""
     times = START_S + np.arange(5) * tables.YEAR_S / 2
     clips = rows_at(times, 1000 * (1 + 0.05 * np.arange(5)), sigma=1.0)
     failed = camera_row('cam', 'acme', None, 'failed', clips)
@@ -77,7 +79,19 @@ def test_the_overview_draws_the_fleet():
                for turns, (name, make, verdict, fx) in enumerate((
                    ('cam', 'acme', 'accepted', 1100.0), ('two', 'acme', 'weak', 1000.0),
                    ('<b>three', '', 'weak', 900.0)))]
-    page = overview_html([*cameras, {**failed, 'camera': 'none'}], clips)
+    return overview_html([*cameras, {**failed, 'camera': 'none'}], clips)
+
+
+@pytest.mark.skipif(BROWSER is None, reason='no chromium on the PATH')
+@pytest.mark.parametrize('width', [1280, 390])
+def test_nothing_of_the_overview_is_cut_in_a_browser(tmp_path, width):
+    found = found_by_the_browser(tmp_path, drawn_fleet(), width)
+    assert found.pop('texts') > 10
+    assert not any(found.values()), found
+
+
+def test_the_overview_draws_the_fleet():
+    page = drawn_fleet()
     assert Page(page).tags.count('svg') == 3
     # fx and sigma of three cameras, five clips, and the line of the one that drifts
     assert page.count('class="all-turns"') == 1 and page.count('h0') == 3 + 3 + 5
