@@ -96,8 +96,7 @@ def loss_of(given: Camera, solution: Solution, config: Config) -> float:
 
     given: of the solution's pictures. Poses and points are adjusted anew with each camera held.
     """
-    from dashcalib_ros.solve.fitting import subsample_tracks
-    from dashcalib_ros.solve.held import costs_with
+    from dashcalib_ros.solve.fitting import costs_with, subsample_tracks
     from dashcalib_ros.solve.prior import loss_px_of
     # a part of the tracks says it, and takes a fifth of the time
     scenes = [subsample_tracks(scene, config.intrinsics.first_tracks)

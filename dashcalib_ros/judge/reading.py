@@ -11,8 +11,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.heading import Heading, heading
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.information import information
-from dashcalib_ros.solve.misfit import misfits
+from dashcalib_ros.solve.normal import turn_cost
 from dashcalib_ros.solve.prior import loss_px_of
 
 
@@ -47,18 +46,16 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
 
     scene: as its turn was reconstructed. camera: of the scene's pictures.
     """
-    from dashcalib_ros.solve.held import scene_with
+    from dashcalib_ros.solve.fitting import misfits, scene_with
     count = len(camera.names())
     found = scene_with(camera, scene, config)
     misfit = np.inf if found is None else misfits(
         [scene], [found], camera, config.scene.error_px)[scene.turn]
     if found is None or misfit > config.verdict.max_misfit:
         return Reading(scene.turn, np.zeros((count, count)), np.zeros(count), None, False, misfit)
-    part = information(found, camera, loss_px_of([found], camera, config.intrinsics))
-    noise = part.squares / part.freedom
-    hessian = part.hessian[:count, :count] / noise
-    by_track = part.by_track[:count, :count] / noise**2
+    turn = turn_cost(found, camera, loss_px_of([found], camera, config.intrinsics))
+    cost = turn.of(np.arange(count)).at_noise(turn.squares / turn.freedom)
     # errors that the observations of a track share make it worth less than their number
-    inflation = max(1.0, float(np.trace(np.linalg.pinv(hessian) @ by_track)) / count)
-    return Reading(scene.turn, hessian / inflation, part.score[:count] / noise / inflation,
-                   heading(found), misfit=misfit)
+    inflation = max(1.0, float(np.trace(np.linalg.pinv(cost.hessian) @ cost.by_track)) / count)
+    cost = cost.at_noise(inflation)
+    return Reading(scene.turn, cost.hessian, cost.score, heading(found), misfit=misfit)

@@ -24,7 +24,7 @@ from dashcalib_ros.judge.agreement import (
 from dashcalib_ros.judge.calibration import Verdict
 from dashcalib_ros.judge.next_turn import next_turn
 from dashcalib_ros.reconstruct.heading import roll_deg
-from dashcalib_ros.solve.departures import Departure, largest_crop
+from dashcalib_ros.solve.fixed_camera import FixedCameraTest, largest_crop
 from dashcalib_ros.solve.solution import Solution
 
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
@@ -194,7 +194,7 @@ def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
     A stabilised video's movement may have been taken out. The lens is right then, but no
     camera_info holds for pictures that move.
     """
-    clear = [each for each in solution.departures if each.clear]
+    clear = [each for each in solution.fixed_camera if each.clear]
     crop = largest_crop(solution.crops) if solution.crops else 0.0
     if crop > config.max_crop_sigmas * solution.picture.rms:
         return _moving('up to', crop, solution)
@@ -212,7 +212,7 @@ def _moving(how: str, px: float, solution: Solution) -> Finding:
                            f'all pictures', STEADY, cause=True)
 
 
-def _departure_texts(departure: Departure, solution: Solution) -> tuple[str, str]:
+def _departure_texts(departure: FixedCameraTest, solution: Solution) -> tuple[str, str]:
     """Return what is wrong, and what to do."""
     if departure.kind == 'bend':
         return (f'the picture is bent in places, as no lens of the model {solution.camera.model} '

@@ -8,7 +8,7 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
-from dashcalib_ros.reconstruct.adjust import Solver, adjust_distortion
+from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
 from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
 
@@ -85,7 +85,7 @@ def _held_cost(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> 
     costs = [cost(moved, camera)]
     # the first residuals are large: the loss must be as wide, or it ignores them
     for loss_px in (0.01 * camera.image_size[0], config.loss_px, config.loss_px):
-        moved, camera = adjust_distortion(moved, camera, Solver(loss_px, config.iterations))
+        moved, camera = adjust(moved, camera, Solver(loss_px, config.iterations), 'distortion')
         moved = [retriangulate(scene, camera, config) for scene in moved]
         costs.append(cost(moved, camera))
     return min(costs)

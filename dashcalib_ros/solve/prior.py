@@ -11,15 +11,16 @@ from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.prior import Prior
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
+from dashcalib_ros.solve.quadratic import Quadratic
 
 # rendered images without noise would make the loss cut off everything
 LEAST_LOSS_PX = 0.05
 
 
 def prior_of(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
-    """Return the prior of step 2: square pixels and a centred principal point, with their sigmas.
+    """Return the prior: square pixels and a centred principal point, with their sigmas.
 
-    noise: variance of a residual, px^2. The adjustment treats residuals in px as if their sigma
+    camera: centred, as found with one focal length. noise: variance of a residual, px^2. The adjustment treats residuals in px as if their sigma
     were 1, so the prior's covariance is divided by the noise.
     """
     width, _ = camera.image_size
@@ -33,7 +34,7 @@ def prior_of(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
 
 
 def bounds_of(camera: Camera, config: IntrinsicsConfig) -> tuple[Floats, Floats]:
-    """Return the lowest and the highest values of step 2 (the paper: 'within bounds'), (n,)."""
+    """Return the lowest and the highest values (n,) that are allowed, around a centred camera."""
     width, height = camera.image_size
     reach = np.full(len(camera.names()), config.k_bound)
     reach[:4] = (camera.fx * config.focal_bound, camera.fx * config.focal_bound,
@@ -54,6 +55,19 @@ def prior_information(camera: Camera, config: IntrinsicsConfig) -> Floats:
 def extra_sigma_of(camera: Camera) -> Floats:
     """Return the prior sigmas of the coefficients that only the wider model has."""
     return np.array(camera.widened().spread[len(camera.spread):])
+
+
+def wider_prior(camera: Camera, centred: Camera, config: IntrinsicsConfig,
+                sigmas: Sequence[float] = ()) -> Quadratic:
+    """Return the prior about the wider model's parameters, and e further ones, at unit noise.
+
+    centred: the camera that the prior is about; camera: where the prior draws from. sigmas: (e,)
+    of the further ones.
+    """
+    information = prior_information(centred, config)
+    further = 1 / np.square(np.r_[extra_sigma_of(camera), sigmas])
+    draws = information @ (prior_of(centred, config, 1.0).mean - camera.params)
+    return Quadratic.prior(information, further, np.r_[draws, np.zeros(len(further))])
 
 
 def floor_of(camera: Camera, config: IntrinsicsConfig, field: Field | None = None) -> Floats:

@@ -377,7 +377,7 @@ def test_pixels_are_colmaps_minus_a_half(colmap_scene):
 
 def test_colmap_is_given_its_own_pixels(colmap_scene):
     camera = colmap_scene.camera
-    reconstruction = adjust._reconstruction([colmap_scene], camera, camera.step2)
+    reconstruction = adjust._reconstruction([colmap_scene], camera, camera.colmap)
     first = reconstruction.image(1).points2D[0].xy
     t = int(np.flatnonzero(colmap_scene.structure.used[0])[0])
     np.testing.assert_allclose(first, colmap_scene.tracks.xy[0, t] + 0.5)

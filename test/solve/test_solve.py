@@ -293,7 +293,7 @@ def test_information_agrees_with_colmaps_covariance():
     loss = 100.0
     [scene], camera = adjusted(scenes_of(1, start=LENS), loss)
     part = information(scene, camera, loss)
-    reconstruction = adjust._reconstruction([scene], camera, camera.step2)
+    reconstruction = adjust._reconstruction([scene], camera, camera.colmap)
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
