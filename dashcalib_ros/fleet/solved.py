@@ -19,7 +19,7 @@ from dashcalib_ros.fleet.fuse import Fused
 from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 FORMAT = 1
 

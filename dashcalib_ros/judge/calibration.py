@@ -24,7 +24,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.reconstruct.picture import TurnPicture
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.cross_validation import LeftOut
-from dashcalib_ros.solve.picture import PictureSigma, sigma_over
+from dashcalib_ros.solve.knowledge import PictureSigma, sigma_over
 from dashcalib_ros.solve.solution import Solution
 
 UNKNOWN_COVARIANCE = ('this calibration does not know how its parameters are correlated: '

@@ -40,7 +40,7 @@ from dashcalib_ros.reconstruct.scene import Scene, rms_px
 from dashcalib_ros.reconstruct.scene_file import StoredTurn
 from dashcalib_ros.solve.cross_validation import LeftOut, cross_validation
 from dashcalib_ros.solve.fixed_camera import largest_crop
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 
 # why turns are not used

@@ -18,7 +18,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
-from dashcalib_ros.solve.picture import PictureSigma, SigmaMap, sigma_over
+from dashcalib_ros.solve.knowledge import PictureSigma, SigmaMap, sigma_over
 from dashcalib_ros.solve.solution import Solution
 
 Way = Literal['focal length', 'centre', 'distortion']

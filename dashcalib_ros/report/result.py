@@ -22,7 +22,7 @@ from dashcalib_ros.limits import JSON_BYTES, parse_yaml, read_text
 from dashcalib_ros.limits import parse_json as parse_any_json
 from dashcalib_ros.report.camera_file import parse_camera
 from dashcalib_ros.solve.cross_validation import LeftOut
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 
 def result_dict(calibration: Calibration) -> dict[str, Any]:

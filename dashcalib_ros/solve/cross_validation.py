@@ -8,8 +8,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.solve.knowledge import Knowledge
-from dashcalib_ros.solve.picture import sigma_over
+from dashcalib_ros.solve.knowledge import Knowledge, sigma_over
 from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.solve.solution import Solution
 
@@ -58,7 +57,7 @@ def cross_validation(solution: Solution) -> tuple[LeftOut, ...]:
     balance = Quadratic.together(turn.of(own) for turn in known.turns).score
 
     def camera_of(some: Knowledge) -> tuple[Floats, float]:
-        """Return the parameters' offsets from the solution (n,), and the sigma over the picture."""
+        """Return how far its parameters (n,) are off the solution, and sigma over the picture."""
         cost = Quadratic.together([prior, *(turn.of(own) for turn in some.turns)])
         return (replace(cost, score=cost.score - balance).optimum,
                 _rms(sigma_over(moves, some.covariance[:known.count, :known.count])))

@@ -45,7 +45,7 @@ def with_field(first: Fit, config: Config) -> Fit:
     found = replace(found, scenes=retriangulate_all(found.scenes, found.camera, config.scene))
     _, problem = _problem(found, _field_of(found), found.solver.loss_px)
     gains = problem.gains_of_turns_left_out(problem.evidence(size[0]))
-    return found if is_clear(gains, settings.least_gain) else doubtful
+    return found if is_clear(gains) else doubtful
 
 
 def with_field_of_all_tracks(fit: Fit, config: Config) -> Fit:

@@ -16,6 +16,8 @@ from dashcalib_ros.solve.prior import loss_px_of
 
 # px^2; lower costs count as this, so that the ratio of two tiny costs is near 1
 LEAST_COST = 0.01
+# of each turn, where a part of its tracks is enough
+FIRST_TRACKS = 200
 # of an adjustment with a fixed camera; it moves poses and points only, and is cheap
 ITERATIONS = 20
 ROUNDS = 3
@@ -126,9 +128,9 @@ def misfits(per_turn: Sequence[Scene], together: Sequence[Scene], camera: Camera
     """Return the ratio of each turn's cost with the shared camera to that with its own, by turn.
 
     per_turn: the turns as they were reconstructed, each with its own camera (one focal length,
-    k1, k2). together: those that are left, adjusted with the shared camera. limit_px: larger errors
-    count as this. Costs are means over all observations. The ratio is about 1 or less for a turn
-    of the shared camera; a turn that is not in together costs limit_px squared.
+    k1, k2). together: those that are left, adjusted with the shared camera. limit_px: larger
+    errors count as this. Costs are means over all observations. The ratio is about 1 or less for a
+    turn of the shared camera; a turn that is not in together costs limit_px squared.
     """
     adjusted = {scene.turn: scene for scene in together}
 

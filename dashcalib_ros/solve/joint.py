@@ -99,8 +99,8 @@ def _steadied(first: Fit, config: Config) -> Fit:
 
     rounds = config.intrinsics.crop_rounds
     # the bend takes longer, and is asked for only where the picture moves
-    if (not rounds or not moves(first.tests_of_fixed_camera(bent=False))
-            or not moves(first.tests_of_fixed_camera())):
+    if (not rounds or not moves(first.fixed_camera_tests(bent=False))
+            or not moves(first.fixed_camera_tests())):
         return first
     return without_stabiliser(first, config, rounds)
 
@@ -166,14 +166,14 @@ def _shared_with_field(fit: Fit) -> Floats:
 def _solution(fit: Fit, per_turn: Sequence[Scene], profiles: tuple[Profile, Profile],
               tried: tuple[Candidate, ...], config: Config) -> Solution:
     """Return the solution with its covariance. profiles: the coarse one, and that around it."""
-    tests = fit.tests_of_fixed_camera()
+    tests = fit.fixed_camera_tests()
     known = replace(fit.known, systematic=max(1.0, *(each.strength for each in tests)))
     return Solution(
         camera=fit.camera, centred=fit.centred, scenes=tuple(fit.scenes), known=known,
         covariance=(known.covariance[:known.count, :known.count]
                     + np.diag(_shared_with_field(fit)**2)),
         coarse=profiles[0], around=profiles[1],
-        bounds=np.array(bounds_of(fit.centred, config.intrinsics)), readout_s=fit.readout_s,
+        bounds=np.array(bounds_of(fit.centred)), readout_s=fit.readout_s,
         readout_sigma_s=known.readout_sigma if fit.readout_s else 0.0,
         misfits=misfits(per_turn, fit.scenes, fit.camera, config.scene.error_px), tried=tried,
         sigma_map=known.sigma_map(fit.used_field), fixed_camera=tests, crops=fit.crops,

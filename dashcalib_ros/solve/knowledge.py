@@ -25,12 +25,46 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.solve.picture import SigmaMap, sigma_over
 from dashcalib_ros.solve.prior import extra_sigma_of
 from dashcalib_ros.solve.quadratic import Quadratic, TurnCost, noise_of
 
 # a turn's information in a direction, as a share of its best one; with less it says nothing there
 LEAST_SHARE = 1e-6
+# noise variances of a track: a larger model, or a field, must predict turns so much better
+LEAST_GAIN = 30.0
+
+
+@dataclass(frozen=True)
+class PictureSigma:
+    """Standard deviation of where the camera sees a ray, the best common rotation removed, px.
+
+    rms: over the picture. worst: where it is largest, mostly a corner.
+    """
+
+    rms: float
+    worst: float
+
+
+@dataclass(frozen=True)
+class SigmaMap:
+    """The same at single pixels. pixels: (m, 2), a grid over the picture; sigma: (m,), px."""
+
+    pixels: Floats
+    sigma: Floats
+
+    @property
+    def whole(self) -> PictureSigma:
+        """Return the sigma over the whole picture."""
+        return PictureSigma(float(np.sqrt(np.mean(self.sigma**2))), float(self.sigma.max()))
+
+
+def sigma_over(moves: Floats, covariance: Floats) -> Floats:
+    """Return (m,) the sigma of pixels, px, where the parameters have a covariance (n, n).
+
+    moves: (m, 2, n) derivatives of pixels by the parameters, as sensitivity() returns them.
+    """
+    variances = np.einsum('mai,ij,maj->m', moves, covariance, moves)
+    return np.asarray(np.sqrt(variances))
 
 
 @dataclass(frozen=True)
@@ -275,11 +309,11 @@ def scatter_between_turns(turns: Sequence[Quadratic], covariance: Floats, basis:
     return float(squares / max(freedom, 1) * tail**2)
 
 
-def is_clear(gains: Floats, least: float) -> bool:
+def is_clear(gains: Floats) -> bool:
     """Return whether the gains (n,) of turns, in noise variances of a track, are clear evidence.
 
     They must be larger in sum than chance explains, and not come from one turn.
     """
     several = len(gains) < 2 or (np.sum(np.sort(gains)[:-1]) > 0
                                  and np.sum(gains > 0) > len(gains) / 2)
-    return bool(gains.sum() > least and several)
+    return bool(gains.sum() > LEAST_GAIN and several)

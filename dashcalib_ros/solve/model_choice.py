@@ -19,7 +19,7 @@ from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
-from dashcalib_ros.solve.fitting import retriangulate_all, subsample_tracks
+from dashcalib_ros.solve.fitting import FIRST_TRACKS, retriangulate_all, subsample_tracks
 from dashcalib_ros.solve.knowledge import is_clear
 from dashcalib_ros.solve.shutter import readout
 from dashcalib_ros.solve.solution import Candidate
@@ -99,7 +99,7 @@ def left_out_costs(fit: Fit, loss_px: float, limit_px: float) -> dict[TurnId, fl
         errors = np.minimum(errors_px(scene, fit.camera), limit_px)[scene.tracks.seen]
         costs[scene.turn] = float(loss_px**2 * np.log1p(errors**2 / loss_px**2).sum())
         if len(fit.scenes) > 1:
-            step = -np.linalg.solve(total - turn.hessian, turn.score)
+            step = np.asarray(-np.linalg.solve(total - turn.hessian, turn.score))
             costs[scene.turn] += known.noise * turn.change(step)
     return costs
 
@@ -123,8 +123,7 @@ def chosen_of(results: Sequence[Fit], config: Config) -> tuple[Fit, tuple[Candid
               for turn in worst} for cost in costs]
     best = 0
     for n in range(1, len(results)):
-        clear = is_clear(np.array([gains[n][turn] - gains[best][turn] for turn in worst]),
-                         config.intrinsics.least_gain)
+        clear = is_clear(np.array([gains[n][turn] - gains[best][turn] for turn in worst]))
         if clear and not _alike(results[n], results[best], config):
             best = n
     chosen = results[best]
@@ -138,10 +137,9 @@ def chosen_of(results: Sequence[Fit], config: Config) -> tuple[Fit, tuple[Candid
 
 def _few(first: Fit, full_scenes: ByTurn, config: Config) -> tuple[Fit, ByTurn]:
     """Return the result, and the scenes as they were measured, with a part of the tracks."""
-    wanted = config.intrinsics.first_tracks
-    scenes = [subsample_tracks(scene, wanted) for scene in first.scenes]
+    scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in first.scenes]
     return (replace(first, scenes=scenes),
-            {turn: subsample_tracks(scene, wanted) for turn, scene in full_scenes.items()})
+            {turn: subsample_tracks(scene, FIRST_TRACKS) for turn, scene in full_scenes.items()})
 
 
 def _without_shutter(first: Fit, model: type[Camera], measured: ByTurn, config: Config
@@ -159,7 +157,7 @@ def _without_shutter(first: Fit, model: type[Camera], measured: ByTurn, config: 
         return None
     left_s, sigma_s = readout(
         found.scenes, found.camera, found.solver.loss_px, found.prior)
-    return None if is_rolling(left_s, sigma_s, config.intrinsics) else found
+    return None if is_rolling(left_s, sigma_s) else found
 
 
 def _leaves_more(result: Fit, config: Config) -> bool:
@@ -169,8 +167,7 @@ def _leaves_more(result: Fit, config: Config) -> bool:
         return False
     if result.readout_s:
         return abs(result.readout_s) < SHORT_READOUT_S
-    return is_clear(result.known.gains_of_wider_model / result.known.track_inflation,
-                    config.intrinsics.least_gain)
+    return is_clear(result.known.gains_of_wider_model / result.known.track_inflation)
 
 
 def _refitted(first: Fit, model: type[Camera], full_scenes: ByTurn, config: Config

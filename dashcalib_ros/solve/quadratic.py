@@ -65,6 +65,7 @@ class Quadratic:
 
     def of(self, places: Sequence[int] | Ints) -> Quadratic:
         """Return the cost about these parameters; the others are fixed at the solution."""
+        places = np.asarray(places)
         block = np.ix_(places, places)
         return Quadratic(self.hessian[block], self.score[places], self.by_track[block])
 

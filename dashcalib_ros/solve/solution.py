@@ -14,8 +14,7 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Profile, Scene, rms_px
 from dashcalib_ros.solve.field import FoundField, displacements
 from dashcalib_ros.solve.fixed_camera import Crops, FixedCameraTest
-from dashcalib_ros.solve.knowledge import Knowledge
-from dashcalib_ros.solve.picture import PictureSigma, SigmaMap, sigma_over
+from dashcalib_ros.solve.knowledge import Knowledge, PictureSigma, SigmaMap, sigma_over
 
 
 @dataclass(frozen=True)

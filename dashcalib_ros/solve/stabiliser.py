@@ -64,7 +64,7 @@ def _step(fit: Fit, problem: Problem, shutter: Sequence[Floats]) -> tuple[Fit, f
     camera = fit.camera
     count, lens = problem.own, len(camera.widened().names())
     shared = range(count, lens + bool(shutter))
-    priors = shift_priors(problem, fit.settings, fit.crops)
+    priors = shift_priors(problem, fit.crops)
     moving = problem.solved(priors, shared)
     strength = moving.strength(problem.solved(None, shared))
     moving = problem.solved(priors, shared, max(strength, 1.0))

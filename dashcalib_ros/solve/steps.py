@@ -20,6 +20,7 @@ from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.fitting import (
+    FIRST_TRACKS,
     explained_by,
     retriangulate_all,
     subsample_tracks,
@@ -29,8 +30,8 @@ from dashcalib_ros.solve.fitting import (
 from dashcalib_ros.solve.fixed_camera import (
     Crops,
     FixedCameraTest,
+    fixed_camera_tests,
     shift_prior,
-    tests_of_fixed_camera,
 )
 from dashcalib_ros.solve.knowledge import Knowledge
 from dashcalib_ros.solve.normal import noise_in, turn_cost
@@ -40,6 +41,12 @@ from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shi
 
 ByTurn = Mapping[TurnId, Scene]
 Progress = Callable[[str, float], None]
+
+# ratio: with one focal length the search goes this far to either side of the profile's minimum
+FOCAL_REACH = 1.35
+# a shorter readout, in its sigmas and in s, counts as a global shutter: six came out at 0 to 0.5
+# ms
+CLEAR_SIGMAS, LEAST_READOUT_S = 4.0, 1.0 / 1e3
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,7 @@ class Fit:
         scenes, camera = adjust(
             self.scenes, self.camera, self.solver, 'everything',
             prior=prior_of(self.centred, self.settings, self.noise if noise is None else noise),
-            bounds=bounds_of(self.centred, self.settings))
+            bounds=bounds_of(self.centred))
         return replace(self, scenes=scenes, camera=camera)
 
     def with_usual_loss(self) -> Fit:
@@ -100,10 +107,10 @@ class Fit:
         noise = noise_in(self.scenes, camera, loss_px) if self.crops else 0.0
         turns = tuple(turn_cost(
             scene, camera, loss_px, self._by_shared(scene),
-            shift_prior(scene, noise, self.settings, self.crops[scene.turn]) if self.crops
+            shift_prior(scene, noise, self.crops[scene.turn]) if self.crops
             else None) for scene in self.scenes)
         return Knowledge(camera, turns, self.prior,
-                         floor_of(camera, self.settings, self.used_field), self._shared_prior(),
+                         floor_of(camera, self.used_field), self._shared_prior(),
                          one_turn_sigma=self.settings.one_turn_sigma * camera.fx)
 
     def _by_shared(self, scene: Scene) -> Floats | None:
@@ -124,13 +131,13 @@ class Fit:
         return Quadratic.prior(np.diag(np.r_[readout, precision]),
                                score=np.r_[readout, -precision * self.field.directions])
 
-    def tests_of_fixed_camera(self, bent: bool = True) -> tuple[FixedCameraTest, ...]:
+    def fixed_camera_tests(self, bent: bool = True) -> tuple[FixedCameraTest, ...]:
         """Return in what the drive departs from a fixed camera, the strongest first.
 
         bent: False leaves out the local bend, which takes longer.
         """
-        scenes = [subsample_tracks(scene, self.settings.first_tracks) for scene in self.scenes]
-        return tests_of_fixed_camera(
+        scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in self.scenes]
+        return fixed_camera_tests(
             scenes, self.camera, self.centred, self.solver.loss_px, self.settings, self.crops,
             bent, bool(self.readout_s), self.field)
 
@@ -143,15 +150,15 @@ def fit_one_focal_length(full_scenes: ByTurn, start: Camera, config: Config, pro
     """
     settings = config.intrinsics
     solver = Solver(config.scene.loss_px, config.scene.iterations)
-    reach = (start.fx / settings.focal_reach, start.fx * settings.focal_reach)
-    few = [subsample_tracks(scene, settings.first_tracks) for scene in full_scenes.values()]
+    reach = (start.fx / FOCAL_REACH, start.fx * FOCAL_REACH)
+    few = [subsample_tracks(scene, FIRST_TRACKS) for scene in full_scenes.values()]
     camera = start
     for n in range(settings.rounds):
         progress('adjusting one focal length', n / settings.rounds)
         few, camera = adjust(few, camera, solver, 'one focal length', reach)
         few = retriangulate_all(few, camera, config.scene)
     kept = explained_by(few, full_scenes, camera, config)
-    return Fit([subsample_tracks(scene, settings.first_tracks) for scene in kept], camera, camera,
+    return Fit([subsample_tracks(scene, FIRST_TRACKS) for scene in kept], camera, camera,
                solver, settings)
 
 
@@ -168,7 +175,7 @@ def fit_roughly(first: Fit, config: Config) -> Fit:
         # the prior is about the camera of this round, not that of the first step
         found, sigma = readout(fit.scenes, fit.camera, fit.solver.loss_px,
                                prior_information(fit.camera, settings))
-        if (abs(found) < sigma) if fit.readout_s else not is_rolling(found, sigma, settings):
+        if (abs(found) < sigma) if fit.readout_s else not is_rolling(found, sigma):
             break
         fit = _without_rolling_shutter(fit, measured, fit.readout_s + found, config)
         fit = fit.adjusted(noise)
@@ -176,9 +183,9 @@ def fit_roughly(first: Fit, config: Config) -> Fit:
     return fit
 
 
-def is_rolling(readout_s: float, sigma_s: float, config: IntrinsicsConfig) -> bool:
+def is_rolling(readout_s: float, sigma_s: float) -> bool:
     """Return whether a readout is clear evidence of a rolling shutter."""
-    return abs(readout_s) >= max(config.shutter_sigmas * sigma_s, config.least_readout_ms / 1e3)
+    return abs(readout_s) >= max(CLEAR_SIGMAS * sigma_s, LEAST_READOUT_S)
 
 
 def with_all_tracks(rough: Fit, full_scenes: ByTurn, per_turn: Sequence[Scene], config: Config

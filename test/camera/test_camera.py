@@ -262,7 +262,8 @@ def test_parameters_go_to_colmap_and_back(model):
     np.testing.assert_array_equal(model.colmap.params(values), params)
     assert not values[model.colmap.fixed].any()
     # one focal length: that of x
-    single = model.colmap_one_focal.params(model.colmap_one_focal.values(params[:len(model.colmap_one_focal.places)]))
+    one = model.colmap_one_focal
+    single = one.params(one.values(params[:len(one.places)]))
     assert single[0] == single[1] == params[0]
 
 

@@ -16,7 +16,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import Path, TurnOdometry
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 
 @stands_in_for(Calibrator)
