@@ -88,7 +88,7 @@ def shares_of(solution: Solution | None, turns: Mapping[TurnId, ClipTurn], px: f
     for clip in sorted(clips):
         own = known.of(n for n, scene in enumerate(solution.scenes)
                        if turns[scene.turn].clip == clip)
-        cost = own.of_camera(known.noise)
+        cost = own.with_prior([own.sum(known.own).at_noise(known.noise)])
         # observations of a track share its errors
         variance = max(float(cost.covariance[0, 0]), float(cost.covariance_by_track[0, 0]))
         offset = float((cost.covariance @ cost.score)[0])

@@ -58,13 +58,13 @@ def outdated(turns: Set[TurnId], of_another: Set[TurnId]) -> set[TurnId]:
 
 def focal_disagreement(solution: Solution) -> float:
     """Return the weighted scatter between the turns' own fx, relative to fx."""
-    known, own = solution.known, np.arange(solution.known.count)
+    known = solution.known
     if len(known.turns) < 2:
         return 0.0
     weights, offsets = [], []
-    for turn in known.turns:
-        alone = known.with_prior([turn.of(own).at_noise(known.noise)]).covariance
-        offsets.append(float((alone @ turn.score[own])[0] / known.noise))
+    for turn, cost in zip(known.turns, known.each(known.own), strict=True):
+        alone = known.with_prior([cost]).covariance
+        offsets.append(float((alone @ turn.score[known.own])[0] / known.noise))
         weights.append(1 / float(alone[0, 0]))
     mean = np.average(offsets, weights=weights)
     scatter = np.average((np.array(offsets) - mean) ** 2, weights=weights)
@@ -73,8 +73,8 @@ def focal_disagreement(solution: Solution) -> float:
 
 def leverages(solution: Solution) -> dict[TurnId, float]:
     """Return each turn's share in the information about fx; the shares sum to 1."""
-    known, own = solution.known, np.arange(solution.known.count)
-    turns = [turn.of(own).at_noise(known.noise) for turn in known.turns]
+    known = solution.known
+    turns = known.each(known.own)
     together = known.with_prior(turns).covariance
     shares = [float((together @ turn.hessian)[0, 0]) for turn in turns]
     # they sum to less than 1: the prior has the rest

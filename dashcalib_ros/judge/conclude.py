@@ -190,7 +190,7 @@ def _model_error_warnings(solution: Solution, px: float, config: Config) -> tupl
 
     px: of the input, in one pixel of the scenes.
     """
-    count, names = solution.known.count, solution.camera.widened().names()
+    count, names = len(solution.known.own), solution.camera.widened().names()
     step = solution.known.step_to_wider_model
     shifts, others = step[:4], step[count:]
     scale = np.repeat([solution.camera.fx, solution.camera.image_size[0]], 2)
@@ -286,7 +286,7 @@ def _error_px(scene: Scene, evidence: Evidence, solution: Solution | None) -> fl
 
 def _details(solution: Solution) -> dict[str, object]:
     width = solution.camera.image_size[0]
-    others = solution.known.count
+    others = len(solution.known.own)
     return {
         'step1': {'f_over_width': solution.centred.fx / width,
                   **dict(list(solution.centred.named.items())[4:])},

@@ -26,8 +26,8 @@ def focal_alone(solution: Solution) -> dict[TurnId, FocalEstimate]:
     known, found = replace(solution.known, one_turn_sigma=0.0), {}
     for n, scene in enumerate(solution.scenes):
         alone = known.of([n])
-        score = alone.turns[0].score[:known.count]
-        offset = float(alone.of_camera(alone.noise).covariance[0] @ score / alone.noise)
+        own = alone.with_prior(alone.each(known.own)).covariance
+        offset = float(own[0] @ alone.turns[0].score[known.own] / alone.noise)
         found[scene.turn] = FocalEstimate(solution.camera.fx + offset,
                                           float(np.sqrt(alone.covariance[0, 0])))
     return found

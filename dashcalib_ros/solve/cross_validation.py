@@ -50,17 +50,16 @@ def cross_validation(solution: Solution) -> tuple[LeftOut, ...]:
     known = replace(solution.known, one_turn_sigma=0.0)
     if len(known.turns) < LEAST_TURNS:
         return ()
-    moves, _ = sensitivity(known.camera)
-    own = np.arange(known.count)
-    prior = Quadratic.prior(known.noise * known.prior)
+    (moves, _), count = sensitivity(known.camera), len(known.own)
+    prior = Quadratic.prior(known.noise * known.prior.of(known.own).hessian)
     # at the solution the prior balances the scores of all turns
-    balance = Quadratic.together(turn.of(own) for turn in known.turns).score
+    balance = known.sum(known.own).score
 
     def camera_of(some: Knowledge) -> tuple[Floats, float]:
         """Return how far its parameters (n,) are off the solution, and sigma over the picture."""
-        cost = Quadratic.together([prior, *(turn.of(own) for turn in some.turns)])
+        cost = Quadratic.together([prior, *(turn.of(known.own) for turn in some.turns)])
         return (replace(cost, score=cost.score - balance).optimum,
-                _rms(sigma_over(moves, some.covariance[:known.count, :known.count])))
+                _rms(sigma_over(moves, some.covariance[:count, :count])))
 
     found = []
     for n, scene in enumerate(solution.scenes):

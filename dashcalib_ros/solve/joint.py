@@ -170,7 +170,7 @@ def _solution(fit: Fit, per_turn: Sequence[Scene], profiles: tuple[Profile, Prof
     known = replace(fit.known, systematic=max(1.0, *(each.strength for each in tests)))
     return Solution(
         camera=fit.camera, centred=fit.centred, scenes=tuple(fit.scenes), known=known,
-        covariance=(known.covariance[:known.count, :known.count]
+        covariance=(known.covariance[np.ix_(known.own, known.own)]
                     + np.diag(_shared_with_field(fit)**2)),
         coarse=profiles[0], around=profiles[1],
         bounds=np.array(bounds_of(fit.centred)), readout_s=fit.readout_s,

@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import sensitivity
@@ -71,18 +71,17 @@ def sigma_over(moves: Floats, covariance: Floats) -> Floats:
 class Knowledge:
     """What turns know of a camera with n parameters, which is at the optimum of them all.
 
-    turns: the cost of each turn. prior: (n, n) information of the camera's prior, at unit noise.
-    floor: (n,) sigmas of systematic errors, which no number of turns averages out. shared: the
-    prior of the e further parameters that turns share; None where it is 0. systematic: by how much
-    errors that tracks share inflate the second estimate. one_turn_sigma: px by which fx differs
-    between turns: a single one does not show that.
+    turns: the cost of each turn. prior: at unit noise, of the p = n + e parameters that are free:
+    the camera's, and what else turns share. floor: (n,) sigmas of systematic errors, which no
+    number of turns averages out. systematic: by how much errors that tracks share inflate the
+    second estimate. one_turn_sigma: px by which fx differs between turns: a single one does not
+    show that.
     """
 
     camera: Camera
     turns: tuple[TurnCost, ...]
-    prior: Floats
+    prior: Quadratic
     floor: Floats
-    shared: Quadratic | None = None
     systematic: float = 1.0
     one_turn_sigma: float = 0.0
 
@@ -95,86 +94,73 @@ class Knowledge:
         return self.of(n for n in range(len(self.turns)) if n != place)
 
     @property
-    def count(self) -> int:
-        """Return n, the number of the camera's parameters."""
-        return len(self.prior)
-
-    @property
     def noise(self) -> float:
         """Return the variance of a residual, px^2."""
         return noise_of(self.turns)
 
-    def of_camera(self, noise: float) -> Quadratic:
-        """Return the cost of these turns and the prior about the camera only, at unit noise.
+    @property
+    def own(self) -> Ints:
+        """Return (n,) the places of the camera's own parameters in a turn's cost."""
+        return np.arange(len(self.camera.names()))
 
-        noise: variance of a residual, px^2, by which their cost is divided.
-        """
-        own = np.arange(self.count)
-        turns = Quadratic.together(turn.of(own) for turn in self.turns)
-        return self.with_prior([turns.at_noise(noise)])
+    @property
+    def wider(self) -> Ints:
+        """Return (lens,) the places of the wider model's parameters, the camera's own first."""
+        return np.arange(self.turns[0].lens)
+
+    @property
+    def free(self) -> Ints:
+        """Return (p,) the places of what is free: the wider model's others are fixed at 0."""
+        first = self.turns[0]
+        return np.concatenate([self.own, np.arange(first.lens, len(first.score))])
+
+    def each(self, places: Ints) -> list[Quadratic]:
+        """Return each turn's cost about these parameters, at unit noise."""
+        return [turn.of(places).at_noise(self.noise) for turn in self.turns]
+
+    def sum(self, places: Ints) -> Quadratic:
+        """Return the cost of all turns about these parameters, px^2."""
+        return Quadratic.together(turn.of(places) for turn in self.turns)
 
     def with_prior(self, turns: Iterable[Quadratic]) -> Quadratic:
-        """Return the sum of costs about the camera only, at unit noise, and of its prior."""
-        return Quadratic.together([*turns, Quadratic.prior(self.prior)])
+        """Return the sum of costs about the camera's own parameters, and of its prior."""
+        return Quadratic.together([*turns, self.prior.of(self.own)])
 
     @cached_property
     def total(self) -> Quadratic:
-        """Return the cost of all turns and priors about the p parameters that turns share.
-
-        At unit noise; the camera's own come first. The wider model's others are fixed at 0.
-        """
-        turns = self._turns()
-        shared = self._shared
-        prior = Quadratic.prior(self.prior, np.diag(shared.hessian),
-                                np.r_[np.zeros(self.count), shared.score])
-        # summed before they are divided: a result stays the same to its last bit
-        by_track = Quadratic.together(turn.of(self._free) for turn in self.turns).by_track
-        return replace(Quadratic.together([*turns, prior]), by_track=by_track / self.noise**2)
+        """Return the cost of all turns and the prior about what is free, at unit noise."""
+        total = Quadratic.together([*self.each(self.free), self.prior])
+        # summed first: so a result stays the same to its last bit
+        return replace(total, by_track=self.sum(self.free).by_track / self.noise**2)
 
     @cached_property
     def left(self) -> Floats:
         """Return (p,) the step to the optimum: 0 but for a field that was left in the tracks."""
-        settled = np.r_[np.ones(self.count, bool), np.diag(self._shared.hessian) == 0]
+        settled = np.diag(self.prior.hessian) == 0
+        settled[self.own] = True
         return np.asarray(self.total.covariance @ self.total.settled(settled).score)
 
     @cached_property
     def turns_at_optimum(self) -> tuple[Quadratic, ...]:
-        """Return each turn's cost about the p parameters, at unit noise, at the optimum of all."""
-        return tuple(turn.moved(self.left) for turn in self._turns())
-
-    @property
-    def _free(self) -> list[int]:
-        first = self.turns[0]
-        return [*range(self.count), *range(first.lens, len(first.score))]
-
-    def _turns(self) -> list[Quadratic]:
-        return [turn.of(self._free).at_noise(self.noise) for turn in self.turns]
-
-    @property
-    def _shared(self) -> Quadratic:
-        first = self.turns[0]
-        size = len(first.score) - first.lens
-        return self.shared or Quadratic.prior(np.zeros((size, size)))
+        """Return each turn's cost about what is free, at unit noise, at the optimum of all."""
+        return tuple(turn.moved(self.left) for turn in self.each(self.free))
 
     # the wider model
 
-    def _with_wider_model(self, turns: Iterable[Quadratic], score: Floats | None = None
+    def _with_wider_prior(self, turns: Iterable[Quadratic], score: Floats | None = None
                           ) -> Quadratic:
-        """Return the sum of turns, at unit noise, and of the prior of the wider model."""
+        """Return the sum of costs about the wider model's parameters, and of their prior."""
         return Quadratic.together([*turns, Quadratic.prior(
-            self.prior, 1 / np.square(extra_sigma_of(self.camera)), score)])
+            self.prior.of(self.own).hessian, 1 / np.square(extra_sigma_of(self.camera)), score)])
 
     @cached_property
     def step_to_wider_model(self) -> Floats:
         """Return (lens,) the Gauss-Newton step when all parameters of the wider model are free.
 
-        First come those of this model, then those that only the wider model has; only these have
-        a gradient here. What else turns share is fixed.
+        Only those that this model does not have have a gradient. What else turns share is fixed.
         """
-        places = np.arange(self.turns[0].lens)
-        turns = Quadratic.together(turn.of(places) for turn in self.turns)
-        total = self._with_wider_model([turns.at_noise(self.noise)])
-        return total.settled(places < self.count).optimum
+        total = self._with_wider_prior([self.sum(self.wider).at_noise(self.noise)])
+        return total.settled(self.wider < len(self.own)).optimum
 
     @property
     def gains_of_wider_model(self) -> Floats:
@@ -183,14 +169,12 @@ class Knowledge:
         From the other turns. Both models' steps start from this model's solution; those of the
         narrower one leave the further coefficients at 0.
         """
-        own, places = np.arange(self.count), np.arange(self.turns[0].lens)
-        turns = [turn.of(places).at_noise(self.noise) for turn in self.turns]
+        turns, own, gains = self.each(self.wider), self.own, []
         # at the solution the prior balances the turns' scores
-        balance = np.where(places < self.count, -Quadratic.together(turns).score, 0.0)
-        gains = []
+        balance = np.where(self.wider < len(own), -Quadratic.together(turns).score, 0.0)
         for n, turn in enumerate(turns):
-            others = self._with_wider_model([*turns[:n], *turns[n + 1:]], balance)
-            narrow = np.zeros(len(places))
+            others = self._with_wider_prior([*turns[:n], *turns[n + 1:]], balance)
+            narrow = np.zeros(len(balance))
             narrow[own] = others.of(own).optimum
             gains.append(turn.change(narrow) - turn.change(others.optimum))
         return np.array(gains)
@@ -201,14 +185,14 @@ class Knowledge:
         given: of this model, or of its wider one. Where it has coefficients that are 0 here, the
         turns make up for them with their other parameters.
         """
-        own, others = self.count, given.params[self.count:]
+        count = len(self.own)
+        others = given.params[count:]
         if not len(others):
             return given.params
-        places = np.arange(self.turns[0].lens)
-        turns = Quadratic.together(turn.of(places) for turn in self.turns).hessian
-        hessian = turns[:own, :own] + self.noise * self.prior
+        turns = self.sum(self.wider).hessian
+        hessian = turns[:count, :count] + self.noise * self.prior.of(self.own).hessian
         return np.asarray(
-            given.params[:own] + np.linalg.solve(hessian, turns[:own, own:] @ others))
+            given.params[:count] + np.linalg.solve(hessian, turns[:count, count:] @ others))
 
     # the covariance
 
@@ -219,9 +203,10 @@ class Knowledge:
         The camera's own come first; of the others only the step is known, which counts as an
         error.
         """
+        count = len(self.own)
         covariance = np.outer(self.step_to_wider_model, self.step_to_wider_model)
-        covariance[:self.count, :self.count] += self.own_covariance
-        covariance[:self.count, :self.count] += self.covariance_between_turns
+        covariance[:count, :count] += self.own_covariance
+        covariance[:count, :count] += self.covariance_between_turns
         return covariance
 
     @property
@@ -230,7 +215,7 @@ class Knowledge:
 
         Without what a single turn does not show.
         """
-        left = self.left[:self.count]
+        left = self.left[self.own]
         return np.asarray(np.diag(self.floor**2) + np.outer(left, left) + self._largest_estimate())
 
     @property
@@ -240,15 +225,15 @@ class Knowledge:
         The other parameters follow fx as the turn lets them make up for it. 0 for several turns.
         """
         if len(self.turns) > 1:
-            return np.zeros((self.count, self.count))
-        own = self.total.covariance[:self.count, :self.count]
-        along = self.one_turn_sigma * own[0] / own[0, 0]
+            return np.zeros((len(self.own), len(self.own)))
+        own = self.total.covariance[0, self.own]
+        along = self.one_turn_sigma * own / own[0]
         return np.outer(along, along)
 
     def _largest_estimate(self) -> Floats:
-        root = np.linalg.cholesky(self.total.covariance)
+        root, count = np.linalg.cholesky(self.total.covariance), len(self.own)
         # the readout, if there is one, moves nothing in the picture of a camera that stands
-        flat = sensitivity(self.camera)[0].reshape(-1, self.count) @ root[:self.count]
+        flat = sensitivity(self.camera)[0].reshape(-1, count) @ root[:count]
         _, _, modes = np.linalg.svd(flat, full_matrices=False)
         basis = root @ modes.T
         back = modes @ np.linalg.inv(root)
@@ -258,7 +243,7 @@ class Knowledge:
         if len(self.turns) > 1:
             scatter = scatter_between_turns(self.turns_at_optimum, self.total.covariance, basis)
             estimates.append(np.full(len(modes), scatter))
-        own = basis[:self.count]
+        own = basis[:count]
         return np.asarray(own * np.max(estimates, axis=0) @ own.T)
 
     @property
@@ -270,9 +255,10 @@ class Knowledge:
     @property
     def readout_sigma(self) -> float:
         """Return the sigma of a rolling shutter's readout, s: it is behind the camera's own."""
+        place = len(self.own)
         return float(np.sqrt(max(
-            self.total.covariance[self.count, self.count],
-            self.systematic * self.total.covariance_by_track[self.count, self.count])))
+            self.total.covariance[place, place],
+            self.systematic * self.total.covariance_by_track[place, place])))
 
     def sigma_map(self, field: Field | None = None) -> SigmaMap:
         """Return the sigma at a grid of pixels, those for which the camera has a viewing ray.

@@ -18,6 +18,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.knowledge import Knowledge
 from dashcalib_ros.solve.normal import turn_cost
+from dashcalib_ros.solve.quadratic import Quadratic
 
 # s; step of the central difference for a point's speed in the picture
 STEP_S = 1e-3
@@ -64,7 +65,8 @@ def readout(scenes: Sequence[Scene], camera: Camera, loss_px: float, prior: Floa
         return 0.0, float(np.inf)
     known = Knowledge(camera, tuple(
         turn_cost(scene, camera, loss_px, shift[..., None])
-        for scene, shift in zip(scenes, shifts, strict=True)), prior, np.zeros(len(prior)))
+        for scene, shift in zip(scenes, shifts, strict=True)),
+        Quadratic.prior(prior, np.zeros(1)), np.zeros(len(prior)))
     # the camera is at its optimum: only the readout has a gradient
     score = np.sum([turn.score[-1] for turn in known.turns_at_optimum])
     return float(known.total.covariance[-1, -1] * score), known.readout_sigma

@@ -97,7 +97,7 @@ class Solution:
     @property
     def rays_sigma_px(self) -> float:
         """Return how far rays with the camera and the field may be off, RMS over the picture."""
-        found, count, together = self.field, self.known.count, self.known.total.covariance
+        found, count, together = self.field, len(self.known.own), self.known.total.covariance
         if found is None:
             return self.picture.rms
         moves, pixels = sensitivity(self.camera)

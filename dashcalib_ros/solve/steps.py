@@ -109,8 +109,7 @@ class Fit:
             scene, camera, loss_px, self._by_shared(scene),
             shift_prior(scene, noise, self.crops[scene.turn]) if self.crops
             else None) for scene in self.scenes)
-        return Knowledge(camera, turns, self.prior,
-                         floor_of(camera, self.used_field), self._shared_prior(),
+        return Knowledge(camera, turns, self._prior_of_all(), floor_of(camera, self.used_field),
                          one_turn_sigma=self.settings.one_turn_sigma * camera.fx)
 
     def _by_shared(self, scene: Scene) -> Floats | None:
@@ -122,14 +121,14 @@ class Fit:
             columns.append(self.field.columns(scene, self.camera))
         return np.concatenate(columns, axis=-1) if columns else None
 
-    def _shared_prior(self) -> Quadratic | None:
-        """Return the prior of the readout, which is 0, and of the field."""
-        if self.field is None:
-            return None
-        readout = np.zeros(1 if self.readout_s else 0)
-        precision = np.full(self.field.basis.shape[1], self.field.sigma_px**-2.0)
-        return Quadratic.prior(np.diag(np.r_[readout, precision]),
-                               score=np.r_[readout, -precision * self.field.directions])
+    def _prior_of_all(self) -> Quadratic:
+        """Return the prior of the camera, of the readout, which has none, and of the field."""
+        further = score = np.zeros(1 if self.readout_s else 0)
+        if self.field is not None:
+            precision = np.full(self.field.basis.shape[1], self.field.sigma_px**-2.0)
+            further = np.r_[further, precision]
+            score = np.r_[score, -precision * self.field.directions]
+        return Quadratic.prior(self.prior, further, np.r_[np.zeros(len(self.prior)), score])
 
     def fixed_camera_tests(self, bent: bool = True) -> tuple[FixedCameraTest, ...]:
         """Return in what the drive departs from a fixed camera, the strongest first.

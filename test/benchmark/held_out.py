@@ -35,9 +35,9 @@ def solved_drives(cache: Path) -> list[Solved]:
 
 def without(solution: Solution, number: int) -> Camera:
     """Return the camera without a turn, by one linear step."""
-    known, own = solution.known, np.arange(solution.known.count)
-    others = known.without(number).of_camera(known.noise)
-    step = np.linalg.solve(others.hessian, known.turns[number].score[own] / known.noise)
+    known, other = solution.known, solution.known.without(number)
+    cost = known.with_prior([other.sum(known.own).at_noise(known.noise)])
+    step = np.linalg.solve(cost.hessian, known.turns[number].score[known.own] / known.noise)
     return solution.camera.with_params(solution.camera.params - step)
 
 

@@ -142,7 +142,8 @@ def test_the_wider_model_gains_only_where_the_lens_needs_it():
     def gains(extra):
         found = solved(scenes_of(4, extra=extra), CONFIG.replace({'model': 'radial'}))
         turns = tuple(turn_cost(scene, found.camera, 1.0) for scene in found.scenes)
-        return Knowledge(found.camera, turns, 1e-9 * np.eye(6), np.zeros(6)).gains_of_wider_model
+        prior = Quadratic.prior(1e-9 * np.eye(6))
+        return Knowledge(found.camera, turns, prior, np.zeros(6)).gains_of_wider_model
     assert gains((0.0, 0.0, 0.0)).sum() < 10
     assert is_clear(gains((0.002, -0.002, 0.0)))
 

@@ -304,7 +304,7 @@ def test_information_agrees_with_colmaps_covariance():
 
 
 def knowledge(parts, prior=NOTHING, camera=LENS) -> Knowledge:
-    return Knowledge(camera, tuple(parts), prior, np.zeros(6))
+    return Knowledge(camera, tuple(parts), Quadratic.prior(prior), np.zeros(6))
 
 
 def sigmas(parts, prior):
