@@ -121,12 +121,13 @@ class Problem:
             cost = normal.shared if images is None else images[n].eliminated(normal)
             costs.append(cost.of(free).at_noise(noise))
             if images is not None:
-                own = images[n].gain_and_chance(normal)
-                gain, chance = gain + own[0] / noise, chance + own[1] / noise
+                own = images[n].of(normal)
+                gain += float(own.score @ own.covariance @ own.score) / noise
+                chance += own.chance / noise
         total = Quadratic.together(costs)
         step = total.covariance @ total.score
         return Step(gain + float(total.score @ step),
-                    chance + float(np.sum(total.covariance * total.by_track)), step,
+                    chance + total.chance, step,
                     () if images is None else tuple(
                         each.step(normal, free, step)
                         for each, normal in zip(images, self.normals, strict=True)))

@@ -94,39 +94,27 @@ class ImagePrior:
     precision: Floats
     values: Floats
 
+    def of(self, normal: Normal) -> Quadratic:
+        """Return the cost about these parameters with the prior; what turns share is fixed."""
+        return Quadratic.together([normal.cost.of(self.free), Quadratic.prior(
+            self.precision, score=-self.precision @ self.values)])
+
     def eliminated(self, normal: Normal) -> Quadratic:
         """Return the cost about what turns share, these parameters at their optimum."""
-        cost, shared = normal.cost, slice(IMAGE * normal.images, None)
-        inverse, mixed = self._inverse(normal), cost.hessian[self.free, shared]
+        own, cost, shared = self.of(normal), normal.cost, slice(IMAGE * normal.images, None)
+        mixed = cost.hessian[self.free, shared]
         combine = np.zeros((len(cost.score) - IMAGE * normal.images, len(cost.score)))
         combine[:, shared] = np.eye(len(combine))
-        combine[:, self.free] = -mixed.T @ inverse
-        return Quadratic(cost.hessian[shared, shared] - mixed.T @ inverse @ mixed,
-                         cost.score[shared] - mixed.T @ inverse @ self._score(normal),
+        combine[:, self.free] = -mixed.T @ own.covariance
+        return Quadratic(cost.hessian[shared, shared] - mixed.T @ own.covariance @ mixed,
+                         cost.score[shared] - mixed.T @ own.covariance @ own.score,
                          combine @ cost.by_track @ combine.T)
 
     def step(self, normal: Normal, others: Ints, step: Floats) -> Floats:
         """Return (p,) their step, given that (s,) of others, indices behind the images'."""
+        own = self.of(normal)
         mixed = normal.cost.hessian[np.ix_(self.free, IMAGE * normal.images + others)]
-        return np.asarray(self._inverse(normal) @ (self._score(normal) - mixed @ step))
-
-    def gain_and_chance(self, normal: Normal) -> tuple[float, float]:
-        """Return by how much their own step lowers the cost, and how much chance would, px^2.
-
-        The first times the noise, the second times its square: neither is at unit noise.
-        """
-        inverse, score = self._inverse(normal), self._score(normal)
-        scatter = normal.cost.by_track[np.ix_(self.free, self.free)]
-        return float(score @ inverse @ score), float(np.sum(inverse * scatter))
-
-    def _inverse(self, normal: Normal) -> Floats:
-        """Return (p, p) the inverse of their block, with the prior."""
-        return np.asarray(np.linalg.inv(
-            normal.cost.hessian[np.ix_(self.free, self.free)] + self.precision), np.float64)
-
-    def _score(self, normal: Normal) -> Floats:
-        """Return (p,) their score, with the prior's."""
-        return np.asarray(normal.cost.score[self.free] - self.precision @ self.values)
+        return np.asarray(own.covariance @ (own.score - mixed @ step))
 
 
 def turn_cost(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None = None,

@@ -110,6 +110,11 @@ class Quadratic:
         covariance = self.covariance
         return np.asarray(covariance @ self.by_track @ covariance)
 
+    @property
+    def chance(self) -> float:
+        """Return by how much noise alone makes the optimum lower, each track one measurement."""
+        return float(np.sum(self.covariance * self.by_track))
+
 
 @dataclass(frozen=True)
 class TurnCost(Quadratic):
