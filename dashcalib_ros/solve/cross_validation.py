@@ -8,8 +8,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.solve.knowledge import Knowledge, sigma_over
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.solve.knowledge import sigma_over
 from dashcalib_ros.solve.solution import Solution
 
 # fewer turns are not left out: one of two says little of the other
@@ -50,23 +49,15 @@ def cross_validation(solution: Solution) -> tuple[LeftOut, ...]:
     known = replace(solution.known, one_turn_sigma=0.0)
     if len(known.turns) < LEAST_TURNS:
         return ()
-    (moves, _), count = sensitivity(known.camera), len(known.own)
-    prior = Quadratic.prior(known.noise * known.prior.of(known.own).hessian)
-    # at the solution the prior balances the scores of all turns
-    balance = known.sum(known.own).score
-
-    def camera_of(some: Knowledge) -> tuple[Floats, float]:
-        """Return how far its parameters (n,) are off the solution, and sigma over the picture."""
-        cost = Quadratic.together([prior, *(turn.of(known.own) for turn in some.turns)])
-        return (replace(cost, score=cost.score - balance).optimum,
-                _rms(sigma_over(moves, some.covariance[:count, :count])))
-
+    moves, _ = sensitivity(known.camera)
+    block = np.ix_(known.own, known.own)
     found = []
     for n, scene in enumerate(solution.scenes):
-        others, others_sigma = camera_of(known.without(n))
-        alone, sigma = camera_of(known.of([n]))
-        apart = _rms(np.linalg.norm(moves @ (alone - others), axis=1))
-        found.append(LeftOut(scene.turn, apart, sigma, others_sigma))
+        alone, others = known.of([n]), known.without(n)
+        apart = moves @ (known.offset_of(alone) - known.offset_of(others))
+        found.append(LeftOut(
+            scene.turn, _rms(np.linalg.norm(apart, axis=1)),
+            *(_rms(sigma_over(moves, some.covariance[block])) for some in (alone, others))))
     return tuple(found)
 
 

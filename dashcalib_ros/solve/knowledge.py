@@ -145,6 +145,13 @@ class Knowledge:
         """Return each turn's cost about what is free, at unit noise, at the optimum of all."""
         return tuple(turn.moved(self.left) for turn in self.each(self.free))
 
+    def offset_of(self, some: Knowledge) -> Floats:
+        """Return (n,) how far the camera of some of these turns is off that of them all."""
+        prior = Quadratic.prior(self.noise * self.prior.of(self.own).hessian)
+        cost = Quadratic.together([prior, *(turn.of(self.own) for turn in some.turns)])
+        # at the solution the prior balances the scores of all turns
+        return np.asarray(np.linalg.solve(cost.hessian, cost.score - self.sum(self.own).score))
+
     # the wider model
 
     def _with_wider_prior(self, turns: Iterable[Quadratic], score: Floats | None = None

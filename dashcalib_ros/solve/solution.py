@@ -84,7 +84,7 @@ class Solution:
 
         Of those that this model has not, the step is all that is known.
         """
-        covariance = self.known.covariance.copy()
+        covariance = np.array(self.known.covariance)
         if self.doubt is not None:
             covariance[:len(self.doubt), :len(self.doubt)] += self.doubt
         return covariance
