@@ -117,7 +117,7 @@ def with_better_poses(scenes: Sequence[Scene], per_turn: Sequence[Scene], camera
 
 def _readjusted(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
     """Return the scene adjusted to a camera that is nearly right."""
-    # the focal length is held; the distortion that is found is not used
+    # the focal length is fixed; the distortion that is found is not used
     solver = Solver(0.01 * camera.image_size[0], config.iterations)
     [moved], _ = adjust([retriangulate(scene, camera, config)], camera, solver, 'distortion')
     return retriangulate(moved, camera, config)

@@ -55,7 +55,7 @@ Crops = Mapping[TurnId, Floats]
 
 @dataclass(frozen=True)
 class FixedCameraTest:
-    """Whether a drive departs from a fixed camera in one way.
+    """Whether the camera is fixed, or its picture moves in one way.
 
     strength: what the parameters of this kind gain, over what chance would gain; more than limit
     is clear. size: the root mean square of the shift or the field, px, or of the zoom. by_turn:
@@ -95,7 +95,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Problem:
-    """The linearised problem of all scenes, about the camera and all that it may depart in.
+    """The linearised problem of all scenes, about the camera and all that may move in its picture.
 
     own: the number of the camera's parameters; prior: about all that turns share, at unit noise.
     noise: variance of a residual, px^2.
@@ -198,7 +198,7 @@ def fixed_camera_tests(scenes: Sequence[Scene], camera: Camera, centred: Camera,
                           config: IntrinsicsConfig, crops: Crops | None = None, bent: bool = True,
                           rolling: bool = False, found: FoundField | None = None
                           ) -> tuple[FixedCameraTest, ...]:
-    """Return in what the scenes depart from a fixed camera, the strongest first.
+    """Return the tests whether the camera is a fixed one, the clearest that it is not first.
 
     centred: the camera that priors are about. crops: of a stabilised video, as taken out already.
     bent: False leaves out the local bend. rolling: a rolling shutter was taken out: what is left

@@ -54,9 +54,9 @@ def solve(per_turn: Sequence[Scene], config: Config,
 
     per_turn: at least one scene, each as its turn was reconstructed. The minimum of the summed
     focal profile is the start; a scene with a camera far from it is chained anew, and one that the
-    shared camera does not explain is dropped. Where turns may be of two kinds of lenses, both are
-    tried with a part of the tracks. Where the better one leaves something, larger models are
-    tried, too.
+    shared camera does not explain is dropped. Where turns may be of a pinhole or of a fisheye,
+    both are tried with a part of the tracks. Larger lens models are tried where they may explain
+    what is left of the errors.
     """
     begun = [found for kind in kinds_of_lenses(per_turn)
              if (found := _begun(kind, per_turn, config, progress)) is not None]

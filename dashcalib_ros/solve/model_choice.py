@@ -1,4 +1,4 @@
-"""Larger models of the lens are tried where the simplest leaves something, and one is chosen.
+"""Larger models of the lens are tried where errors are left to explain, and one is chosen.
 
 The one that predicts turns it was not fitted to: each turn is left out in turn. At a model's
 solution the cost of every turn is known as a quadratic function of the camera's parameters, so

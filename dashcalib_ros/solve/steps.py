@@ -131,7 +131,7 @@ class Fit:
         return Quadratic.prior(self.prior, further, np.r_[np.zeros(len(self.prior)), score])
 
     def fixed_camera_tests(self, bent: bool = True) -> tuple[FixedCameraTest, ...]:
-        """Return in what the drive departs from a fixed camera, the strongest first.
+        """Return the tests whether the camera is a fixed one, the clearest that it is not first.
 
         bent: False leaves out the local bend, which takes longer.
         """

@@ -52,7 +52,8 @@ def chained(turn: SyntheticTurn, camera: Camera) -> Scene:
 
 
 def one_focal_length(scenes, camera, solver, reach) -> tuple[list[Scene], Camera]:
-    return adjust.adjust(scenes, camera, solver, 'one focal length', reach)
+    free = 'first distortion' if reach is None else 'one focal length'
+    return adjust.adjust(scenes, camera, solver, free, reach)
 
 
 def everything(scenes, camera, solver, prior, bounds) -> tuple[list[Scene], Camera]:
