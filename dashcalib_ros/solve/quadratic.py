@@ -21,6 +21,8 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
 
+NONE = np.zeros(0)
+
 
 @dataclass(frozen=True)
 class Quadratic:
@@ -35,18 +37,17 @@ class Quadratic:
     by_track: Floats
 
     @staticmethod
-    def prior(information: Floats, further: Floats | None = None, score: Floats | None = None
+    def prior(information: Floats, further: Floats = NONE, score: Floats | None = None
               ) -> Quadratic:
         """Return a prior about n parameters, and about e further ones that are independent.
 
         information: (n, n) the inverse of its covariance; further: (e,) likewise. score: (n + e,)
         how the prior draws at the solution; 0 where it is not given.
         """
-        count, size = len(information), len(information) + len(() if further is None else further)
+        count, size = len(information), len(information) + len(further)
         hessian = np.zeros((size, size))
         hessian[:count, :count] = information
-        if further is not None:
-            hessian[count:, count:] = np.diag(further)
+        hessian[count:, count:] = np.diag(further)
         return Quadratic(hessian, np.zeros(size) if score is None else score,
                          np.zeros((size, size)))
 
