@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from dashcalib_ros.camera.field import TERMS, Field
-from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.field import FieldProblem, FoundField, field_basis, without_field
 from dashcalib_ros.solve.fitting import retriangulate_all
@@ -23,13 +22,13 @@ LOSSES = (2.0, 1.0, 0.5, 0.0, 0.0)
 LAST_LOSSES = (0.0, 0.0)
 
 
-def with_field(first: Fit, config: Config) -> Fit:
+def with_field(first: Fit) -> Fit:
     """Return the fit with the field taken out of its tracks, where the turns confirm one.
 
     Where only the evidence speaks for a field, the fit keeps its prior, for its sigma. What the
     removal of a rolling shutter leaves looks like a field: behind one, none is looked for.
     """
-    settings, size = config.intrinsics, first.camera.image_size
+    settings, size = first.config.intrinsics, first.camera.image_size
     if len(first.scenes) < 2 or first.readout_s:
         return first
     none = FoundField(Field(size, np.zeros((2, len(TERMS)))), field_basis(first.camera), np.inf)
@@ -38,29 +37,28 @@ def with_field(first: Fit, config: Config) -> Fit:
     if evidence.nats < settings.least_field_nats:
         return first
     doubtful = replace(first, field=replace(none, sigma_px=evidence.sigma_px))
-    found = _rounds(replace(first, field=none), LOSSES, config)
+    found = _rounds(replace(first, field=none), LOSSES)
     if found is None:
         return doubtful
-    found = found.with_usual_loss().adjusted()
-    found = replace(found, scenes=retriangulate_all(found.scenes, found.camera, config.scene))
+    found = found.with_usual_loss().adjusted().retriangulated()
     _, problem = _problem(found, _field_of(found), found.solver.loss_px)
     gains = problem.gains_of_turns_left_out(problem.evidence(size[0]))
     return found if is_clear(gains) else doubtful
 
 
-def with_field_of_all_tracks(fit: Fit, config: Config) -> Fit:
+def with_field_of_all_tracks(fit: Fit) -> Fit:
     """Return the fit with its field, found with a part of the tracks, estimated anew."""
     if fit.used_field is None:
         return fit
-    return _rounds(fit, LAST_LOSSES, config) or fit
+    return _rounds(fit, LAST_LOSSES) or fit
 
 
-def _rounds(first: Fit, losses: Sequence[float], config: Config) -> Fit | None:
+def _rounds(first: Fit, losses: Sequence[float]) -> Fit | None:
     """Return the fit after a Gauss-Newton round for each loss, px, at the least.
 
     None where it loses a turn.
     """
-    now = first
+    now, config = first, first.config
     for least_px in losses:
         found, camera = _field_of(now), now.camera
         loss_px = max(loss_px_of(now.scenes, camera, config.intrinsics), least_px)
@@ -99,5 +97,5 @@ def _problem(now: Fit, found: FoundField, loss_px: float) -> tuple[list[Normal],
     normals = [normal_equations(scene, now.camera, loss_px, found.columns(scene, now.camera))
                for scene in now.scenes]
     return normals, FieldProblem(tuple(normal.cost.at_noise(noise) for normal in normals),
-                                 wider_prior(now.camera, now.centred, now.settings),
+                                 wider_prior(now.camera, now.centred, now.config.intrinsics),
                                  found.directions)

@@ -62,50 +62,50 @@ def solve(per_turn: Sequence[Scene], config: Config,
              if (found := _begun(kind, per_turn, config, progress)) is not None]
     if not begun:
         return None
-    start, tried = _best_of(begun, config)
+    start, tried = _best_of(begun)
     progress('looking for a field', 0.0)
-    fit, full_scenes = with_field(start.fit, config), start.full_scenes
+    fit, full_scenes = with_field(start.fit), start.full_scenes
     field = fit.used_field
     if field is not None:
         full_scenes = {turn: without_field(scene, field) for turn, scene in full_scenes.items()}
-    fit = _steadied(fit, config)
+    fit = _steadied(fit)
     crops = fit.crops
     if crops:
         full_scenes = {turn: without_crops(full_scenes[turn], crops) for turn in crops}
-    fit = with_all_tracks(fit, full_scenes, per_turn, config)
+    fit = with_all_tracks(fit, full_scenes, per_turn)
     if not fit.scenes:
         return None
-    fit = fit_all(with_field_of_all_tracks(fit, config), full_scenes, config, progress)
+    fit = fit_all(with_field_of_all_tracks(fit), full_scenes, progress)
     if crops:
         # a part of the tracks leaves the crops uncertain
-        fit = without_stabiliser(fit, config, FINAL_ROUNDS)
+        fit = without_stabiliser(fit, FINAL_ROUNDS)
     elif config.model == AUTO and field is None:
         progress('choosing the lens model', 0.0)
-        fit, others = with_model_chosen(fit, full_scenes, config)
+        fit, others = with_model_chosen(fit, full_scenes)
         tried = _merged(tried, others)
     elif config.model != AUTO:
         progress('comparing the lens model with others', 0.0)
-        tried = compared_with_others(fit, full_scenes, config)
+        tried = compared_with_others(fit, full_scenes)
     progress('trying other focal lengths', 0.0)
     around = profile_around(fit.scenes, fit.camera, start.profile, config)
     progress('estimating the uncertainty', 0.0)
-    return _solution(fit, per_turn, (start.profile, around), tried, config)
+    return _solution(fit, per_turn, (start.profile, around), tried)
 
 
-def _steadied(first: Fit, config: Config) -> Fit:
+def _steadied(first: Fit) -> Fit:
     """Return the fit with a fixed crop of a stabilised video, if that is what the video shows."""
     def moves(found: Sequence[FixedCameraTest]) -> bool:
         return found[0].kind == 'shift' and found[0].clear
 
-    rounds = config.intrinsics.crop_rounds
+    rounds = first.config.intrinsics.crop_rounds
     # the bend takes longer, and is asked for only where the picture moves
     if (not rounds or not moves(first.fixed_camera_tests(bent=False))
             or not moves(first.fixed_camera_tests())):
         return first
-    return without_stabiliser(first, config, rounds)
+    return without_stabiliser(first, rounds)
 
 
-def _best_of(begun: Sequence[_Begun], config: Config) -> tuple[_Begun, tuple[Candidate, ...]]:
+def _best_of(begun: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
     """Return the kind of lens that explains the turns best, and how the kinds compare.
 
     A kind may lose by the bad poses of one turn only. So all are fitted again from the poses of
@@ -114,14 +114,14 @@ def _best_of(begun: Sequence[_Begun], config: Config) -> tuple[_Begun, tuple[Can
     and it stays.
     """
     def chosen(found: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
-        fit, tried = chosen_of([each.fit for each in found], config)
+        fit, tried = chosen_of([each.fit for each in found])
         return next(each for each in found if each.fit is fit), tried
 
     best, tried = chosen(begun)
     if len(begun) == 1 or len(best.fit.scenes) < 2:
         return best, tried
     again = [replace(each, fit=fit) for each in begun if (fit := refitted(
-        best.fit, type(each.fit.camera), best.full_scenes, config)) is not None]
+        best.fit, type(each.fit.camera), best.full_scenes)) is not None]
     best_again = any(type(each.fit.camera) is type(best.fit.camera) for each in again)
     return chosen(again) if best_again else (best, tried)
 
@@ -140,7 +140,7 @@ def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progr
     if not first.scenes:
         return None
     progress('adjusting all parameters', 0.0)
-    return _Begun(fit_roughly(first, config), full_scenes, profile)
+    return _Begun(fit_roughly(first), full_scenes, profile)
 
 
 def _merged(first: Sequence[Candidate], later: Sequence[Candidate]) -> tuple[Candidate, ...]:
@@ -164,7 +164,7 @@ def _shared_with_field(fit: Fit) -> Floats:
 
 
 def _solution(fit: Fit, per_turn: Sequence[Scene], profiles: tuple[Profile, Profile],
-              tried: tuple[Candidate, ...], config: Config) -> Solution:
+              tried: tuple[Candidate, ...]) -> Solution:
     """Return the solution with its covariance. profiles: the coarse one, and that around it."""
     tests = fit.fixed_camera_tests()
     known = replace(fit.known, systematic=max(1.0, *(each.strength for each in tests)))
@@ -175,6 +175,7 @@ def _solution(fit: Fit, per_turn: Sequence[Scene], profiles: tuple[Profile, Prof
         coarse=profiles[0], around=profiles[1],
         bounds=np.array(bounds_of(fit.centred)), readout_s=fit.readout_s,
         readout_sigma_s=known.readout_sigma if fit.readout_s else 0.0,
-        misfits=misfits(per_turn, fit.scenes, fit.camera, config.scene.error_px), tried=tried,
+        misfits=misfits(per_turn, fit.scenes, fit.camera, fit.config.scene.error_px),
+        tried=tried,
         sigma_map=known.sigma_map(fit.used_field), fixed_camera=tests, crops=fit.crops,
         field=fit.field)

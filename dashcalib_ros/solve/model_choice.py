@@ -16,10 +16,9 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera, calibrated_models, larger_models
 from dashcalib_ros.camera.mapping import as_model, mapping_error
-from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
-from dashcalib_ros.solve.fitting import FIRST_TRACKS, retriangulate_all, subsample_tracks
+from dashcalib_ros.solve.fitting import FIRST_TRACKS, subsample_tracks
 from dashcalib_ros.solve.knowledge import is_clear
 from dashcalib_ros.solve.shutter import readout
 from dashcalib_ros.solve.solution import Candidate
@@ -31,69 +30,65 @@ SHORT_READOUT_S = 0.008
 PLACES = 500
 
 
-def with_model_chosen(first: Fit, full_scenes: ByTurn, config: Config
-                      ) -> tuple[Fit, tuple[Candidate, ...]]:
+def with_model_chosen(first: Fit, full_scenes: ByTurn) -> tuple[Fit, tuple[Candidate, ...]]:
     """Return the result with the model that the turns prove, and how the models compare.
 
     Others are tried only where the first one leaves something for them to explain, and with a part
     of the tracks; the one that is chosen is adjusted with all.
     """
     camera = first.camera
-    if len(first.known.turns) < 2 or not _leaves_more(first, config):
+    if len(first.scenes) < 2 or not _leaves_more(first):
         return first, ()
     models = larger_models(camera)
-    few, measured = _few(first, full_scenes, config)
-    found = [_refitted(few, type(camera), measured, config),
-             *(_without_shutter(few, model, measured, config) for model in models)]
-    chosen, tried = chosen_of([result for result in found if result is not None], config)
+    few, measured = _few(first, full_scenes)
+    found = [_refitted(few, type(camera), measured),
+             *(_without_shutter(few, model, measured) for model in models)]
+    chosen, tried = chosen_of([result for result in found if result is not None])
     model = type(chosen.camera)
     if model is type(camera):
         return first, tried
-    return _without_shutter(first, model, full_scenes, config) or first, tried
+    return _without_shutter(first, model, full_scenes) or first, tried
 
 
-def refitted(result: Fit, model: type[Camera], full_scenes: ByTurn, config: Config
-             ) -> Fit | None:
+def refitted(result: Fit, model: type[Camera], full_scenes: ByTurn) -> Fit | None:
     """Return a result's turns explained with a model, from the poses that they have now.
 
     None where it does not explain all of them.
     """
-    few, measured = _few(result, full_scenes, config)
-    return _refitted(few, model, measured, config)
+    few, measured = _few(result, full_scenes)
+    return _refitted(few, model, measured)
 
 
-def compared_with_others(asked: Fit, full_scenes: ByTurn, config: Config
-                         ) -> tuple[Candidate, ...]:
+def compared_with_others(asked: Fit, full_scenes: ByTurn) -> tuple[Candidate, ...]:
     """Return how a model that was asked for compares with all others, with a part of the tracks.
 
     Empty where one turn is all there is, or no other model explains the turns.
     """
-    if len(asked.known.turns) < 2:
+    if len(asked.scenes) < 2:
         return ()
-    few, measured = _few(asked, full_scenes, config)
+    few, measured = _few(asked, full_scenes)
     camera = asked.camera
     larger = larger_models(camera)
-    found = [_refitted(few, type(camera), measured, config)]
+    found = [_refitted(few, type(camera), measured)]
     if found[0] is None:
         return ()
     for model in calibrated_models():
         if model is not type(camera):
             fitted = _without_shutter if model in larger else _refitted
-            found.append(fitted(few, model, measured, config))
-    chosen, tried = chosen_of([result for result in found if result is not None], config)
+            found.append(fitted(few, model, measured))
+    chosen, tried = chosen_of([result for result in found if result is not None])
     # the result is adjusted with all tracks
     apart_px = mapping_error(camera, chosen.camera)
     return tuple(replace(each, apart_px=apart_px) if each.model == camera.model else each
                  for each in tried)
 
 
-def left_out_costs(fit: Fit, loss_px: float, limit_px: float) -> dict[TurnId, float]:
+def left_out_costs(fit: Fit, loss_px: float) -> dict[TurnId, float]:
     """Return for each turn its cost with the camera of the other turns, px^2.
 
-    loss_px: of the Cauchy loss; errors above limit_px count as it. With one turn only, its cost
-    with its own camera.
+    loss_px: of the Cauchy loss. With one turn only, its cost with its own camera.
     """
-    known, costs = fit.known, {}
+    known, limit_px, costs = fit.known, fit.config.scene.error_px, {}
     total = np.linalg.inv(known.total.covariance)
     for scene, turn in zip(fit.scenes, known.turns_at_optimum, strict=True):
         errors = np.minimum(errors_px(scene, fit.camera), limit_px)[scene.tracks.seen]
@@ -104,7 +99,7 @@ def left_out_costs(fit: Fit, loss_px: float, limit_px: float) -> dict[TurnId, fl
     return costs
 
 
-def chosen_of(results: Sequence[Fit], config: Config) -> tuple[Fit, tuple[Candidate, ...]]:
+def chosen_of(results: Sequence[Fit]) -> tuple[Fit, tuple[Candidate, ...]]:
     """Return the result whose model predicts the turns best, and how the others compare.
 
     The simplest comes first; one with more parameters must be clearly better, and map rays
@@ -114,7 +109,7 @@ def chosen_of(results: Sequence[Fit], config: Config) -> tuple[Fit, tuple[Candid
         return results[0], ()
     results = sorted(results, key=lambda result: len(result.camera.names()))
     loss_px = min(result.solver.loss_px for result in results)
-    costs = [left_out_costs(result, loss_px, config.scene.error_px) for result in results]
+    costs = [left_out_costs(result, loss_px) for result in results]
     noise = min(result.known.noise for result in results)
     inflation = min(result.known.track_inflation for result in results)
     # a turn that a camera does not explain at all counts against it
@@ -124,7 +119,7 @@ def chosen_of(results: Sequence[Fit], config: Config) -> tuple[Fit, tuple[Candid
     best = 0
     for n in range(1, len(results)):
         clear = is_clear(np.array([gains[n][turn] - gains[best][turn] for turn in worst]))
-        if clear and not _alike(results[n], results[best], config):
+        if clear and not _alike(results[n], results[best]):
             best = n
     chosen = results[best]
     totals = [sum(cost.get(turn, 2 * worst[turn]) for turn in worst) for cost in costs]
@@ -135,24 +130,23 @@ def chosen_of(results: Sequence[Fit], config: Config) -> tuple[Fit, tuple[Candid
         for n, result in enumerate(results))
 
 
-def _few(first: Fit, full_scenes: ByTurn, config: Config) -> tuple[Fit, ByTurn]:
+def _few(first: Fit, full_scenes: ByTurn) -> tuple[Fit, ByTurn]:
     """Return the result, and the scenes as they were measured, with a part of the tracks."""
     scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in first.scenes]
     return (replace(first, scenes=scenes),
             {turn: subsample_tracks(scene, FIRST_TRACKS) for turn, scene in full_scenes.items()})
 
 
-def _without_shutter(first: Fit, model: type[Camera], measured: ByTurn, config: Config
-                     ) -> Fit | None:
+def _without_shutter(first: Fit, model: type[Camera], measured: ByTurn) -> Fit | None:
     """Return the result with another model and a global shutter; None where that is not enough.
 
     A decentred lens looks like a short rolling shutter, and what the removal of a true one leaves
     over looks like a decentred lens: the larger model must do without.
     """
     if not first.readout_s:
-        return _refitted(first, model, measured, config)
+        return _refitted(first, model, measured)
     scenes = [replace(scene, tracks=measured[scene.turn].tracks) for scene in first.scenes]
-    found = _refitted(replace(first, scenes=scenes, readout_s=0.0), model, measured, config)
+    found = _refitted(replace(first, scenes=scenes, readout_s=0.0), model, measured)
     if found is None:
         return None
     left_s, sigma_s = readout(
@@ -160,7 +154,7 @@ def _without_shutter(first: Fit, model: type[Camera], measured: ByTurn, config: 
     return None if is_rolling(left_s, sigma_s) else found
 
 
-def _leaves_more(result: Fit, config: Config) -> bool:
+def _leaves_more(result: Fit) -> bool:
     """Return whether a wider model may predict the turns clearly better."""
     camera = result.camera
     if type(camera.widened()) is type(camera):
@@ -170,8 +164,7 @@ def _leaves_more(result: Fit, config: Config) -> bool:
     return is_clear(result.known.gains_of_wider_model / result.known.track_inflation)
 
 
-def _refitted(first: Fit, model: type[Camera], full_scenes: ByTurn, config: Config
-              ) -> Fit | None:
+def _refitted(first: Fit, model: type[Camera], full_scenes: ByTurn) -> Fit | None:
     """Return the result with another model, None where it does not explain all turns."""
     camera = first.camera
     if type(camera) is not model:
@@ -181,11 +174,10 @@ def _refitted(first: Fit, model: type[Camera], full_scenes: ByTurn, config: Conf
     if model.family == first.centred.family:
         distortion = first.centred.params[4:len(model.names())]
         centred = model.centred(camera.image_size, first.centred.fx, *distortion)
-    scenes = retriangulate_all(first.scenes, camera, config.scene)
-    if len(scenes) < len(first.scenes):
+    ready = replace(first, camera=camera, centred=centred).retriangulated()
+    if len(ready.scenes) < len(first.scenes):
         return None
-    fit = fit_all(replace(first, scenes=scenes, camera=camera, centred=centred), full_scenes,
-                  config)
+    fit = fit_all(ready, full_scenes)
     return None if len(fit.scenes) < len(first.scenes) else fit
 
 
@@ -195,7 +187,7 @@ def _seen(scenes: Sequence[Scene]) -> Floats:
     return np.asarray(places[::max(1, len(places) // PLACES)])
 
 
-def _alike(larger: Fit, simpler: Fit, config: Config) -> bool:
+def _alike(larger: Fit, simpler: Fit) -> bool:
     """Return whether two models map rays alike, as far as the turns can tell."""
     apart = mapping_error(larger.camera, simpler.camera)
     return apart is not None and apart < larger.known.sigma_map(larger.used_field).whole.rms

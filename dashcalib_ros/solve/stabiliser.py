@@ -14,9 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.fitting import retriangulate_all
 from dashcalib_ros.solve.fixed_camera import READOUT_S, Crops, Problem, problem_of, shift_priors
 from dashcalib_ros.solve.normal import IMAGE
 from dashcalib_ros.solve.shutter import row_shift
@@ -34,7 +32,7 @@ def without_crops(scene: Scene, crops: Crops) -> Scene:
     return replace(scene, tracks=replace(scene.tracks, xy=moved))
 
 
-def without_stabiliser(given: Fit, config: Config, rounds: int) -> Fit:
+def without_stabiliser(given: Fit, rounds: int) -> Fit:
     """Return the fit with the movement of the crop taken out, in so many rounds at the most.
 
     The same fit if a turn is lost. A rolling shutter that was taken out before is estimated anew
@@ -46,12 +44,12 @@ def without_stabiliser(given: Fit, config: Config, rounds: int) -> Fit:
     for _ in range(rounds):
         now = now.with_usual_loss()
         shutter = [row_shift(scene, now.camera) for scene in now.scenes] if now.readout_s else []
-        problem = problem_of(now.scenes, now.camera, now.centred, now.solver.loss_px, now.settings,
+        problem = problem_of(now.scenes, now.camera, now.centred, now.solver.loss_px,
+                             now.config.intrinsics,
                              [shift[..., None] for shift in shutter],
                              [READOUT_S] * bool(shutter))
         now, strength = _step(now, problem, shutter)
-        now = now.adjusted(problem.noise)
-        now = replace(now, scenes=retriangulate_all(now.scenes, now.camera, config.scene))
+        now = now.adjusted(problem.noise).retriangulated()
         if len(now.scenes) < len(given.scenes):
             return given
         if strength < SETTLED:

@@ -14,7 +14,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
-from dashcalib_ros.config import Config, IntrinsicsConfig
+from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Scene
@@ -63,7 +63,7 @@ class Fit:
     camera: Camera
     centred: Camera
     solver: Solver
-    settings: IntrinsicsConfig
+    config: Config
     readout_s: float = 0.0
     crops: Crops = default(default_factory=dict)
     field: FoundField | None = None
@@ -75,13 +75,18 @@ class Fit:
         """
         scenes, camera = adjust(
             self.scenes, self.camera, self.solver, 'everything',
-            prior=prior_of(self.centred, self.settings, self.noise if noise is None else noise),
+            prior=prior_of(self.centred, self.config.intrinsics,
+                           self.noise if noise is None else noise),
             bounds=bounds_of(self.centred))
         return replace(self, scenes=scenes, camera=camera)
 
+    def retriangulated(self) -> Fit:
+        """Return the fit with its tracks triangulated anew; scenes without points are dropped."""
+        return replace(self, scenes=retriangulate_all(self.scenes, self.camera, self.config.scene))
+
     def with_usual_loss(self) -> Fit:
         """Return the fit with the loss that its residuals ask for."""
-        loss_px = loss_px_of(self.scenes, self.camera, self.settings)
+        loss_px = loss_px_of(self.scenes, self.camera, self.config.intrinsics)
         return replace(self, solver=replace(self.solver, loss_px=loss_px))
 
     @property
@@ -93,7 +98,7 @@ class Fit:
     @property
     def prior(self) -> Floats:
         """Return the prior's information (n, n) about the camera."""
-        return prior_information(self.centred, self.settings)
+        return prior_information(self.centred, self.config.intrinsics)
 
     @property
     def used_field(self) -> Field | None:
@@ -110,7 +115,7 @@ class Fit:
             shift_prior(scene, noise, self.crops[scene.turn]) if self.crops
             else None) for scene in self.scenes)
         return Knowledge(camera, turns, self._prior_of_all(), floor_of(camera, self.used_field),
-                         one_turn_sigma=self.settings.one_turn_sigma * camera.fx)
+                         one_turn_sigma=self.config.intrinsics.one_turn_sigma * camera.fx)
 
     def _by_shared(self, scene: Scene) -> Floats | None:
         """Return (k, t, 2, e) derivatives by the readout and by the directions of the field."""
@@ -137,8 +142,8 @@ class Fit:
         """
         scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in self.scenes]
         return fixed_camera_tests(
-            scenes, self.camera, self.centred, self.solver.loss_px, self.settings, self.crops,
-            bent, bool(self.readout_s), self.field)
+            scenes, self.camera, self.centred, self.solver.loss_px, self.config.intrinsics,
+            self.crops, bent, bool(self.readout_s), self.field)
 
 
 def fit_one_focal_length(full_scenes: ByTurn, start: Camera, config: Config, progress: Progress
@@ -158,16 +163,16 @@ def fit_one_focal_length(full_scenes: ByTurn, start: Camera, config: Config, pro
         few = retriangulate_all(few, camera, config.scene)
     kept = explained_by(few, full_scenes, camera, config)
     return Fit([subsample_tracks(scene, FIRST_TRACKS) for scene in kept], camera, camera,
-               solver, settings)
+               solver, config)
 
 
-def fit_roughly(first: Fit, config: Config) -> Fit:
+def fit_roughly(first: Fit) -> Fit:
     """Return the scenes adjusted with all parameters, the effect of a rolling shutter removed.
 
     Without clear evidence of a rolling shutter the readout is 0: readouts of less than 1 ms were
     measured with global shutters.
     """
-    settings, noise = config.intrinsics, first.noise
+    settings, noise = first.config.intrinsics, first.noise
     fit = first.adjusted(noise)
     measured = {scene.turn: scene for scene in fit.scenes}
     for _ in range(settings.shutter_rounds):
@@ -176,9 +181,8 @@ def fit_roughly(first: Fit, config: Config) -> Fit:
                                prior_information(fit.camera, settings))
         if (abs(found) < sigma) if fit.readout_s else not is_rolling(found, sigma):
             break
-        fit = _without_rolling_shutter(fit, measured, fit.readout_s + found, config)
-        fit = fit.adjusted(noise)
-        fit = replace(fit, scenes=retriangulate_all(fit.scenes, fit.camera, config.scene))
+        fit = _without_rolling_shutter(fit, measured, fit.readout_s + found)
+        fit = fit.adjusted(noise).retriangulated()
     return fit
 
 
@@ -187,10 +191,9 @@ def is_rolling(readout_s: float, sigma_s: float) -> bool:
     return abs(readout_s) >= max(CLEAR_SIGMAS * sigma_s, LEAST_READOUT_S)
 
 
-def with_all_tracks(rough: Fit, full_scenes: ByTurn, per_turn: Sequence[Scene], config: Config
-                    ) -> Fit:
+def with_all_tracks(rough: Fit, full_scenes: ByTurn, per_turn: Sequence[Scene]) -> Fit:
     """Return the scenes with all their tracks, without those that the camera does not explain."""
-    camera = rough.camera
+    camera, config = rough.camera, rough.config
     scenes = [with_poses_of(full_scenes[scene.turn], scene) for scene in rough.scenes]
     measured = {scene.turn: scene for scene in scenes}
     if rough.readout_s:
@@ -199,21 +202,21 @@ def with_all_tracks(rough: Fit, full_scenes: ByTurn, per_turn: Sequence[Scene], 
                            error_px=config.scene.chain_error * camera.image_size[0])
         scenes = retriangulate_all(scenes, camera, generous)
         scenes = _without_rolling_shutter(
-            replace(rough, scenes=scenes), measured, rough.readout_s, config).scenes
+            replace(rough, scenes=scenes), measured, rough.readout_s).scenes
     else:
         scenes = retriangulate_all(scenes, camera, config.scene)
     scenes = explained_by(scenes, {scene.turn: scene for scene in scenes}, camera, config)
     return replace(rough, scenes=with_better_poses(scenes, per_turn, camera, config.scene))
 
 
-def fit_all(complete: Fit, full_scenes: ByTurn, config: Config,
+def fit_all(complete: Fit, full_scenes: ByTurn,
             progress: Progress = lambda stage, done: None) -> Fit:
     """Return the scenes adjusted with all parameters, in rounds of triangulation."""
-    settings, fit = config.intrinsics, complete
+    settings, fit = complete.config.intrinsics, complete
     for n in range(settings.rounds):
         progress('adjusting all parameters', (n + 1) / (settings.rounds + 1))
         if n > 0:
-            ready = _retriangulated(fit, full_scenes, config)
+            ready = _measured_again(fit, full_scenes)
             if not fit.readout_s and _changed(fit, ready) < settings.settled:
                 break
             fit = ready
@@ -221,20 +224,19 @@ def fit_all(complete: Fit, full_scenes: ByTurn, config: Config,
     return fit
 
 
-def _retriangulated(fit: Fit, full_scenes: ByTurn, config: Config) -> Fit:
+def _measured_again(fit: Fit, full_scenes: ByTurn) -> Fit:
     """Return the scenes triangulated anew, after the readout was measured once more."""
     if not fit.readout_s:
-        return replace(fit, scenes=retriangulate_all(fit.scenes, fit.camera, config.scene))
+        return fit.retriangulated()
     step_s, _ = readout(fit.scenes, fit.camera, fit.solver.loss_px, fit.prior)
-    return _without_rolling_shutter(fit, full_scenes, fit.readout_s + step_s, config)
+    return _without_rolling_shutter(fit, full_scenes, fit.readout_s + step_s)
 
 
-def _without_rolling_shutter(fit: Fit, measured: ByTurn, readout_s: float, config: Config) -> Fit:
+def _without_rolling_shutter(fit: Fit, measured: ByTurn, readout_s: float) -> Fit:
     """Return the scenes triangulated from tracks with the rolling shutter's effect removed."""
     moved = [remove_rolling_shutter(scene, measured[scene.turn], fit.camera, readout_s)
              for scene in fit.scenes]
-    return replace(fit, scenes=retriangulate_all(moved, fit.camera, config.scene),
-                   readout_s=readout_s)
+    return replace(fit, scenes=moved, readout_s=readout_s).retriangulated()
 
 
 def _changed(before: Fit, after: Fit) -> float:
