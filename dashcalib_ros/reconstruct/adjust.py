@@ -22,9 +22,9 @@ MAX_DISTORTION = 1.0
 # cosine (88 degrees): COLMAP's fisheye models project nothing from beside or behind the camera
 IN_FRONT = 0.035
 
-# what of the camera is adjusted: 'first distortion' are the coefficients that COLMAP's model with
-# one focal length has, and with 'one focal length' they are free, too. The coefficients that it
-# does not have stay as they are, which is right only where they are 0
+# What of the camera is free beside poses and points. COLMAP's models with one focal length have
+# the first coefficients of distortion only: 'first distortion' frees those, 'one focal length' the
+# focal length with them. The others stay as they are, which is right only where they are 0
 Free = Literal['nothing', 'first distortion', 'distortion', 'one focal length', 'everything']
 
 
@@ -46,7 +46,7 @@ def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
     focal_range: px, lowest and highest, for one focal length. prior, and bounds, the lowest and
     highest values (n,), for everything. Scenes without observations stay as they are.
     """
-    # a model with all coefficients of this camera is as good with one focal length, and smaller
+    # smaller, and enough where it has all coefficients
     single = free in ('first distortion', 'one focal length') or (
         free == 'distortion' and len(camera.colmap_one_focal.places) == len(camera.names()))
     model = camera.colmap_one_focal if single else camera.colmap

@@ -20,13 +20,13 @@ from dashcalib_ros.solve.model_choice import (
     chosen_of,
     compared_with_others,
     refitted,
+    with_few_tracks,
     with_model_chosen,
 )
 from dashcalib_ros.solve.prior import bounds_of
 from dashcalib_ros.solve.solution import Candidate, Solution
 from dashcalib_ros.solve.stabiliser import without_crops, without_stabiliser
 from dashcalib_ros.solve.steps import (
-    ByTurn,
     Fit,
     Progress,
     fit_all,
@@ -41,10 +41,9 @@ FINAL_ROUNDS = 4
 
 @dataclass(frozen=True)
 class _Begun:
-    """A kind of lens after the first fit. full_scenes: the turns with all their tracks."""
+    """A kind of lens after the first fit, and the sum of its turns' focal profiles."""
 
     fit: Fit
-    full_scenes: ByTurn
     profile: Profile
 
 
@@ -64,32 +63,34 @@ def solve(per_turn: Sequence[Scene], config: Config,
         return None
     start, tried = _best_of(begun)
     progress('looking for a field', 0.0)
-    fit, full_scenes = with_field(start.fit), start.full_scenes
-    field = fit.used_field
-    if field is not None:
-        full_scenes = {turn: without_field(scene, field) for turn, scene in full_scenes.items()}
-    fit = _steadied(fit)
-    crops = fit.crops
-    if crops:
-        full_scenes = {turn: without_crops(full_scenes[turn], crops) for turn in crops}
-    fit = with_all_tracks(fit, full_scenes, per_turn)
+    fit = _steadied(with_field(start.fit))
+    fit = with_all_tracks(replace(fit, measured={
+        scene.turn: _without_distortions(fit, scene) for scene in fit.measured.values()}),
+        per_turn)
     if not fit.scenes:
         return None
-    fit = fit_all(with_field_of_all_tracks(fit), full_scenes, progress)
-    if crops:
+    fit = fit_all(with_field_of_all_tracks(fit), progress)
+    if fit.crops:
         # a part of the tracks leaves the crops uncertain
         fit = without_stabiliser(fit, FINAL_ROUNDS)
-    elif config.model == AUTO and field is None:
+    elif config.model == AUTO and fit.used_field is None:
         progress('choosing the lens model', 0.0)
-        fit, others = with_model_chosen(fit, full_scenes)
+        fit, others = with_model_chosen(fit)
         tried = _merged(tried, others)
     elif config.model != AUTO:
         progress('comparing the lens model with others', 0.0)
-        tried = compared_with_others(fit, full_scenes)
+        tried = compared_with_others(fit)
     progress('trying other focal lengths', 0.0)
     around = profile_around(fit.scenes, fit.camera, start.profile, config)
     progress('estimating the uncertainty', 0.0)
     return _solution(fit, per_turn, (start.profile, around), tried)
+
+
+def _without_distortions(fit: Fit, scene: Scene) -> Scene:
+    """Return a turn with all its tracks, the field and the crop that were found taken out."""
+    if fit.used_field is not None:
+        scene = without_field(scene, fit.used_field)
+    return without_crops(scene, fit.crops) if scene.turn in fit.crops else scene
 
 
 def _steadied(first: Fit) -> Fit:
@@ -120,8 +121,9 @@ def _best_of(begun: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
     best, tried = chosen(begun)
     if len(begun) == 1 or len(best.fit.scenes) < 2:
         return best, tried
-    again = [replace(each, fit=fit) for each in begun if (fit := refitted(
-        best.fit, type(each.fit.camera), best.full_scenes)) is not None]
+    few = with_few_tracks(best.fit)
+    again = [replace(each, fit=replace(fit, measured=each.fit.measured)) for each in begun
+             if (fit := refitted(few, type(each.fit.camera))) is not None]
     best_again = any(type(each.fit.camera) is type(best.fit.camera) for each in again)
     return chosen(again) if best_again else (best, tried)
 
@@ -135,12 +137,12 @@ def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progr
     starts = [scene.starts[kind] for scene in per_turn if kind in scene.starts]
     profile = summed([start.profile for start in starts])
     start = nearest_start([start.camera for start in starts], profile)
-    full_scenes = {scene.turn: adapted_to(scene, start, config) for scene in per_turn}
-    first = fit_one_focal_length(full_scenes, start, config, progress)
+    measured = {scene.turn: adapted_to(scene, start, config) for scene in per_turn}
+    first = fit_one_focal_length(measured, start, config, progress)
     if not first.scenes:
         return None
     progress('adjusting all parameters', 0.0)
-    return _Begun(fit_roughly(first), full_scenes, profile)
+    return _Begun(fit_roughly(first), profile)
 
 
 def _merged(first: Sequence[Candidate], later: Sequence[Candidate]) -> tuple[Candidate, ...]:

@@ -22,7 +22,7 @@ from dashcalib_ros.solve.fitting import FIRST_TRACKS, subsample_tracks
 from dashcalib_ros.solve.knowledge import is_clear
 from dashcalib_ros.solve.shutter import readout
 from dashcalib_ros.solve.solution import Candidate
-from dashcalib_ros.solve.steps import ByTurn, Fit, fit_all, is_rolling
+from dashcalib_ros.solve.steps import Fit, fit_all, is_rolling
 
 # a lens with p1, p2 of 0.003 looks like a shutter of 3 ms
 SHORT_READOUT_S = 0.008
@@ -30,7 +30,7 @@ SHORT_READOUT_S = 0.008
 PLACES = 500
 
 
-def with_model_chosen(first: Fit, full_scenes: ByTurn) -> tuple[Fit, tuple[Candidate, ...]]:
+def with_model_chosen(first: Fit) -> tuple[Fit, tuple[Candidate, ...]]:
     """Return the result with the model that the turns prove, and how the models compare.
 
     Others are tried only where the first one leaves something for them to explain, and with a part
@@ -40,42 +40,32 @@ def with_model_chosen(first: Fit, full_scenes: ByTurn) -> tuple[Fit, tuple[Candi
     if len(first.scenes) < 2 or not _leaves_more(first):
         return first, ()
     models = larger_models(camera)
-    few, measured = _few(first, full_scenes)
-    found = [_refitted(few, type(camera), measured),
-             *(_without_shutter(few, model, measured) for model in models)]
+    few = with_few_tracks(first)
+    found = [refitted(few, type(camera)), *(_without_shutter(few, model) for model in models)]
     chosen, tried = chosen_of([result for result in found if result is not None])
     model = type(chosen.camera)
     if model is type(camera):
         return first, tried
-    return _without_shutter(first, model, full_scenes) or first, tried
+    return _without_shutter(first, model) or first, tried
 
 
-def refitted(result: Fit, model: type[Camera], full_scenes: ByTurn) -> Fit | None:
-    """Return a result's turns explained with a model, from the poses that they have now.
-
-    None where it does not explain all of them.
-    """
-    few, measured = _few(result, full_scenes)
-    return _refitted(few, model, measured)
-
-
-def compared_with_others(asked: Fit, full_scenes: ByTurn) -> tuple[Candidate, ...]:
+def compared_with_others(asked: Fit) -> tuple[Candidate, ...]:
     """Return how a model that was asked for compares with all others, with a part of the tracks.
 
     Empty where one turn is all there is, or no other model explains the turns.
     """
     if len(asked.scenes) < 2:
         return ()
-    few, measured = _few(asked, full_scenes)
+    few = with_few_tracks(asked)
     camera = asked.camera
     larger = larger_models(camera)
-    found = [_refitted(few, type(camera), measured)]
+    found = [refitted(few, type(camera))]
     if found[0] is None:
         return ()
     for model in calibrated_models():
         if model is not type(camera):
-            fitted = _without_shutter if model in larger else _refitted
-            found.append(fitted(few, model, measured))
+            fitted = _without_shutter if model in larger else refitted
+            found.append(fitted(few, model))
     chosen, tried = chosen_of([result for result in found if result is not None])
     # the result is adjusted with all tracks
     apart_px = mapping_error(camera, chosen.camera)
@@ -130,23 +120,24 @@ def chosen_of(results: Sequence[Fit]) -> tuple[Fit, tuple[Candidate, ...]]:
         for n, result in enumerate(results))
 
 
-def _few(first: Fit, full_scenes: ByTurn) -> tuple[Fit, ByTurn]:
-    """Return the result, and the scenes as they were measured, with a part of the tracks."""
-    scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in first.scenes]
-    return (replace(first, scenes=scenes),
-            {turn: subsample_tracks(scene, FIRST_TRACKS) for turn, scene in full_scenes.items()})
+def with_few_tracks(fit: Fit) -> Fit:
+    """Return the fit with a part of its tracks."""
+    return replace(
+        fit, scenes=[subsample_tracks(scene, FIRST_TRACKS) for scene in fit.scenes],
+        measured={turn: subsample_tracks(scene, FIRST_TRACKS)
+                  for turn, scene in fit.measured.items()})
 
 
-def _without_shutter(first: Fit, model: type[Camera], measured: ByTurn) -> Fit | None:
+def _without_shutter(first: Fit, model: type[Camera]) -> Fit | None:
     """Return the result with another model and a global shutter; None where that is not enough.
 
     A decentred lens looks like a short rolling shutter, and what the removal of a true one leaves
     over looks like a decentred lens: the larger model must do without.
     """
     if not first.readout_s:
-        return _refitted(first, model, measured)
-    scenes = [replace(scene, tracks=measured[scene.turn].tracks) for scene in first.scenes]
-    found = _refitted(replace(first, scenes=scenes, readout_s=0.0), model, measured)
+        return refitted(first, model)
+    scenes = [replace(scene, tracks=first.measured[scene.turn].tracks) for scene in first.scenes]
+    found = refitted(replace(first, scenes=scenes, readout_s=0.0), model)
     if found is None:
         return None
     left_s, sigma_s = readout(
@@ -164,8 +155,11 @@ def _leaves_more(result: Fit) -> bool:
     return is_clear(result.known.gains_of_wider_model / result.known.track_inflation)
 
 
-def _refitted(first: Fit, model: type[Camera], full_scenes: ByTurn) -> Fit | None:
-    """Return the result with another model, None where it does not explain all turns."""
+def refitted(first: Fit, model: type[Camera]) -> Fit | None:
+    """Return the turns explained with a model, from the poses that they have now.
+
+    None where it does not explain all of them.
+    """
     camera = first.camera
     if type(camera) is not model:
         # where nothing was seen the first one may be far off, and must not draw the other there
@@ -177,7 +171,7 @@ def _refitted(first: Fit, model: type[Camera], full_scenes: ByTurn) -> Fit | Non
     ready = replace(first, camera=camera, centred=centred).retriangulated()
     if len(ready.scenes) < len(first.scenes):
         return None
-    fit = fit_all(ready, full_scenes)
+    fit = fit_all(ready)
     return None if len(fit.scenes) < len(first.scenes) else fit
 
 

@@ -54,15 +54,17 @@ class Fit:
     """The state of the adjustment, and what the turns know there.
 
     centred: the camera that was found with one focal length, about which priors and bounds are.
-    readout_s: of the rolling shutter that was removed from the scenes' tracks. crops: of the
-    stabilised video, as removed; empty for a fixed picture. field: what no lens model has, as
-    removed; None where nothing speaks for one.
+    solver: with the loss that the residuals asked for last. measured: each turn with all its
+    tracks, a rolling shutter's effect in them. readout_s: of the rolling shutter that was removed
+    from the scenes' tracks. crops: of the stabilised video, as removed; empty for a fixed picture.
+    field: what no lens model has, as removed; None where nothing speaks for one.
     """
 
     scenes: list[Scene]
     camera: Camera
     centred: Camera
     solver: Solver
+    measured: ByTurn
     config: Config
     readout_s: float = 0.0
     crops: Crops = default(default_factory=dict)
@@ -146,7 +148,7 @@ class Fit:
             self.crops, bent, bool(self.readout_s), self.field)
 
 
-def fit_one_focal_length(full_scenes: ByTurn, start: Camera, config: Config, progress: Progress
+def fit_one_focal_length(measured: ByTurn, start: Camera, config: Config, progress: Progress
                          ) -> Fit:
     """Return the scenes adjusted with one focal length and distortion; the centre is fixed.
 
@@ -155,15 +157,15 @@ def fit_one_focal_length(full_scenes: ByTurn, start: Camera, config: Config, pro
     settings = config.intrinsics
     solver = Solver(config.scene.loss_px, config.scene.iterations)
     reach = (start.fx / FOCAL_REACH, start.fx * FOCAL_REACH)
-    few = [subsample_tracks(scene, FIRST_TRACKS) for scene in full_scenes.values()]
+    few = [subsample_tracks(scene, FIRST_TRACKS) for scene in measured.values()]
     camera = start
     for n in range(settings.rounds):
         progress('adjusting one focal length', n / settings.rounds)
         few, camera = adjust(few, camera, solver, 'one focal length', reach)
         few = retriangulate_all(few, camera, config.scene)
-    kept = explained_by(few, full_scenes, camera, config)
-    return Fit([subsample_tracks(scene, FIRST_TRACKS) for scene in kept], camera, camera,
-               solver, config)
+    kept = explained_by(few, measured, camera, config)
+    return Fit([subsample_tracks(scene, FIRST_TRACKS) for scene in kept], camera, camera, solver,
+               measured, config)
 
 
 def fit_roughly(first: Fit) -> Fit:
@@ -191,10 +193,10 @@ def is_rolling(readout_s: float, sigma_s: float) -> bool:
     return abs(readout_s) >= max(CLEAR_SIGMAS * sigma_s, LEAST_READOUT_S)
 
 
-def with_all_tracks(rough: Fit, full_scenes: ByTurn, per_turn: Sequence[Scene]) -> Fit:
+def with_all_tracks(rough: Fit, per_turn: Sequence[Scene]) -> Fit:
     """Return the scenes with all their tracks, without those that the camera does not explain."""
     camera, config = rough.camera, rough.config
-    scenes = [with_poses_of(full_scenes[scene.turn], scene) for scene in rough.scenes]
+    scenes = [with_poses_of(rough.measured[scene.turn], scene) for scene in rough.scenes]
     measured = {scene.turn: scene for scene in scenes}
     if rough.readout_s:
         # the shutter's displacements depend on the points: find these with a generous limit first
@@ -209,14 +211,13 @@ def with_all_tracks(rough: Fit, full_scenes: ByTurn, per_turn: Sequence[Scene]) 
     return replace(rough, scenes=with_better_poses(scenes, per_turn, camera, config.scene))
 
 
-def fit_all(complete: Fit, full_scenes: ByTurn,
-            progress: Progress = lambda stage, done: None) -> Fit:
+def fit_all(complete: Fit, progress: Progress = lambda stage, done: None) -> Fit:
     """Return the scenes adjusted with all parameters, in rounds of triangulation."""
     settings, fit = complete.config.intrinsics, complete
     for n in range(settings.rounds):
         progress('adjusting all parameters', (n + 1) / (settings.rounds + 1))
         if n > 0:
-            ready = _measured_again(fit, full_scenes)
+            ready = _measured_again(fit)
             if not fit.readout_s and _changed(fit, ready) < settings.settled:
                 break
             fit = ready
@@ -224,12 +225,12 @@ def fit_all(complete: Fit, full_scenes: ByTurn,
     return fit
 
 
-def _measured_again(fit: Fit, full_scenes: ByTurn) -> Fit:
+def _measured_again(fit: Fit) -> Fit:
     """Return the scenes triangulated anew, after the readout was measured once more."""
     if not fit.readout_s:
         return fit.retriangulated()
     step_s, _ = readout(fit.scenes, fit.camera, fit.solver.loss_px, fit.prior)
-    return _without_rolling_shutter(fit, full_scenes, fit.readout_s + step_s)
+    return _without_rolling_shutter(fit, fit.measured, fit.readout_s + step_s)
 
 
 def _without_rolling_shutter(fit: Fit, measured: ByTurn, readout_s: float) -> Fit:

@@ -46,8 +46,9 @@ def refitted(solution: Solution, number: int, config: Config) -> Camera:
     scenes = [scene for n, scene in enumerate(solution.scenes) if n != number]
     loss_px = loss_px_of(scenes, solution.camera, config.intrinsics)
     fit = Fit(scenes, solution.camera, solution.centred,
-              Solver(loss_px, config.scene.iterations), config)
-    return fit_all(fit, {scene.turn: scene for scene in scenes}).camera
+              Solver(loss_px, config.scene.iterations), {scene.turn: scene for scene in scenes},
+              config)
+    return fit_all(fit).camera
 
 
 def drives_table(drives: Iterable[Solved]) -> str:
