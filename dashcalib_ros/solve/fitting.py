@@ -73,17 +73,17 @@ def adapted_to(scene: Scene, camera: Camera, config: Config) -> Scene:
     return retriangulate(scene, camera, config.scene)
 
 
-def explained_by(scenes: Sequence[Scene], full_scenes: Mapping[TurnId, Scene], camera: Camera,
+def explained_by(scenes: Sequence[Scene], measured: Mapping[TurnId, Scene], camera: Camera,
                  config: Config) -> list[Scene]:
     """Return the scenes that the camera explains, some of them chained anew with it.
 
-    full_scenes: the scenes with all their tracks, by turn: a chain of few tracks soon breaks. The
+    measured: the scenes with all their tracks, by turn: a chain of few tracks soon breaks. The
     first chain of a scene may be broken in its middle, as the lens was unknown then.
     """
     kept = []
     for scene in scenes:
         if scene.explained < config.scene.well_explained:
-            scene = max(scene, _rechained(full_scenes[scene.turn], camera, config),
+            scene = max(scene, _rechained(measured[scene.turn], camera, config),
                         key=lambda candidate: candidate.explained)
         if scene.explained >= config.scene.min_explained:
             kept.append(scene)

@@ -54,10 +54,10 @@ class Fit:
     """The state of the adjustment, and what the turns know there.
 
     centred: the camera that was found with one focal length, about which priors and bounds are.
-    solver: with the loss that the residuals asked for last. measured: each turn with all its
-    tracks, a rolling shutter's effect in them. readout_s: of the rolling shutter that was removed
-    from the scenes' tracks. crops: of the stabilised video, as removed; empty for a fixed picture.
-    field: what no lens model has, as removed; None where nothing speaks for one.
+    measured: each turn with all its tracks, a rolling shutter's effect still in them. readout_s:
+    of the rolling shutter that was removed from the scenes' tracks. crops: of the stabilised
+    video, as removed; empty for a fixed picture. field: what no lens model has, as removed; None
+    where nothing speaks for one.
     """
 
     scenes: list[Scene]
@@ -175,17 +175,16 @@ def fit_roughly(first: Fit) -> Fit:
     measured with global shutters.
     """
     settings, noise = first.config.intrinsics, first.noise
-    fit = first.adjusted(noise)
-    measured = {scene.turn: scene for scene in fit.scenes}
+    fit = replace(first, measured={scene.turn: scene for scene in first.scenes}).adjusted(noise)
     for _ in range(settings.shutter_rounds):
         # the prior is about the camera of this round, not that of the first step
         found, sigma = readout(fit.scenes, fit.camera, fit.solver.loss_px,
                                prior_information(fit.camera, settings))
         if (abs(found) < sigma) if fit.readout_s else not is_rolling(found, sigma):
             break
-        fit = _without_rolling_shutter(fit, measured, fit.readout_s + found)
+        fit = _without_rolling_shutter(fit, fit.readout_s + found)
         fit = fit.adjusted(noise).retriangulated()
-    return fit
+    return replace(fit, measured=first.measured)
 
 
 def is_rolling(readout_s: float, sigma_s: float) -> bool:
@@ -197,14 +196,12 @@ def with_all_tracks(rough: Fit, per_turn: Sequence[Scene]) -> Fit:
     """Return the scenes with all their tracks, without those that the camera does not explain."""
     camera, config = rough.camera, rough.config
     scenes = [with_poses_of(rough.measured[scene.turn], scene) for scene in rough.scenes]
-    measured = {scene.turn: scene for scene in scenes}
     if rough.readout_s:
         # the shutter's displacements depend on the points: find these with a generous limit first
         generous = replace(config.scene,
                            error_px=config.scene.chain_error * camera.image_size[0])
         scenes = retriangulate_all(scenes, camera, generous)
-        scenes = _without_rolling_shutter(
-            replace(rough, scenes=scenes), measured, rough.readout_s).scenes
+        scenes = _without_rolling_shutter(replace(rough, scenes=scenes), rough.readout_s).scenes
     else:
         scenes = retriangulate_all(scenes, camera, config.scene)
     scenes = explained_by(scenes, {scene.turn: scene for scene in scenes}, camera, config)
@@ -230,12 +227,12 @@ def _measured_again(fit: Fit) -> Fit:
     if not fit.readout_s:
         return fit.retriangulated()
     step_s, _ = readout(fit.scenes, fit.camera, fit.solver.loss_px, fit.prior)
-    return _without_rolling_shutter(fit, fit.measured, fit.readout_s + step_s)
+    return _without_rolling_shutter(fit, fit.readout_s + step_s)
 
 
-def _without_rolling_shutter(fit: Fit, measured: ByTurn, readout_s: float) -> Fit:
+def _without_rolling_shutter(fit: Fit, readout_s: float) -> Fit:
     """Return the scenes triangulated from tracks with the rolling shutter's effect removed."""
-    moved = [remove_rolling_shutter(scene, measured[scene.turn], fit.camera, readout_s)
+    moved = [remove_rolling_shutter(scene, fit.measured[scene.turn], fit.camera, readout_s)
              for scene in fit.scenes]
     return replace(fit, scenes=moved, readout_s=readout_s).retriangulated()
 
