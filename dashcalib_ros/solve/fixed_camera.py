@@ -126,11 +126,10 @@ class Problem:
                 chance += own.chance / noise
         total = Quadratic.together(costs)
         step = total.covariance @ total.score
-        return Step(gain + float(total.score @ step),
-                    chance + total.chance, step,
-                    () if images is None else tuple(
-                        each.step(normal, free, step)
-                        for each, normal in zip(images, self.normals, strict=True)))
+        of_images = () if images is None else tuple(
+            each.step(normal, free, step)
+            for each, normal in zip(images, self.normals, strict=True))
+        return Step(gain + float(total.score @ step), chance + total.chance, step, of_images)
 
 
 def problem_of(scenes: Sequence[Scene], camera: Camera, centred: Camera, loss_px: float,
@@ -195,9 +194,9 @@ def _indices(keyframes: Ints, *components: int) -> Ints:
 
 
 def fixed_camera_tests(scenes: Sequence[Scene], camera: Camera, centred: Camera, loss_px: float,
-                          config: IntrinsicsConfig, crops: Crops | None = None, bent: bool = True,
-                          rolling: bool = False, found: FoundField | None = None
-                          ) -> tuple[FixedCameraTest, ...]:
+                       config: IntrinsicsConfig, crops: Crops | None = None, bent: bool = True,
+                       rolling: bool = False, found: FoundField | None = None
+                       ) -> tuple[FixedCameraTest, ...]:
     """Return the tests whether the camera is a fixed one, the clearest that it is not first.
 
     centred: the camera that priors are about. crops: of a stabilised video, as taken out already.

@@ -140,13 +140,12 @@ def _without_shutter(first: Fit, model: type[Camera]) -> Fit | None:
     found = refitted(replace(first, scenes=scenes, readout_s=0.0), model)
     if found is None:
         return None
-    left_s, sigma_s = readout(
-        found.scenes, found.camera, found.solver.loss_px, found.prior)
+    left_s, sigma_s = readout(found.scenes, found.camera, found.solver.loss_px, found.prior)
     return None if is_rolling(left_s, sigma_s) else found
 
 
 def _leaves_more(result: Fit) -> bool:
-    """Return whether a wider model may predict the turns clearly better."""
+    """Return whether errors are left with which a wider model predicts the turns better."""
     camera = result.camera
     if type(camera.widened()) is type(camera):
         return False
