@@ -161,7 +161,7 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class IntrinsicsConfig:
-    """Scenes -> the six parameters: their bounds and their priors."""
+    """Scenes -> the parameters of the lens."""
 
     rounds: int = expert(
         2, 'adjustments of a step at the most, with new triangulation between', 1, 10)
