@@ -161,72 +161,30 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class IntrinsicsConfig:
-    """Scenes -> the six parameters: their bounds and their priors."""
+    """Scenes -> the parameters of the lens."""
 
     rounds: int = expert(
-        2, 'adjustments of each step at the most, with new triangulation between', 1, 10)
+        2, 'adjustments of a step at the most, with new triangulation between', 1, 10)
     settled: float = expert(
-        0.002, 'of the observations; where new triangulation changes fewer, step 2 ends', 0.0, 1.0)
-    focal_reach: float = expert(
-        1.35, "ratio; step 1 searches this far to either side of the profile's minimum", 1.0, 3.0)
-    focal_bound: float = expert(
-        0.15, "of step 1's; step 2 moves fx and fy no farther", 0.01, 0.5)
-    centre_bound: float = expert(0.1, "of the size; AliceVision's bound", 0.01, 0.5)
-    k_bound: float = expert(1.0, 'no lens has larger k1 and k2', 0.1, 5.0)
-    first_tracks: int = expert(
-        200, 'of each turn, until step 2 has begun; then all', 20, 5000)
+        0.002, 'of the observations; where new triangulation changes fewer, no round follows',
+        0.0, 1.0)
     loss: float = expert(
         1.0, 'times the median reprojection error; scale of the Cauchy loss', 0.1, 100.0)
     profile_tracks: int = expert(
         120, 'of each turn, for the focal profile around the result', 20, 5000)
-    least_gain: float = expert(
-        30.0, 'noise variances of a track; a larger lens model must foretell turns so much better',
-        0.0, 1e6)
     aspect_sigma: float = expert(
         0.003, 'fy / fx is 1 to within this: planar turns know fx but hardly fy', 1e-5, 1.0)
     shutter_rounds: int = expert(
         5, 'corrections of a rolling shutter at the most; with 0 every shutter counts as global',
         0, 20)
-    shutter_sigmas: float = expert(
-        4.0, 'of its readout; a shorter readout counts as a global shutter', 1.0, 100.0)
-    least_readout_ms: float = expert(
-        1.0, 'ms; six global shutters came out at 0.0 to 0.5', 0.0, 100.0)
-    clear_shift: float = expert(
-        2.0, 'times what chance gains; more is a picture that moves: 0.9 to 1.3 are fixed ones',
-        1.0, 1e6)
-    clear_rolling_shift: float = expert(
-        2.7, 'the same, of a rolling shutter: what is left of it comes to 1.3 to 2.4', 1.0, 1e6)
-    left_shift: float = expert(
-        4.0, "the same, after a stabiliser's movement was taken out", 1.0, 1e6)
-    clear_zoom: float = expert(
-        3.0, 'the same, of a picture that zooms: 0.9 to 1.5 are fixed ones', 1.0, 1e6)
-    clear_bend: float = expert(
-        8.0, 'the same, of a picture that is bent: kitti03 has 4, by its own rectification',
-        1.0, 1e6)
-    crop_sigma: float = expert(
-        0.03, 'of the width; how far a stabiliser moves its crop', 1e-4, 1.0)
-    crop_time_s: float = expert(
-        1.0, 's; a stabiliser holds its crop about so long', 0.01, 100.0)
     crop_rounds: int = expert(
         10, 'corrections of a stabilised picture at the most; with 0 none is taken out', 0, 100)
-    focal_floor: float = expert(
-        0.0005, 'of fx, added to the sigma of fx and fy: systematic errors of the tracking',
-        0.0, 0.1)
     one_turn_sigma: float = expert(
         0.012, 'of fx, added where one turn is all: those of real drives differ by 0.6 to 2 %',
         0.0, 0.1)
     least_field_nats: float = expert(
         10.0, 'of evidence for a field that no lens model has: sound lenses 0, KITTI 60 to 400',
         0.0, 1e6)
-    field_floor: float = expert(
-        0.0025, 'of fx, the same behind a field: KITTI 03 and 07 are so far from true rotations',
-        0.0, 0.1)
-    whole_field_px: float = expert(
-        0.1, 'px; behind a smaller field, the floor is smaller', 1e-3, 100.0)
-    centre_floor: float = expert(
-        0.0003, 'of the width, the same for cx and cy', 0.0, 0.1)
-    centre_sigma: float = expert(
-        0.02, 'of the width; how far lenses sit off the middle of their sensors', 1e-4, 1.0)
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,7 @@ def steps(seen: Measured) -> None:
     assert camera is not None and sigma is not None
     figure, panel = plt.subplots(figsize=(7, 3.2), layout='constrained')
     places = np.arange(len(names))
-    for offset, label, found in ((-0.2, 'after step 1: f, k1, k2', seen.solution.step1),
+    for offset, label, found in ((-0.2, 'after step 1: f, k1, k2', seen.solution.centred),
                                  (0.2, 'after step 2: all', camera)):
         panel.bar(places + offset, [_percent(found, seen.truth, name) for name in names], 0.36,
                   label=label)

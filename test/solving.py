@@ -9,7 +9,7 @@ from synthetic import LENS, SIZE, synthetic_turn
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.camera.prior import Prior
 from dashcalib_ros.config import Config
-from dashcalib_ros.reconstruct.adjust import Solver, adjust_step2
+from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.joint import solve
 from dashcalib_ros.solve.prior import extra_sigma_of
@@ -45,6 +45,6 @@ def z_of(solution: Solution, truth: Camera = LENS) -> np.ndarray:
 def adjusted(scenes: list[Scene], loss_px: float, rounds: int = 1) -> tuple[list[Scene], Camera]:
     camera = LENS
     for _ in range(rounds):
-        scenes, camera = adjust_step2(
-            scenes, camera, Solver(loss_px, 200, 1e-14), NO_PRIOR, FREE)
+        scenes, camera = adjust(scenes, camera, Solver(loss_px, 200, 1e-14), 'everything',
+                                prior=NO_PRIOR, bounds=FREE)
     return scenes, camera

@@ -43,8 +43,8 @@ class OneTerm(Camera):
     model: ClassVar[str] = 'one_term'
     ros_model: ClassVar[str] = 'plumb_bob'
     family: ClassVar[str] = PINHOLE
-    step1: ClassVar[ColmapModel] = ColmapModel('SIMPLE_RADIAL', 4, (0, 0, 1, 2, 3))
-    step2: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4))
+    colmap_one_focal: ClassVar[ColmapModel] = ColmapModel('SIMPLE_RADIAL', 4, (0, 0, 1, 2, 3))
+    colmap: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4))
     spread: ClassVar[tuple[float, ...]] = (1.0,)
 
     def widened(self) -> Camera:

@@ -30,7 +30,7 @@ class ColmapModel:
 
     name: of COLMAP's model; size: how many parameters it has. places: the index of each of our
     parameters among them; two may share one (a single focal length). COLMAP's other parameters
-    are held at 0.
+    are fixed at 0.
     """
 
     name: str
@@ -38,8 +38,8 @@ class ColmapModel:
     places: tuple[int, ...]
 
     @property
-    def held(self) -> list[int]:
-        """Return the indices of COLMAP's parameters that are held at 0."""
+    def fixed(self) -> list[int]:
+        """Return the indices of COLMAP's parameters that are fixed at 0."""
         return sorted(set(range(self.size)) - set(self.places))
 
     def values(self, params: npt.ArrayLike) -> Floats:
@@ -64,9 +64,10 @@ class Camera(ABC):
     model: its name in result.json and --model. ros_model: CameraInfo's distortion_model.
     family: PINHOLE or FISHEYE; within one, a coefficient has one meaning. given_only:
     whether no turns can determine its coefficients: then it may only be read from files.
-    step1, step2: how COLMAP adjusts it with one focal length and the centre fixed, and with all
-    parameters (paper, 3.2). spread: prior standard deviation of each distortion coefficient,
-    around 0. focal_ratios: focal lengths over the image width that the search for a start tries.
+    colmap_one_focal, colmap: how COLMAP adjusts it with one focal length and the centre fixed, and
+    with all parameters (paper, 3.2). spread: prior standard deviation of each distortion
+    coefficient, around 0. focal_ratios: focal lengths over the image width that the search for a
+    start tries.
     sees_behind: whether it projects rays beyond 90 degrees from its axis.
     """
 
@@ -80,8 +81,8 @@ class Camera(ABC):
     ros_model: ClassVar[str]
     family: ClassVar[str]
     given_only: ClassVar[bool] = False
-    step1: ClassVar[ColmapModel]
-    step2: ClassVar[ColmapModel]
+    colmap_one_focal: ClassVar[ColmapModel]
+    colmap: ClassVar[ColmapModel]
     spread: ClassVar[tuple[float, ...]]
     # 126 to 29 degrees across, without distortion
     focal_ratios: ClassVar[tuple[float, ...]] = tuple(0.256 * 1.25**n for n in range(10))

@@ -38,8 +38,8 @@ class Radial(Camera):
     model: ClassVar[str] = 'radial'
     ros_model: ClassVar[str] = 'plumb_bob'
     family: ClassVar[str] = PINHOLE
-    step1: ClassVar[ColmapModel] = ColmapModel('RADIAL', 5, (0, 0, 1, 2, 3, 4))
-    step2: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4, 5))
+    colmap_one_focal: ClassVar[ColmapModel] = ColmapModel('RADIAL', 5, (0, 0, 1, 2, 3, 4))
+    colmap: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4, 5))
     spread: ClassVar[tuple[float, ...]] = (1.0, 1.0)
 
     def widened(self) -> Camera:
@@ -122,7 +122,7 @@ class Brown(Radial):
     k3: float = 0.0
 
     model: ClassVar[str] = 'brown'
-    step2: ClassVar[ColmapModel] = ColmapModel('FULL_OPENCV', 12, (0, 1, 2, 3, 4, 5, 6, 7, 8))
+    colmap: ClassVar[ColmapModel] = ColmapModel('FULL_OPENCV', 12, (0, 1, 2, 3, 4, 5, 6, 7, 8))
     spread: ClassVar[tuple[float, ...]] = (1.0, 1.0, 1e-3, 1e-3, 0.1)
 
     def widened(self) -> Camera:

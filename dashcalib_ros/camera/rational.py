@@ -31,7 +31,7 @@ class Rational(Brown):
     model: ClassVar[str] = 'rational_polynomial'
     ros_model: ClassVar[str] = 'rational_polynomial'
     given_only: ClassVar[bool] = True
-    step2: ClassVar[ColmapModel] = ColmapModel('FULL_OPENCV', 12, tuple(range(12)))
+    colmap: ClassVar[ColmapModel] = ColmapModel('FULL_OPENCV', 12, tuple(range(12)))
     spread: ClassVar[tuple[float, ...]] = (1.0, 1.0, 1e-3, 1e-3, 0.1, 1.0, 1.0, 0.1)
 
     def ros_distortion(self) -> list[float]:

@@ -11,7 +11,6 @@ from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.agreement import turns_of_another_camera
 from dashcalib_ros.reconstruct.scene_file import StoredTurn
-from dashcalib_ros.solve.information import noise_of
 from dashcalib_ros.solve.solution import Solution
 
 # a clip whose own fx is farther off that of most, in sigmas and in shares of it, is of another
@@ -84,19 +83,15 @@ def shares_of(solution: Solution | None, turns: Mapping[TurnId, ClipTurn], px: f
     """Return what each clip gave, and what its turns alone say of fx."""
     if solution is None:
         return {}
-    count, noise = len(solution.prior_information), noise_of(solution.parts)
-    found = {}
+    known, found = solution.known, {}
     clips = {turns[scene.turn].clip for scene in solution.scenes}
     for clip in sorted(clips):
-        own = [part for scene, part in zip(solution.scenes, solution.parts, strict=True)
-               if turns[scene.turn].clip == clip]
-        hessian = sum(part.hessian[:count, :count] for part in own) / noise
-        inverse = np.linalg.inv(hessian + solution.prior_information)
-        score = sum(part.score[:count] for part in own) / noise
+        own = known.of(n for n, scene in enumerate(solution.scenes)
+                       if turns[scene.turn].clip == clip)
+        cost = own.with_prior([own.sum(known.own).at_noise(known.noise)])
         # observations of a track share its errors
-        by_track = sum(part.by_track[:count, :count] for part in own) / noise**2
-        variance = max(float(inverse[0, 0]), float((inverse @ by_track @ inverse)[0, 0]))
-        found[clip] = ClipShare(
-            used=len(own), fx=px * (solution.camera.fx + float((inverse @ score)[0])),
-            fx_sigma=px * float(np.sqrt(variance)))
+        variance = max(float(cost.covariance[0, 0]), float(cost.covariance_by_track[0, 0]))
+        offset = float((cost.covariance @ cost.score)[0])
+        found[clip] = ClipShare(used=len(own.turns), fx=px * (solution.camera.fx + offset),
+                                fx_sigma=px * float(np.sqrt(variance)))
     return found

@@ -17,7 +17,7 @@ from dashcalib_ros.fleet.lens_prior import LensPrior, Unit, curvature, focal_len
 from dashcalib_ros.fleet.lens_prior import Verdict as PriorVerdict
 from dashcalib_ros.fleet.solved import Estimate, Solved, sigmas
 from dashcalib_ros.judge import Calibration, Verdict
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 # of the information about fx; with more the prior decided, not the camera's own turns
 DECIDES = 0.5

@@ -19,8 +19,7 @@ from dashcalib_ros.fleet.fuse import Fused
 from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.solve.information import pooled
-from dashcalib_ros.solve.picture import PictureSigma, of_one_turn
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 FORMAT = 1
 
@@ -67,13 +66,10 @@ def _estimate(fused: Fused) -> Estimate | None:
         return None
     px = fused.scale.px
     units = np.where(np.arange(len(solution.sigma)) < 4, px, 1.0)
-    lone = of_one_turn(
-        pooled(solution.parts, solution.prior_information), len(solution.sigma),
-        solution.one_turn_sigma if len(solution.parts) == 1 else 0.0)
     return Estimate(
         solution.camera.resized(px, fused.calibration.image_size),
         solution.covariance * np.outer(units, units),
-        (solution.covariance - lone) * np.outer(units, units),
+        (solution.covariance - solution.known.covariance_between_turns) * np.outer(units, units),
         PictureSigma(solution.picture.rms * px, solution.picture.worst * px),
         solution.reprojection_error_px * px, fused.sound)
 

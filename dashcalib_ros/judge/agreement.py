@@ -8,7 +8,6 @@ import numpy as np
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.information import noise_of
 from dashcalib_ros.solve.solution import Solution
 
 # least sum of the turns' shares in the information about fx: avoids a division by zero
@@ -59,14 +58,14 @@ def outdated(turns: Set[TurnId], of_another: Set[TurnId]) -> set[TurnId]:
 
 def focal_disagreement(solution: Solution) -> float:
     """Return the weighted scatter between the turns' own fx, relative to fx."""
-    if len(solution.parts) < 2:
+    known = solution.known
+    if len(known.turns) < 2:
         return 0.0
-    noise, count = noise_of(solution.parts), len(solution.prior_information)
     weights, offsets = [], []
-    for part in solution.parts:
-        inverse = np.linalg.inv(part.hessian[:count, :count] / noise + solution.prior_information)
-        offsets.append(float((inverse @ part.score[:count])[0] / noise))
-        weights.append(1 / float(inverse[0, 0]))
+    for turn, cost in zip(known.turns, known.each(known.own), strict=True):
+        alone = known.with_prior([cost]).covariance
+        offsets.append(float((alone @ turn.score[known.own])[0] / known.noise))
+        weights.append(1 / float(alone[0, 0]))
     mean = np.average(offsets, weights=weights)
     scatter = np.average((np.array(offsets) - mean) ** 2, weights=weights)
     return float(np.sqrt(scatter) / solution.camera.fx)
@@ -74,10 +73,10 @@ def focal_disagreement(solution: Solution) -> float:
 
 def leverages(solution: Solution) -> dict[TurnId, float]:
     """Return each turn's share in the information about fx; the shares sum to 1."""
-    noise, count = noise_of(solution.parts), len(solution.prior_information)
-    hessians = [part.hessian[:count, :count] / noise for part in solution.parts]
-    inverse = np.linalg.inv(sum(hessians) + solution.prior_information)
-    shares = [float((inverse @ hessian)[0, 0]) for hessian in hessians]
+    known = solution.known
+    turns = known.each(known.own)
+    together = known.with_prior(turns).covariance
+    shares = [float((together @ turn.hessian)[0, 0]) for turn in turns]
     # they sum to less than 1: the prior has the rest
     total = max(sum(shares), LEAST_SHARE)
     return {scene.turn: share / total

@@ -23,8 +23,8 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.reconstruct.picture import TurnPicture
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.opinions import HeldOut
-from dashcalib_ros.solve.picture import PictureSigma, sigma_over
+from dashcalib_ros.solve.cross_validation import LeftOut
+from dashcalib_ros.solve.knowledge import PictureSigma, sigma_over
 from dashcalib_ros.solve.solution import Solution
 
 UNKNOWN_COVARIANCE = ('this calibration does not know how its parameters are correlated: '
@@ -179,7 +179,7 @@ class Calibration:
     sigma_px: PictureSigma | None = None
     stabiliser: Stabiliser | None = None
     field: LensField | None = None
-    held_out: tuple[HeldOut, ...] = ()
+    held_out: tuple[LeftOut, ...] = ()
     straight_lines: Bend | None = None
     start_s: float = 0.0
     material: Material | None = default(default=None, compare=False)

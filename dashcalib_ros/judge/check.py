@@ -14,7 +14,7 @@ from dashcalib_ros.judge.calibration import Verdict
 from dashcalib_ros.judge.difference import Difference, difference_of
 from dashcalib_ros.judge.picture_size import scaled_parameters, size_reason
 from dashcalib_ros.judge.wording import reasons_of
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 
 Answer = Literal['right', 'wrong', 'cannot tell']
@@ -96,12 +96,10 @@ def loss_of(given: Camera, solution: Solution, config: Config) -> float:
 
     given: of the solution's pictures. Poses and points are adjusted anew with each camera held.
     """
-    from dashcalib_ros.solve.fitting import subsample_tracks
-    from dashcalib_ros.solve.held import costs_with
+    from dashcalib_ros.solve.fitting import FIRST_TRACKS, costs_with, subsample_tracks
     from dashcalib_ros.solve.prior import loss_px_of
     # a part of the tracks says it, and takes a fifth of the time
-    scenes = [subsample_tracks(scene, config.intrinsics.first_tracks)
-              for scene in solution.scenes]
+    scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in solution.scenes]
     loss_px = loss_px_of(scenes, solution.camera, config.intrinsics)
     own, other = (float(np.mean(costs_with(camera, scenes, loss_px, config.scene.error_px)))
                   for camera in (solution.camera, given))

@@ -38,9 +38,9 @@ from dashcalib_ros.judge.verdict import (
 from dashcalib_ros.reconstruct.picture import TurnPicture, picture_of
 from dashcalib_ros.reconstruct.scene import Scene, rms_px
 from dashcalib_ros.reconstruct.scene_file import StoredTurn
-from dashcalib_ros.solve.departures import largest_crop
-from dashcalib_ros.solve.opinions import HeldOut, held_out, wider_covariance_of
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.cross_validation import LeftOut, cross_validation
+from dashcalib_ros.solve.fixed_camera import largest_crop
+from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 
 # why turns are not used
@@ -110,7 +110,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     camera = sigma = error = shutter = sigma_px = stabiliser = straight_lines = None
     field = None
     details: dict[str, object] = {}
-    without: tuple[HeldOut, ...] = ()
+    without: tuple[LeftOut, ...] = ()
     warnings = evidence.warnings
     if solution is not None and verdict.level != 'accepted' and config.model != AUTO:
         warnings += (f'the lens model {config.model} was asked for and may be why the result is '
@@ -123,12 +123,12 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
             # fx, fy, cx and cy are pixels
             units = np.where(np.arange(len(solution.sigma)) < 4, px, 1)
             sigma = dict(zip(camera.names(), (solution.sigma * units).tolist(), strict=True))
-            wider = wider_covariance_of(solution)
+            wider = solution.wider_covariance
             units = np.where(np.arange(len(wider)) < 4, px, 1)
             details['picture_covariance'] = (wider * np.outer(units, units)).tolist()
             error = solution.reprojection_error_px * px
             sigma_px = PictureSigma(solution.picture.rms * px, solution.picture.worst * px)
-            without = tuple(each.times(px) for each in held_out(solution))
+            without = tuple(each.times(px) for each in cross_validation(solution))
             straight_lines = witness and witness.resized(px)
             warnings += _model_error_warnings(solution, px, config)
             field = _field(solution, px, evidence.image_size)
@@ -190,8 +190,8 @@ def _model_error_warnings(solution: Solution, px: float, config: Config) -> tupl
 
     px: of the input, in one pixel of the scenes.
     """
-    count, names = len(solution.prior_information), solution.camera.widened().names()
-    step = solution.step_to_wider_model
+    count, names = len(solution.known.own), solution.camera.widened().names()
+    step = solution.known.step_to_wider_model
     shifts, others = step[:4], step[count:]
     scale = np.repeat([solution.camera.fx, solution.camera.image_size[0]], 2)
     if not np.max(np.abs(shifts) / scale) > config.verdict.max_untold_model_error:
@@ -286,18 +286,18 @@ def _error_px(scene: Scene, evidence: Evidence, solution: Solution | None) -> fl
 
 def _details(solution: Solution) -> dict[str, object]:
     width = solution.camera.image_size[0]
-    others = len(solution.prior_information)
+    others = len(solution.known.own)
     return {
-        'step1': {'f_over_width': solution.step1.fx / width,
-                  **dict(list(solution.step1.named.items())[4:])},
+        'step1': {'f_over_width': solution.centred.fx / width,
+                  **dict(list(solution.centred.named.items())[4:])},
         'focal_profile': {'f_over_width': solution.around.ratios.tolist(),
                           'cost_px2': solution.around.costs.tolist()},
         'profile_contrast': profile_contrast(solution),
         'turns_disagree_fx': focal_disagreement(solution),
         'left_out': dict(zip(solution.camera.widened().names()[others:],
-                             solution.step_to_wider_model[others:].tolist(), strict=True)),
+                             solution.known.step_to_wider_model[others:].tolist(), strict=True)),
         'fixed_camera': {each.kind: {'strength': each.strength, 'size': each.size}
-                         for each in solution.departures},
+                         for each in solution.fixed_camera},
         'models': [asdict(candidate) for candidate in solution.tried],
         'correlation': (solution.covariance / np.outer(solution.sigma, solution.sigma)).tolist(),
     }

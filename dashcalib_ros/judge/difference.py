@@ -18,8 +18,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
-from dashcalib_ros.solve.opinions import seen_by_turns
-from dashcalib_ros.solve.picture import PictureSigma, SigmaMap, sigma_over
+from dashcalib_ros.solve.knowledge import PictureSigma, SigmaMap, sigma_over
 from dashcalib_ros.solve.solution import Solution
 
 Way = Literal['focal length', 'centre', 'distortion']
@@ -204,7 +203,7 @@ def difference_of(given: Camera, solution: Solution, px: float
     alike = small if isinstance(wide, type(small)) else as_model(small, type(wide))
     padded = type(wide).of(wide.image_size, np.pad(
         alike.params, (0, len(wide.params) - len(alike.params))))
-    offsets = seen_by_turns(solution, padded) - found.params
+    offsets = solution.known.seen_by_turns(padded) - found.params
     units = np.where(np.arange(len(offsets)) < 4, px, 1.0)
     own = found.resized(px, given.image_size)
     return Difference(

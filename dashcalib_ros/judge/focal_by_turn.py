@@ -1,15 +1,11 @@
 """What turns say of fx: each alone, and the first few of them together."""
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.solve.information import Information, noise_of, step_to_wider_model
-from dashcalib_ros.solve.picture import picture_covariance
-from dashcalib_ros.solve.prior import extra_sigma_of
 from dashcalib_ros.solve.solution import Solution
 
 
@@ -24,28 +20,20 @@ class FocalEstimate:
 def focal_alone(solution: Solution) -> dict[TurnId, FocalEstimate]:
     """Return what each turn says of fx alone, linearised at the common result.
 
-    A field is held, as it is shared. Sigma cannot hold how much turns differ: one turn does not
+    A field is fixed, as it is shared. Sigma cannot hold how much turns differ: one turn does not
     show that.
     """
-    found, count = {}, len(solution.prior_information)
-    for scene, part in zip(solution.scenes, solution.parts, strict=True):
-        noise = noise_of([part])
-        inverse = np.linalg.inv(part.hessian[:count, :count] / noise + solution.prior_information)
-        offset = float(inverse[0] @ part.score[:count] / noise)
+    known, found = replace(solution.known, one_turn_sigma=0.0), {}
+    for n, scene in enumerate(solution.scenes):
+        alone = known.of([n])
+        own = alone.with_prior(alone.each(known.own)).covariance
+        offset = float(own[0] @ alone.turns[0].score[known.own] / alone.noise)
         found[scene.turn] = FocalEstimate(solution.camera.fx + offset,
-                                          _sigma([part], solution, 0.0))
+                                          float(np.sqrt(alone.covariance[0, 0])))
     return found
 
 
 def sigma_by_count(solution: Solution) -> list[float]:
     """Return the sigma of fx with the first turn, with the first two, ... and with all, px."""
-    return [_sigma(solution.parts[:count], solution, solution.one_turn_sigma)
-            for count in range(1, len(solution.parts) + 1)]
-
-
-def _sigma(parts: Sequence[Information], solution: Solution, one_turn_sigma: float) -> float:
-    """Return the sigma of fx from some of the turns, px, as that of all turns is found."""
-    step = step_to_wider_model(parts, solution.prior_information, extra_sigma_of(solution.camera))
-    found = picture_covariance(solution.camera, parts, solution.prior_information, solution.floor,
-                               step, solution.systematic, one_turn_sigma)
-    return float(np.sqrt(found[0, 0]))
+    return [float(np.sqrt(solution.known.of(range(count)).covariance[0, 0]))
+            for count in range(1, len(solution.known.turns) + 1)]

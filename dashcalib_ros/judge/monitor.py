@@ -22,6 +22,7 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.contradiction import CONTRADICTION, LEAST_SIGMA
 from dashcalib_ros.judge.difference import RELEVANT, Way, limit_of
 from dashcalib_ros.judge.reading import Reading
+from dashcalib_ros.solve.quadratic import Quadratic
 
 Kind = Literal['lens', 'mount']
 # least sigma of a coefficient of distortion: good calibrations differ by this much
@@ -169,7 +170,7 @@ class Monitor:
         """
         if not reading.explained:
             return True
-        offsets = np.asarray(np.linalg.pinv(reading.hessian) @ reading.score, np.float64)
+        offsets = np.asarray(np.linalg.pinv(reading.cost.hessian) @ reading.cost.score, np.float64)
         return (reading.misfit > self.config.max_misfit
                 and reading.gain(offsets) / self.config.scatter > self.config.limit)
 
@@ -209,17 +210,22 @@ class Monitor:
         trusted: whether such an error is as small as the covariance says. The evidence is that of
         a chi-squared with m degrees of freedom.
         """
-        count = len(self.camera.params)
-        hessian, score = _sum(newest, count, self.config.scatter)
-        others, pulled = _sum(before, count, self.config.scatter)
+        newer = self._together(newest)
         covariance = self.covariance if trusted else UNKNOWN**2 * self.covariance
-        others = others + np.linalg.inv(covariance)
+        known = Quadratic.prior(np.asarray(np.linalg.inv(covariance)))
+        others = Quadratic.together([self._together(before), known])
         # the share of the newest turns in what all turns together say of an error alike in all
-        share = hessian @ np.linalg.inv(hessian + others)
-        information = basis.T @ (hessian - share @ hessian) @ basis
-        pull = basis.T @ (score - share @ (score + pulled))
+        share = newer.hessian @ np.linalg.inv(newer.hessian + others.hessian)
+        information = basis.T @ (newer.hessian - share @ newer.hessian) @ basis
+        pull = basis.T @ (newer.score - share @ (newer.score + others.score))
         size = np.linalg.lstsq(information, pull, rcond=None)[0]
         return size, float(pull @ size)
+
+    def _together(self, readings: Sequence[Reading]) -> Quadratic:
+        """Return the sum of turns' costs, for their true scatter; 0 for no turns."""
+        nothing = Quadratic.prior(np.zeros_like(self.covariance))
+        return Quadratic.together([nothing, *(each.cost for each in readings)]).at_noise(
+            self.config.scatter)
 
     def _zoom_and_shift(self) -> Floats:
         """Return (n, 3): a zoom of 1, and shifts of the centre by the picture's width."""
@@ -313,10 +319,3 @@ def _covariance(camera: Camera, sigma: Mapping[str, float]) -> Floats:
     least[:4] = LEAST_SIGMA * camera.fx
     known = [sigma.get(name, 0.0) for name in camera.names()]
     return np.diag(np.maximum(known, least) ** 2)
-
-
-def _sum(readings: Sequence[Reading], count: int, scatter: float) -> tuple[Floats, Floats]:
-    """Return the sums of the turns' hessians (n, n) and scores (n,), for their true scatter."""
-    hessian = sum((each.hessian for each in readings), np.zeros((count, count)))
-    score = sum((each.score for each in readings), np.zeros(count))
-    return hessian / scatter, score / scatter

@@ -24,7 +24,7 @@ from dashcalib_ros.judge.agreement import (
 from dashcalib_ros.judge.calibration import Verdict
 from dashcalib_ros.judge.next_turn import next_turn
 from dashcalib_ros.reconstruct.heading import roll_deg
-from dashcalib_ros.solve.departures import Departure, largest_crop
+from dashcalib_ros.solve.fixed_camera import FixedCameraTest, largest_crop
 from dashcalib_ros.solve.solution import Solution
 
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
@@ -194,7 +194,7 @@ def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
     A stabilised video's movement may have been taken out. The lens is right then, but no
     camera_info holds for pictures that move.
     """
-    clear = [each for each in solution.departures if each.clear]
+    clear = [each for each in solution.fixed_camera if each.clear]
     crop = largest_crop(solution.crops) if solution.crops else 0.0
     if crop > config.max_crop_sigmas * solution.picture.rms:
         return _moving('up to', crop, solution)
@@ -202,7 +202,7 @@ def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
         return None
     if clear[0].kind == 'shift':
         return _moving('about', clear[0].size, solution)
-    return Finding('weak', *_departure_texts(clear[0], solution))
+    return Finding('weak', *_texts_of_test(clear[0], solution))
 
 
 def _moving(how: str, px: float, solution: Solution) -> Finding:
@@ -212,18 +212,18 @@ def _moving(how: str, px: float, solution: Solution) -> Finding:
                            f'all pictures', STEADY, cause=True)
 
 
-def _departure_texts(departure: Departure, solution: Solution) -> tuple[str, str]:
+def _texts_of_test(test: FixedCameraTest, solution: Solution) -> tuple[str, str]:
     """Return what is wrong, and what to do."""
-    if departure.kind == 'bend':
+    if test.kind == 'bend':
         return (f'the picture is bent in places, as no lens of the model {solution.camera.model} '
                 f'bends it', 'take away the windscreen or cover that does so, or try another '
                              '--model')
-    zooms = departure.by_turn
+    zooms = test.by_turn
     larger = sorted(turn for turn, zoom in zooms.items() if zoom > np.mean(list(zooms.values())))
     apart = max(zooms.values()) - min(zooms.values())
     cure = 'fix the zoom and the focus'
-    if apart < departure.size:
-        return (f'the zoom changes from image to image, by about {100 * departure.size:.1f} %',
+    if apart < test.size:
+        return (f'the zoom changes from image to image, by about {100 * test.size:.1f} %',
                 cure)
     return (f'the zoom changes by about {100 * apart:.1f} %, it is larger in {_turns(larger)} '
             f'than in the others', cure)

@@ -6,10 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel
 from dashcalib_ros.camera.prior import Prior
@@ -20,6 +21,11 @@ from dashcalib_ros.reconstruct.scene import Scene
 MAX_DISTORTION = 1.0
 # cosine (88 degrees): COLMAP's fisheye models project nothing from beside or behind the camera
 IN_FRONT = 0.035
+
+# What of the camera is free beside poses and points. COLMAP's models with one focal length have
+# the first coefficients of distortion only: 'first distortion' frees those, 'one focal length' the
+# focal length with them. The others stay as they are, which is right only where they are 0
+Free = Literal['nothing', 'first distortion', 'distortion', 'one focal length', 'everything']
 
 
 @dataclass(frozen=True)
@@ -32,95 +38,49 @@ class Solver:
     threads: int = 1
 
 
-def adjust_step1(scenes: Sequence[Scene], camera: Camera, solver: Solver,
-                 focal_range: tuple[float, float] | None) -> tuple[list[Scene], Camera]:
-    """Adjust with one focal length and the distortion, the centre fixed (paper, 3.2, step 1).
+def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
+           focal_range: tuple[float, float] | None = None, prior: Prior | None = None,
+           bounds: tuple[Floats, Floats] | None = None) -> tuple[list[Scene], Camera]:
+    """Adjust poses, points and what is free of the camera's n parameters; the others are fixed.
 
-    focal_range: px, lowest and highest focal length; None holds the focal length, for one point of
-    its profile. Coefficients that the model's step 1 does not have stay as they are, which is
-    right only where they are 0; adjust_distortion() is for the others.
+    focal_range: px, lowest and highest, for one focal length. prior, and bounds, the lowest and
+    highest values (n,), for everything. Scenes without observations stay as they are.
     """
-    model = camera.step1
-    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
-    reconstruction = _reconstruction(scenes, camera, model)
-    adjuster = _adjuster(reconstruction, solver, refine_focal=focal_range is not None,
-                         refine_centre=False)
-    values = reconstruction.cameras[1].params
-    if not adjuster.problem.has_parameter_block(values):
-        return _with_used(scenes, all_used), camera  # there are no observations
-    if focal_range is not None:
-        _bound(adjuster.problem, values, model.places[0], *focal_range)
-    for place in model.places[4:]:
-        _bound(adjuster.problem, values, place, -MAX_DISTORTION, MAX_DISTORTION)
-    adjuster.solve()
-    found = model.params(reconstruction.cameras[1].params)
-    # the conversion from COLMAP's pixels rounds: keep the centre exact
-    found[2:4] = camera.params[2:4]
-    return _with_used(_updated(scenes, reconstruction), all_used), _completed(camera, found)
-
-
-def adjust_distortion(scenes: Sequence[Scene], camera: Camera, solver: Solver
-                      ) -> tuple[list[Scene], Camera]:
-    """Adjust the distortion, with all coefficients; the focal lengths and the centre are held."""
-    if len(camera.step1.places) == len(camera.names()):
-        return adjust_step1(scenes, camera, solver, None)
-    model = camera.step2
-    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
-    reconstruction = _reconstruction(scenes, camera, model)
-    adjuster = _adjuster(reconstruction, solver, refine_focal=False, refine_centre=False)
-    values, problem = reconstruction.cameras[1].params, adjuster.problem
+    # smaller, and enough where it has all coefficients
+    single = free in ('first distortion', 'one focal length') or (
+        free == 'distortion' and len(camera.colmap_one_focal.places) == len(camera.names()))
+    model = camera.colmap_one_focal if single else camera.colmap
+    adjustable = _in_front(scenes)
+    reconstruction = _reconstruction(adjustable, camera, model)
+    adjuster = _adjuster(reconstruction, solver,
+                         refine_focal=free in ('one focal length', 'everything'),
+                         refine_centre=free == 'everything')
+    problem, values = adjuster.problem, reconstruction.cameras[1].params
     if not problem.has_parameter_block(values):
-        return _with_used(scenes, all_used), camera
-    problem.set_manifold(values, pyceres.SubsetManifold(
-        model.size, sorted({*model.held, *model.places[:4]})))
-    for place in model.places[4:]:
-        _bound(problem, values, place, -MAX_DISTORTION, MAX_DISTORTION)
+        return list(scenes), camera
+    if free == 'nothing':
+        problem.set_parameter_block_constant(values)
+    elif free == 'everything':
+        assert prior is not None and bounds is not None
+        _constrain(problem, values, model, prior, bounds)
+    else:
+        if not single:
+            problem.set_manifold(values, pyceres.SubsetManifold(
+                model.size, sorted({*model.fixed, *model.places[:4]})))
+        if focal_range is not None:
+            _bound(problem, values, model.places[0], *focal_range)
+        for place in model.places[4:]:
+            _bound(problem, values, place, -MAX_DISTORTION, MAX_DISTORTION)
     adjuster.solve()
-    found = model.params(reconstruction.cameras[1].params)
-    found[:4] = camera.params[:4]
-    return _with_used(_updated(scenes, reconstruction), all_used), camera.with_params(found)
-
-
-def adjust_step2(scenes: Sequence[Scene], camera: Camera, solver: Solver, prior: Prior,
-                 bounds: tuple[Floats, Floats]) -> tuple[list[Scene], Camera]:
-    """Adjust all n parameters within bounds and under a prior (paper, 3.2, step 2).
-
-    bounds: lowest and highest values, (n,) each, in the order of camera.names().
-    """
-    model = camera.step2
-    places = list(model.places)
-    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
-    reconstruction = _reconstruction(scenes, camera, model)
-    adjuster = _adjuster(reconstruction, solver, refine_focal=True, refine_centre=True)
-    values = reconstruction.cameras[1].params
-    problem = adjuster.problem
-    if not problem.has_parameter_block(values):
-        return _with_used(scenes, all_used), camera
-    if model.held:
-        problem.set_manifold(values, pyceres.SubsetManifold(model.size, model.held))
-    low, high = (model.values(bound) for bound in bounds)
-    for place in places:
-        _bound(problem, values, place, low[place], high[place])
-    covariance = np.eye(model.size)
-    covariance[np.ix_(places, places)] = prior.covariance
-    problem.add_residual_block(
-        pyceres.factors.NormalPrior(model.values(prior.mean), covariance),
-        pyceres.TrivialLoss(), [values])
-    adjuster.solve()
-    return (_with_used(_updated(scenes, reconstruction), all_used),
-            camera.with_params(model.params(reconstruction.cameras[1].params)))
-
-
-def adjust_poses(scenes: Sequence[Scene], camera: Camera, solver: Solver) -> list[Scene]:
-    """Adjust poses and points with the camera held as it is."""
-    scenes, all_used = _in_front(scenes), [scene.structure.used for scene in scenes]
-    reconstruction = _reconstruction(scenes, camera, camera.step2)
-    adjuster = _adjuster(reconstruction, solver, refine_focal=False, refine_centre=False)
-    values = reconstruction.cameras[1].params
-    if adjuster.problem.has_parameter_block(values):
-        adjuster.problem.set_parameter_block_constant(values)
-        adjuster.solve()
-    return _with_used(_updated(scenes, reconstruction), all_used)
+    moved = _updated(scenes, adjustable, reconstruction)
+    if free == 'nothing':
+        return moved, camera
+    found = camera.params
+    found[:len(model.places)] = model.params(reconstruction.cameras[1].params)
+    # the conversion from COLMAP's pixels rounds: keep what was fixed exact
+    first, end = {'one focal length': (2, 4), 'everything': (0, 0)}.get(free, (0, 4))
+    found[first:end] = camera.params[first:end]
+    return moved, camera.with_params(found)
 
 
 def _in_front(scenes: Sequence[Scene]) -> list[Scene]:
@@ -138,17 +98,6 @@ def _in_front(scenes: Sequence[Scene]) -> list[Scene]:
         used &= used.sum(axis=0) >= 2
         found.append(replace(scene, structure=replace(structure, used=used)))
     return found
-
-
-def _with_used(scenes: Sequence[Scene], all_used: Sequence[Mask]) -> list[Scene]:
-    """Return the scenes with their observations as they were before _in_front()."""
-    return [replace(scene, structure=replace(scene.structure, used=used))
-            for scene, used in zip(scenes, all_used, strict=True)]
-
-
-def _completed(camera: Camera, found: Floats) -> Camera:
-    """Return the camera with the parameters found; those that were not adjusted stay."""
-    return camera.with_params([*found, *camera.params[len(found):]])
 
 
 def _reconstruction(scenes: Sequence[Scene], camera: Camera, model: ColmapModel
@@ -204,6 +153,20 @@ def _adjuster(reconstruction: pycolmap.Reconstruction, solver: Solver, refine_fo
     return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
 
 
+def _constrain(problem: pyceres.Problem, values: Floats, model: ColmapModel, prior: Prior,
+               bounds: tuple[Floats, Floats]) -> None:
+    if model.fixed:
+        problem.set_manifold(values, pyceres.SubsetManifold(model.size, model.fixed))
+    places, (low, high) = list(model.places), map(model.values, bounds)
+    for place in places:
+        _bound(problem, values, place, low[place], high[place])
+    covariance = np.eye(model.size)
+    covariance[np.ix_(places, places)] = prior.covariance
+    problem.add_residual_block(
+        pyceres.factors.NormalPrior(model.values(prior.mean), covariance),
+        pyceres.TrivialLoss(), [values])
+
+
 def _bound(problem: pyceres.Problem, values: Floats, index: int, low: float, high: float) -> None:
     # Ceres refuses a start outside its bounds
     values[index] = min(max(values[index], low), high)
@@ -211,18 +174,22 @@ def _bound(problem: pyceres.Problem, values: Floats, index: int, low: float, hig
     problem.set_parameter_upper_bound(values, index, high)
 
 
-def _updated(scenes: Sequence[Scene], reconstruction: pycolmap.Reconstruction) -> list[Scene]:
-    """Return the scenes with the poses and points that COLMAP has moved."""
+def _updated(scenes: Sequence[Scene], adjusted: Sequence[Scene],
+             reconstruction: pycolmap.Reconstruction) -> list[Scene]:
+    """Return the scenes with the poses and points that COLMAP has moved.
+
+    adjusted: the same scenes with those observations only that were adjusted.
+    """
     updated = []
     point_ids = iter(sorted(reconstruction.point3D_ids()))
-    for scene, first_id in zip(scenes, _first_ids(scenes), strict=True):
+    for scene, part, first_id in zip(scenes, adjusted, _first_ids(scenes), strict=True):
         structure = scene.structure
         rotations, translations = structure.rotations.copy(), structure.translations.copy()
         for k in np.flatnonzero(structure.registered):
             pose = reconstruction.image(int(first_id + k)).cam_from_world()
             rotations[k], translations[k] = pose.rotation.matrix(), pose.translation
         points = structure.points.copy()
-        for t in np.flatnonzero(structure.used.any(axis=0)):
+        for t in np.flatnonzero(part.structure.used.any(axis=0)):
             points[t] = reconstruction.point3D(next(point_ids)).xyz
         updated.append(replace(scene, structure=replace(
             structure, rotations=rotations, translations=translations, points=points)))

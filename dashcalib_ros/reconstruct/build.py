@@ -15,7 +15,7 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.detect.turn import Turn, TurnId
-from dashcalib_ros.reconstruct.adjust import Solver, adjust_step1
+from dashcalib_ros.reconstruct.adjust import Free, Solver, adjust
 from dashcalib_ros.reconstruct.chain import chain
 from dashcalib_ros.reconstruct.register import register_tracks
 from dashcalib_ros.reconstruct.scene import (
@@ -114,8 +114,9 @@ def _refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | Non
              rounds: int = 2, tolerance: float = Solver.tolerance) -> Scene:
     """Return the scene after rounds of adjustment and triangulation."""
     solver = Solver(config.loss_px, config.iterations, tolerance)
+    free: Free = 'first distortion' if reach is None else 'one focal length'
     for _ in range(rounds):
-        [scene], camera = adjust_step1([scene], scene.camera, solver, reach)
+        [scene], camera = adjust([scene], scene.camera, solver, free, reach)
         scene = retriangulated(scene, camera, config.error_px, config.min_angle_deg)
     return scene
 

@@ -10,7 +10,7 @@ from dashcalib_ros.report.lens_figures import WIDTH, sigma_svg
 from dashcalib_ros.report.lens_sections import Drawing
 from dashcalib_ros.report.page import template
 from dashcalib_ros.report.tables import answers, comparison_rows
-from dashcalib_ros.solve.picture import SigmaMap
+from dashcalib_ros.solve.knowledge import SigmaMap
 
 LONGEST = 22.0  # px of the drawing; of an arrow
 

@@ -79,10 +79,10 @@ def _opencv(camera: Camera) -> str:
 def _colmap(camera: Camera) -> str:
     """Return COLMAP's cameras.txt."""
     width, height = camera.image_size
-    values = ' '.join(repr(float(value)) for value in camera.step2.values(camera.params))
+    values = ' '.join(repr(float(value)) for value in camera.colmap.values(camera.params))
     return ('# Camera list with one line of data per camera:\n'
             '#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n'
-            f'1 {camera.step2.name} {width} {height} {values}\n')
+            f'1 {camera.colmap.name} {width} {height} {values}\n')
 
 
 def _kalibr(camera: Camera) -> str:

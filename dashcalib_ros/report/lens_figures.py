@@ -21,7 +21,7 @@ from dashcalib_ros.report.charts import (
     ticks,
 )
 from dashcalib_ros.report.figures import png_data_uri
-from dashcalib_ros.solve.picture import SigmaMap
+from dashcalib_ros.solve.knowledge import SigmaMap
 
 WIDTH = 440  # px of a plot
 CELLS = 18  # columns of the maps of observations

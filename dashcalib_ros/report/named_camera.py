@@ -16,7 +16,7 @@ from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.limits import SIDE
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser, Stor
 from dashcalib_ros.limits import JSON_BYTES, parse_yaml, read_text
 from dashcalib_ros.limits import parse_json as parse_any_json
 from dashcalib_ros.report.camera_file import parse_camera
-from dashcalib_ros.solve.opinions import HeldOut
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.cross_validation import LeftOut
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 
 def result_dict(calibration: Calibration) -> dict[str, Any]:
@@ -106,7 +106,7 @@ def _calibration(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
     stored = [StoredTurnSummary(id=TurnId.stored(place), stamp_s=turn['stamp'],
                                 **{key: turn[key] for key in turn if key != 'stamp'})
               for place, turn in enumerate(data.get('stored_turns', ()))]
-    held_out = [HeldOut(
+    held_out = [LeftOut(
         TurnId.stored(place) if turn['center'] is None else TurnId.at(turn['center']),
         turn['px'], turn['sigma_px'], turn['others_sigma_px'])
         for place, turn in enumerate(data.get('held_out', ()))]
@@ -178,7 +178,7 @@ def plain_values(value: Any) -> Any:
     return str(value)
 
 
-def _held_out_dict(turn: HeldOut) -> dict[str, Any]:
+def _held_out_dict(turn: LeftOut) -> dict[str, Any]:
     # a stored turn has no place in this drive
     center = turn.turn.number if turn.turn.of_this_drive else None
     return {'center': center, 'px': turn.px, 'sigmas': turn.sigmas, 'sigma_px': turn.sigma_px,

@@ -41,10 +41,10 @@ def _opencv(camera: Camera) -> str:
 
 
 def _colmap(camera: Camera) -> str:
-    values = ','.join(f'{value:.10g}' for value in camera.step2.values(camera.params))
+    values = ','.join(f'{value:.10g}' for value in camera.colmap.values(camera.params))
     return ('colmap feature_extractor --database_path database.db --image_path images '
             '--ImageReader.single_camera 1 '
-            f'--ImageReader.camera_model {camera.step2.name} '
+            f'--ImageReader.camera_model {camera.colmap.name} '
             f'--ImageReader.camera_params {quote(values)}')
 
 

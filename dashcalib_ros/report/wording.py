@@ -9,7 +9,7 @@ from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report.usage import FieldOfView
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 ADVICE = {
     'accepted': 'Good to use.',

@@ -17,9 +17,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import as_model, sensitivity
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.information import Information, noise_of, step_to_wider_model
-from dashcalib_ros.solve.picture import picture_covariance, sigma_over
-from dashcalib_ros.solve.prior import extra_sigma_of
+from dashcalib_ros.solve.knowledge import sigma_over
 from dashcalib_ros.solve.solution import Solution
 
 # of fx, and as much over the picture in every other parameter: by how much the cameras of two
@@ -116,43 +114,20 @@ def _compared(solution: Solution) -> Comparison:
     The joint camera takes over the share of it that the earlier turns have in the information.
     """
     from scipy import stats
-    count, noise = len(solution.prior_information), noise_of(solution.parts)
-    prior = noise * solution.prior_information
-    by_unit = _by_unit(solution.camera)
+    known = solution.known
+    own, earlier = (known.of(n for n, scene in enumerate(solution.scenes)
+                             if scene.turn.of_this_drive == this_drive)
+                    for this_drive in (True, False))
+    by_unit, block = _by_unit(solution.camera), np.ix_(known.own, known.own)
     before = np.diag((OTHER_CAMERA * solution.camera.fx * by_unit[0] / by_unit)**2)
-    own, own_covariance, _ = _camera_of(_parts_of(solution, True), solution)
-    earlier, earlier_covariance, earlier_hessian = _camera_of(_parts_of(solution, False), solution)
-    difference, covariance = own - earlier, own_covariance + earlier_covariance
+    difference = known.offset_of(own) - known.offset_of(earlier)
+    covariance = own.covariance[block] + earlier.covariance[block]
     distance = float(difference @ np.linalg.solve(covariance, difference))
     gain = before @ np.linalg.inv(before + covariance)
     mean = gain @ difference
-    total = sum((part.hessian[:count, :count] for part in solution.parts), prior)
-    share = np.linalg.solve(total, earlier_hessian)
+    share = np.linalg.solve(known.with_prior(known.each(known.own)).hessian,
+                            earlier.sum(known.own).at_noise(known.noise).hessian)
     doubt = share @ (np.outer(mean, mean) + before - gain @ before) @ share.T
     moves, _ = sensitivity(solution.camera)
-    return Comparison(float(stats.norm.isf(stats.chi2.sf(distance, count) / 2)),
+    return Comparison(float(stats.norm.isf(stats.chi2.sf(distance, len(by_unit)) / 2)),
                       _rms(moves @ difference), np.asarray(doubt + doubt.T) / 2)
-
-
-def _parts_of(solution: Solution, this_drive: bool) -> list[Information]:
-    return [part for part, scene in zip(solution.parts, solution.scenes, strict=True)
-            if scene.turn.of_this_drive == this_drive]
-
-
-def _camera_of(parts: Sequence[Information], solution: Solution) -> tuple[Floats, Floats, Floats]:
-    """Return the camera of some turns: offset from the solution (n,), covariance, hessian (n, n).
-
-    The hessian is that of the turns alone, at the noise of all.
-    """
-    prior, noise = solution.prior_information, noise_of(solution.parts)
-    count = len(prior)
-    hessian = sum((part.hessian[:count, :count] for part in parts), np.zeros((count, count)))
-    score = sum((part.score[:count] for part in parts), np.zeros(count))
-    # at the solution the prior balances the scores of all turns
-    balance = sum((part.score[:count] for part in solution.parts), np.zeros(count))
-    covariance = picture_covariance(
-        solution.camera, parts, prior, solution.floor,
-        step_to_wider_model(parts, prior, extra_sigma_of(solution.camera)), solution.systematic,
-        solution.one_turn_sigma)[:count, :count]
-    camera = np.linalg.solve(hessian + noise * prior, score - balance)
-    return np.asarray(camera), covariance, np.asarray(hessian)

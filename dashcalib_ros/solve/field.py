@@ -9,14 +9,16 @@ predicted better with it, and beyond what the wider lens model explains.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import TERMS, Field, field_terms
-from dashcalib_ros.camera.mapping import grid_of, sensitivity
+from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.reconstruct.scene import Scene, residuals_px
+from dashcalib_ros.solve.quadratic import Quadratic
 
 # px of 1000 px of width: sizes of the field among which the evidence chooses
 SIZES = tuple(0.0125 * 2.0**n for n in range(9))
@@ -94,11 +96,6 @@ def _rotations(camera: Camera, pixels: Floats) -> Floats:
     return np.asarray(by_point @ turned)
 
 
-def grid_field(found: FoundField, camera: Camera) -> Floats:
-    """Return (m, 2, f) the fields of its free directions at a grid over the picture."""
-    return displacements(grid_of(camera), camera.image_size, found.basis)
-
-
 @dataclass(frozen=True)
 class Evidence:
     """The evidence for the field of the size that it favours, over that for none, in nats.
@@ -115,16 +112,12 @@ class Evidence:
 class FieldProblem:
     """The linearised problem of the lens, with its wider model, and of the field, at unit noise.
 
-    hessians: (t, m, m), scores: (t, m), by_track: (t, m, m) of t turns about m parameters, the
-    lens's first. prior: (l, l), pull: (l,) information and gradient of the lens's prior. at: (f,)
-    the present field's directions, by which the tracks were moved already.
+    turns: the cost of each about the lens's parameters, then the field's. lens: the prior of the
+    former. at: (f,) the present field's directions, by which the tracks were moved already.
     """
 
-    hessians: Floats
-    scores: Floats
-    by_track: Floats
-    prior: Floats
-    pull: Floats
+    turns: tuple[Quadratic, ...]
+    lens: Quadratic
     at: Floats
 
     def evidence(self, width: int) -> Evidence:
@@ -133,60 +126,52 @@ class FieldProblem:
                    key=lambda each: each.nats)
 
     def _evidence(self, sigma_px: float) -> Evidence:
-        inflation = self._inflation(sigma_px)
-        hessian, score = self._own(self.hessians.sum(axis=0), self.scores.sum(axis=0), inflation)
+        total = self._total
+        inverse = Quadratic.together([total, self._prior(sigma_px)]).covariance
+        # by how much errors that a track's observations share inflate the variances
+        inflation = max(1.0, float(np.sum(inverse * total.by_track)
+                                   / np.sum(inverse * total.hessian)))
+        field = self._of_field(total, inflation)
         prior = np.eye(len(self.at)) / sigma_px**2
-        _, size = np.linalg.slogdet(np.eye(len(self.at)) + sigma_px**2 * hessian)
-        nats = 0.5 * (score @ np.linalg.solve(hessian + prior, score) - size)
+        _, size = np.linalg.slogdet(np.eye(len(self.at)) + sigma_px**2 * field.hessian)
+        nats = 0.5 * (field.score @ np.linalg.solve(field.hessian + prior, field.score) - size)
         return Evidence(sigma_px, float(nats), inflation)
 
-    def _inflation(self, sigma_px: float) -> float:
-        """Return by how much errors that a track's observations share inflate the variances."""
-        hessian = self.hessians.sum(axis=0)
-        inverse = np.linalg.inv(hessian + self.information(sigma_px))
-        return max(1.0, float(np.sum(inverse * self.by_track.sum(axis=0))
-                              / np.sum(inverse * hessian)))
+    @cached_property
+    def _total(self) -> Quadratic:
+        return Quadratic.together(self.turns)
 
-    def information(self, sigma_px: float) -> Floats:
-        """Return (m, m) the information of the priors of the lens and of the field."""
-        lens, size = len(self.pull), len(self.scores[0])
-        prior = np.zeros((size, size))
-        prior[:lens, :lens] = self.prior
-        prior[lens:, lens:] = np.eye(size - lens) / sigma_px**2
-        return prior
+    def _prior(self, sigma_px: float) -> Quadratic:
+        """Return the prior of the lens and of a field of this size."""
+        return Quadratic.prior(self.lens.hessian, np.full(len(self.at), 1 / sigma_px**2),
+                               np.r_[self.lens.score, -self.at / sigma_px**2])
 
-    def _own(self, hessian: Floats, score: Floats, inflation: float) -> tuple[Floats, Floats]:
-        """Return hessian and score of the field (about no field), the lens at its optimum."""
-        lens = len(self.pull)
-        hessian, score = hessian / inflation, score / inflation
-        mixed = np.linalg.solve(hessian[:lens, :lens] + self.prior, hessian[:lens, lens:])
-        own = hessian[lens:, lens:] - hessian[lens:, :lens] @ mixed
-        return own, score[lens:] - mixed.T @ (score[:lens] + self.pull) + own @ self.at
+    def _of_field(self, cost: Quadratic, inflation: float) -> Quadratic:
+        """Return the cost about the field, from where there is none, the lens at its optimum."""
+        lens = Quadratic.prior(self.lens.hessian, np.zeros(len(self.at)),
+                               np.r_[self.lens.score, np.zeros(len(self.at))])
+        both = Quadratic.together([cost.at_noise(inflation), lens])
+        return both.eliminated(len(self.lens.score)).moved(-self.at)
 
     def step(self, evidence: Evidence, narrow: int) -> Floats:
         """Return the step (m,) of all parameters; of the lens's only the first (narrow,) move."""
-        lens, free = len(self.pull), np.r_[:narrow, len(self.pull):len(self.scores[0])]
-        information = self.information(evidence.sigma_px)
-        hessian = self.hessians.sum(axis=0) / evidence.inflation + information
-        score = self.scores.sum(axis=0) / evidence.inflation
-        score[:lens] += self.pull
-        score[lens:] -= self.at / evidence.sigma_px**2
-        step = np.zeros(len(score))
-        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], score[free])
+        total = Quadratic.together([self._total.at_noise(evidence.inflation),
+                                    self._prior(evidence.sigma_px)])
+        lens, step = len(self.lens.score), np.zeros(len(total.score))
+        free = np.r_[:narrow, lens:len(step)]
+        step[free] = total.of(free).optimum
         return step
 
-    def held_out_gains(self, evidence: Evidence) -> Floats:
+    def gains_of_turns_left_out(self, evidence: Evidence) -> Floats:
         """Return (t,) by how much the field of the other turns explains each turn better.
 
         Each turn's lens is free, with and without the field: so only what turns share counts.
         In noise variances of a track.
         """
+        prior = Quadratic.prior(np.eye(len(self.at)) / evidence.sigma_px**2)
         gains = []
-        for n in range(len(self.scores)):
-            others = np.arange(len(self.scores)) != n
-            hessian, score = self._own(self.hessians[others].sum(axis=0),
-                                       self.scores[others].sum(axis=0), evidence.inflation)
-            field = np.linalg.solve(hessian + np.eye(len(self.at)) / evidence.sigma_px**2, score)
-            hessian, score = self._own(self.hessians[n], self.scores[n], evidence.inflation)
-            gains.append(float(2 * score @ field - field @ hessian @ field))
+        for n, turn in enumerate(self.turns):
+            others = Quadratic.together([*self.turns[:n], *self.turns[n + 1:]])
+            field = Quadratic.together([self._of_field(others, evidence.inflation), prior]).optimum
+            gains.append(-self._of_field(turn, evidence.inflation).change(field))
         return np.array(gains)

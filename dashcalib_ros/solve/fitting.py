@@ -1,4 +1,4 @@
-"""Scenes are fitted to a given camera: triangulated anew, chained anew, or given other poses."""
+"""Scenes are fitted to a given camera: triangulated or chained anew, given other poses, judged."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -9,10 +9,18 @@ import numpy as np
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.reconstruct.adjust import Solver, adjust_distortion
+from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.build import chain_scene
-from dashcalib_ros.reconstruct.scene import Scene, retriangulated, truncated_cost
-from dashcalib_ros.solve.misfit import misfits
+from dashcalib_ros.reconstruct.scene import Scene, errors_px, retriangulated, truncated_cost
+from dashcalib_ros.solve.prior import loss_px_of
+
+# px^2; lower costs count as this, so that the ratio of two tiny costs is near 1
+LEAST_COST = 0.01
+# of each turn, where a part of its tracks is enough
+FIRST_TRACKS = 200
+# of an adjustment with a fixed camera; it moves poses and points only, and is cheap
+ITERATIONS = 20
+ROUNDS = 3
 
 
 def retriangulate(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
@@ -65,17 +73,17 @@ def adapted_to(scene: Scene, camera: Camera, config: Config) -> Scene:
     return retriangulate(scene, camera, config.scene)
 
 
-def explained_by(scenes: Sequence[Scene], full_scenes: Mapping[TurnId, Scene], camera: Camera,
+def explained_by(scenes: Sequence[Scene], measured: Mapping[TurnId, Scene], camera: Camera,
                  config: Config) -> list[Scene]:
     """Return the scenes that the camera explains, some of them chained anew with it.
 
-    full_scenes: the scenes with all their tracks, by turn: a chain of few tracks soon breaks. The
+    measured: the scenes with all their tracks, by turn: a chain of few tracks soon breaks. The
     first chain of a scene may be broken in its middle, as the lens was unknown then.
     """
     kept = []
     for scene in scenes:
         if scene.explained < config.scene.well_explained:
-            scene = max(scene, _rechained(full_scenes[scene.turn], camera, config),
+            scene = max(scene, _rechained(measured[scene.turn], camera, config),
                         key=lambda candidate: candidate.explained)
         if scene.explained >= config.scene.min_explained:
             kept.append(scene)
@@ -89,15 +97,15 @@ def _rechained(scene: Scene, camera: Camera, config: Config) -> Scene:
             else _readjusted(anew, camera, config.scene))
 
 
-def with_better_poses(scenes: Sequence[Scene], separate: Sequence[Scene], camera: Camera,
+def with_better_poses(scenes: Sequence[Scene], per_turn: Sequence[Scene], camera: Camera,
                       config: SceneConfig) -> list[Scene]:
-    """Return the scenes, with their poses from separate where these explain clearly more.
+    """Return the scenes, with their poses from per_turn where these explain clearly more.
 
     The first steps use a part of the tracks only: the pose of an image that sees few of them may
     be wrong.
     """
-    found = misfits(separate, scenes, camera, config.error_px)
-    own = {scene.turn: scene.structure for scene in separate}
+    found = misfits(per_turn, scenes, camera, config.error_px)
+    own = {scene.turn: scene.structure for scene in per_turn}
 
     def cost(scene: Scene) -> float:
         return truncated_cost(scene, camera, config.error_px)
@@ -109,7 +117,70 @@ def with_better_poses(scenes: Sequence[Scene], separate: Sequence[Scene], camera
 
 def _readjusted(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
     """Return the scene adjusted to a camera that is nearly right."""
-    # the focal length is held; the distortion that is found is not used
+    # the focal length is fixed; the distortion that is found is not used
     solver = Solver(0.01 * camera.image_size[0], config.iterations)
-    [moved], _ = adjust_distortion([retriangulate(scene, camera, config)], camera, solver)
+    [moved], _ = adjust([retriangulate(scene, camera, config)], camera, solver, 'distortion')
     return retriangulate(moved, camera, config)
+
+
+def misfits(per_turn: Sequence[Scene], together: Sequence[Scene], camera: Camera, limit_px: float
+            ) -> dict[TurnId, float]:
+    """Return the ratio of each turn's cost with the shared camera to that with its own, by turn.
+
+    per_turn: the turns as they were reconstructed, each with its own camera (one focal length,
+    k1, k2). together: those that are left, adjusted with the shared camera. limit_px: larger
+    errors count as this. Costs are means over all observations. The ratio is about 1 or less for a
+    turn of the shared camera; a turn that is not in together costs limit_px squared.
+    """
+    adjusted = {scene.turn: scene for scene in together}
+
+    def cost(scene: Scene, camera: Camera) -> float:
+        return max(truncated_cost(scene, camera, limit_px), LEAST_COST)
+
+    return {scene.turn: (cost(adjusted[scene.turn], camera) if scene.turn in adjusted
+                         else limit_px**2) / cost(scene, scene.camera) for scene in per_turn}
+
+
+def costs_with(camera: Camera, scenes: Sequence[Scene], loss_px: float, limit_px: float
+               ) -> list[float]:
+    """Return what each scene costs with a fixed camera, px^2 for each observation it uses.
+
+    loss_px: scale of the Cauchy loss. limit_px: larger errors, and points that the camera cannot
+    see, count as this.
+    """
+    adjusted, _ = adjust(scenes, camera, Solver(loss_px, ITERATIONS), 'nothing')
+    costs = []
+    for scene in adjusted:
+        errors = np.minimum(errors_px(scene, camera), limit_px)[scene.structure.used]
+        costs.append(float(loss_px**2 * np.mean(np.log1p(errors**2 / loss_px**2))))
+    return costs
+
+
+def scene_with(camera: Camera, scene: Scene, config: Config) -> Scene | None:
+    """Return the scene as a camera explains it; None where it explains no observation.
+
+    It is triangulated, and also chained anew where its own camera is far from this one, and
+    adjusted with that camera: the better one counts, as a chain may break where images are
+    lost. The first rounds are generous: the camera may be wrong.
+    """
+    width = camera.image_size[0]
+    generous = replace(config.scene, error_px=max(config.scene.error_px,
+                                                  config.scene.chain_error * width))
+    anew = (rechain(scene, camera, replace(config, scene=generous)) if is_far(scene, camera)
+            else None)
+    found = [_with_fixed(camera, each, generous, config)
+             for each in (scene, anew) if each is not None]
+    return min((each for each in found if each is not None), default=None,
+               key=lambda each: truncated_cost(each, camera, config.scene.error_px))
+
+
+def _with_fixed(camera: Camera, found: Scene, generous: SceneConfig, config: Config
+                ) -> Scene | None:
+    for n in range(ROUNDS):
+        limits = generous if n < ROUNDS - 1 else config.scene
+        found = retriangulate(found, camera, limits)
+        if not found.structure.used.any():
+            return None
+        loss_px = loss_px_of([found], camera, config.intrinsics)
+        [found], _ = adjust([found], camera, Solver(loss_px, ITERATIONS), 'nothing')
+    return found

@@ -8,7 +8,7 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
-from dashcalib_ros.reconstruct.adjust import Solver, adjust_distortion
+from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
 from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
 
@@ -50,7 +50,7 @@ def nearest_start(cameras: Sequence[Camera], profile: Profile) -> Camera:
 
 def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
                    config: Config) -> Profile:
-    """Return the cost with the focal length held at PROBES times the result, all else adjusted.
+    """Return the cost with the focal length fixed at PROBES times the result, all else adjusted.
 
     Each probe is an adjustment that starts from the result, with a part of the tracks. If the
     coarse profile has its minimum outside the probes, that focal length is probed too, with scenes
@@ -60,18 +60,18 @@ def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
     width = camera.image_size[0]
     costs = {}
     for probe in PROBES:
-        held = camera.with_focal(camera.fx * probe)
-        costs[held.fx / width] = _held_cost(few, held, config.scene)
+        fixed = camera.with_focal(camera.fx * probe)
+        costs[fixed.fx / width] = _cost_at(few, fixed, config.scene)
     if not PROBES[0] < coarse.best * width / camera.fx < PROBES[-1]:
-        held = type(camera).centred(camera.image_size, coarse.best * width)
-        anew = [rechain(scene, held, config) or scene for scene in few]
-        costs[coarse.best] = _held_cost(anew, held, config.scene)
+        fixed = type(camera).centred(camera.image_size, coarse.best * width)
+        anew = [rechain(scene, fixed, config) or scene for scene in few]
+        costs[coarse.best] = _cost_at(anew, fixed, config.scene)
     ratios = sorted(costs)
     observations = sum(int(scene.tracks.seen.sum()) for scene in few)
     return Profile(np.array(ratios), np.array([costs[ratio] for ratio in ratios]), observations)
 
 
-def _held_cost(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> float:
+def _cost_at(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> float:
     """Return the truncated cost over all scenes after adjusting all but the focal length, px^2.
 
     The lowest cost met on the way: the wide loss may lead away from a start that is right.
@@ -85,7 +85,7 @@ def _held_cost(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> 
     costs = [cost(moved, camera)]
     # the first residuals are large: the loss must be as wide, or it ignores them
     for loss_px in (0.01 * camera.image_size[0], config.loss_px, config.loss_px):
-        moved, camera = adjust_distortion(moved, camera, Solver(loss_px, config.iterations))
+        moved, camera = adjust(moved, camera, Solver(loss_px, config.iterations), 'distortion')
         moved = [retriangulate(scene, camera, config) for scene in moved]
         costs.append(cost(moved, camera))
     return min(costs)

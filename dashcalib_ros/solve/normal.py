@@ -1,11 +1,14 @@
 """The normal equations of one scene, with its points and poses eliminated (Schur complement).
 
-At the adjusted solution the residuals are linearised by the scene's points and poses, and by what
-is asked for: the lens, further parameters that all turns share, and, where wanted, three of each
-image: a shift of its picture in x and y, and its zoom.
+At the adjusted solution the residuals are linearised by the scene's points and poses, by the
+parameters of the wider lens model (those that this model does not have are 0: p1, p2 and k3 beside
+the paper's six), by further ones that all turns share (a rolling shutter's readout, a field over
+the picture), and, where wanted, by three of each image: a shift of its picture in x and y, and its
+zoom.
 """
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,8 +16,9 @@ import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.reconstruct.scene import Scene, residuals_px
 from dashcalib_ros.reconstruct.structure import Structure
+from dashcalib_ros.solve.quadratic import Quadratic, TurnCost
 
 # parameters of a pose, and of an image: its shift in x and y (px), its zoom (1 = 100 %)
 POSE = 6
@@ -23,10 +27,11 @@ IMAGE = 3
 
 @dataclass(frozen=True)
 class Eliminated:
-    """What finds the points and poses again. keyframes: (k,), tracks: (t,) those that are used.
+    """How poses and points of a scene follow the m parameters that are left.
 
-    pose_inverse: (6k, 6k); pose_score: (6k,); pose_mixed: (6k, m) with the parameters that are
-    left. point_inverse: (t, 3, 3); point_score: (t, 3); point_mixed: (t, 6k + m, 3).
+    keyframes: (k,), tracks: (t,) those that are used. pose_inverse: (6k, 6k) the inverse of the
+    poses' block; pose_score: (6k,); pose_mixed: (6k, m). point_inverse: (t, 3, 3); point_score:
+    (t, 3); point_mixed: (t, 6k + m, 3).
     """
 
     keyframes: Ints
@@ -39,10 +44,7 @@ class Eliminated:
     point_mixed: Floats
 
     def moved(self, structure: Structure, step: Floats) -> Structure:
-        """Return the structure at its optimum after a step (m,) of the parameters that are left.
-
-        Of the linearised problem.
-        """
+        """Return the structure at its optimum (of the linearised problem) after a step (m,)."""
         pose = self.pose_inverse @ (self.pose_score - self.pose_mixed @ step)
         both = np.concatenate([pose, step])
         shift = np.einsum('tij,tj->ti', self.point_inverse,
@@ -58,27 +60,20 @@ class Eliminated:
 
 @dataclass(frozen=True)
 class Normal:
-    """The normal equations of one scene, in px^-2, about m parameters.
+    """The normal equations of one scene.
 
-    First come IMAGE parameters of each of its k used keyframes, if they were asked for; then lens
-    parameters of the wider model; then further ones. hessian: (m, m); score: (m,) the negative
-    gradient; by_track: (m, m) sum over tracks of the outer products of their scores. squares and
-    freedom: see Information.
+    cost: about IMAGE parameters of each of its used keyframes, if they were asked for, and then
+    about what turns share. images: how many keyframes have parameters.
     """
 
-    hessian: Floats
-    score: Floats
-    by_track: Floats
-    squares: float
-    freedom: float
-    lens: int
+    cost: TurnCost
     images: int
     eliminated: Eliminated
 
-    def without_images(self) -> tuple[Floats, Floats, Floats]:
-        """Return hessian, score and by_track of the other parameters, the images' held."""
-        shared = slice(IMAGE * self.images, None)
-        return self.hessian[shared, shared], self.score[shared], self.by_track[shared, shared]
+    @property
+    def shared(self) -> Quadratic:
+        """Return the cost about what turns share, the images' parameters fixed."""
+        return self.cost.of(np.arange(IMAGE * self.images, len(self.cost.score)))
 
 
 def used_keyframes(scene: Scene) -> Ints:
@@ -90,7 +85,7 @@ def used_keyframes(scene: Scene) -> Ints:
 class ImagePrior:
     """What may differ between the images of a scene, and how much: a normal distribution.
 
-    free: (p,) the indices of these parameters among the images'; the others are held. precision:
+    free: (p,) the indices of these parameters among the images'; the others are fixed. precision:
     (p, p) the inverse of their covariance around 0, times the noise in px^2. values: (p,) how
     large they are already, in the scene's tracks.
     """
@@ -99,51 +94,63 @@ class ImagePrior:
     precision: Floats
     values: Floats
 
-    def inverse(self, normal: Normal) -> Floats:
-        """Return (p, p) the inverse of their block, with the prior."""
-        return np.asarray(np.linalg.inv(
-            normal.hessian[np.ix_(self.free, self.free)] + self.precision), np.float64)
+    def of(self, normal: Normal) -> Quadratic:
+        """Return the cost about these parameters with the prior; what turns share is fixed."""
+        return Quadratic.together([normal.cost.of(self.free), Quadratic.prior(
+            self.precision, score=-self.precision @ self.values)])
 
-    def pull(self, normal: Normal) -> Floats:
-        """Return (p,) their negative gradient, with the prior's."""
-        return np.asarray(normal.score[self.free] - self.precision @ self.values)
-
-    def eliminated(self, normal: Normal) -> tuple[Floats, Floats, Floats]:
-        """Return hessian, score and by_track of the other parameters, these at their optimum."""
-        shared = slice(IMAGE * normal.images, None)
-        inverse, mixed = self.inverse(normal), normal.hessian[self.free, shared]
-        combine = np.zeros((len(normal.score) - IMAGE * normal.images, len(normal.score)))
+    def eliminated(self, normal: Normal) -> Quadratic:
+        """Return the cost about what turns share, these parameters at their optimum."""
+        own, cost, shared = self.of(normal), normal.cost, slice(IMAGE * normal.images, None)
+        mixed = cost.hessian[self.free, shared]
+        combine = np.zeros((len(cost.score) - IMAGE * normal.images, len(cost.score)))
         combine[:, shared] = np.eye(len(combine))
-        combine[:, self.free] = -mixed.T @ inverse
-        hessian = normal.hessian[shared, shared] - mixed.T @ inverse @ mixed
-        score = normal.score[shared] - mixed.T @ inverse @ self.pull(normal)
-        return hessian, score, combine @ normal.by_track @ combine.T
+        combine[:, self.free] = -mixed.T @ own.covariance
+        return Quadratic(cost.hessian[shared, shared] - mixed.T @ own.covariance @ mixed,
+                         cost.score[shared] - mixed.T @ own.covariance @ own.score,
+                         combine @ cost.by_track @ combine.T)
 
     def step(self, normal: Normal, others: Ints, step: Floats) -> Floats:
         """Return (p,) their step, given that (s,) of others, indices behind the images'."""
-        mixed = normal.hessian[np.ix_(self.free, IMAGE * normal.images + others)]
-        return np.asarray(self.inverse(normal) @ (self.pull(normal) - mixed @ step))
-
-    def gain_and_chance(self, normal: Normal) -> tuple[float, float]:
-        """Return by how much their own step lowers the cost, and how much chance would, px^2.
-
-        The first times the noise, the second times its square: neither is at unit noise.
-        """
-        inverse, pull = self.inverse(normal), self.pull(normal)
-        scatter = normal.by_track[np.ix_(self.free, self.free)]
-        return float(pull @ inverse @ pull), float(np.sum(inverse * scatter))
+        own = self.of(normal)
+        mixed = normal.cost.hessian[np.ix_(self.free, IMAGE * normal.images + others)]
+        return np.asarray(own.covariance @ (own.score - mixed @ step))
 
 
-def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats | None = None,
+def turn_cost(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None = None,
+              images: ImagePrior | None = None) -> TurnCost:
+    """Return what a scene knows of the camera, at the solution.
+
+    loss_px, by_shared: as normal_equations()'. images: what may differ between the images; None:
+    nothing.
+    """
+    normal = normal_equations(scene, camera, loss_px, by_shared, by_image=images is not None)
+    cost = normal.shared if images is None else images.eliminated(normal)
+    return replace(normal.cost, hessian=cost.hessian, score=cost.score, by_track=cost.by_track)
+
+
+def noise_in(scenes: Sequence[Scene], camera: Camera, loss_px: float) -> float:
+    """Return what noise_of() returns for these scenes, without their normal equations."""
+    squares = freedom = 0.0
+    for scene in scenes:
+        used = scene.structure.used
+        residual = residuals_px(scene, camera)[used]
+        more = _squares_and_freedom(used, residual, _weights(residual, loss_px),
+                                    len(camera.names()))
+        squares, freedom = squares + more[0], freedom + more[1]
+    return squares / freedom
+
+
+def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None = None,
                      by_image: bool = False) -> Normal:
     """Return the normal equations of a scene at the solution.
 
     loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply.
-    by_extra: (k, t, 2, e) derivatives of the observations by e more parameters that all turns
+    by_shared: (k, t, 2, e) derivatives of the observations by e more parameters that all turns
     share. by_image: with the parameters of each image.
     """
     used = scene.structure.used
-    linear = _linearised(scene, camera, loss_px, by_extra, by_image)
+    linear = _linearised(scene, camera, loss_px, by_shared, by_image)
     rows, columns = np.nonzero(used)
     keyframes, image = np.unique(rows, return_inverse=True)
     tracks, point = np.unique(columns, return_inverse=True)
@@ -167,13 +174,13 @@ def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_extra: Flo
     track_score[:, where[0, POSE + own:]] = _summed(pulls[:, POSE + own:], point)
     track_score -= (mixed @ (inverse @ point_score[:, :, None]))[:, :, 0]
     scores = track_score[:, poses:] - track_score[:, :poses] @ response
+    noise = _squares_and_freedom(used, linear.residual, linear.weight, len(camera.names()))
     return Normal(
-        hessian, scores.sum(axis=0), scores.T @ scores,
-        *squares_and_freedom(used, linear.residual, linear.weight, len(camera.names())),
-        lens=len(camera.widened().names()), images=images // IMAGE,
-        eliminated=Eliminated(keyframes, tracks, pose_inverse,
-                              track_score[:, :poses].sum(axis=0), reduced[:poses, poses:],
-                              inverse, point_score, mixed))
+        TurnCost(hessian, scores.sum(axis=0), scores.T @ scores, *noise,
+                 lens=len(camera.widened().names())),
+        images // IMAGE,
+        Eliminated(keyframes, tracks, pose_inverse, track_score[:, :poses].sum(axis=0),
+                   reduced[:poses, poses:], inverse, point_score, mixed))
 
 
 @dataclass(frozen=True)
@@ -190,7 +197,7 @@ class _Linear:
     weight: Floats
 
 
-def _linearised(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats | None,
+def _linearised(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None,
                 by_image: bool) -> _Linear:
     structure = scene.structure
     rows, columns = np.nonzero(structure.used)
@@ -200,7 +207,7 @@ def _linearised(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats |
         rotated + structure.translations[rows])
     residual = scene.tracks.xy[rows, columns] - projected
     # the loss has the gradient w e, and the curvature w^2 on average over the directions of e
-    weight = weights(residual, loss_px)
+    weight = _weights(residual, loss_px)
     # a small rotation w of the camera moves the local point by w x (R X)
     parts = [by_local @ -_cross(rotated), by_local]
     if by_image:
@@ -208,8 +215,8 @@ def _linearised(scene: Scene, camera: Camera, loss_px: float, by_extra: Floats |
         shift = np.broadcast_to(np.eye(2), (len(rows), 2, 2))
         parts += [shift, (projected - middle)[:, :, None]]
     parts.append(by_camera)
-    if by_extra is not None:
-        parts.append(by_extra[rows, columns])
+    if by_shared is not None:
+        parts.append(by_shared[rows, columns])
     wide = np.concatenate(parts, axis=2)
     return _Linear(wide * weight[:, None, None], by_local @ rotation * weight[:, None, None],
                    residual, weight)
@@ -269,13 +276,13 @@ def _pose_inverse(poses: Floats) -> Floats:
     return np.asarray(inner * scale[:, None] * scale)
 
 
-def weights(residual: Floats, loss_px: float) -> Floats:
+def _weights(residual: Floats, loss_px: float) -> Floats:
     """Return (n,) weights of residuals (n, 2) under the Cauchy loss."""
     return np.asarray(1 / (1 + np.sum(residual**2, axis=1) / loss_px**2))
 
 
-def squares_and_freedom(used: Mask, residual: Floats, weight: Floats, parameters: int
-                        ) -> tuple[float, float]:
+def _squares_and_freedom(used: Mask, residual: Floats, weight: Floats, parameters: int
+                         ) -> tuple[float, float]:
     """Return the sum of the weighted squared residuals, px^2, and their degrees of freedom."""
     observations, points, poses = used.sum(), used.any(axis=0).sum(), used.any(axis=1).sum()
     # the gauge (position, rotation and scale of the scene) is free: seven

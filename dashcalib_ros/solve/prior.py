@@ -11,33 +11,45 @@ from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.prior import Prior
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
+from dashcalib_ros.solve.quadratic import Quadratic
 
 # rendered images without noise would make the loss cut off everything
 LEAST_LOSS_PX = 0.05
+# of the width: how far lenses sit off the middle of their sensors
+CENTRE_SIGMA = 0.02
+# how far parameters may go from the centred camera: fx and fy of its focal length, the centre of
+# the picture's size (AliceVision's bound); no lens has larger k1 and k2
+FOCAL_BOUND, CENTRE_BOUND, DISTORTION_BOUND = 0.15, 0.1, 1.0
+# systematic errors of the tracking: of fx, for fx and fy; of the width, for cx and cy
+FOCAL_FLOOR, CENTRE_FLOOR = 0.0005, 0.0003
+# of fx, the same behind a field: KITTI 03 and 07 are so far from true rotations; behind a field
+# smaller than this, in px, it is smaller
+FIELD_FLOOR, WHOLE_FIELD_PX = 0.0025, 0.1
 
 
 def prior_of(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
-    """Return the prior of step 2: square pixels and a centred principal point, with their sigmas.
+    """Return the prior: square pixels and a centred principal point.
 
-    noise: variance of a residual, px^2. The adjustment treats residuals in px as if their sigma
-    were 1, so the prior's covariance is divided by the noise.
+    camera: centred, as found with one focal length. noise: variance of a residual, px^2. The
+    adjustment treats residuals in px as if their sigma were 1, so the prior's covariance is
+    divided by the noise.
     """
     width, _ = camera.image_size
     wide = (10 * camera.fx) ** 2
-    spread = np.diag([wide, wide, (config.centre_sigma * width) ** 2,
-                      (config.centre_sigma * width) ** 2, *np.square(camera.spread)])
+    spread = np.diag([wide, wide, (CENTRE_SIGMA * width) ** 2,
+                      (CENTRE_SIGMA * width) ** 2, *np.square(camera.spread)])
     # fx is free; fy equals fx to within the sigma of the aspect ratio
     spread[0, 1] = spread[1, 0] = wide
     spread[1, 1] += (config.aspect_sigma * camera.fx) ** 2
     return Prior(_undistorted(camera), spread / noise)
 
 
-def bounds_of(camera: Camera, config: IntrinsicsConfig) -> tuple[Floats, Floats]:
-    """Return the lowest and the highest values of step 2 (the paper: 'within bounds'), (n,)."""
+def bounds_of(camera: Camera) -> tuple[Floats, Floats]:
+    """Return the lowest and the highest values (n,) that are allowed, around a centred camera."""
     width, height = camera.image_size
-    reach = np.full(len(camera.names()), config.k_bound)
-    reach[:4] = (camera.fx * config.focal_bound, camera.fx * config.focal_bound,
-                 width * config.centre_bound, height * config.centre_bound)
+    reach = np.full(len(camera.names()), DISTORTION_BOUND)
+    reach[:4] = (camera.fx * FOCAL_BOUND, camera.fx * FOCAL_BOUND,
+                 width * CENTRE_BOUND, height * CENTRE_BOUND)
     return _undistorted(camera) - reach, _undistorted(camera) + reach
 
 
@@ -56,7 +68,20 @@ def extra_sigma_of(camera: Camera) -> Floats:
     return np.array(camera.widened().spread[len(camera.spread):])
 
 
-def floor_of(camera: Camera, config: IntrinsicsConfig, field: Field | None = None) -> Floats:
+def wider_prior(camera: Camera, centred: Camera, config: IntrinsicsConfig,
+                sigmas: Sequence[float] = ()) -> Quadratic:
+    """Return the prior about the wider model's parameters, and e further ones, at unit noise.
+
+    centred: the camera that the prior is about; camera: where the prior draws from. sigmas: (e,)
+    of the further ones.
+    """
+    information = prior_information(centred, config)
+    further = 1 / np.square(np.r_[extra_sigma_of(camera), sigmas])
+    draws = information @ (prior_of(centred, config, 1.0).mean - camera.params)
+    return Quadratic.prior(information, further, np.r_[draws, np.zeros(len(further))])
+
+
+def floor_of(camera: Camera, field: Field | None = None) -> Floats:
     """Return the sigmas (n,) of systematic errors, which no number of turns averages out.
 
     field: that was taken out of the tracks: what is left of it is the same for all turns.
@@ -65,9 +90,9 @@ def floor_of(camera: Camera, config: IntrinsicsConfig, field: Field | None = Non
     left = 0.0
     if field is not None:
         size_px = float(np.sqrt(np.mean(field.over(camera)**2)))
-        left = config.field_floor * min(1.0, size_px / config.whole_field_px)
-    floor[:2] = np.hypot(config.focal_floor, left) * camera.fx
-    floor[2:4] = config.centre_floor * camera.image_size[0]
+        left = FIELD_FLOOR * min(1.0, size_px / WHOLE_FIELD_PX)
+    floor[:2] = np.hypot(FOCAL_FLOOR, left) * camera.fx
+    floor[2:4] = CENTRE_FLOOR * camera.image_size[0]
     return floor
 
 

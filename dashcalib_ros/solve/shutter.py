@@ -16,7 +16,9 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.information import Information, Pooled, information, pooled
+from dashcalib_ros.solve.knowledge import Knowledge
+from dashcalib_ros.solve.normal import turn_cost
+from dashcalib_ros.solve.quadratic import Quadratic
 
 # s; step of the central difference for a point's speed in the picture
 STEP_S = 1e-3
@@ -54,29 +56,20 @@ def readout(scenes: Sequence[Scene], camera: Camera, loss_px: float, prior: Floa
             ) -> tuple[float, float]:
     """Return the readout that is still left in the scenes, and its sigma, s.
 
-    prior: (n, n) information of the prior, as for covariance(). One Gauss-Newton step from a
-    solution without a readout. The sigma treats each track as one measurement, and is inf where
-    nothing moves or the stamps give no speed.
+    prior: (n, n) information of the camera's prior. One Gauss-Newton step from a solution without
+    a readout. The sigma treats each track as one measurement, and is inf where nothing moves or
+    the stamps give no speed.
     """
     shifts = [row_shift(scene, camera) for scene in scenes]
     if not any(shift.any() for shift in shifts):
         return 0.0, float(np.inf)
-    together = pooled([information(scene, camera, loss_px, shift[..., None])
-                       for scene, shift in zip(scenes, shifts, strict=True)], prior)
+    known = Knowledge(camera, tuple(
+        turn_cost(scene, camera, loss_px, shift[..., None])
+        for scene, shift in zip(scenes, shifts, strict=True)),
+        Quadratic.prior(prior, np.zeros(1)), np.zeros(len(prior)))
     # the camera is at its optimum: only the readout has a gradient
-    seconds = together.inverse[-1, -1] * together.scores[:, -1].sum()
-    return float(seconds), _sigma(together, len(prior), 1.0)
-
-
-def readout_sigma(parts: Sequence[Information], prior: Floats, systematic: float) -> float:
-    """Return the sigma of the readout that was taken out, s; the arguments are as elsewhere."""
-    return _sigma(pooled(parts, prior), len(prior), systematic)
-
-
-def _sigma(together: Pooled, place: int, systematic: float) -> float:
-    """Return the sigma of the readout, the parameter behind the camera's."""
-    return float(np.sqrt(max(together.inverse[place, place],
-                             systematic * together.clustered[place, place])))
+    score = np.sum([turn.score[-1] for turn in known.turns_at_optimum])
+    return float(known.total.covariance[-1, -1] * score), known.readout_sigma
 
 
 def remove_rolling_shutter(scene: Scene, measured: Scene, camera: Camera, readout_s: float

@@ -12,56 +12,64 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Profile, Scene, rms_px
-from dashcalib_ros.solve.choice import Candidate
-from dashcalib_ros.solve.departures import Crops, Departure
 from dashcalib_ros.solve.field import FoundField, displacements
-from dashcalib_ros.solve.information import Information, pooled, step_to_wider_model
-from dashcalib_ros.solve.picture import PictureSigma, SigmaMap, picture_covariance, sigma_over
-from dashcalib_ros.solve.prior import extra_sigma_of
+from dashcalib_ros.solve.fixed_camera import Crops, FixedCameraTest
+from dashcalib_ros.solve.knowledge import Knowledge, PictureSigma, SigmaMap, sigma_over
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model that was tried.
+
+    loses_by: how much worse than the chosen model it predicts the turns left out: the sum of the
+    robust squared errors, in units of the noise of a track; 0 for the chosen one, negative for one
+    that does better, but not clearly. apart_px: how far its camera is from the chosen one over the
+    picture; None where they cannot be compared. chosen: it is the one that the turns choose.
+    cost_ratio: its cost of the turns left out over that of the chosen one.
+    """
+
+    model: str
+    loses_by: float
+    apart_px: float | None = None
+    chosen: bool = False
+    cost_ratio: float = 1.0
 
 
 @dataclass(frozen=True)
 class Solution:
     """All turns adjusted together.
 
-    camera: its n parameters; covariance: (n, n) of them; step1: the camera after the first step.
-    scenes: as adjusted, in the order given; parts: the information of each about the lens.
-    coarse: the sum of the turns' focal profiles; around: the profile near the result, of all
-    turns. bounds: (2, n) lowest and highest values that were allowed.
-    prior_information: (n, n) information that the prior adds to that of the turns.
-    readout_s: from the first row to the last of a rolling shutter whose effect was removed from
-    the scenes' tracks; 0 for a global one. readout_sigma_s: its standard deviation.
-    misfits: of every turn that was given: the ratio of its cost with this camera to its cost
-    with its own camera. tried: the models that were compared, the simplest first; empty where
-    the first one left nothing to explain. sigma_map: over the picture. departures: from a fixed
-    camera, the strongest first. crops: of a stabilised video, taken out of the tracks. systematic:
-    as for picture_covariance(). field: what no lens model has; None: nothing speaks for one.
-    floor: (n,) sigmas of systematic errors. one_turn_sigma: of fx, px, where one turn is all.
-    doubt: (n, n) the part of covariance that says how little this drive's turns confirm those of
-    earlier drives; None where there are none.
-    px: of the input's pictures, in one pixel of the scenes.
+    camera: its n parameters; covariance: (n, n) of them; centred: the camera with one focal length
+    that was found first, about which priors and bounds are. scenes: as adjusted, in the order
+    given; known: what they know, in the same order. coarse: the sum of the turns' focal profiles;
+    around: the profile near the result, of all turns. bounds: (2, n) lowest and highest values
+    that were allowed. readout_s: from the first row to the last of a rolling shutter whose effect
+    was removed from the scenes' tracks; 0 for a global one. readout_sigma_s: its standard
+    deviation. misfits: of every turn that was given: the ratio of its cost with this camera to its
+    cost with its own camera. tried: the models that were compared, the simplest first; empty where
+    the first one left nothing to explain. sigma_map: over the picture. fixed_camera: the tests
+    whether it is one, the strongest first. crops: of a stabilised video, taken out of the tracks.
+    field: what no lens model has; None: nothing speaks for one. doubt: (n, n) the part of
+    covariance that says how little this drive's turns confirm those of earlier drives; None where
+    there are none. px: of the input's pictures, in one pixel of the scenes.
     """
 
     camera: Camera
     covariance: Floats
-    step1: Camera
+    centred: Camera
     scenes: tuple[Scene, ...]
-    parts: tuple[Information, ...]
+    known: Knowledge
     coarse: Profile
     around: Profile
     bounds: Floats
-    prior_information: Floats
     sigma_map: SigmaMap
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     misfits: Mapping[TurnId, float] = default(default_factory=dict)
     tried: tuple[Candidate, ...] = ()
-    departures: tuple[Departure, ...] = ()
+    fixed_camera: tuple[FixedCameraTest, ...] = ()
     crops: Crops = default(default_factory=dict)
-    systematic: float = 1.0
     field: FoundField | None = None
-    floor: Floats = default(default_factory=lambda: np.zeros(0))
-    one_turn_sigma: float = 0.0
     doubt: Floats | None = None
     px: float = 1.0
 
@@ -71,6 +79,17 @@ class Solution:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
+    def wider_covariance(self) -> Floats:
+        """Return the covariance of the wider model's parameters: the camera's own come first.
+
+        Of those that this model has not, the step is all that is known.
+        """
+        covariance = np.array(self.known.covariance)
+        if self.doubt is not None:
+            covariance[:len(self.doubt), :len(self.doubt)] += self.doubt
+        return covariance
+
+    @property
     def picture(self) -> PictureSigma:
         """Return the sigma over the picture."""
         return self.sigma_map.whole
@@ -78,26 +97,18 @@ class Solution:
     @property
     def rays_sigma_px(self) -> float:
         """Return how far rays with the camera and the field may be off, RMS over the picture."""
-        count, found = len(self.camera.names()), self.field
+        found, count, together = self.field, len(self.known.own), self.known.total.covariance
         if found is None:
             return self.picture.rms
-        together = pooled(self.parts, self.prior_information)
         moves, pixels = sensitivity(self.camera)
         bends = displacements(pixels, self.camera.image_size, found.basis)
         # the readout, if there is one, moves nothing in the picture of a camera that stands
-        still = np.zeros((*bends.shape[:2], len(together.inverse) - count - bends.shape[2]))
-        camera_only = sigma_over(moves, together.inverse[:count, :count])
-        both = sigma_over(np.concatenate([moves, still, bends], axis=2), together.inverse)
-        covariance = picture_covariance(
-            self.camera, self.parts, self.prior_information, self.floor, self.step_to_wider_model,
-            self.systematic, self.one_turn_sigma)[:count, :count]
+        still = np.zeros((*bends.shape[:2], len(together) - count - bends.shape[2]))
+        camera_only = sigma_over(moves, together[:count, :count])
+        both = sigma_over(np.concatenate([moves, still, bends], axis=2), together)
+        covariance = self.known.covariance[:count, :count]
         inflation = np.sum(sigma_over(moves, covariance)**2) / np.sum(camera_only**2)
         return float(np.sqrt(inflation * np.mean(both**2)))
-
-    @property
-    def step_to_wider_model(self) -> Floats:
-        """Return the Gauss-Newton step of all parameters of the wider model, from this camera."""
-        return step_to_wider_model(self.parts, self.prior_information, extra_sigma_of(self.camera))
 
     @property
     def reprojection_error_px(self) -> float:

@@ -1,4 +1,7 @@
-"""The paper's two steps (3.2): all scenes are adjusted with one camera, and what they then say."""
+"""The paper's two steps (3.2): all scenes are adjusted with one camera, and what they then know.
+
+First one focal length and the distortion are free, then all parameters.
+"""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,229 +14,227 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
-from dashcalib_ros.config import Config, IntrinsicsConfig
+from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.reconstruct.adjust import Solver, adjust_step1, adjust_step2
+from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.departures import Crops, Departure, departures, shift_prior
 from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.fitting import (
+    FIRST_TRACKS,
     explained_by,
     retriangulate_all,
     subsample_tracks,
     with_better_poses,
     with_poses_of,
 )
-from dashcalib_ros.solve.information import Information, information, noise_in, step_to_wider_model
-from dashcalib_ros.solve.picture import SigmaMap, sigma_map
-from dashcalib_ros.solve.prior import (
-    bounds_of,
-    extra_sigma_of,
-    floor_of,
-    loss_px_of,
-    prior_information,
-    prior_of,
+from dashcalib_ros.solve.fixed_camera import (
+    Crops,
+    FixedCameraTest,
+    fixed_camera_tests,
+    shift_prior,
 )
+from dashcalib_ros.solve.knowledge import Knowledge
+from dashcalib_ros.solve.normal import noise_in, turn_cost
+from dashcalib_ros.solve.prior import bounds_of, floor_of, loss_px_of, prior_information, prior_of
+from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shift
 
 ByTurn = Mapping[TurnId, Scene]
 Progress = Callable[[str, float], None]
 
+# ratio: with one focal length the search goes this far to either side of the profile's minimum
+FOCAL_REACH = 1.35
+# a shorter readout, in its sigmas and in s, counts as a global shutter: six came out at 0 to 0.5
+# ms
+CLEAR_SIGMAS, LEAST_READOUT_S = 4.0, 1.0 / 1e3
+
 
 @dataclass(frozen=True)
 class Fit:
-    """The state of the adjustment. readout_s: of the rolling shutter that was removed.
+    """The state of the adjustment, and what the turns know there.
 
-    crops: of the stabilised video, as removed; empty for a fixed picture. field: what no lens
-    model has, as removed; None where nothing speaks for one.
+    centred: the camera that was found with one focal length, about which priors and bounds are.
+    measured: each turn with all its tracks, a rolling shutter's effect still in them. readout_s:
+    of the rolling shutter that was removed from the scenes' tracks. crops: of the stabilised
+    video, as removed; empty for a fixed picture. field: what no lens model has, as removed; None
+    where nothing speaks for one.
     """
 
     scenes: list[Scene]
     camera: Camera
+    centred: Camera
     solver: Solver
+    measured: ByTurn
+    config: Config
     readout_s: float = 0.0
     crops: Crops = default(default_factory=dict)
     field: FoundField | None = None
 
-    def noise(self, loss_px: float) -> float:
-        """Return the variance of a residual for the priors, px^2; loss_px: of the Cauchy loss."""
-        inflation = self.field.inflation if self.field is not None else 1.0
-        return inflation * noise_in(self.scenes, self.camera, loss_px)
+    def adjusted(self, noise: float | None = None) -> Fit:
+        """Return the fit with everything adjusted, within bounds and under priors.
 
-
-@dataclass(frozen=True)
-class Result:
-    """A fit at its end, and what the priors come from."""
-
-    fit: Fit
-    step1: Camera
-    settings: IntrinsicsConfig
-
-    @cached_property
-    def parts(self) -> tuple[Information, ...]:
-        """Return what each turn says of the lens."""
-        fit, loss_px = self.fit, self.fit.solver.loss_px
-        noise = noise_in(fit.scenes, fit.camera, loss_px) if fit.crops else 0.0
-        return tuple(information(
-            scene, fit.camera, loss_px, *self._extras(scene),
-            shift_prior(scene, noise, self.settings, fit.crops[scene.turn]) if fit.crops else None)
-            for scene in fit.scenes)
-
-    def _extras(self, scene: Scene) -> tuple[Floats | None, tuple[Floats, Floats]]:
-        """Return a scene's derivatives by what all turns share beside the lens, and its prior.
-
-        (k, t, 2, e) for the readout of a rolling shutter and the directions of the field, and
-        (e,) the information and the negative gradient of their priors.
+        noise: variance of a residual for the priors, px^2; None: that of the fit.
         """
-        fit, columns, prior, pull = self.fit, [], [np.zeros(0)], [np.zeros(0)]
-        if fit.readout_s:
-            columns.append(row_shift(scene, fit.camera)[..., None])
-            prior.append(np.zeros(1))
-            pull.append(np.zeros(1))
-        if fit.field is not None:
-            columns.append(fit.field.columns(scene, fit.camera))
-            prior.append(np.full(columns[-1].shape[-1], fit.field.sigma_px**-2.0))
-            pull.append(-prior[-1] * fit.field.directions)
-        return (np.concatenate(columns, axis=-1) if columns else None,
-                (np.concatenate(prior), np.concatenate(pull)))
+        scenes, camera = adjust(
+            self.scenes, self.camera, self.solver, 'everything',
+            prior=prior_of(self.centred, self.config.intrinsics,
+                           self.noise if noise is None else noise),
+            bounds=bounds_of(self.centred))
+        return replace(self, scenes=scenes, camera=camera)
 
-    @cached_property
+    def retriangulated(self) -> Fit:
+        """Return the fit with its tracks triangulated anew; scenes without points are dropped."""
+        return replace(self, scenes=retriangulate_all(self.scenes, self.camera, self.config.scene))
+
+    def with_usual_loss(self) -> Fit:
+        """Return the fit with the loss that its residuals ask for."""
+        loss_px = loss_px_of(self.scenes, self.camera, self.config.intrinsics)
+        return replace(self, solver=replace(self.solver, loss_px=loss_px))
+
+    @property
+    def noise(self) -> float:
+        """Return the variance of a residual for the priors, px^2."""
+        inflation = self.field.inflation if self.field is not None else 1.0
+        return inflation * noise_in(self.scenes, self.camera, self.solver.loss_px)
+
+    @property
     def prior(self) -> Floats:
         """Return the prior's information (n, n) about the camera."""
-        return prior_information(self.step1, self.settings)
-
-    def departures(self, bent: bool = True) -> tuple[Departure, ...]:
-        """Return how the drive departs from a fixed camera, the strongest first."""
-        fit = self.fit
-        scenes = [subsample_tracks(scene, self.settings.first_tracks) for scene in fit.scenes]
-        return departures(scenes, fit.camera, self.step1, fit.solver.loss_px, self.settings,
-                          fit.crops, bent, bool(fit.readout_s), fit.field)
-
-    @property
-    def floor(self) -> Floats:
-        """Return the sigmas (n,) of systematic errors."""
-        return floor_of(self.fit.camera, self.settings, self.used_field)
-
-    @property
-    def one_turn_sigma(self) -> float:
-        """Return by how much fx differs between single turns, px."""
-        return self.settings.one_turn_sigma * self.fit.camera.fx
+        return prior_information(self.centred, self.config.intrinsics)
 
     @property
     def used_field(self) -> Field | None:
         """Return the field that was taken out of the tracks, None without one."""
-        found = self.fit.field
-        return found.field if found is not None and found.used else None
+        return self.field.field if self.field is not None and self.field.used else None
 
-    def sigma_map(self, systematic: float = 1.0) -> SigmaMap:
-        """Return the sigma over the picture; systematic: as for picture_covariance()."""
-        camera = self.fit.camera
-        return sigma_map(
-            camera, self.parts, self.prior, self.floor,
-            step_to_wider_model(self.parts, self.prior, extra_sigma_of(camera)), systematic,
-            self.one_turn_sigma, self.used_field)
+    @cached_property
+    def known(self) -> Knowledge:
+        """Return what the turns know of the camera."""
+        camera, loss_px = self.camera, self.solver.loss_px
+        noise = noise_in(self.scenes, camera, loss_px) if self.crops else 0.0
+        turns = tuple(turn_cost(
+            scene, camera, loss_px, self._by_shared(scene),
+            shift_prior(scene, noise, self.crops[scene.turn]) if self.crops
+            else None) for scene in self.scenes)
+        return Knowledge(camera, turns, self._prior_of_all(), floor_of(camera, self.used_field),
+                         one_turn_sigma=self.config.intrinsics.one_turn_sigma * camera.fx)
+
+    def _by_shared(self, scene: Scene) -> Floats | None:
+        """Return (k, t, 2, e) derivatives by the readout and by the directions of the field."""
+        columns = []
+        if self.readout_s:
+            columns.append(row_shift(scene, self.camera)[..., None])
+        if self.field is not None:
+            columns.append(self.field.columns(scene, self.camera))
+        return np.concatenate(columns, axis=-1) if columns else None
+
+    def _prior_of_all(self) -> Quadratic:
+        """Return the prior of the camera, of the readout, which has none, and of the field."""
+        further = score = np.zeros(1 if self.readout_s else 0)
+        if self.field is not None:
+            precision = np.full(self.field.basis.shape[1], self.field.sigma_px**-2.0)
+            further = np.r_[further, precision]
+            score = np.r_[score, -precision * self.field.directions]
+        return Quadratic.prior(self.prior, further, np.r_[np.zeros(len(self.prior)), score])
+
+    def fixed_camera_tests(self, bent: bool = True) -> tuple[FixedCameraTest, ...]:
+        """Return the tests whether the camera is a fixed one, the clearest that it is not first.
+
+        bent: False leaves out the local bend, which takes longer.
+        """
+        scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in self.scenes]
+        return fixed_camera_tests(
+            scenes, self.camera, self.centred, self.solver.loss_px, self.config.intrinsics,
+            self.crops, bent, bool(self.readout_s), self.field)
 
 
-def step1(full_scenes: ByTurn, start: Camera, config: Config, progress: Progress) -> Fit:
-    """Return the scenes adjusted with one focal length and distortion; the centre is held.
+def fit_one_focal_length(measured: ByTurn, start: Camera, config: Config, progress: Progress
+                         ) -> Fit:
+    """Return the scenes adjusted with one focal length and distortion; the centre is fixed.
 
     A part of the tracks is enough to come near the result, and takes a third of the time.
     """
     settings = config.intrinsics
     solver = Solver(config.scene.loss_px, config.scene.iterations)
-    reach = (start.fx / settings.focal_reach, start.fx * settings.focal_reach)
-    few = [subsample_tracks(scene, settings.first_tracks) for scene in full_scenes.values()]
+    reach = (start.fx / FOCAL_REACH, start.fx * FOCAL_REACH)
+    few = [subsample_tracks(scene, FIRST_TRACKS) for scene in measured.values()]
     camera = start
     for n in range(settings.rounds):
         progress('adjusting one focal length', n / settings.rounds)
-        few, camera = adjust_step1(few, camera, solver, reach)
+        few, camera = adjust(few, camera, solver, 'one focal length', reach)
         few = retriangulate_all(few, camera, config.scene)
-    kept = explained_by(few, full_scenes, camera, config)
-    return Fit([subsample_tracks(scene, settings.first_tracks) for scene in kept], camera, solver)
+    kept = explained_by(few, measured, camera, config)
+    return Fit([subsample_tracks(scene, FIRST_TRACKS) for scene in kept], camera, camera, solver,
+               measured, config)
 
 
-def step2_roughly(first: Fit, config: Config) -> Fit:
+def fit_roughly(first: Fit) -> Fit:
     """Return the scenes adjusted with all parameters, the effect of a rolling shutter removed.
 
     Without clear evidence of a rolling shutter the readout is 0: readouts of less than 1 ms were
     measured with global shutters.
     """
-    settings, solver = config.intrinsics, first.solver
-    prior = prior_of(first.camera, settings, noise_in(first.scenes, first.camera, solver.loss_px))
-    bounds = bounds_of(first.camera, settings)
-    scenes, camera = adjust_step2(first.scenes, first.camera, solver, prior, bounds)
-    measured = {scene.turn: scene for scene in scenes}
-    total = 0.0
+    settings, noise = first.config.intrinsics, first.noise
+    fit = replace(first, measured={scene.turn: scene for scene in first.scenes}).adjusted(noise)
     for _ in range(settings.shutter_rounds):
-        found, sigma = readout(scenes, camera, solver.loss_px, prior_information(camera, settings))
-        if (abs(found) < sigma) if total else not is_rolling(found, sigma, settings):
+        # the prior is about the camera of this round, not that of the first step
+        found, sigma = readout(fit.scenes, fit.camera, fit.solver.loss_px,
+                               prior_information(fit.camera, settings))
+        if (abs(found) < sigma) if fit.readout_s else not is_rolling(found, sigma):
             break
-        total += found
-        scenes = _without_rolling_shutter(scenes, measured, camera, total, config)
-        scenes, camera = adjust_step2(scenes, camera, solver, prior, bounds)
-        scenes = retriangulate_all(scenes, camera, config.scene)
-    return Fit(scenes, camera, solver, total)
+        fit = _without_rolling_shutter(fit, fit.readout_s + found)
+        fit = fit.adjusted(noise).retriangulated()
+    return replace(fit, measured=first.measured)
 
 
-def is_rolling(readout_s: float, sigma_s: float, config: IntrinsicsConfig) -> bool:
+def is_rolling(readout_s: float, sigma_s: float) -> bool:
     """Return whether a readout is clear evidence of a rolling shutter."""
-    return abs(readout_s) >= max(config.shutter_sigmas * sigma_s, config.least_readout_ms / 1e3)
+    return abs(readout_s) >= max(CLEAR_SIGMAS * sigma_s, LEAST_READOUT_S)
 
 
-def with_all_tracks(rough: Fit, full_scenes: ByTurn, separate: Sequence[Scene], config: Config
-                    ) -> Fit:
+def with_all_tracks(rough: Fit, per_turn: Sequence[Scene]) -> Fit:
     """Return the scenes with all their tracks, without those that the camera does not explain."""
-    camera = rough.camera
-    scenes = [with_poses_of(full_scenes[scene.turn], scene) for scene in rough.scenes]
-    measured = {scene.turn: scene for scene in scenes}
+    camera, config = rough.camera, rough.config
+    scenes = [with_poses_of(rough.measured[scene.turn], scene) for scene in rough.scenes]
     if rough.readout_s:
         # the shutter's displacements depend on the points: find these with a generous limit first
         generous = replace(config.scene,
                            error_px=config.scene.chain_error * camera.image_size[0])
         scenes = retriangulate_all(scenes, camera, generous)
-        scenes = _without_rolling_shutter(scenes, measured, camera, rough.readout_s, config)
+        scenes = _without_rolling_shutter(replace(rough, scenes=scenes), rough.readout_s).scenes
     else:
         scenes = retriangulate_all(scenes, camera, config.scene)
     scenes = explained_by(scenes, {scene.turn: scene for scene in scenes}, camera, config)
-    return replace(rough, scenes=with_better_poses(scenes, separate, camera, config.scene))
+    return replace(rough, scenes=with_better_poses(scenes, per_turn, camera, config.scene))
 
 
-def step2(complete: Fit, full_scenes: ByTurn, step1: Camera, config: Config,
-           progress: Progress = lambda stage, done: None) -> Fit:
-    """Return the scenes adjusted with all parameters, within bounds and priors from step 1."""
-    settings = config.intrinsics
-    fit, bounds = complete, bounds_of(step1, settings)
+def fit_all(complete: Fit, progress: Progress = lambda stage, done: None) -> Fit:
+    """Return the scenes adjusted with all parameters, in rounds of triangulation."""
+    settings, fit = complete.config.intrinsics, complete
     for n in range(settings.rounds):
         progress('adjusting all parameters', (n + 1) / (settings.rounds + 1))
         if n > 0:
-            ready = _retriangulated(fit, full_scenes, step1, config)
+            ready = _measured_again(fit)
             if not fit.readout_s and _changed(fit, ready) < settings.settled:
                 break
             fit = ready
-        solver = replace(fit.solver, loss_px=loss_px_of(fit.scenes, fit.camera, settings))
-        prior = prior_of(step1, settings, fit.noise(solver.loss_px))
-        scenes, camera = adjust_step2(fit.scenes, fit.camera, solver, prior, bounds)
-        fit = replace(fit, scenes=scenes, camera=camera, solver=solver)
+        fit = fit.with_usual_loss().adjusted()
     return fit
 
 
-def _retriangulated(fit: Fit, full_scenes: ByTurn, step1: Camera, config: Config) -> Fit:
+def _measured_again(fit: Fit) -> Fit:
     """Return the scenes triangulated anew, after the readout was measured once more."""
     if not fit.readout_s:
-        return replace(fit, scenes=retriangulate_all(fit.scenes, fit.camera, config.scene))
-    prior = prior_information(step1, config.intrinsics)
-    step_s, _ = readout(fit.scenes, fit.camera, fit.solver.loss_px, prior)
-    readout_s = fit.readout_s + step_s
-    scenes = _without_rolling_shutter(fit.scenes, full_scenes, fit.camera, readout_s, config)
-    return replace(fit, scenes=scenes, readout_s=readout_s)
+        return fit.retriangulated()
+    step_s, _ = readout(fit.scenes, fit.camera, fit.solver.loss_px, fit.prior)
+    return _without_rolling_shutter(fit, fit.readout_s + step_s)
 
 
-def _without_rolling_shutter(scenes: Sequence[Scene], measured: ByTurn, camera: Camera,
-                             readout_s: float, config: Config) -> list[Scene]:
+def _without_rolling_shutter(fit: Fit, readout_s: float) -> Fit:
     """Return the scenes triangulated from tracks with the rolling shutter's effect removed."""
-    moved = [remove_rolling_shutter(scene, measured[scene.turn], camera, readout_s)
-             for scene in scenes]
-    return retriangulate_all(moved, camera, config.scene)
+    moved = [remove_rolling_shutter(scene, fit.measured[scene.turn], fit.camera, readout_s)
+             for scene in fit.scenes]
+    return replace(fit, scenes=moved, readout_s=readout_s).retriangulated()
 
 
 def _changed(before: Fit, after: Fit) -> float:

@@ -21,11 +21,10 @@ from dashcalib_ros import Config
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.reconstruct.adjust import Solver
-from dashcalib_ros.solve.information import noise_of
-from dashcalib_ros.solve.opinions import held_out
+from dashcalib_ros.solve.cross_validation import cross_validation
 from dashcalib_ros.solve.prior import loss_px_of
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.solve.steps import Fit, step2
+from dashcalib_ros.solve.steps import Fit, fit_all
 
 
 def solved_drives(cache: Path) -> list[Solved]:
@@ -36,21 +35,20 @@ def solved_drives(cache: Path) -> list[Solved]:
 
 def without(solution: Solution, number: int) -> Camera:
     """Return the camera without a turn, by one linear step."""
-    count = len(solution.prior_information)
-    others = [part for n, part in enumerate(solution.parts) if n != number]
-    total = sum((part.hessian[:count, :count] for part in others),
-                noise_of(solution.parts) * solution.prior_information)
-    step = np.linalg.solve(total, solution.parts[number].score[:count])
+    known, other = solution.known, solution.known.without(number)
+    cost = known.with_prior([other.sum(known.own).at_noise(known.noise)])
+    step = np.linalg.solve(cost.hessian, known.turns[number].score[known.own] / known.noise)
     return solution.camera.with_params(solution.camera.params - step)
 
 
 def refitted(solution: Solution, number: int, config: Config) -> Camera:
-    """Return the camera without a turn, by the second step of a calibration, from the solution."""
+    """Return the camera without a turn, adjusted from the solution."""
     scenes = [scene for n, scene in enumerate(solution.scenes) if n != number]
     loss_px = loss_px_of(scenes, solution.camera, config.intrinsics)
-    fit = Fit(scenes, solution.camera, Solver(loss_px, config.scene.iterations))
-    full = {scene.turn: scene for scene in scenes}
-    return step2(fit, full, solution.step1, config).camera
+    fit = Fit(scenes, solution.camera, solution.centred,
+              Solver(loss_px, config.scene.iterations), {scene.turn: scene for scene in scenes},
+              config)
+    return fit_all(fit).camera
 
 
 def drives_table(drives: Iterable[Solved]) -> str:
@@ -59,7 +57,7 @@ def drives_table(drives: Iterable[Solved]) -> str:
     for each in drives:
         if each.solution is None or each.calibration.verdict.level != 'accepted':
             continue
-        found = held_out(each.solution)
+        found = cross_validation(each.solution)
         if not found:
             continue
         good = [turn.px <= turn.sigma_px + turn.others_sigma_px for turn in found]

@@ -256,13 +256,14 @@ def test_points_behind_the_camera_have_no_pixel():
 @pytest.mark.parametrize('model', MODELS.values(), ids=lambda model: model.model)
 def test_parameters_go_to_colmap_and_back(model):
     params = np.arange(1.0, 1.0 + len(model.names()))
-    values = model.step2.values(params)
-    assert len(values) == model.step2.size
-    assert values[model.step2.places[2]] == params[2] + 0.5  # COLMAP's pixel centres
-    np.testing.assert_array_equal(model.step2.params(values), params)
-    assert not values[model.step2.held].any()
+    values = model.colmap.values(params)
+    assert len(values) == model.colmap.size
+    assert values[model.colmap.places[2]] == params[2] + 0.5  # COLMAP's pixel centres
+    np.testing.assert_array_equal(model.colmap.params(values), params)
+    assert not values[model.colmap.fixed].any()
     # one focal length: that of x
-    single = model.step1.params(model.step1.values(params[:len(model.step1.places)]))
+    one = model.colmap_one_focal
+    single = one.params(one.values(params[:len(one.places)]))
     assert single[0] == single[1] == params[0]
 
 
@@ -270,8 +271,8 @@ def test_parameters_go_to_colmap_and_back(model):
 def test_colmap_projects_as_we_do(name):
     pycolmap = pytest.importorskip('dashcalib_ros.reconstruct.colmap').pycolmap
     camera = CAMERAS[name]
-    colmap = pycolmap.Camera(camera_id=1, model=camera.step2.name, width=SIZE[0], height=SIZE[1],
-                             params=camera.step2.values(camera.params))
+    colmap = pycolmap.Camera(camera_id=1, model=camera.colmap.name, width=SIZE[0], height=SIZE[1],
+                             params=camera.colmap.values(camera.params))
     points = np.random.default_rng(2).uniform([-3, -2, 4], [3, 2, 9], (40, 3))
     np.testing.assert_allclose(np.array(colmap.img_from_cam(points)) - 0.5,
                                camera.project(points), atol=1e-9)

@@ -16,7 +16,8 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import Path, TurnOdometry
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
+from dashcalib_ros.solve.quadratic import Quadratic
 
 
 @stands_in_for(Calibrator)
@@ -52,7 +53,7 @@ class FakeCalibrator:
         return Odometry(('given', 'ours', 'guess'), (turn,))
 
     def watch(self, camera, sigma=None, progress=None):
-        seen = [Reading(TurnId.at(n), 100 * np.eye(6), np.zeros(6), None, n < self.fits)
+        seen = [Reading(TurnId.at(n), Quadratic.prior(100 * np.eye(6)), None, n < self.fits)
                 for n in range(5)]
         return watch(seen, camera, sigma, Config().monitor)
 

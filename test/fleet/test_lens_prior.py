@@ -22,7 +22,7 @@ from dashcalib_ros.fleet.posterior import conditioned, final_of, unit_of
 from dashcalib_ros.fleet.solved import Estimate, Solved
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge import Verdict as OwnVerdict
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 CONFIG = FleetConfig()
 MEAN = np.array([curvature(0.65), -0.28, 0.09])

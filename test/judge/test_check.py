@@ -16,7 +16,7 @@ from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.difference import Difference, difference_of, distance
 from dashcalib_ros.judge.wording import answers_of
 from dashcalib_ros.report import NamedCamera, compare
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 ACCEPTED = Verdict('accepted')
 

@@ -15,7 +15,9 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge import Reading, watch
 from dashcalib_ros.reconstruct.heading import Heading, heading
 from dashcalib_ros.solve import fitting
+from dashcalib_ros.solve.quadratic import Quadratic
 
+NOTHING = Quadratic.prior(np.zeros((6, 6)))
 ZOOMED = replace(LENS, fx=1.03 * LENS.fx, fy=1.03 * LENS.fy)
 EXCHANGED = replace(LENS, fx=1.3 * LENS.fx, fy=1.3 * LENS.fy, k1=0.0, k2=0.0)
 YAWS = (80.0, -70.0, 85.0)
@@ -59,7 +61,8 @@ def test_a_zoom_is_suspected_after_one_turn_and_told_after_two(readings):
 
 
 def test_another_distortion_is_not_told_as_a_focal_length(readings):
-    bent = [replace(each, score=each.hessian @ (0, 0, 0, 0, 0.03, 0))
+    bent = [replace(each, cost=replace(
+                each.cost, score=each.cost.hessian @ (0, 0, 0, 0, 0.03, 0)))
             for each in readings['same'][:2]]
     [change] = watched(driven(*readings['same'], *bent)).changes
     assert change.looks_like == ('its distortion were another',)
@@ -69,9 +72,9 @@ def test_turns_that_cannot_tell_focal_length_from_distortion_leave_it_open(readi
     """They know the centre, and of the others only the sum of zoom and k1."""
     zoom_and_k1 = np.array([0.5 / LENS.fx, 0.5 / LENS.fy, 0.0, 0.0, 1.0, 0.0])
     hessian = 1e6 * np.outer(zoom_and_k1, zoom_and_k1) + np.diag([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
-    before = [replace(each, hessian=hessian, score=np.zeros(6)) for each in readings['same']]
-    after = [replace(each, score=0.02 * hessian @ zoom_and_k1 / (zoom_and_k1 @ zoom_and_k1))
-             for each in before[:2]]
+    before = [replace(each, cost=Quadratic.prior(hessian)) for each in readings['same']]
+    score = 0.02 * hessian @ zoom_and_k1 / (zoom_and_k1 @ zoom_and_k1)
+    after = [replace(each, cost=replace(each.cost, score=score)) for each in before[:2]]
     [change] = watched(driven(*before, *after)).changes
     assert change.looks_like == ('its focal length were 0.8 to 2.6 % too short',
                                  'its distortion were another')
@@ -97,7 +100,7 @@ def test_a_turn_that_the_calibration_explains_shows_that_it_changed(readings):
         [change] = watched(driven(readings['same'][0], *readings[name]), None).changes
         assert change.since == TurnId.at(1)
         # not one that any camera would explain
-        nothing = replace(readings['same'][0], hessian=np.zeros((6, 6)), score=np.zeros(6))
+        nothing = replace(readings['same'][0], cost=NOTHING)
         assert watched(driven(nothing, *readings[name]), None).changes == ()
 
 
@@ -116,7 +119,7 @@ def test_turns_of_this_drive_that_know_the_lens_confirm_the_camera_in_use(readin
     # not those of earlier drives, nor one that any camera would explain
     assert not watched([replace(each, turn=TurnId.stored(n)) for n, each in
                         enumerate(turns)]).agrees
-    assert not watched([replace(turns[0], hessian=np.zeros((6, 6)), score=np.zeros(6))]).agrees
+    assert not watched([replace(turns[0], cost=NOTHING)]).agrees
 
 
 def test_one_odd_turn_is_no_change(readings):
@@ -132,8 +135,7 @@ def test_a_change_is_taken_back_only_when_two_turns_speak_against_it(readings):
 
 def unexplained(reading):
     """As a turn in the middle of which images were lost."""
-    return replace(reading, hessian=np.zeros((6, 6)), score=np.zeros(6), explained=False,
-                   misfit=3.2)
+    return replace(reading, cost=NOTHING, explained=False, misfit=3.2)
 
 
 def test_a_chain_that_breaks_where_images_are_lost_is_no_other_camera(monkeypatch):
@@ -174,7 +176,7 @@ def test_another_camera_is_told_although_no_size_can_be(readings):
 
 
 def test_turns_that_know_nothing_say_nothing(readings):
-    nothing = replace(readings['same'][0], hessian=np.zeros((6, 6)), score=np.zeros(6))
+    nothing = replace(readings['same'][0], cost=NOTHING)
     assert watched(driven(*[nothing] * 5)).changes == ()
 
 
@@ -187,8 +189,7 @@ def test_turns_that_the_camera_does_not_explain_do_not_show_where_it_points(read
 
 
 def looking(yaw_deg, pitch_deg, number, sigma_deg=0.1):
-    return Reading(TurnId.at(number), np.zeros((6, 6)), np.zeros(6),
-                   Heading(yaw_deg, pitch_deg, sigma_deg, sigma_deg))
+    return Reading(TurnId.at(number), NOTHING, Heading(yaw_deg, pitch_deg, sigma_deg, sigma_deg))
 
 
 def test_a_camera_that_is_moved_on_the_car_is_told_and_its_calibration_stays():

@@ -9,9 +9,6 @@ from solving import CONFIG, scenes_of, solved
 
 from dashcalib_ros.judge.next_turn import next_turn, with_right_angles
 from dashcalib_ros.judge.verdict import judge
-from dashcalib_ros.solve.information import step_to_wider_model
-from dashcalib_ros.solve.picture import picture_covariance
-from dashcalib_ros.solve.prior import extra_sigma_of
 from dashcalib_ros.solve.solution import Solution
 
 NEEDS_MORE = CONFIG.replace({'verdict.min_turns': 9}).verdict
@@ -24,12 +21,9 @@ def four():
 
 def first(solution: Solution, count: int) -> Solution:
     """Return the solution as if only the first turns had been there."""
-    parts = solution.parts[:count]
-    step = step_to_wider_model(parts, solution.prior_information, extra_sigma_of(solution.camera))
-    found = picture_covariance(solution.camera, parts, solution.prior_information, solution.floor,
-                               step, solution.systematic)[:6, :6]
-    return dataclasses.replace(solution, scenes=solution.scenes[:count], parts=parts,
-                               covariance=found)
+    known = dataclasses.replace(solution.known.of(range(count)), one_turn_sigma=0.0)
+    return dataclasses.replace(solution, scenes=solution.scenes[:count], known=known,
+                               covariance=known.covariance[:6, :6])
 
 
 @pytest.mark.parametrize(('count', 'more'), [(1, 2), (2, 1), (3, 1)])
@@ -45,8 +39,10 @@ def test_a_single_turn_is_told_what_two_more_bring(four):
 
 
 def test_where_nothing_is_known_nothing_is_told(four):
-    blind = dataclasses.replace(four, parts=tuple(dataclasses.replace(
-        part, hessian=1e-9 * part.hessian, by_track=1e-9 * part.by_track) for part in four.parts))
+    turns = tuple(dataclasses.replace(
+        turn, hessian=1e-9 * turn.hessian, by_track=1e-9 * turn.by_track)
+        for turn in four.known.turns)
+    blind = dataclasses.replace(four, known=dataclasses.replace(four.known, turns=turns))
     assert next_turn(blind) == ''
 
 

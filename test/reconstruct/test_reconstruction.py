@@ -14,7 +14,7 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
 from dashcalib_ros.reconstruct import adjust, build
-from dashcalib_ros.reconstruct.adjust import Solver, adjust_step1, adjust_step2
+from dashcalib_ros.reconstruct.adjust import Solver
 from dashcalib_ros.reconstruct.chain import chain
 from dashcalib_ros.reconstruct.poses import absolute_pose, relative_pose
 from dashcalib_ros.reconstruct.register import register_tracks
@@ -51,9 +51,18 @@ def chained(turn: SyntheticTurn, camera: Camera) -> Scene:
     return Scene(TurnId.at(0), turn.tracks, structure, camera, NO_PROFILE)
 
 
+def one_focal_length(scenes, camera, solver, reach) -> tuple[list[Scene], Camera]:
+    free = 'first distortion' if reach is None else 'one focal length'
+    return adjust.adjust(scenes, camera, solver, free, reach)
+
+
+def everything(scenes, camera, solver, prior, bounds) -> tuple[list[Scene], Camera]:
+    return adjust.adjust(scenes, camera, solver, 'everything', prior=prior, bounds=bounds)
+
+
 def refined(scene: Scene, reach: tuple[float, float] | None, rounds: int = 2) -> Scene:
     for _ in range(rounds):
-        [scene], camera = adjust_step1([scene], scene.camera, Solver(0.5, 20), reach)
+        [scene], camera = one_focal_length([scene], scene.camera, Solver(0.5, 20), reach)
         scene = retriangulated(scene, camera, 2.0, CONFIG.min_angle_deg)
     return scene
 
@@ -253,7 +262,7 @@ def test_the_profile_finds_a_barrel_lens(turn):
 
 # adjust
 
-def test_step1_recovers_the_focal_length_and_the_distortion(turn):
+def test_one_focal_length_recovers_the_focal_length_and_the_distortion(turn):
     start = Radial.centred(SIZE, 1.1 * LENS.fx, -0.2)
     scene = refined(chained(turn, start), (300.0, 900.0), rounds=4)
     camera = scene.camera
@@ -270,24 +279,24 @@ def test_step1_recovers_the_focal_length_and_the_distortion(turn):
     assert angle_deg(relative, true) < 1.0
 
 
-def test_step1_holds_the_focal_length_or_keeps_it_in_range(turn):
+def test_the_focal_length_is_fixed_or_stays_in_range(turn):
     scene = turn.scene(scaled(LENS, 1.1))
-    [held], camera = adjust_step1([scene], scene.camera, Solver(0.5, 10), None)
+    [held], camera = adjust.adjust([scene], scene.camera, Solver(0.5, 10), 'first distortion')
     assert camera.fx == scene.camera.fx and camera.k1 != scene.camera.k1
     assert (held.structure.points != scene.structure.points).any()
-    _, camera = adjust_step1([scene], scene.camera, Solver(0.5, 30), (560.0, 900.0))
+    _, camera = one_focal_length([scene], scene.camera, Solver(0.5, 30), (560.0, 900.0))
     assert camera.fx == pytest.approx(560.0, abs=0.5)
-    _, camera = adjust_step1([scene], scaled(LENS, 3), Solver(0.5, 1), (560.0, 900.0))
+    _, camera = one_focal_length([scene], scaled(LENS, 3), Solver(0.5, 1), (560.0, 900.0))
     assert 560.0 <= camera.fx <= 900.0
 
 
-def test_step2_recovers_all_six(turn):
+def test_everything_recovers_all_six(turn):
     other = synthetic_turn(yaw_deg=-75.0, world=1)
     start = Radial.centred(SIZE, 1.03 * LENS.fx, -0.25)
     scenes = [turn.scene(start), other.scene(start, 1)]
     camera = start
     for _ in range(4):
-        scenes, camera = adjust_step2(scenes, camera, Solver(0.5, 30), NO_PRIOR, FREE)
+        scenes, camera = everything(scenes, camera, Solver(0.5, 30), NO_PRIOR, FREE)
         scenes = [retriangulated(scene, camera, 2.0, 1.0) for scene in scenes]
     np.testing.assert_allclose(camera.params[:4], LENS.params[:4], atol=3.0)
     np.testing.assert_allclose(camera.params[4:], LENS.params[4:], atol=0.006)
@@ -298,16 +307,16 @@ def test_step2_recovers_all_six(turn):
         assert scene.tracks is truth.tracks
 
 
-def test_step2_stays_within_its_bounds_and_believes_its_prior(turn):
+def test_everything_stays_within_its_bounds_and_believes_its_prior(turn):
     scene = turn.scene(LENS)
     low, high = FREE[0].copy(), FREE[1].copy()
     low[2], high[4] = 411.0, -0.30
-    _, camera = adjust_step2([scene], LENS, Solver(0.5, 30), NO_PRIOR, (low, high))
+    _, camera = everything([scene], LENS, Solver(0.5, 30), NO_PRIOR, (low, high))
     assert camera.cx == pytest.approx(411.0, abs=0.05)
     assert camera.k1 == pytest.approx(-0.30, abs=1e-3)
     wish = LENS.params + [30, -20, 5, 5, 0.05, -0.05]
     strict = Prior(wish, np.diag([1e-6, 1e-6, 1e-6, 1e-6, 1e-12, 1e-12]))
-    _, camera = adjust_step2([scene], LENS, Solver(0.5, 30), strict, FREE)
+    _, camera = everything([scene], LENS, Solver(0.5, 30), strict, FREE)
     np.testing.assert_allclose(camera.params, wish, atol=0.05)
 
 
@@ -316,14 +325,14 @@ def test_scenes_without_any_point_are_no_crash(turn):
     empty = replace(scene, structure=replace(
         scene.structure, used=np.zeros_like(scene.structure.used)))
     for scenes in ([empty], [empty, empty]):
-        again, camera = adjust_step1(scenes, LENS, Solver(), (300.0, 900.0))
+        again, camera = one_focal_length(scenes, LENS, Solver(), (300.0, 900.0))
         assert camera == LENS and len(again) == len(scenes)
-        again, camera = adjust_step2(scenes, LENS, Solver(), NO_PRIOR, FREE)
+        again, camera = everything(scenes, LENS, Solver(), NO_PRIOR, FREE)
         assert camera == LENS and len(again) == len(scenes)
     assert truncated_cost(empty, LENS, 2.0) == pytest.approx(4.0)
     # beside one that has some, nothing is mixed up
-    [untouched, moved], camera = adjust_step1([empty, scene], LENS, Solver(), (300.0, 900.0))
-    [alone], expected = adjust_step1([scene], LENS, Solver(), (300.0, 900.0))
+    [untouched, moved], camera = one_focal_length([empty, scene], LENS, Solver(), (300.0, 900.0))
+    [alone], expected = one_focal_length([scene], LENS, Solver(), (300.0, 900.0))
     assert camera.fx == pytest.approx(expected.fx, rel=1e-6)
     np.testing.assert_allclose(
         moved.structure.points, alone.structure.points, rtol=1e-3, atol=1e-3)
@@ -332,7 +341,7 @@ def test_scenes_without_any_point_are_no_crash(turn):
                       structure=replace(scene.structure, points=np.zeros((0, 3)),
                                         used=np.zeros((20, 0), bool)))
     assert truncated_cost(nothing, LENS, 2.0) == 0.0
-    assert adjust_step1([nothing], LENS, Solver(), None)[1] == LENS
+    assert adjust.adjust([nothing], LENS, Solver(), 'first distortion')[1] == LENS
 
 
 # against COLMAP's own synthetic scenes
@@ -377,7 +386,7 @@ def test_pixels_are_colmaps_minus_a_half(colmap_scene):
 
 def test_colmap_is_given_its_own_pixels(colmap_scene):
     camera = colmap_scene.camera
-    reconstruction = adjust._reconstruction([colmap_scene], camera, camera.step2)
+    reconstruction = adjust._reconstruction([colmap_scene], camera, camera.colmap)
     first = reconstruction.image(1).points2D[0].xy
     t = int(np.flatnonzero(colmap_scene.structure.used[0])[0])
     np.testing.assert_allclose(first, colmap_scene.tracks.xy[0, t] + 0.5)
@@ -390,13 +399,13 @@ def test_the_principal_point_comes_back_in_our_pixels(colmap_scene):
     start = replace(colmap_scene.camera, fx=F * 1.01, fy=F * 0.99, cx=CX + 6, cy=CY - 6, k1=-0.1)
     prior = Prior(start.params, np.diag([1e12, 1e12, 1e12, 1e12, 1e6, 1e6]))
     bounds = (start.params - 100, start.params + 100)
-    _, camera = adjust_step2([colmap_scene], start, Solver(1.0, 100, 1e-14), prior, bounds)
+    _, camera = everything([colmap_scene], start, Solver(1.0, 100, 1e-14), prior, bounds)
     np.testing.assert_allclose(camera.params[:4], [F, F, CX - 0.5, CY - 0.5], atol=1e-3)
     np.testing.assert_allclose(camera.params[4:], [K1, K2], atol=1e-5)
 
 
-def test_step1_at_the_truth_stays_there(colmap_scene):
-    [scene], camera = adjust_step1(
+def test_one_focal_length_at_the_truth_stays_there(colmap_scene):
+    [scene], camera = one_focal_length(
         [colmap_scene], colmap_scene.camera, Solver(1.0, 20, 1e-12), (500.0, 1500.0))
     np.testing.assert_allclose(camera.params, colmap_scene.camera.params, atol=1e-6)
     np.testing.assert_allclose(

@@ -15,8 +15,8 @@ from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report import load_camera, result_dict
 from dashcalib_ros.report.export import exported
-from dashcalib_ros.solve.opinions import HeldOut
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.cross_validation import LeftOut
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 
 @pytest.fixture(params=EACH_MODEL)
@@ -112,7 +112,7 @@ def test_it_is_read_back(calibration, tmp_path):
         calibration, mask=None, stored_turns=(stored,), details={'correlation': correlation},
         rolling_shutter=Shutter(21.0, 0.3), stabiliser=Stabiliser(30.0), warnings=('dark',),
         sigma_px=PictureSigma(0.5, 1.5), straight_lines=Bend(9, 3, 0.2, 0.01, 0.02, None, 0.5),
-        held_out=(HeldOut(TurnId.at(88), 0.5, 0.7, 0.8), HeldOut(TurnId.stored(1), 1.0, 2.0, 3.0)))
+        held_out=(LeftOut(TurnId.at(88), 0.5, 0.7, 0.8), LeftOut(TurnId.stored(1), 1.0, 2.0, 3.0)))
     full.save(tmp_path)
     for path in (tmp_path, tmp_path / 'result.json'):
         read = Calibration.load(path)

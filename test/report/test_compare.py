@@ -24,7 +24,7 @@ from dashcalib_ros.report import (
     result_json,
 )
 from dashcalib_ros.report.difference_page import difference_html
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 SIZE = (1242, 375)
 REFERENCE = NamedCamera('truth', TRUTH)

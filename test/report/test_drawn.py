@@ -231,7 +231,7 @@ def test_the_line_for_colmap_is_colmap_s(model, tmp_path):
                            pycolmap.CameraMode.SINGLE, options=reader)
     with pycolmap.Database.open(tmp_path / 'database.db') as database:
         [found] = database.read_all_cameras()
-    assert found.model.name == camera.step2.name
+    assert found.model.name == camera.colmap.name
     ray = np.array([0.2, -0.1, 1.0])
     np.testing.assert_allclose(found.img_from_cam(ray) - 0.5, camera.project(ray), atol=1e-3)
 

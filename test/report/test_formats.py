@@ -163,8 +163,8 @@ def test_a_model_that_colmap_wrote(tmp_path):
     model = pycolmap.Reconstruction()
     for number, lens in enumerate((BROWN, FISHEYE), 1):
         model.add_camera(pycolmap.Camera(
-            camera_id=number, model=lens.step2.name, width=SIZE[0], height=SIZE[1],
-            params=lens.step2.values(lens.params)))
+            camera_id=number, model=lens.colmap.name, width=SIZE[0], height=SIZE[1],
+            params=lens.colmap.values(lens.params)))
     for name, write in (('text', model.write_text), ('binary', model.write_binary)):
         folder = tmp_path / name
         folder.mkdir()

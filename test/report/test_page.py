@@ -18,7 +18,7 @@ from dashcalib_ros.report import report_html
 from dashcalib_ros.report.charts import log_ticks, ticks
 from dashcalib_ros.report.figures import magnitude_svg, mask_data_uri
 from dashcalib_ros.report.tables import summary
-from dashcalib_ros.solve.picture import PictureSigma
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 
 def terminal(renderable, **options):

@@ -30,14 +30,14 @@ from dashcalib_ros.ros import learner, node
 from dashcalib_ros.ros.messages import camera_info
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.stream import LASTING
+from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.status import Status
 
 TOPIC = '/camera_info'
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
-ZERO = np.zeros(6)
 # of a turn that knows each parameter to 0.1
-KNOWS = 100 * np.eye(6)
+KNOWS = Quadratic.prior(100 * np.eye(6))
 
 
 @stands_in_for(Calibrator)
@@ -72,7 +72,7 @@ class Core:
         return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
 
     def watch(self, camera, sigma=None):
-        return watch((Reading(turn, KNOWS, ZERO, None, turn not in self.strangers)
+        return watch((Reading(turn, KNOWS, None, turn not in self.strangers)
                       for turn in self.ready), camera, sigma, Config().monitor)
 
     def forget_stored(self, but=frozenset()):

@@ -23,13 +23,14 @@ from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros import learner as room
 from dashcalib_ros.ros.learner import Learner
 from dashcalib_ros.ros.news import Listener
+from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.status import Status, View
 
 LIMIT = 20.0
 CONFIG = Config().replace({'turns.wanted': 2})
 CAMERA = NamedCamera('in use', Radial((64, 48), 60.0, 60.0, 31.5, 23.5, -0.1, 0.01),
                      dict.fromkeys(('fx', 'fy', 'cx', 'cy', 'k1', 'k2'), 0.1))
-ZERO = np.zeros((6, 6))
+ZERO = Quadratic.prior(np.zeros((6, 6)))
 
 
 @stands_in_for(Calibrator)
@@ -83,7 +84,7 @@ class Core:
         self.watched.append((camera, self.ready))
         if Core.failures:
             raise Core.failures.pop()
-        return watch((Reading(turn, ZERO, ZERO[0], None, explained=turn not in self.strangers)
+        return watch((Reading(turn, ZERO, None, explained=turn not in self.strangers)
                       for turn in self.ready), camera, sigma, CONFIG.monitor)
 
     def check(self, given, calibration, progress=None):

@@ -5,16 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solving import CONFIG, EXTRA, NOTHING, scenes_of, solved
+from solving import CONFIG, scenes_of, solved
 from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Profile, Start
-from dashcalib_ros.solve.choice import Candidate, gain_of_wider_model, is_clear
-from dashcalib_ros.solve.information import Pooled, information
-from dashcalib_ros.solve.picture import scatter_between_turns
+from dashcalib_ros.solve.knowledge import Knowledge, is_clear, scatter_between_turns
+from dashcalib_ros.solve.normal import turn_cost
+from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.solve.solution import Candidate
 
 WIDE = Fisheye(SIZE, 300.0, 300.6, 404.0, 221.0, 0.02, -0.008, 0.003, -0.0005)
 DECENTRED = Brown(SIZE, *LENS.params, 0.003, -0.003, 0.0)
@@ -140,18 +141,18 @@ def test_a_pinhole_that_all_turns_were_taken_for_a_fisheye_is_one():
 def test_the_wider_model_gains_only_where_the_lens_needs_it():
     def gains(extra):
         found = solved(scenes_of(4, extra=extra), CONFIG.replace({'model': 'radial'}))
-        return gain_of_wider_model(
-            [information(scene, found.camera, 1.0) for scene in found.scenes],
-            NOTHING + 1e-9 * np.eye(6), EXTRA)
+        turns = tuple(turn_cost(scene, found.camera, 1.0) for scene in found.scenes)
+        prior = Quadratic.prior(1e-9 * np.eye(6))
+        return Knowledge(found.camera, turns, prior, np.zeros(6)).gains_of_wider_model
     assert gains((0.0, 0.0, 0.0)).sum() < 10
-    assert is_clear(gains((0.002, -0.002, 0.0)), 30)
+    assert is_clear(gains((0.002, -0.002, 0.0)))
 
 
 def test_what_one_turn_alone_says_is_not_clear():
-    assert is_clear(np.array([20.0, 15.0, 18.0]), 30)
-    assert not is_clear(np.array([90.0, -3.0, -2.0]), 30)
-    assert not is_clear(np.array([90.0, 2.0, -1.0, -2.0]), 30)
-    assert not is_clear(np.array([5.0, 4.0, 6.0]), 30)
+    assert is_clear(np.array([20.0, 15.0, 18.0]))
+    assert not is_clear(np.array([90.0, -3.0, -2.0]))
+    assert not is_clear(np.array([90.0, 2.0, -1.0, -2.0]))
+    assert not is_clear(np.array([5.0, 4.0, 6.0]))
 
 
 def test_turns_that_agree_scatter_as_their_noise():
@@ -163,10 +164,10 @@ def test_turns_that_agree_scatter_as_their_noise():
     whole = np.linalg.cholesky(inverse)
     scores = np.array([rng.multivariate_normal(np.zeros(size), h - h @ inverse @ h)
                        for h in hessians])
-    nothing = np.zeros((size, size)), np.zeros(size)
     for times in (1, 3):
-        together = Pooled(hessians, times * scores, inverse, *nothing)
-        assert scatter_between_turns(together, whole) == pytest.approx(times**2, rel=0.15)
+        turns = [Quadratic(hessian, times * score, np.zeros((size, size)))
+                 for hessian, score in zip(hessians, scores, strict=True)]
+        assert scatter_between_turns(turns, inverse, whole) == pytest.approx(times**2, rel=0.15)
 
 
 @pytest.mark.parametrize('seed', range(4))

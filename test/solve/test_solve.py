@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solving import CONFIG, EXTRA, NOTHING, START, adjusted, scenes_of, solved, z_of
+from solving import CONFIG, NOTHING, START, adjusted, scenes_of, solved, z_of
 from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
 from dashcalib_ros import stages
@@ -23,7 +23,7 @@ from dashcalib_ros.judge.agreement import (
 from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import judge, profile_contrast
 from dashcalib_ros.reconstruct import adjust
-from dashcalib_ros.reconstruct.adjust import Solver, adjust_step1, adjust_step2
+from dashcalib_ros.reconstruct.adjust import Solver
 from dashcalib_ros.reconstruct.scene import (
     Profile,
     Scene,
@@ -32,18 +32,12 @@ from dashcalib_ros.reconstruct.scene import (
     truncated_cost,
 )
 from dashcalib_ros.solve import fitting, focal, steps
+from dashcalib_ros.solve.fitting import misfits
 from dashcalib_ros.solve.focal import summed
-from dashcalib_ros.solve.information import (
-    Information,
-    Pooled,
-    information,
-    noise_in,
-    noise_of,
-    step_to_wider_model,
-)
 from dashcalib_ros.solve.joint import solve
-from dashcalib_ros.solve.misfit import misfits
-from dashcalib_ros.solve.picture import picture_covariance, scatter_between_turns
+from dashcalib_ros.solve.knowledge import Knowledge, scatter_between_turns
+from dashcalib_ros.solve.normal import noise_in, turn_cost
+from dashcalib_ros.solve.quadratic import Quadratic, TurnCost, noise_of
 from dashcalib_ros.solve.solution import Solution
 
 at, stored = TurnId.at, TurnId.stored
@@ -66,11 +60,11 @@ def good() -> Solution:
 def test_step_2_ends_where_a_round_would_change_little(monkeypatch, no_profile, settled, rounds):
     calls = []
 
-    def counted(*arguments):
-        calls.append(arguments)
-        return adjust_step2(*arguments)
+    def counted(*arguments, **limits):
+        calls.extend(arguments[3:] if limits else ())
+        return adjust.adjust(*arguments, **limits)
 
-    monkeypatch.setattr(steps, 'adjust_step2', counted)
+    monkeypatch.setattr(steps, 'adjust', counted)
     solution = solved(scenes_of(2, outliers=0.03, tracks=100), CONFIG.replace(
         {'intrinsics.rounds': 3, 'intrinsics.settled': settled}))
     # one more with a part of the tracks, where a rolling shutter is looked for
@@ -86,7 +80,7 @@ def test_three_turns_give_all_six_within_three_sigma(good):
     assert np.abs(good.camera.params[4:] - LENS.params[4:]).max() < 0.01
     assert 0.25 < good.reprojection_error_px < 0.5
     assert [scene.turn for scene in good.scenes] == [at(0), at(1), at(2)]
-    assert good.step1.fx == good.step1.fy and good.step1.cx == (SIZE[0] - 1) / 2
+    assert good.centred.fx == good.centred.fy and good.centred.cx == (SIZE[0] - 1) / 2
     ratio = LENS.fx / SIZE[0]
     assert good.coarse.best == pytest.approx(ratio, rel=0.1)
     assert np.argmin(good.around.costs) not in (0, len(good.around.costs) - 1)
@@ -143,15 +137,16 @@ def test_the_scatter_between_turns_holds_95_percent(shares, effect):
         inverse = np.linalg.inv(hessians.sum(axis=0))
         estimate = inverse @ np.einsum('nij,nj->i', hessians, own)
         scores = np.einsum('nij,nj->ni', hessians, own - estimate)
-        together = Pooled(hessians, scores, inverse, np.zeros((6, 6)), np.zeros(6))
-        scatter = scatter_between_turns(together, np.linalg.cholesky(inverse))
+        turns = [Quadratic(*each, np.zeros((6, 6)))
+                 for each in zip(hessians, scores, strict=True)]
+        scatter = scatter_between_turns(turns, inverse, np.linalg.cholesky(inverse))
         held.append(np.abs(estimate) < 2 * np.sqrt(scatter * np.diag(inverse)))
     assert 0.88 <= np.mean(held) <= 0.995
 
 
 def test_the_noise_alone_is_that_of_the_information():
     scenes, camera = adjusted(scenes_of(2, tracks=60), 0.5)
-    parts = [information(scene, camera, 0.5) for scene in scenes]
+    parts = [turn_cost(scene, camera, 0.5) for scene in scenes]
     assert noise_in(scenes, camera, 0.5) == pytest.approx(noise_of(parts))
 
 
@@ -253,7 +248,7 @@ def numeric(scene: Scene, loss_px: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize('loss_px', [0.5, 50.0])
 def test_information_agrees_with_differences(loss_px):
     scene = small_scene()
-    part = information(scene, LENS, loss_px)
+    part = turn_cost(scene, LENS, loss_px)
     hessian, score = numeric(scene, loss_px)
     scale = 1 / np.sqrt(np.diag(hessian))
     np.testing.assert_allclose(part.hessian * np.outer(scale, scale),
@@ -262,15 +257,12 @@ def test_information_agrees_with_differences(loss_px):
     assert np.abs(score * scale).max() > 0.1
 
 
-
-
-
 def test_the_score_is_nothing_at_the_optimum():
     scenes = scenes_of(2, start=LENS, tracks=120)
     loss = 0.5
-    before = [information(scene, LENS, loss) for scene in scenes]
+    before = [turn_cost(scene, LENS, loss) for scene in scenes]
     scenes, camera = adjusted(scenes, loss, 3)
-    parts = [information(scene, camera, loss) for scene in scenes]
+    parts = [turn_cost(scene, camera, loss) for scene in scenes]
     noise = noise_of(parts)
     together = sum(part.hessian for part in parts)
     pull = sum(part.score for part in parts) / np.sqrt(np.diag(together) * noise)
@@ -284,7 +276,7 @@ def test_the_score_is_nothing_at_the_optimum():
 
 def test_the_variance_of_the_noise_is_found():
     scenes, camera = adjusted(scenes_of(2, start=LENS, noise_px=0.3), 100.0)
-    assert noise_of([information(scene, camera, 100.0) for scene in scenes]) == pytest.approx(
+    assert noise_of([turn_cost(scene, camera, 100.0) for scene in scenes]) == pytest.approx(
         0.09, rel=0.08)
 
 
@@ -292,8 +284,8 @@ def test_information_agrees_with_colmaps_covariance():
     import pycolmap
     loss = 100.0
     [scene], camera = adjusted(scenes_of(1, start=LENS), loss)
-    part = information(scene, camera, loss)
-    reconstruction = adjust._reconstruction([scene], camera, camera.step2)
+    part = turn_cost(scene, camera, loss)
+    reconstruction = adjust._reconstruction([scene], camera, camera.colmap)
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
@@ -311,22 +303,22 @@ def test_information_agrees_with_colmaps_covariance():
                                atol=0.01)
 
 
-NONE = np.zeros(0)
+def knowledge(parts, prior=NOTHING, camera=LENS) -> Knowledge:
+    return Knowledge(camera, tuple(parts), Quadratic.prior(prior), np.zeros(6))
 
 
 def sigmas(parts, prior):
-    step = step_to_wider_model(parts, prior, EXTRA)
-    return np.sqrt(np.diag(picture_covariance(LENS, parts, prior, np.zeros(6), step)))[:6]
+    return np.sqrt(np.diag(knowledge(parts, prior).covariance))[:6]
 
 
 def test_the_largest_of_the_estimates_counts():
     eye = np.eye(9)
     hessian = 1e4 * eye
 
-    def part(score: float, by_track: float = 1e4) -> Information:
-        return Information(hessian, np.full(9, score), by_track * eye, 100.0, 100.0, 9, NONE, NONE)
+    def part(score: float, by_track: float = 1e4) -> TurnCost:
+        return TurnCost(hessian, np.full(9, score), by_track * eye, 100.0, 100.0, 9)
 
-    def sigma(*parts: Information) -> np.ndarray:
+    def sigma(*parts: TurnCost) -> np.ndarray:
         return sigmas(parts, NOTHING)
 
     calm = sigma(part(1.0), part(-1.0))
@@ -341,10 +333,8 @@ def test_the_largest_of_the_estimates_counts():
 
 
 def test_a_turn_without_information_adds_no_certainty():
-    nothing = Information(np.zeros((9, 9)), np.zeros(9), np.zeros((9, 9)), 1.0, 1.0, 9, NONE,
-                          NONE)
-    something = Information(1e4 * np.eye(9), np.ones(9), 1e4 * np.eye(9), 100.0, 100.0, 9,
-                            NONE, NONE)
+    nothing = TurnCost(np.zeros((9, 9)), np.zeros(9), np.zeros((9, 9)), 1.0, 1.0, 9)
+    something = TurnCost(1e4 * np.eye(9), np.ones(9), 1e4 * np.eye(9), 100.0, 100.0, 9)
     prior = 1e-2 * np.eye(6)
     alone = sigmas([nothing], prior)
     assert (alone > 9.99).all()
@@ -361,8 +351,8 @@ def test_the_models_error_shows_in_sigma():
         scenes, camera = adjusted(scenes, 0.5, 2)
         scenes = [retriangulated(scene, camera, 2.0, 1.0) for scene in scenes]
         scenes, camera = adjusted(scenes, 0.5)
-        parts = [information(scene, camera, 0.5) for scene in scenes]
-        found = step_to_wider_model(parts, NOTHING, EXTRA)
+        parts = [turn_cost(scene, camera, 0.5) for scene in scenes]
+        found = knowledge(parts, camera=camera).step_to_wider_model
         errors[name] = np.abs(found[:6])
         # as they are, though only one step away
         np.testing.assert_allclose(found[6:8], extra[:2], rtol=0.25, atol=4e-4)
@@ -388,7 +378,7 @@ def test_a_good_solution_is_accepted_without_reasons(good):
 
 
 def test_one_turn_is_weak(good):
-    level, reasons = levels(replace(good, scenes=good.scenes[:1], parts=good.parts[:1]))
+    level, reasons = levels(replace(good, scenes=good.scenes[:1], known=good.known.of([0])))
     assert level == 'weak' and 'only 1 of at least 2 turns' in reasons
 
 
@@ -467,9 +457,9 @@ def test_sigma_too_large(good, relative, level):
 @pytest.mark.parametrize('others, level', [(0.5, 'accepted'), (0.01, 'weak')])
 def test_where_one_turn_knows_all_the_others_confirm_nothing(good, others, level):
     """A sharp turn and gentle bends: what the bends say moves nothing, so nothing scatters."""
-    parts = tuple(replace(part, hessian=part.hessian * (others if n else 1.0))
-                  for n, part in enumerate(good.parts))
-    solution = replace(good, parts=parts)
+    turns = tuple(replace(turn, hessian=turn.hessian * (others if n else 1.0))
+                  for n, turn in enumerate(good.known.turns))
+    solution = replace(good, known=replace(good.known, turns=turns))
     shares = leverages(solution)
     assert sum(shares.values()) == pytest.approx(1.0)
     found, reasons = levels(solution)
@@ -479,14 +469,14 @@ def test_where_one_turn_knows_all_the_others_confirm_nothing(good, others, level
 
 
 def test_turns_that_disagree_are_weak(good):
-    parts = [replace(part, score=part.score + part.hessian @ np.array(
+    turns = tuple(replace(turn, score=turn.score + turn.hessian @ np.array(
         [side * 0.08 * LENS.fx, side * 0.08 * LENS.fx, *np.zeros(7)]))
-        for part, side in zip(good.parts, (1, -1, 0), strict=True)]
-    solution = replace(good, parts=tuple(parts))
+        for turn, side in zip(good.known.turns, (1, -1, 0), strict=True))
+    solution = replace(good, known=replace(good.known, turns=turns))
     assert focal_disagreement(good) < 0.01 < 0.03 < focal_disagreement(solution)
     level, reasons = levels(solution)
     assert level == 'weak' and 'disagree about the focal length' in reasons
-    assert focal_disagreement(replace(good, parts=good.parts[:1])) == 0.0
+    assert focal_disagreement(replace(good, known=good.known.of([0]))) == 0.0
 
 
 @pytest.mark.parametrize('name', ['fx', 'cy', 'k2'])
@@ -522,7 +512,8 @@ def built(scene: Scene, rounds: int = 3) -> Scene:
     """Return the scene as finish_scene() leaves it: with a focal length and k1, k2 of its own."""
     reach = (scene.camera.fx / 1.3, scene.camera.fx * 1.3)
     for _ in range(rounds):
-        [scene], camera = adjust_step1([scene], scene.camera, Solver(0.5), reach)
+        [scene], camera = adjust.adjust(
+            [scene], scene.camera, Solver(0.5), 'one focal length', reach)
         scene = retriangulated(scene, camera, 2.0, 0.3)
     return scene
 
@@ -637,7 +628,8 @@ def test_a_refused_solution_gives_no_numbers(good):
 def test_a_lens_that_the_six_do_not_describe_is_told_of(good, monkeypatch):
     assert not conclude(good, evidence_for(good), CONFIG).warnings
     step = np.array([0.3, -2.0, 0.02 * SIZE[0], -4.0, 0.0, 0.0, 0.0012, -0.001, 0.02])
-    monkeypatch.setattr(Solution, 'step_to_wider_model', step)
+    monkeypatch.setattr(Knowledge, 'step_to_wider_model', step)
+    good = replace(good, known=replace(good.known))
     calibration = conclude(good, evidence_for(good, Scale(shrink=2)), CONFIG)
     [warning] = calibration.warnings
     assert 'p1 +0.0012, p2 -0.0010, k3 +0.0200' in warning

@@ -9,7 +9,7 @@ from solving import CONFIG, scenes_of, solved
 from synthetic import LENS
 
 from dashcalib_ros.camera.mapping import mapping_error
-from dashcalib_ros.solve.opinions import LEAST_TURNS, held_out
+from dashcalib_ros.solve.cross_validation import LEAST_TURNS, cross_validation
 
 
 @pytest.fixture(scope='module')
@@ -17,8 +17,8 @@ def solution():
     return solved(scenes_of(4))
 
 
-def test_turns_of_one_camera_foretell_each_other(solution):
-    found = held_out(solution)
+def test_turns_of_one_camera_predict_each_other(solution):
+    found = cross_validation(solution)
     assert [each.turn for each in found] == [scene.turn for scene in solution.scenes]
     for each in found:
         assert 0 < each.px <= each.sigma_px + each.others_sigma_px
@@ -33,7 +33,7 @@ def test_a_turn_of_another_lens_stands_out():
     lens = replace(LENS, fx=1.02 * LENS.fx, fy=1.02 * LENS.fy)
     scenes = [*scenes_of(3), scenes_of(4, lens)[3]]
     # a loss that does not outvote it
-    found = held_out(solved(scenes, CONFIG.replace({'intrinsics.loss': 50.0})))
+    found = cross_validation(solved(scenes, CONFIG.replace({'intrinsics.loss': 50.0})))
     worst = max(found, key=lambda each: each.px)
     assert worst.turn == scenes[3].turn
     assert worst.px == pytest.approx(mapping_error(lens, LENS), rel=0.3)
@@ -41,5 +41,5 @@ def test_a_turn_of_another_lens_stands_out():
 
 def test_two_turns_are_too_few(solution):
     assert LEAST_TURNS == 3
-    two = replace(solution, scenes=solution.scenes[:2], parts=solution.parts[:2])
-    assert held_out(two) == ()
+    two = replace(solution, scenes=solution.scenes[:2], known=solution.known.of(range(2)))
+    assert cross_validation(two) == ()

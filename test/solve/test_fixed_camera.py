@@ -15,7 +15,7 @@ from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve import focal
-from dashcalib_ros.solve.departures import departures
+from dashcalib_ros.solve.fixed_camera import fixed_camera_tests
 from dashcalib_ros.solve.normal import normal_equations
 from dashcalib_ros.solve.stabiliser import without_crops
 
@@ -60,21 +60,21 @@ def bent(scene: Scene, most_px: float) -> np.ndarray:
 
 def test_a_fixed_camera_departs_in_nothing():
     solution = solved(scenes_of(4))
-    assert {each.kind for each in solution.departures} == {'shift', 'zoom', 'bend'}
-    assert all(0.3 < each.strength < 1.7 and not each.clear for each in solution.departures)
+    assert {each.kind for each in solution.fixed_camera} == {'shift', 'zoom', 'bend'}
+    assert all(0.3 < each.strength < 1.7 and not each.clear for each in solution.fixed_camera)
     assert not solution.crops
 
 
 def test_a_stabilised_video_is_found_and_taken_out():
     scenes = moved(scenes_of(4, tracks=200, keyframes=16, noise_px=0.15), stabilised)
     kept, found = solved(scenes, KEPT), solved(scenes)
-    strongest = kept.departures[0]
+    strongest = kept.fixed_camera[0]
     assert strongest.kind == 'shift' and strongest.clear
     [reason] = [text for text in judge(kept, CONFIG.verdict).reasons if 'stabil' in text]
     assert 'switch the stabiliser off' in reason
     wrong, left = (mapping_error(each.camera, LENS) for each in (kept, found))
     assert wrong > 1.0 and left < 0.4
-    assert not found.departures[0].clear
+    assert not found.fixed_camera[0].clear
     # sigma knows that the crop is uncertain
     assert np.abs(z_of(found)).max() < 3.5
     assert found.sigma[2] > 2.0
@@ -110,11 +110,11 @@ def test_a_zoom_between_turns_is_named(turns):
     scenes = [moved([scene], lambda each: zoomed(each, 1.03))[0] if n in turns else scene
               for n, scene in enumerate(scenes)]
     solution = solved(scenes)
-    assert solution.departures[0].kind == 'zoom' and solution.departures[0].clear
+    assert solution.fixed_camera[0].kind == 'zoom' and solution.fixed_camera[0].clear
     verdict = judge(solution, CONFIG.verdict)
     assert verdict.level == 'weak'
     assert any('zoom changes by about' in reason for reason in verdict.reasons)
-    zooms = solution.departures[0].by_turn
+    zooms = solution.fixed_camera[0].by_turn
     larger = {scene.turn for n, scene in enumerate(scenes) if n in turns}
     assert min(zooms[turn] for turn in larger) > max(
         zoom for turn, zoom in zooms.items() if turn not in larger)
@@ -126,14 +126,14 @@ def test_every_other_picture_zoomed_is_named():
         return odd[:, None, None] * zoomed(scene, 1.02)
 
     solution = solved(moved(scenes_of(4), breathing))
-    assert solution.departures[0].kind == 'zoom'
+    assert solution.fixed_camera[0].kind == 'zoom'
     assert any('from image to image' in reason
                for reason in judge(solution, CONFIG.verdict).reasons)
 
 
 def test_a_windscreen_that_bends_the_picture_is_named():
     solution = solved(moved(scenes_of(4, tracks=260), lambda scene: bent(scene, 4.0)))
-    assert solution.departures[0].kind == 'bend' and solution.departures[0].clear
+    assert solution.fixed_camera[0].kind == 'bend' and solution.fixed_camera[0].clear
     verdict = judge(solution, CONFIG.verdict)
     assert verdict.level != 'accepted' and any('bent' in text for text in verdict.reasons)
 
@@ -142,7 +142,7 @@ def test_what_tracks_share_makes_sigma_larger():
     fixed = solved(scenes_of(3))
     slightly = solved(moved(scenes_of(3), lambda scene: bent(scene, 1.0)))
     assert fixed.field is None and slightly.field.used
-    assert max(each.strength for each in slightly.departures) < 1.5
+    assert max(each.strength for each in slightly.fixed_camera) < 1.5
     assert slightly.picture.rms > 1.1 * fixed.picture.rms
 
 
@@ -150,7 +150,7 @@ def test_points_and_poses_follow_the_camera():
     solution = solved(scenes_of(2))
     [scene, _], camera = solution.scenes, solution.camera
     normal = normal_equations(scene, camera, 0.5)
-    step = np.zeros(normal.lens)
+    step = np.zeros(normal.cost.lens)
     step[0] = 1e-3 * camera.fx
     after = normal.eliminated.moved(scene.structure, step)
     other = camera.with_params(camera.params + step[:6])
@@ -168,7 +168,7 @@ def test_points_and_poses_follow_the_camera():
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
 
 
-def test_departures_of_one_scene_are_finite():
+def test_one_scene_can_be_tested():
     solution = solved(scenes_of(1))
-    found = departures(solution.scenes, solution.camera, START, 0.3, SETTINGS)
+    found = fixed_camera_tests(solution.scenes, solution.camera, START, 0.3, SETTINGS)
     assert all(np.isfinite(each.strength) for each in found)

@@ -1,4 +1,4 @@
-"""What a fixed camera cannot do is estimated: its picture shifts, zooms, or is bent locally.
+"""Tests of a fixed camera: whether the picture shifts, zooms or is bent locally.
 
 Each is a few more parameters of the linearised problem: a shift and a zoom of each image, a smooth
 field of displacements over the picture that all images share. What they gain is compared with what
@@ -27,31 +27,39 @@ from dashcalib_ros.solve.normal import (
     normal_equations,
     used_keyframes,
 )
-from dashcalib_ros.solve.prior import extra_sigma_of, prior_information, prior_of
+from dashcalib_ros.solve.prior import wider_prior
+from dashcalib_ros.solve.quadratic import Quadratic, noise_of
 from dashcalib_ros.solve.shutter import row_shift
 
 Kind = Literal['shift', 'zoom', 'bend']
 
-# columns and rows of the smooth field's supports over the picture
-FIELD = (5, 4)
-# prior sigma of the field at each of them, px
-FIELD_PX = 3.0
+# columns and rows over the picture of places at which a local bend is estimated
+BENDS = (5, 4)
+# prior sigma of the bend at each of them, px
+BEND_PX = 3.0
 # prior sigma of what is left of a rolling shutter's readout, s
 READOUT_S = 3.0
 # prior sigmas of the zoom: of one image, of a stretch, of a turn
 ZOOM_IMAGE, ZOOM_STRETCH, ZOOM_TURN = 0.01, 0.02, 0.03
+# prior sigma of a stabiliser's crop, of the width, and how long it holds it, s
+CROP_SIGMA, CROP_TIME_S = 0.03, 1.0
+# times what chance gains; more is clear. Fixed cameras have 0.9 to 1.3 for the shift, 0.9 to 1.5
+# for the zoom, and kitti03, by its own rectification, 4 for the bend
+CLEAR: Mapping[Kind, float] = {'shift': 2.0, 'zoom': 3.0, 'bend': 8.0}
+# what is left of a rolling shutter comes to 1.3 to 2.4; and after a stabiliser was taken out
+CLEAR_ROLLING_SHIFT, LEFT_SHIFT = 2.7, 4.0
 
 # by turn: (k, 2) shifts of the keyframes' pictures that were taken out of the tracks, px
 Crops = Mapping[TurnId, Floats]
 
 
 @dataclass(frozen=True)
-class Departure:
-    """How a drive departs from a fixed camera.
+class FixedCameraTest:
+    """Whether the camera is fixed, or its picture moves in one way.
 
-    strength: what its parameters gain, over what chance would gain; more than limit is clear.
-    size: the root mean square of the shift or the field, px, or of the zoom. by_turn: the mean
-    zoom of each turn; empty for other kinds.
+    strength: what the parameters of this kind gain, over what chance would gain; more than limit
+    is clear. size: the root mean square of the shift or the field, px, or of the zoom. by_turn:
+    the mean zoom of each turn; empty for other kinds.
     """
 
     kind: Kind
@@ -72,14 +80,13 @@ class Step:
 
     gain: by how much it lowers the cost, at unit noise; chance: how much noise alone would, each
     track counted as one measurement. shared: (s,) of the camera, of the wider model and of what
-    follows it; images: (p,) of each scene's free image parameters. covariance: (s, s) of shared.
+    follows it; images: (p,) of each scene's free image parameters.
     """
 
     gain: float
     chance: float
     shared: Floats
     images: tuple[Floats, ...]
-    covariance: Floats
 
     def strength(self, base: Step) -> float:
         """Return what this step gains over one without its parameters, over what chance would."""
@@ -88,18 +95,16 @@ class Step:
 
 @dataclass(frozen=True)
 class Problem:
-    """The linearised problem of all scenes, about the camera and all that it may depart in.
+    """The linearised problem of all scenes, about the camera and all that may move in its picture.
 
-    prior_pull: (n,) the negative gradient of the camera's prior; prior: (n, n) its information.
-    extra: variances of the shared parameters that follow the camera's own. noise: variance of a
-    residual, px^2.
+    own: the number of the camera's parameters; prior: about all that turns share, at unit noise.
+    noise: variance of a residual, px^2.
     """
 
     scenes: tuple[Scene, ...]
     normals: tuple[Normal, ...]
-    prior: Floats
-    prior_pull: Floats
-    extra: Floats
+    own: int
+    prior: Quadratic
     noise: float
 
     def solved(self, images: Sequence[ImagePrior] | None, shared: Sequence[int],
@@ -109,88 +114,77 @@ class Problem:
         shared: indices of those behind the camera's own. inflation: of the noise: it makes the
         camera's prior count more where the present solution is far from the right one.
         """
-        count, noise = len(self.prior), self.noise * inflation
-        free = np.array([*range(count), *shared])
-        total = np.diag(np.concatenate([np.zeros(count), 1 / self.extra[free[count:] - count]]))
-        total[:count, :count] = self.prior
-        pull = np.concatenate([self.prior_pull, np.zeros(len(shared))])
+        free, noise = np.array([*range(self.own), *shared]), self.noise * inflation
         gain = chance = 0.0
-        scatter = np.zeros_like(total)
+        costs = [self.prior.of(free)]
         for n, normal in enumerate(self.normals):
-            if images is None:
-                hessian, score, by_track = normal.without_images()
-            else:
-                hessian, score, by_track = images[n].eliminated(normal)
-                own = images[n].gain_and_chance(normal)
-                gain, chance = gain + own[0] / noise, chance + own[1] / noise
-            total += hessian[np.ix_(free, free)] / noise
-            pull += score[free] / noise
-            scatter += by_track[np.ix_(free, free)] / noise**2
-        covariance = np.linalg.inv(total)
-        step = covariance @ pull
-        steps = () if images is None else tuple(
+            cost = normal.shared if images is None else images[n].eliminated(normal)
+            costs.append(cost.of(free).at_noise(noise))
+            if images is not None:
+                own = images[n].of(normal)
+                gain += float(own.score @ own.covariance @ own.score) / noise
+                chance += own.chance / noise
+        total = Quadratic.together(costs)
+        step = total.covariance @ total.score
+        of_images = () if images is None else tuple(
             each.step(normal, free, step)
             for each, normal in zip(images, self.normals, strict=True))
-        return Step(gain + float(pull @ step), chance + float(np.sum(covariance * scatter)), step,
-                    steps, covariance)
+        return Step(gain + float(total.score @ step), chance + total.chance, step, of_images)
 
 
-def problem_of(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: float,
-               config: IntrinsicsConfig, by_extra: Sequence[Floats] = (),
+def problem_of(scenes: Sequence[Scene], camera: Camera, centred: Camera, loss_px: float,
+               config: IntrinsicsConfig, by_shared: Sequence[Floats] = (),
                sigmas: Sequence[float] = ()) -> Problem:
     """Return the linearised problem of scenes at their solution.
 
-    by_extra: for each scene (k, t, 2, e) derivatives by parameters that follow the wider model's;
-    sigmas: (e,) of their priors.
+    centred: the camera that priors are about. by_shared: for each scene (k, t, 2, e) derivatives
+    by parameters that follow the wider model's; sigmas: (e,) of their priors.
     """
     normals = tuple(
-        normal_equations(scene, camera, loss_px, by_extra[n] if by_extra else None, by_image=True)
+        normal_equations(scene, camera, loss_px, by_shared[n] if by_shared else None,
+                         by_image=True)
         for n, scene in enumerate(scenes))
-    noise = (sum(normal.squares for normal in normals)
-             / sum(normal.freedom for normal in normals))
-    information = prior_information(step1, config)
-    return Problem(tuple(scenes), normals, information,
-                   information @ (prior_of(step1, config, 1.0).mean - camera.params),
-                   np.square(np.r_[extra_sigma_of(camera), sigmas]), noise)
+    return Problem(tuple(scenes), normals, len(camera.names()),
+                   wider_prior(camera, centred, config, sigmas),
+                   noise_of([normal.cost for normal in normals]))
 
 
-def shift_priors(problem: Problem, config: IntrinsicsConfig, crops: Crops) -> list[ImagePrior]:
+def shift_priors(problem: Problem, crops: Crops) -> list[ImagePrior]:
     """Return for each scene the prior of its images' shifts.
 
     crops: shifts that were taken out of the tracks already; empty for none.
     """
-    return [shift_prior(scene, problem.noise, config, crops.get(scene.turn))
+    return [shift_prior(scene, problem.noise, crops.get(scene.turn))
             for scene in problem.scenes]
 
 
-def shift_prior(scene: Scene, noise: float, config: IntrinsicsConfig, crop: Floats | None = None
-                ) -> ImagePrior:
+def shift_prior(scene: Scene, noise: float, crop: Floats | None = None) -> ImagePrior:
     """Return the prior of the shifts of a scene's images: smooth in time.
 
     noise: variance of a residual, px^2. crop: (k, 2) what was taken out of the tracks already, px.
     """
     keyframes = used_keyframes(scene)
-    spread = (config.crop_sigma * scene.tracks.image_size[0])**2 * (
-        np.exp(-_apart(scene, config)) + 1e-6 * np.eye(len(keyframes)))
+    spread = (CROP_SIGMA * scene.tracks.image_size[0])**2 * (
+        np.exp(-_apart(scene)) + 1e-6 * np.eye(len(keyframes)))
     inner = np.asarray(np.linalg.inv(spread) * noise, np.float64)
     zero = np.zeros_like(inner)
     values = np.zeros(2 * len(keyframes)) if crop is None else crop[keyframes].T.ravel()
     return ImagePrior(_indices(keyframes, 0, 1), np.block([[inner, zero], [zero, inner]]), values)
 
 
-def _zoom_prior(scene: Scene, noise: float, config: IntrinsicsConfig) -> ImagePrior:
+def _zoom_prior(scene: Scene, noise: float) -> ImagePrior:
     """Return the prior of the zooms of a scene's images."""
     keyframes = used_keyframes(scene)
-    spread = (ZOOM_STRETCH**2 * np.exp(-_apart(scene, config))
+    spread = (ZOOM_STRETCH**2 * np.exp(-_apart(scene))
               + ZOOM_IMAGE**2 * np.eye(len(keyframes)) + ZOOM_TURN**2)
     precision = np.asarray(np.linalg.inv(spread) * noise, np.float64)
     return ImagePrior(_indices(keyframes, 2), precision, np.zeros(len(keyframes)))
 
 
-def _apart(scene: Scene, config: IntrinsicsConfig) -> Floats:
+def _apart(scene: Scene) -> Floats:
     """Return (k, k) how far the used keyframes are apart, in units of a stabiliser's time."""
     seconds = scene.tracks.stamps_ns[used_keyframes(scene)] / 1e9
-    return np.asarray(np.abs(seconds[:, None] - seconds) / config.crop_time_s)
+    return np.asarray(np.abs(seconds[:, None] - seconds) / CROP_TIME_S)
 
 
 def _indices(keyframes: Ints, *components: int) -> Ints:
@@ -199,14 +193,15 @@ def _indices(keyframes: Ints, *components: int) -> Ints:
                            for component in components])
 
 
-def departures(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: float,
-               config: IntrinsicsConfig, crops: Crops | None = None, bent: bool = True,
-               rolling: bool = False, found: FoundField | None = None) -> tuple[Departure, ...]:
-    """Return how the scenes depart from a fixed camera, the strongest first.
+def fixed_camera_tests(scenes: Sequence[Scene], camera: Camera, centred: Camera, loss_px: float,
+                       config: IntrinsicsConfig, crops: Crops | None = None, bent: bool = True,
+                       rolling: bool = False, found: FoundField | None = None
+                       ) -> tuple[FixedCameraTest, ...]:
+    """Return the tests whether the camera is a fixed one, the clearest that it is not first.
 
-    crops: of a stabilised video, as taken out already. bent: False leaves out the field. rolling:
-    a rolling shutter was taken out: what is left of it is no departure. found: the field that no
-    lens model has: what is left of that is none either.
+    centred: the camera that priors are about. crops: of a stabilised video, as taken out already.
+    bent: False leaves out the local bend. rolling: a rolling shutter was taken out: what is left
+    of it counts as one still. found: the field that no lens model has: likewise.
     """
     columns, sigmas = [], []
     if rolling:
@@ -218,37 +213,36 @@ def departures(scenes: Sequence[Scene], camera: Camera, step1: Camera, loss_px: 
     free = len(sigmas)
     if bent:
         columns.append([_bends(scene, camera) for scene in scenes])
-        sigmas += [FIELD_PX] * columns[-1][0].shape[-1]
-    problem = problem_of(scenes, camera, step1, loss_px, config,
+        sigmas += [BEND_PX] * columns[-1][0].shape[-1]
+    problem = problem_of(scenes, camera, centred, loss_px, config,
                          [np.concatenate(parts, axis=-1) for parts in zip(*columns, strict=True)],
                          sigmas)
-    count, lens = len(camera.names()), len(camera.widened().names())
+    count, lens = problem.own, len(camera.widened().names())
     wide = range(count, lens + free)
-    shifts = shift_priors(problem, config, crops or {})
-    zooms = [_zoom_prior(scene, problem.noise, config) for scene in scenes]
+    shifts = shift_priors(problem, crops or {})
+    zooms = [_zoom_prior(scene, problem.noise) for scene in scenes]
     fixed = problem.solved(None, wide)
     # what a stabiliser's removal leaves over makes sigma larger, and may be larger itself
-    limit = (config.left_shift if crops else
-             config.clear_rolling_shift if rolling else config.clear_shift)
-    tests = [_departure('shift', problem.solved(shifts, wide), fixed, scenes, limit),
-             _departure('zoom', problem.solved(zooms, wide), fixed, scenes, config.clear_zoom)]
+    limit = LEFT_SHIFT if crops else CLEAR_ROLLING_SHIFT if rolling else CLEAR['shift']
+    tests = [_test('shift', problem.solved(shifts, wide), fixed, scenes, limit),
+             _test('zoom', problem.solved(zooms, wide), fixed, scenes, CLEAR['zoom'])]
     if bent:
         # a stabilised picture goes on moving
         moving = shifts if crops else None
-        tests.append(_departure(
-            'bend', problem.solved(moving, range(count, count + len(problem.extra))),
-            problem.solved(moving, wide), scenes, config.clear_bend))
+        everything = range(count, len(problem.prior.score))
+        tests.append(_test('bend', problem.solved(moving, everything),
+                           problem.solved(moving, wide), scenes, CLEAR['bend']))
     return tuple(sorted(tests, key=lambda each: -each.strength / each.limit))
 
 
-def _departure(kind: Kind, step: Step, base: Step, scenes: Sequence[Scene], limit: float
-               ) -> Departure:
-    """Return the departure that a step finds. base: the step without its parameters."""
+def _test(kind: Kind, step: Step, base: Step, scenes: Sequence[Scene], limit: float
+          ) -> FixedCameraTest:
+    """Return what a step tells. base: the step without the parameters of this kind."""
     parts = step.images if kind != 'bend' else (step.shared[len(base.shared):],)
     turns = {scene.turn: float(part.mean()) for scene, part in zip(scenes, parts, strict=False)}
-    return Departure(kind, step.strength(base), limit,
-                     float(np.sqrt(np.mean(np.square(np.concatenate(parts))))),
-                     turns if kind == 'zoom' else {})
+    return FixedCameraTest(kind, step.strength(base), limit,
+                           float(np.sqrt(np.mean(np.square(np.concatenate(parts))))),
+                           turns if kind == 'zoom' else {})
 
 
 def largest_crop(crops: Crops) -> float:
@@ -258,16 +252,16 @@ def largest_crop(crops: Crops) -> float:
 
 
 def _bends(scene: Scene, camera: Camera) -> Floats:
-    """Return (k, t, 2, 2 f) derivatives by a smooth field's displacements at its f supports.
+    """Return (k, t, 2, 2 f) derivatives by a smooth field's displacements at f places.
 
-    The weights of the supports at an observation sum to 1.
+    The weights of the places at an observation sum to 1.
     """
     size = np.array(scene.tracks.image_size)
     # not as observed: errors would correlate with the weights
     places = np.nan_to_num((scene.tracks.xy + residuals_px(scene, camera)) / size)
-    columns, rows = ((np.arange(count) + 0.5) / count for count in FIELD)
-    across = np.exp(-0.5 * ((places[..., :1] - columns) * FIELD[0])**2)
-    down = np.exp(-0.5 * ((places[..., 1:] - rows) * FIELD[1])**2)
+    columns, rows = ((np.arange(count) + 0.5) / count for count in BENDS)
+    across = np.exp(-0.5 * ((places[..., :1] - columns) * BENDS[0])**2)
+    down = np.exp(-0.5 * ((places[..., 1:] - rows) * BENDS[1])**2)
     weight = (across[..., :, None] * down[..., None, :]).reshape(*places.shape[:2], 1, -1)
     weight /= np.maximum(weight.sum(axis=-1, keepdims=True), 1e-9)
     zero = np.zeros_like(weight)
