@@ -112,7 +112,8 @@ def _best_of(begun: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
     A kind may lose by the bad poses of one turn only. So all are fitted again from the poses of
     the best one. That one is fitted again, too: it must not win or lose by fewer steps of
     adjustment. Where it then explains a turn no more, there is nothing to compare the others with,
-    and it stays.
+    and it stays. Each kind is tried with all its coefficients, too: a decentred pinhole is no
+    fisheye. Which of its models is used is chosen later.
     """
     def chosen(found: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
         fit, tried = chosen_of([each.fit for each in found])
@@ -123,9 +124,14 @@ def _best_of(begun: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
         return best, tried
     few = with_few_tracks(best.fit)
     again = [replace(each, fit=replace(fit, measured=each.fit.measured)) for each in begun
-             if (fit := refitted(few, type(each.fit.camera))) is not None]
-    best_again = any(type(each.fit.camera) is type(best.fit.camera) for each in again)
-    return chosen(again) if best_again else (best, tried)
+             for model in dict.fromkeys([type(each.fit.camera), type(each.fit.camera.widened())])
+             if (fit := refitted(few, model)) is not None]
+    if not any(type(each.fit.camera) is type(best.fit.camera) for each in again):
+        return best, tried
+    found, tried = chosen(again)
+    kinds = {type(each.fit.camera) for each in begun}
+    return next(each for each in [found, *again, *begun] if type(each.fit.camera) in kinds
+                and each.profile is found.profile), tried
 
 
 def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progress

@@ -32,6 +32,8 @@ from dashcalib_ros.solve.quadratic import Quadratic, TurnCost, noise_of
 LEAST_SHARE = 1e-6
 # noise variances of a track: a larger model, or a field, must predict turns so much better
 LEAST_GAIN = 30.0
+# of likelihoods; beyond it the less likely case counts for nothing
+LARGEST_LOG = 100.0
 
 
 @dataclass(frozen=True)
@@ -227,15 +229,36 @@ class Knowledge:
 
     @property
     def covariance_between_turns(self) -> Floats:
-        """Return the (n, n) covariance that a single turn does not show: how much turns differ.
+        """Return the (n, n) covariance that few turns do not show: how much turns differ.
 
-        The other parameters follow fx as the turn lets them make up for it. 0 for several turns.
+        Of a single turn the other parameters follow fx as the turn lets them make up for it.
         """
         if len(self.turns) > 1:
-            return np.zeros((len(self.own), len(self.own)))
+            shown = self._largest_estimate()
+            return np.asarray(max(self._variance_of_fx() / shown[0, 0] - 1, 0.0) * shown)
         own = self.total.covariance[0, self.own]
         along = self.one_turn_sigma * own / own[0]
         return np.outer(along, along)
+
+    def _variance_of_fx(self) -> float:
+        """Return the variance of fx if each turn may be off by one_turn_sigma more.
+
+        Either turns differ as their noise says, or by that more: both are as likely before, and
+        are weighed by how well they explain what each turn alone says of fx. Several sharp turns
+        that agree leave nothing of the second case; where one turn knows nearly all, it stays.
+        """
+        alone = [self.of([n]) for n in range(len(self.turns))]
+        offsets = np.array([self.offset_of(each)[0] for each in alone])
+        variances = np.array([each._largest_estimate()[0, 0] for each in alone])
+        logs, found = [], []
+        for more in (0.0, self.one_turn_sigma**2):
+            weights = 1 / (variances + more)
+            mean = float(np.average(offsets, weights=weights))
+            logs.append(0.5 * float(np.log(weights).sum() - np.log(weights.sum())
+                                    - weights @ (offsets - mean)**2))
+            found.append(1 / float(weights.sum()) + mean**2)
+        share = 1 / (1 + np.exp(min(logs[0] - logs[1], LARGEST_LOG)))
+        return float((1 - share) * found[0] + share * found[1])
 
     def _largest_estimate(self) -> Floats:
         root, count = np.linalg.cholesky(self.total.covariance), len(self.own)

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import Camera, calibrated_models, larger_models
+from dashcalib_ros.camera import MODELS, Camera, calibrated_models, larger_models
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
@@ -93,11 +93,14 @@ def chosen_of(results: Sequence[Fit]) -> tuple[Fit, tuple[Candidate, ...]]:
     """Return the result whose model predicts the turns best, and how the others compare.
 
     The simplest comes first; one with more parameters must be clearly better, and map rays
-    differently by more than its sigma.
+    differently by more than its sigma. A fisheye comes after all pinholes, and must be clearly
+    better than each of them: a decentred pinhole is none.
     """
     if len(results) == 1:
         return results[0], ()
-    results = sorted(results, key=lambda result: len(result.camera.names()))
+    families = list(dict.fromkeys(model.family for model in MODELS.values()))
+    results = sorted(results, key=lambda result: (families.index(result.camera.family),
+                                                  len(result.camera.names())))
     loss_px = min(result.solver.loss_px for result in results)
     costs = [left_out_costs(result, loss_px) for result in results]
     noise = min(result.known.noise for result in results)
@@ -108,7 +111,10 @@ def chosen_of(results: Sequence[Fit]) -> tuple[Fit, tuple[Candidate, ...]]:
               for turn in worst} for cost in costs]
     best = 0
     for n in range(1, len(results)):
-        clear = is_clear(np.array([gains[n][turn] - gains[best][turn] for turn in worst]))
+        rivals = [best, *(m for m in range(n)
+                          if results[m].camera.family != results[n].camera.family)]
+        clear = all(is_clear(np.array([gains[n][turn] - gains[m][turn] for turn in worst]))
+                    for m in rivals)
         if clear and not _alike(results[n], results[best]):
             best = n
     chosen = results[best]

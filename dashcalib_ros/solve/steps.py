@@ -47,6 +47,8 @@ FOCAL_REACH = 1.35
 # a shorter readout, in its sigmas and in s, counts as a global shutter: six came out at 0 to 0.5
 # ms
 CLEAR_SIGMAS, LEAST_READOUT_S = 4.0, 1.0 / 1e3
+# of what makes turns differ: most of it was the field that is taken out
+LEFT_BY_FIELD = 0.5
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,10 @@ class Fit:
             scene, camera, loss_px, self._by_shared(scene),
             shift_prior(scene, noise, self.crops[scene.turn]) if self.crops
             else None) for scene in self.scenes)
-        return Knowledge(camera, turns, self._prior_of_all(), floor_of(camera, self.used_field),
-                         one_turn_sigma=self.config.intrinsics.one_turn_sigma * camera.fx)
+        left = LEFT_BY_FIELD if self.used_field is not None else 1.0
+        return Knowledge(
+            camera, turns, self._prior_of_all(), floor_of(camera, self.used_field),
+            one_turn_sigma=left * self.config.intrinsics.one_turn_sigma * camera.fx)
 
     def _by_shared(self, scene: Scene) -> Floats | None:
         """Return (k, t, 2, e) derivatives by the readout and by the directions of the field."""
