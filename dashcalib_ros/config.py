@@ -1,7 +1,7 @@
 """The one home of every default, each with the reason for its value.
 
 Users set some twenty of them, setting(); the others are for experts, expert(). What was measured
-for a value stands in docs/lessons.md.
+for a value stands in docs/notebook/lessons.md.
 
 A setting's full name is SECTION.NAME ('turns.half_width'): the same in --set, in a configuration
 YAML and as a ROS parameter. Values are checked when a Config is made: one that exists is valid.
@@ -26,7 +26,7 @@ def setting(default: T, reason: str, minimum: float | None = None, maximum: floa
     """Declare a setting: its default, why it has that value in one line, and what else it may be.
 
     expert: few users set it; such settings are listed after the others. What was measured
-    for a value stands in docs/lessons.md under the setting's name.
+    for a value stands in docs/notebook/lessons.md under the setting's name.
     """
     metadata = {'reason': reason, 'minimum': minimum, 'maximum': maximum, 'choices': choices,
                 'pattern': pattern, 'expert': expert}

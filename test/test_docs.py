@@ -13,7 +13,7 @@ sys.path.insert(0, str(ROOT / 'test' / 'benchmark'))
 from documents import TABLES, write_table  # noqa: E402 (benchmarks are no package)
 
 DOCUMENTS = ['README.md', 'CONTRIBUTING.md', 'CHANGELOG.md',
-             *sorted(f'docs/{path.name}' for path in (ROOT / 'docs').glob('*.md'))]
+             *sorted(str(path.relative_to(ROOT)) for path in (ROOT / 'docs').rglob('*.md'))]
 
 
 def test_the_architecture_has_every_room():
@@ -56,7 +56,8 @@ def test_each_figure_of_the_readme_names_its_commit():
     rows = [line for line in figures.splitlines() if line.startswith('| ')][1:]
     assert len(rows) == 6
     for row in rows:
-        assert re.search(r'\| \[[0-9a-f]{7}(, [0-9a-f]{7})*\]\(docs/\w+\.md[^)]*\) \|$', row), row
+        assert re.search(
+            r'\| \[[0-9a-f]{7}(, [0-9a-f]{7})*\]\(docs/(notebook/)?\w+\.md[^)]*\) \|$', row), row
 
 
 def test_the_commits_of_figures_are_in_the_history():
@@ -64,7 +65,7 @@ def test_the_commits_of_figures_are_in_the_history():
                              capture_output=True, text=True)
     if shallow.stdout.strip() != 'false':
         pytest.skip('no complete git history here')
-    texts = ''.join(path.read_text() for path in (ROOT / 'README.md', *ROOT.glob('docs/*.md')))
+    texts = ''.join(path.read_text() for path in (ROOT / 'README.md', *ROOT.glob('docs/**/*.md')))
     named = sorted(set(re.findall(r'(?<![\w.])[0-9a-f]{7}(?![\w.])', texts)) - {'accepted'})
     named = [name for name in named if re.search('[0-9]', name) and re.search('[a-f]', name)]
     known = subprocess.run(['git', 'cat-file', '--batch-check=%(objecttype)'], cwd=ROOT, text=True,
@@ -77,7 +78,7 @@ def test_each_table_has_its_place_and_its_benchmark():
     texts = ''.join((ROOT / name).read_text() for name in DOCUMENTS)
     assert set(re.findall('<!-- table: (.*?) -->', texts)) == set(TABLES)
     for name, document in TABLES.items():
-        assert f'<!-- end: {name} -->' in (ROOT / 'docs' / document).read_text()
+        assert f'<!-- end: {name} -->' in (ROOT / 'docs' / 'notebook' / document).read_text()
         assert any(f"write_table('{name}'" in path.read_text()
                    for path in (ROOT / 'test' / 'benchmark').glob('*.py')), name
 

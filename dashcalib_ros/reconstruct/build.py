@@ -1,9 +1,9 @@
 """A turn becomes a scene: its focal profile first, then one scene from the best start.
 
 Incremental reconstruction with a free focal length often diverges, although it registers every
-image with small residuals (docs/lessons.md: f = 157 for 1353). With a wrong focal length held
-fixed it cannot diverge; it only explains fewer observations. So the turn is chained at several
-fixed focal lengths, and the one with the lowest cost over *all* observations is the start.
+image with small residuals (docs/notebook/lessons.md: f = 157 for 1353). With a wrong focal length
+held fixed it cannot diverge; it only explains fewer observations. So the turn is chained at
+several fixed focal lengths, and the one with the lowest cost over *all* observations is the start.
 """
 from __future__ import annotations
 

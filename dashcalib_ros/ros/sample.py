@@ -20,7 +20,7 @@ HEAD = """\
   ros__parameters:
 """
 EXPERTS = """
-    # For experts: few users need these. What was measured for them: docs/lessons.md
+    # For experts: few users need these. What was measured for them: docs/notebook/lessons.md
 """
 
 

@@ -8,7 +8,7 @@
 Runs every setting (or those named; part of a name will do) with every seed. Rows go to
 DIR/accuracy.json after each drive, and one that is there is not run again (--again: it is);
 DIR/accuracy.md has each drive, each setting, the bars and honesty; --docs writes the settings'
-table into docs/accuracy.md. --data: a folder with kitti03/,
+table into docs/notebook/accuracy.md. --data: a folder with kitti03/,
 carnd/ and ntu_campus/ (bag, video or images beside a truth.json); kitti03 is seen through other
 lenses, too (views.py). --cache: where rendered pictures are kept, about 100 MB a drive; a second
 run renders nothing.

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-DOCS = Path(__file__).resolve().parents[2] / 'docs'
+DOCS = Path(__file__).resolve().parents[2] / 'docs' / 'notebook'
 # which document has which table
 TABLES = {'accuracy': 'accuracy.md', 'attacks': 'accuracy.md', 'hostile': 'accuracy.md',
           'joined': 'accuracy.md', 'rivals': 'speed.md', 'speed': 'speed.md',

@@ -6,7 +6,7 @@ Rendered: a picture each second through lenses that are known, seen by the true 
 spoiled ones. Whole: rendered drives whose solution check.py keeps in the cache: how far lines and
 result are apart.
 Real: KITTI odometry 03, with the dataset's own K and with ours; two drives with the cameras that
-others measured. Writes lines.json, and lines.md with the tables of docs/lines.md.
+others measured. Writes lines.json, and lines.md with the tables of docs/notebook/lines.md.
 """
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def _plain(found: Bend | None) -> dict[str, Any] | None:
 
 
 def written(results: Mapping[str, Any]) -> str:
-    """Return the tables of docs/lines.md."""
+    """Return the tables of docs/notebook/lines.md."""
     parts = []
     rows = {name: row for name, row in results.get('rendered', {}).items() if row['true']}
     if rows:

@@ -153,7 +153,7 @@ def measure(minutes: float, rate: float, preview: bool) -> str:
 
 
 def report(bench: Listener, sent: int, spent: dict[bool, Any], memory: list[float]) -> str:
-    """Return the table of docs/speed.md."""
+    """Return the table of docs/notebook/speed.md."""
     values = bench.values
     lines = ['| | |', '|---|---|',
              f'| images sent, received by the node | {sent}, {values["received"]} |',

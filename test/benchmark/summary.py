@@ -29,7 +29,7 @@ def summary(rows: Iterable[Row]) -> str:
 
 
 def settings_table(rows: Sequence[Row]) -> str:
-    """Return a line for each setting, over its seeds: the table of docs/accuracy.md."""
+    """Return a line for each setting, over its seeds: the table of docs/notebook/accuracy.md."""
     lines = []
     for name in dict.fromkeys(row['setting'] for row in rows):
         drives = [row for row in rows if row['setting'] == name]
