@@ -17,8 +17,8 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import FrameSource
+from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.input.inputs import Paths, open_frames
-from dashcalib_ros.input.mask_file import check_mask, read_mask
 from dashcalib_ros.judge import Calibration, Check
 from dashcalib_ros.selection import Progress
 

@@ -10,7 +10,7 @@ from messages import PACKAGE, messages_in
 DOCUMENT = Path(__file__).parents[1] / 'docs' / 'troubleshooting.md'
 EXPLAINED = ('judge/agreement.py', 'judge/calibration.py', 'judge/conclude.py',
              'judge/focal_by_turn.py', 'judge/next_turn.py', 'judge/verdict.py',
-             'selection.py', 'input', 'input/bags', 'detect',
+             'selection.py', 'input', 'detect',
              'reconstruct/scene_file.py', 'turn_store.py', 'workers', 'cli/run.py')
 # texts that are no messages: parts of others that are shown with them, SQL, code
 PARTS = {
@@ -22,16 +22,16 @@ PARTS = {
         ', so that nothing confirms the numbers and their sigma'},
     'input/inputs.py': {' (and … more like it)', 'the time of recording'},
     'input/joined.py': {' (and … more like it)'},
-    'input/bags/camera_info.py': {
+    'input/bag_write.py': {
+        'compressed must be jpeg, png or None, not …',
         "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"},
-    'input/bags/salvage.py': {'… does not start like a bag', '… has a broken chunk (…)'},
-    'input/bags/source.py': {'… images; how many are lost is not known', '… (…, … images…)',
+    'input/bag_salvage.py': {'… does not start like a bag', '… has a broken chunk (…)'},
+    'input/bag_source.py': {'… images; how many are lost is not known', '… (…, … images…)',
                        '… of … images; … are lost', '… of … images; none is lost'},
-    'input/bags/storage.py': {
+    'input/bag_storage.py': {
         "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again or record it again', 'the index does not lead to all messages'},
-    'input/bags/unpack.py': {'a part of the bag', 'a packed part is cut off'},
-    'input/bags/write.py': {'compressed must be jpeg, png or None, not …'},
+    'input/bag_unpack.py': {'a part of the bag', 'a packed part is cut off'},
     'detect/turn.py': {'the turn at frame …'},
     'reconstruct/scene_file.py': {
         'it is too large when unpacked', 'it is too large', 'it has too many parts',

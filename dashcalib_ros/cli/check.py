@@ -15,8 +15,8 @@ from dashcalib_ros.cli.drive import feed, open_calibrator, open_drive
 from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
 from dashcalib_ros.errors import counted
+from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.input.inputs import fits_bag
-from dashcalib_ros.input.mask_file import read_mask
 from dashcalib_ros.judge import Calibration, Check, Odometry, path_files, read_poses, with_faults
 from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.camera_file import load_with_faults

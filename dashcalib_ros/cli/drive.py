@@ -15,8 +15,8 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn
 from dashcalib_ros.errors import counted
 from dashcalib_ros.input import Frame, FrameSource
+from dashcalib_ros.input.decode import check_mask
 from dashcalib_ros.input.inputs import open_frames
-from dashcalib_ros.input.mask_file import check_mask
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.recorded import with_source
 

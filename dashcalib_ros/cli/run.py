@@ -14,7 +14,7 @@ from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, show_text, warn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import FrameSource
-from dashcalib_ros.input.mask_file import read_mask
+from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report import Written, output_folder, result_json, write_results
 from dashcalib_ros.report.files import ACCEPTED
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:
-    from dashcalib_ros.input.bags.camera_info import check_bag
+    from dashcalib_ros.input.bag_write import check_bag
     if len(args.input) > 1 or source.name != str(Path(args.input[0])):
         raise InputError('--write-bag copies one bag: calibrate with all of them, then run it on '
                          'each bag alone')
@@ -55,7 +55,7 @@ def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:
 
 def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration, screen: Screen
                ) -> None:
-    from dashcalib_ros.input.bags.camera_info import camera_info_topic, write_bag
+    from dashcalib_ros.input.bag_write import camera_info_topic, write_bag
     if calibration.verdict.level != 'accepted':
         warn([f'no bag was written: the calibration is {calibration.verdict.level}, not accepted'])
         return

@@ -14,7 +14,7 @@ from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
 from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import counted
-from dashcalib_ros.input.mask_file import read_mask
+from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.tables import TextTable
 

@@ -14,7 +14,7 @@ def render_to_bag(drive: Drive, path: str | os.PathLike[str], processes: int = 2
 
     path: the bag's folder, which must not exist yet. Raises OutputError or WorkerError.
     """
-    from dashcalib_ros.input.bags.write import BagWriter
+    from dashcalib_ros.input.bag_write import BagWriter
     with BagWriter(path, topic, compressed=compressed, quality=quality) as writer:
         for frame in drive.frames(processes=processes):
             writer.write(frame)

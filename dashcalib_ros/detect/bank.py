@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from dashcalib_ros.config import TurnsConfig
 from dashcalib_ros.detect.turn import Turn
-from dashcalib_ros.input.frame import Frame
+from dashcalib_ros.input import Frame
 
 # ns; header stamps are rounded: a frame exactly half_width away belongs to the turn
 ROUNDING = 1_000_000

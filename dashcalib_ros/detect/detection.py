@@ -15,7 +15,7 @@ from dashcalib_ros.detect.motion import TrackedPoints
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
-from dashcalib_ros.input.mask_file import check_mask
+from dashcalib_ros.input.decode import check_mask
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
 
 # images after which the stamps' unit is checked; ns between images of a camera of 2 kHz: in

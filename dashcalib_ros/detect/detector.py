@@ -13,7 +13,7 @@ from dashcalib_ros.detect.median import StreamingMedian
 from dashcalib_ros.detect.motion import Motion
 from dashcalib_ros.detect.peaks import Peak, PeakFinder
 from dashcalib_ros.detect.turn import Turn
-from dashcalib_ros.input.frame import Frame
+from dashcalib_ros.input import Frame
 
 # least prominences; at an edge of the drive a turn rises above this by one more, as nothing tells
 # how straight the car drove beyond. KITTI's raw drive begins in a turn of 46 degrees, with 24

@@ -17,8 +17,8 @@ from dashcalib_ros.detect.motion import Motion, TrackedPoints
 from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.frame import Frame
-from dashcalib_ros.input.shrink import shrink_image
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.scale import shrink_image
 from dashcalib_ros.input.stamps import EARLY, least_step_ns
 
 # px; smaller pictures have no room for points

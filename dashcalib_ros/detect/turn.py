@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dashcalib_ros.input.frame import Frame
+from dashcalib_ros.input import Frame
 
 
 @dataclass(frozen=True, order=True)

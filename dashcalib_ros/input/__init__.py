@@ -1,8 +1,7 @@
-"""Images in: videos and folders as iterables of Frame.
+"""Images in: bags, videos and folders as iterables of Frame.
 
 Nothing here imports OpenCV or rosbags before a drive is opened: `--help` stays quick.
 """
-from dashcalib_ros.input.frame import Frame
-from dashcalib_ros.input.source import FrameSource
+from dashcalib_ros.input.source import Frame, FrameSource
 
 __all__ = ['Frame', 'FrameSource']

@@ -1,22 +1,31 @@
-"""Image messages and image files -> images of 8 bits: grey, or as they are for people to look at.
+"""Image messages and image files -> images of 8 bits, grey or in colour; mask files -> masks.
 
 Works on anything with the fields of sensor_msgs/Image or sensor_msgs/CompressedImage: messages of
 rclpy and of rosbags alike. Needs neither ROS nor cv_bridge.
 """
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-import dashcalib_ros.input.quiet  # noqa: F401
-from dashcalib_ros.arrays import GreyImage, Pixels
+from dashcalib_ros.arrays import GreyImage, Mask, Pixels
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.header import encoded_size
-from dashcalib_ros.limits import check_pixels
+from dashcalib_ros.limits import PICTURE_BYTES, check_pixels, read_file
+
+# OpenCV reports every defect of a file on stderr; what a user must know comes as our own errors.
+# Who wants to see the rest sets OPENCV_LOG_LEVEL
+if 'OPENCV_LOG_LEVEL' not in os.environ:
+    # OpenCV 4 has it elsewhere
+    set_log_level = getattr(cv2, 'setLogLevel', None) or cv2.utils.logging.setLogLevel
+    set_log_level(0)  # LOG_LEVEL_SILENT
 
 _DEPTHS = (8, 10, 12, 14, 16)
 _JPEG_START, _JPEG_END = b'\xff\xd8', b'\xff\xd9'
@@ -231,3 +240,30 @@ def _to_8_bits(image: Pixels, depth: BitDepth | None) -> Pixels:
     if image.dtype == np.uint16:
         return (depth or BitDepth()).to_8_bits(image)
     return image
+
+
+def read_mask(path: Path) -> Mask:
+    """Read a mask picture: (height, width), True where it is not black; ~ is expanded.
+
+    Raises InputError.
+    """
+    with suppress(RuntimeError):  # ~user of an unknown user: the path stays as it is
+        path = path.expanduser()
+    what = f'the mask {path}'
+    data = read_file(path, PICTURE_BYTES, what)
+    try:
+        mask: Mask = decode_pixels(data) > 0
+    except InputError as error:
+        raise InputError(f'{what} is no picture that can be used ({error}); give a PNG, black '
+                         'where the image is not to be used') from error
+    if not mask.any():
+        raise InputError(f'the mask {path} is all black, nothing is left of the image; '
+                         'make the part to use white')
+    return mask
+
+
+def check_mask(mask: Mask | None, size: tuple[int, int]) -> None:
+    """Raise InputError unless the mask is as large as images of this (width, height)."""
+    if mask is not None and (own := mask.shape[::-1]) != size:
+        raise InputError(f'the mask is {own[0]}x{own[1]} and the images are '
+                         f'{size[0]}x{size[1]}; make the mask as large as the images')

@@ -13,8 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.bags.names import METADATA, is_bag_file
-from dashcalib_ros.input.source import IMAGE_SUFFIXES, FrameSource, by_name, os_error
+from dashcalib_ros.input.source import (
+    IMAGE_SUFFIXES,
+    METADATA,
+    FrameSource,
+    by_name,
+    is_bag_file,
+    os_error,
+)
 from dashcalib_ros.limits import check_file, irregular_entry
 
 # not whatever FFmpeg takes: it would play a text file
@@ -226,7 +232,7 @@ def fits_bag(path: Path) -> bool:
 
 
 def _open_bag(path: Path, topic: str | None, fps: float | None) -> FrameSource:
-    from dashcalib_ros.input.bags.source import BagSource
+    from dashcalib_ros.input.bag_source import BagSource
     return BagSource(path, topic, fps)
 
 

@@ -1,4 +1,4 @@
-"""What every kind of input has in common."""
+"""What every kind of input has in common: its frames, and how they are read."""
 from __future__ import annotations
 
 import copy
@@ -7,15 +7,19 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 
-from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.frame import Frame
+from dashcalib_ros.arrays import GreyImage, Pixels
+from dashcalib_ros.errors import InputError, shortened
 
 IMAGE_SUFFIXES = frozenset(
     ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'))
 
+BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
+METADATA = 'metadata.yaml'
+# ns; what a stamp of 64 bits holds
+LAST_NS = 2**63 - 1
 # images are further apart; stamps are rounded
 CLOSE_NS = 1_000_000
 
@@ -26,6 +30,11 @@ def by_name(name: str) -> tuple[list[tuple[int, str]], str]:
     return [(int(part), '') if part[0] in '0123456789' else (-1, part) for part in parts], name
 
 
+def is_bag_file(name: str) -> bool:
+    """Tell whether this is the name of a bag's storage file, compressed or not."""
+    return name.lower().removesuffix('.zstd').removesuffix('.active').endswith(BAG_SUFFIXES)
+
+
 def os_error(path: Path, error: OSError) -> str:
     """Return a message for an input that cannot be read, with the cure."""
     if isinstance(error, FileNotFoundError):
@@ -34,6 +43,39 @@ def os_error(path: Path, error: OSError) -> str:
         where = error.filename or path
         return f'{where} may not be read: change its permissions (chmod a+rX) or its owner'
     return f'{path} cannot be read ({error.strerror}): check the disk or copy it again'
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of the drive.
+
+    index: position among the input's frames, counted from 0.
+    stamp_ns: time of exposure in nanoseconds (the message header's stamp, or index / rate).
+    image: (height, width) uint8, grey. Never written to after the Frame is made.
+    frame_id: the message header's; empty where there is none.
+    after_gap: images are missing before it, or it is of another drive.
+    perhaps_after_gap: the first of another file that may or may not go on where the one before
+    ended, as the next video of a dashcam; how the picture moves tells (motion/continuity.py).
+    Raises InputError for a stamp that is no finite number of 64 bits.
+    """
+
+    index: int
+    stamp_ns: int
+    image: GreyImage
+    frame_id: str = ''
+    after_gap: bool = False
+    perhaps_after_gap: bool = False
+
+    def __post_init__(self) -> None:
+        # NaN is in no range
+        if not (isinstance(self.stamp_ns, Real) and -LAST_NS <= self.stamp_ns <= LAST_NS):
+            raise InputError(f'Frame.stamp_ns must be a number of nanoseconds, not '
+                             f'{shortened(repr(self.stamp_ns))}')
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return (width, height) in pixels."""
+        return self.image.shape[1], self.image.shape[0]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ import numpy as np
 from dashcalib_ros.camera import FISHEYE, MODELS, Camera, Radial, camera_from_ros, ros_faults
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.errors import InputError, shortened
-from dashcalib_ros.input.bags.camera_info import first_camera_info
+from dashcalib_ros.input.bag_write import first_camera_info
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.source import os_error
 from dashcalib_ros.limits import (

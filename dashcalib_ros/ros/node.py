@@ -15,7 +15,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
-from dashcalib_ros.input.mask_file import check_mask, read_mask
+from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.report.camera_yaml import check_camera_name
 from dashcalib_ros.ros.camera_url import camera_info_path
 from dashcalib_ros.ros.commit import Commit

@@ -32,7 +32,7 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import ConfigError, WorkerError
 from dashcalib_ros.input import Frame
-from dashcalib_ros.input.bags.write import BagWriter
+from dashcalib_ros.input.bag_write import BagWriter
 from dashcalib_ros.standard_streams import folded
 from dashcalib_ros.status import Status
 

@@ -16,7 +16,7 @@ from dashcalib_ros.detect.history import History
 from dashcalib_ros.detect.median import StreamingMedian
 from dashcalib_ros.detect.motion import Motion
 from dashcalib_ros.detect.peaks import PeakFinder
-from dashcalib_ros.input.frame import Frame
+from dashcalib_ros.input import Frame
 
 TINY = np.zeros((2, 2), np.uint8)
 # few levels make plateaus and ties; the others are plain random signals

@@ -12,8 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from dashcalib_ros.camera import Brown, Fisheye, Radial, ros_camera
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.input import Frame
-from dashcalib_ros.input.bags.camera_info import camera_info_topic, check_bag, write_bag
-from dashcalib_ros.input.bags.write import BagWriter
+from dashcalib_ros.input.bag_write import BagWriter, camera_info_topic, check_bag, write_bag
 from dashcalib_ros.input.inputs import open_frames
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)

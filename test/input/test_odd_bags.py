@@ -3,20 +3,31 @@ from __future__ import annotations
 
 import bz2
 import os
+from functools import partial
 
 import lz4.frame
 import pytest
 import zstandard
-from made_drives import ROS2, drive, fails, head, images, same, storage, write_bag, write_mcap
-from mcap.writer import CompressionType
-from rosbags.rosbag1.reader import decompressors
+from made_drives import (
+    ROS2,
+    drive,
+    fails,
+    head,
+    images,
+    same,
+    storage,
+    write_bag,
+    write_mcap,
+    write_ros1,
+)
+from mcap.writer import CompressionType, IndexType
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
-from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 
 from dashcalib_ros import limits
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.bags import record, salvage, unpack
-from dashcalib_ros.input.bags.camera_info import check_bag
+from dashcalib_ros.input import bag_salvage, bag_unpack
+from dashcalib_ros.input.bag_write import check_bag
 from dashcalib_ros.input.inputs import open_frames
 
 LAUGHS = 'a0: &a0 [lol, lol]\n' + '\n'.join(
@@ -24,10 +35,10 @@ LAUGHS = 'a0: &a0 [lol, lol]\n' + '\n'.join(
 
 
 @pytest.mark.parametrize(('pack', 'unpacked'), [
-    (zstandard.compress, unpack.unpack_zstd), (lz4.frame.compress, unpack.unpack_lz4),
-    (bz2.compress, unpack.unpack_bz2)])
+    (zstandard.compress, bag_unpack.unpack_zstd), (lz4.frame.compress, bag_unpack.unpack_lz4),
+    (bz2.compress, bag_unpack.unpack_bz2)])
 def test_what_is_packed_is_unpacked_within_the_limit(pack, unpacked):
-    for content in (b'', b'content', os.urandom(3 * unpack.PIECE + 1)):
+    for content in (b'', b'content', os.urandom(3 * bag_unpack.PIECE + 1)):
         assert unpacked(pack(content)) == content
     bomb = pack(bytes(2**24))
     assert len(bomb) < 2**18
@@ -39,33 +50,45 @@ def test_what_is_packed_is_unpacked_within_the_limit(pack, unpacked):
             raise EOFError
 
 
-def test_rosbags_unpacks_within_the_limit(monkeypatch):
-    """Its tables are where this package looks for them, and have our functions."""
-    small = 2**20
-    monkeypatch.setattr(unpack, 'unpack_zstd', lambda data: data[:small])
-    assert {'zstd', 'lz4'} <= set(DECOMPRESSORS) and {'bz2', 'lz4'} <= set(decompressors)
-    assert DECOMPRESSORS['zstd'](bytes(2 * small), 0) == bytes(small)
-    assert decompressors['bz2'] is unpack.unpack_bz2
-    assert decompressors['lz4'] is unpack.unpack_lz4
+NO_INDEX = {'index_types': IndexType.NONE, 'repeat_channels': False, 'repeat_schemas': False,
+            'use_statistics': False, 'use_summary_offsets': False}
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    """Let a chunk have 3000 bytes, unpacked."""
+    for table in (bag_unpack.UNPACK_MCAP, bag_unpack.UNPACK_BAG):
+        for name, unpack in table.items():
+            if name != 'none':
+                monkeypatch.setitem(table, name, partial(unpack, limit=3000))
 
 
 @pytest.mark.parametrize('compression', [CompressionType.ZSTD, CompressionType.LZ4])
-def test_a_chunk_that_is_a_bomb_is_left_out(tmp_path, compression, monkeypatch):
+@pytest.mark.parametrize('options', [{}, NO_INDEX])
+def test_a_chunk_that_is_a_bomb_is_left_out(tmp_path, compression, options, small_chunks):
     frames = drive(5)
-    file = write_mcap(tmp_path / 'drive.mcap', frames, compression=compression, chunk_size=4000)
-    tight = lambda function: lambda data: function(data, 3000)  # noqa: E731
-    monkeypatch.setattr(salvage, 'UNPACK_MCAP', {
-        name: tight(function) for name, function in salvage.UNPACK_MCAP.items()})
-    for name, function in (('zstd', unpack.unpack_zstd), ('lz4', unpack.unpack_lz4)):
-        monkeypatch.setitem(DECOMPRESSORS, name, lambda data, _, f=function: f(data, 3000))
+    file = write_mcap(tmp_path / 'drive.mcap', frames, compression=compression, chunk_size=4000,
+                      **options)
     line = fails('broken chunk', file)
     assert 'unpacks to more than 0 MB' in line
+
+
+@pytest.mark.parametrize('compression', Writer1.CompressionFormat)
+def test_a_chunk_of_a_ros1_bag_that_is_a_bomb_is_left_out(tmp_path, compression, small_chunks):
+    fails('unpacks to more than 0 MB', write_ros1(tmp_path / 'drive.bag', drive(5), compression))
+
+
+def test_messages_of_overlapping_chunks_come_by_time(tmp_path):
+    frames = drive(6)
+    file = write_mcap(tmp_path / 'drive.mcap', [frames[n] for n in (0, 3, 1, 4, 2, 5)],
+                      chunk_size=4000)
+    assert [frame.stamp_ns for frame in open_frames(file)] == [each.stamp_ns for each in frames]
 
 
 def test_a_message_that_is_a_bomb_is_an_undecodable_one(tmp_path, monkeypatch):
     bag = write_bag(tmp_path / 'bag', images(drive(3)), mode=CompressionMode.MESSAGE)
     same(list(open_frames(bag)), drive(3))
-    monkeypatch.setattr(record, 'MESSAGE_BYTES', 1000)
+    monkeypatch.setattr(bag_salvage, 'MESSAGE_BYTES', 1000)
     fails('a message on /camera: a part of the bag unpacks to more than', bag)
 
 

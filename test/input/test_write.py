@@ -12,7 +12,7 @@ from made_drives import (
 
 from dashcalib_ros.errors import OutputError
 from dashcalib_ros.input import Frame
-from dashcalib_ros.input.bags.write import BagWriter
+from dashcalib_ros.input.bag_write import BagWriter
 from dashcalib_ros.input.inputs import open_frames
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.bags.storage import CURE, Bag, Topic, open_bag
+from dashcalib_ros.input.bag_storage import CURE, Bag, Topic, open_bag
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.source import FrameSource, Picture, Reading
 from dashcalib_ros.input.stamps import RECORDED, StampGate

@@ -1,4 +1,4 @@
-"""Damaged bags are read from the start, without their index, as far as possible.
+"""The messages of a bag; damaged ones are read from the start, without index, as far as possible.
 
 Each scanner yields messages in the order in which they were written, up to the end of the file.
 It reports what it leaves out by calling `damage` with a short phrase.
@@ -8,25 +8,71 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from dashcalib_ros.errors import InputError, one_line
-from dashcalib_ros.input.bags.record import Record, ros2_type
-from dashcalib_ros.input.bags.unpack import unpack_bz2, unpack_lz4, unpack_zstd
+from dashcalib_ros.input.bag_unpack import UNPACK_BAG, chunk_records, unpack_zstd
+from dashcalib_ros.limits import MESSAGE_BYTES
 
 Damage = Callable[[str], None]
 
-UNPACK_MCAP: dict[str, Callable[[bytes], bytes]] = {'zstd': unpack_zstd, 'lz4': unpack_lz4}
-UNPACK_BAG: dict[bytes, Callable[[bytes], bytes]] = {
-    b'none': bytes, b'bz2': unpack_bz2, b'lz4': unpack_lz4}
+_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+
+
+@dataclass(frozen=True)
+class Record:
+    """A stored message.
+
+    msgtype: as ROS 2 writes it (sensor_msgs/msg/Image), also for ROS 1.
+    receive_ns: when the recorder got it, in nanoseconds.
+    raw: serialised; ros1 tells how. Bags that compress each message have it compressed here.
+    """
+
+    topic: str
+    msgtype: str
+    receive_ns: int
+    raw: bytes
+    ros1: bool = False
+
+    def message(self) -> Any:
+        """Return the message itself; raises InputError when its bytes make none.
+
+        The types are ROS's own, not the bag's: sensor_msgs' images never changed, and a bag with
+        an invalid definition of another type can still be read.
+        """
+        try:
+            if self.ros1:
+                return _types(Stores.ROS1_NOETIC).deserialize_ros1(self.raw, self.msgtype)
+            raw = self.raw
+            if raw[:4] == _ZSTD_MAGIC:  # a CDR message never starts so
+                raw = unpack_zstd(raw, MESSAGE_BYTES)
+            return _types(Stores.ROS2_JAZZY).deserialize_cdr(raw, self.msgtype)
+        except InputError as error:
+            raise InputError(f'a message on {self.topic}: {error}') from error
+        except Exception as error:  # rosbags lets struct.error, AssertionError ... out
+            raise InputError(f'a damaged message on {self.topic}: record it again') from error
+
+
+def ros2_type(name: str) -> str:
+    """Return a message type as ROS 2 writes it: sensor_msgs/Image -> sensor_msgs/msg/Image."""
+    package, slash, kind = name.partition('/')
+    return f'{package}/msg/{kind}' if slash and '/' not in kind else name
+
+
+@lru_cache
+def _types(store: Stores) -> Typestore:
+    return get_typestore(store)
 
 
 def scan(path: Path, damage: Damage) -> Iterator[Record]:
@@ -76,9 +122,7 @@ def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[M
             yield record
             continue
         try:
-            unpack = UNPACK_MCAP.get(record.compression, bytes)
-            plain = replace(record, compression='', data=unpack(record.data))
-            inner = breakup_chunk(plain, validate_crc=True)
+            inner = chunk_records(record)
         except Exception as error:  # also zstandard's and lz4's own errors
             damage(f'{name} has a broken chunk ({one_line(error)})')
             continue
@@ -128,7 +172,8 @@ def _bag_messages(file: BinaryIO, connections: dict[int, tuple[str, str]]) -> It
         data = file.read(size)
         if kind == 5:
             # a chunk that is cut off may have complete messages at its start
-            yield from _bag_messages(BytesIO(UNPACK_BAG[fields['compression']](data)), connections)
+            unpack = UNPACK_BAG[fields['compression'].decode()]
+            yield from _bag_messages(BytesIO(unpack(data)), connections)
         if len(data) < size:
             raise EOFError(f'{size - len(data)} bytes are missing')
         if kind == 7:

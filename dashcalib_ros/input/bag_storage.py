@@ -16,15 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 import zstandard
-from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag2 import Reader as Reader2
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.bags.names import METADATA, is_bag_file
-from dashcalib_ros.input.bags.record import Record
-from dashcalib_ros.input.bags.salvage import Damage, scan
-from dashcalib_ros.input.bags.unpack import unpack_file
-from dashcalib_ros.input.source import by_name
+from dashcalib_ros.input.bag_salvage import Damage, Record, scan
+from dashcalib_ros.input.bag_unpack import Ros1Reader, Ros2Reader, unpack_file
+from dashcalib_ros.input.source import METADATA, by_name, is_bag_file
 from dashcalib_ros.limits import YAML_BYTES, check_file, irregular_entry, parse_yaml, read_text
 
 IMAGE = 'sensor_msgs/msg/Image'
@@ -182,7 +178,7 @@ def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
         missing = sum(connection.msgcount for connection in wanted)
         if not wanted:
             return
-        ros1 = isinstance(reader, Reader1)
+        ros1 = isinstance(reader, Ros1Reader)
         for connection, receive_ns, raw in reader.messages(wanted):
             missing -= 1
             yield Record(connection.topic, connection.msgtype, receive_ns, bytes(raw), ros1)
@@ -190,9 +186,9 @@ def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
             raise ValueError('the index does not lead to all messages')
 
 
-def _reader(path: Path) -> Reader1 | Reader2:
+def _reader(path: Path) -> Ros1Reader | Ros2Reader:
     with path.open('rb') as file:
-        return Reader1(path) if file.read(7) == b'#ROSBAG' else Reader2(path)
+        return Ros1Reader(path) if file.read(7) == b'#ROSBAG' else Ros2Reader(path)
 
 
 @contextmanager

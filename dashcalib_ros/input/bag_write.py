@@ -1,14 +1,15 @@
-"""Copies a recorded bag and adds a camera_info for each of its images."""
+"""Bags are written: frames as a bag, and a copy of a bag with a camera_info for each image."""
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Literal
 
+import cv2
 import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
@@ -18,8 +19,11 @@ from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.camera_info import RosCamera
 from dashcalib_ros.camera.rectified import SAME
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.input.bags.storage import check_unpacked, open_bag
+from dashcalib_ros.input.bag_storage import check_unpacked, open_bag
+from dashcalib_ros.input.bag_unpack import Ros2Reader
+from dashcalib_ros.input.source import Frame
 
+_FORMATS = {'jpeg': '.jpg', 'png': '.png'}
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 REPAIR = "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
 
@@ -76,26 +80,30 @@ def write_bag(source: str | os.PathLike[str], image_topic: str, camera: Camera,
     out: the new bag's folder; it appears only when all went well. rectified: as ros_camera()'s.
     Raises InputError, OutputError.
     """
-    path = Path(out).absolute()
+    with _opened(source, image_topic) as reader, _new_bag(Path(out).absolute()) as writer:
+        return _copy(reader, writer, image_topic, ros_camera(camera, rectified), source)
+
+
+@contextmanager
+def _new_bag(path: Path) -> Iterator[Writer]:
+    """Give the writer of an MCAP bag, a folder that appears when all went well.
+
+    Raises OutputError when it exists or cannot be written.
+    """
     if path.exists():
         raise OutputError(f'{path} exists: choose another place for the bag or remove it')
-    with _opened(source, image_topic) as reader:
-        draft: Path | None = None
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            draft = Path(tempfile.mkdtemp(prefix='.writing-', dir=path.parent))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix='.writing-', dir=path.parent,
+                                         ignore_cleanup_errors=True) as draft:
             # rosbags names the file inside after the folder: it has its last name already
-            with Writer(draft / path.name, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-                count = _copy(reader, writer, image_topic, ros_camera(camera, rectified),
-                              source)
-            (draft / path.name).rename(path)
-            return count
-        except (OSError, WriterError) as error:
-            raise OutputError(f'{path} cannot be written ({error}): check the permissions and the '
-                              f'room on that disk') from error
-        finally:
-            if draft is not None:
-                shutil.rmtree(draft, ignore_errors=True)
+            with Writer(Path(draft, path.name), version=9,
+                        storage_plugin=StoragePlugin.MCAP) as writer:
+                yield writer
+            Path(draft, path.name).rename(path)
+    except (OSError, WriterError) as error:
+        raise OutputError(f'{path} cannot be written ({error}): check the permissions and the '
+                          f'room on that disk') from error
 
 
 def _copy(reader: Reader, writer: Writer, image_topic: str, camera: RosCamera,
@@ -156,7 +164,7 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
         raise InputError(f'{source} is a ROS 1 bag: convert it first (rosbags-convert)')
     try:
         check_unpacked(path)
-        reader = Reader(path)
+        reader = Ros2Reader(path)
         reader.open()
     except Exception as error:  # a damaged file makes rosbags raise nearly anything
         raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
@@ -180,3 +188,66 @@ def _camera_info(types: Any, c: RosCamera, header: Any) -> Any:
         binning_x=0, binning_y=0,
         roi=types['sensor_msgs/msg/RegionOfInterest'](
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False))
+
+
+class BagWriter:
+    """Writes frames into a new ROS 2 bag (a folder with an MCAP file); use it in a with statement.
+
+    path: of the bag's folder; it must not exist yet, and it appears only when all went well.
+    topic: taken as it is: for compressed images ROS expects it to end in /compressed.
+    frame_id: of every header; the stamps are the frames'.
+    compressed: None for mono8 Images, 'jpeg' or 'png' for CompressedImages.
+    quality: of the JPEG, 1 to 100.
+
+    Raises OutputError when the bag exists or cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], topic: str, frame_id: str = 'camera',
+                 compressed: Literal['jpeg', 'png'] | None = None, quality: int = 90) -> None:
+        if compressed is not None and compressed not in _FORMATS:
+            raise OutputError(f'compressed must be jpeg, png or None, not {compressed!r}')
+        self._path = Path(path).absolute()
+        self._topic = topic
+        self._frame_id = frame_id
+        self._compressed = compressed
+        self._quality = quality
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+
+    def __enter__(self) -> BagWriter:
+        kind = 'sensor_msgs/msg/' + ('CompressedImage' if self._compressed else 'Image')
+        with ExitStack() as stack:
+            self._writer = stack.enter_context(_new_bag(self._path))
+            self._connection: Connection = self._writer.add_connection(
+                self._topic, kind, typestore=self._types)
+            self._stack = stack.pop_all()
+        return self
+
+    def write(self, frame: Frame) -> None:
+        """Append one frame, stamped frame.stamp_ns."""
+        kinds = self._types.types
+        seconds, nanoseconds = divmod(frame.stamp_ns, 10**9)
+        header = kinds['std_msgs/msg/Header'](
+            stamp=kinds['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds),
+            frame_id=self._frame_id)
+        if self._compressed:
+            message = kinds['sensor_msgs/msg/CompressedImage'](
+                header=header, format=f'mono8; {self._compressed} compressed mono8',
+                data=self._encode(frame))
+        else:
+            width, height = frame.size
+            message = kinds['sensor_msgs/msg/Image'](
+                header=header, height=height, width=width, encoding='mono8', is_bigendian=0,
+                step=width, data=np.ascontiguousarray(frame.image).reshape(-1))
+        raw = self._types.serialize_cdr(message, self._connection.msgtype)
+        self._writer.write(self._connection, frame.stamp_ns, raw)
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def _encode(self, frame: Frame) -> np.ndarray[tuple[int], np.dtype[np.uint8]]:
+        assert self._compressed
+        _, data = cv2.imencode(_FORMATS[self._compressed], frame.image,
+                               [cv2.IMWRITE_JPEG_QUALITY, self._quality]
+                               if self._compressed == 'jpeg' else [])
+        return np.asarray(data, np.uint8).reshape(-1)

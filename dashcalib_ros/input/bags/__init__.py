@@ -1,1 +1,0 @@
-"""Everything about rosbags: read, salvage, write, add camera_info to images."""
