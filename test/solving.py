@@ -7,7 +7,7 @@ import numpy as np
 from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Camera, Radial
-from dashcalib_ros.camera.prior import Prior
+from dashcalib_ros.camera.camera import Prior
 from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Scene

@@ -1,7 +1,7 @@
 """The camera models: projection, viewing rays, derivatives, limits; COLMAP's names and ROS's."""
 from dashcalib_ros.camera.camera import FISHEYE, PINHOLE, Camera
 from dashcalib_ros.camera.camera_info import ros_camera, ros_faults
-from dashcalib_ros.camera.equidistant import Fisheye
+from dashcalib_ros.camera.fisheye import Fisheye
 from dashcalib_ros.camera.models import (
     AUTO,
     MODELS,
@@ -12,8 +12,7 @@ from dashcalib_ros.camera.models import (
     model_named,
     searched,
 )
-from dashcalib_ros.camera.plumb_bob import Brown, Radial
-from dashcalib_ros.camera.rational import Rational
+from dashcalib_ros.camera.pinhole import Brown, Radial, Rational
 from dashcalib_ros.camera.rectified import RECTIFIED
 
 __all__ = ['AUTO', 'FISHEYE', 'MODELS', 'PINHOLE', 'RECTIFIED', 'Brown', 'Camera', 'Fisheye',

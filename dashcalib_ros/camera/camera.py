@@ -13,15 +13,30 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, Pixels
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 # COLMAP has the centre of the first pixel at (0.5, 0.5)
 HALF_PIXEL = 0.5
+# a coefficient below this moves no pixel, and as a polynomial's highest one it spoils the roots
+NOTHING = 1e-30
 # the families of lenses: distortion of the tangent of a ray's angle to the axis, or of the angle
 PINHOLE, FISHEYE = 'pinhole', 'fisheye'
+
+
+def resized_pixels(pixels: Pixels, factor: float | np.float32) -> Pixels:
+    """Return where pixels (..., 2) are in pictures that are factor times as large."""
+    return (pixels + HALF_PIXEL) * factor - HALF_PIXEL
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A normal distribution of the n parameters: mean (n,), covariance (n, n)."""
+
+    mean: Floats
+    covariance: Floats
 
 
 @dataclass(frozen=True)
@@ -128,14 +143,16 @@ class Camera(ABC):
         """Return the camera with another focal length, fx = fy."""
         return replace(self, fx=focal, fy=focal)
 
-    def resized(self, factor: float, image_size: tuple[int, int]) -> Self:
+    def resized(self, factor: float, image_size: tuple[int, int],
+                factor_y: float | None = None) -> Self:
         """Return the camera of images that are factor times as large as its own.
 
         image_size: theirs. Pixel x of its own images is (x + 0.5) factor - 0.5 of theirs.
+        factor_y: where their height is another multiple, as sizes are whole numbers.
         """
-        offset = (factor - 1) / 2
-        return replace(self, image_size=image_size, fx=self.fx * factor, fy=self.fy * factor,
-                       cx=self.cx * factor + offset, cy=self.cy * factor + offset)
+        x, y = factor, factor if factor_y is None else factor_y
+        return replace(self, image_size=image_size, fx=self.fx * x, fy=self.fy * y,
+                       cx=self.cx * x + (x - 1) / 2, cy=self.cy * y + (y - 1) / 2)
 
     def without_distortion(self) -> Self:
         """Return the camera with all distortion coefficients 0."""
@@ -146,13 +163,13 @@ class Camera(ABC):
         """Return K (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    @abstractmethod
     def widened(self) -> Camera:
         """Return the same camera in a wider model: its first parameters are this one's.
 
         The values that the further coefficients would have show how well this model describes the
         lens. Returns the camera itself where no model has more.
         """
+        return self
 
     @abstractmethod
     def ros_distortion(self) -> list[float]:

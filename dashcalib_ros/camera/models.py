@@ -1,13 +1,12 @@
-"""The table of camera models. A new model is a class in a file of its own and a row here."""
+"""The table of camera models. A new model is a class in the file of its family and a row here."""
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.camera.camera import Camera
-from dashcalib_ros.camera.equidistant import Fisheye
-from dashcalib_ros.camera.plumb_bob import Brown, Radial
-from dashcalib_ros.camera.rational import Rational
+from dashcalib_ros.camera.fisheye import Fisheye
+from dashcalib_ros.camera.pinhole import Brown, Radial, Rational
 from dashcalib_ros.errors import ConfigError, InputError, shortened
 
 # as a setting: the turns choose
@@ -71,7 +70,7 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
     wanted = np.trim_zeros(np.asarray(d, np.float64), 'b')
     # fewer parameters come first in the table
     for model in MODELS.values():
-        if distortion_model not in (model.ros_model, *SAME.get(model.ros_model, ())):
+        if distortion_model not in (model.ros_model, *ALIASES.get(model.ros_model, ())):
             continue
         size = len(model.names()) - 4
         camera = model.of(image_size, [fx, fy, cx, cy, *wanted[:size],
@@ -84,4 +83,4 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
 
 ROS_MODELS = tuple(dict.fromkeys(model.ros_model for model in MODELS.values()))
 # other names that ROS has for a model, or for one that contains it
-SAME = {'plumb_bob': ('rational_polynomial',), 'equidistant': ('fisheye',)}
+ALIASES = {'plumb_bob': ('rational_polynomial',), 'equidistant': ('fisheye',)}

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.collector import LineCollector
 from dashcalib_ros.detect.detector import TurnDetector
@@ -101,7 +102,7 @@ class Detection:
     def points(self) -> TrackedPoints:
         """Return the points tracked in the newest image, in px of the input."""
         points, px = self._motion.points(), np.float32(self.scale.px)
-        return TrackedPoints(*((xy + 0.5) * px - 0.5 for xy in (points.before, points.now)))
+        return TrackedPoints(*(resized_pixels(xy, px) for xy in (points.before, points.now)))
 
     def lines(self) -> Lines:
         """Return the upright lines of the drive so far, in the resized images."""

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
+from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.config import MaskConfig, MotionConfig
 from dashcalib_ros.detect.continuity import goes_on
 from dashcalib_ros.detect.epipoles import epipoles_of, turning
@@ -143,7 +144,7 @@ class MotionEstimator:
                                             return_indices=True)
             before[here] = earlier.xy[there]
         factor = np.float32(self._factor)
-        return TrackedPoints(*((xy + 0.5) * factor - 0.5 for xy in (before, now)))
+        return TrackedPoints(*(resized_pixels(xy, factor) for xy in (before, now)))
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings about the masks for the user, one line each."""

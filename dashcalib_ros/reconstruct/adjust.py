@@ -12,8 +12,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel
-from dashcalib_ros.camera.prior import Prior
+from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel, Prior
 from dashcalib_ros.reconstruct.colmap import pyceres, pycolmap
 from dashcalib_ros.reconstruct.scene import Scene
 

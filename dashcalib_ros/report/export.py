@@ -49,9 +49,7 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     if abs(size[1] - x * height) > ROUNDING_PX and abs(size[0] - y * width) > ROUNDING_PX:
         raise ConfigError(f'{size[0]}x{size[1]} has another shape than the {width}x{height} of '
                           f'the calibration; was the picture cropped? use --crop')
-    return replace(camera, image_size=size, fx=camera.fx * x, fy=camera.fy * y,
-                   cx=(camera.cx + HALF_PIXEL) * x - HALF_PIXEL,
-                   cy=(camera.cy + HALF_PIXEL) * y - HALF_PIXEL)
+    return camera.resized(x, size, y)
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:

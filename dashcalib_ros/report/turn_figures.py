@@ -7,6 +7,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.reconstruct.picture import TurnPicture
 from dashcalib_ros.reconstruct.scene import Scene, residuals_px
 from dashcalib_ros.report.charts import dots, line, segments, svg, text
@@ -49,7 +50,7 @@ def picture_svg(picture: TurnPicture, scene: Scene | None, camera: Camera | None
 def _observations(picture: TurnPicture, scene: Scene, camera: Camera) -> tuple[str, int]:
     [at] = np.flatnonzero(scene.tracks.frames == picture.frame)[:1] or [0]
     px = picture.image.shape[1] / scene.tracks.image_size[0]
-    xy = (scene.tracks.xy + 0.5) * px - 0.5
+    xy = resized_pixels(scene.tracks.xy, px)
     used = scene.structure.used
     trails = [xy[max(at - TRAIL, 0):at + TRAIL + 1, n][used[max(at - TRAIL, 0):at + TRAIL + 1, n]]
               for n in np.flatnonzero(used[at])]

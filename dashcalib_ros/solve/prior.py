@@ -7,8 +7,8 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.camera import Prior
 from dashcalib_ros.camera.field import Field
-from dashcalib_ros.camera.prior import Prior
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
 from dashcalib_ros.solve.quadratic import Quadratic

@@ -8,7 +8,7 @@ import pytest
 from synthetic import LENS, SIZE, SyntheticTurn, angle_deg, synthetic_turn
 
 from dashcalib_ros.camera import Camera, Radial
-from dashcalib_ros.camera.prior import Prior
+from dashcalib_ros.camera.camera import Prior
 from dashcalib_ros.config import Config, SceneConfig, TracksConfig
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.turn import Turn

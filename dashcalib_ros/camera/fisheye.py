@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera.camera import FISHEYE, Camera, ColmapModel
+from dashcalib_ros.camera.camera import FISHEYE, NOTHING, Camera, ColmapModel
 
 # radians (120 degrees): the corners of a picture that is 190 degrees wide see to 110
 WIDEST = 2.1
@@ -46,10 +46,6 @@ class Fisheye(Camera):
     # 250 to 82 degrees across, without distortion
     focal_ratios: ClassVar[tuple[float, ...]] = tuple(0.23 * 1.2**n for n in range(7))
     sees_behind: ClassVar[bool] = True
-
-    def widened(self) -> Camera:
-        """Return this camera: no model has more."""
-        return self
 
     def ros_distortion(self) -> list[float]:
         """Return k1, k2, k3, k4, the order of ROS and OpenCV."""
@@ -118,7 +114,8 @@ class Fisheye(Camera):
     @cached_property
     def fold(self) -> float:
         """Return the angle at which the model folds over, WIDEST at the most; radians."""
-        roots = np.roots([9 * self.k4, 7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
+        slope = np.array([9 * self.k4, 7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
+        roots = np.roots(np.where(np.abs(slope) < NOTHING, 0.0, slope))
         squares = roots[np.abs(roots.imag) < 1e-9].real
         return float(min([WIDEST, *np.sqrt(squares[squares > 0])]))
 

@@ -1,7 +1,8 @@
-"""Pinhole and distortion polynomials: the paper's model, and Brown's with three terms more.
+"""Pinhole lenses: the paper's two radial terms, Brown's five, OpenCV's quotient of polynomials.
 
 With x, y the point over its depth and s = x^2 + y^2, the pixel is K times
 x (1 + k1 s + k2 s^2 + k3 s^3) + 2 p1 x y + p2 (s + 2 x^2), and for y alike: ROS's plumb_bob.
+Its rational_polynomial divides the radial factor by 1 + k4 s + k5 s^2 + k6 s^3.
 """
 from __future__ import annotations
 
@@ -11,9 +12,10 @@ from typing import Any, ClassVar
 
 import cv2
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera.camera import PINHOLE, Camera, ColmapModel
+from dashcalib_ros.camera.camera import NOTHING, PINHOLE, Camera, ColmapModel
 
 # tangent of 85 degrees: no pinhole camera sees farther out
 WIDEST = 11.4
@@ -147,6 +149,49 @@ class Brown(Radial):
                         - wanted.reshape(-1, 2)).max(axis=1)
         xy[~(reached & (missed < REACHED))] = np.nan
         return _unit(xy.reshape(wanted.shape))
+
+
+@dataclass(frozen=True)
+class Rational(Brown):
+    """A pinhole camera with OpenCV's eight coefficients. Turns cannot tell these apart.
+
+    image_size: (width, height) in pixels. fx, fy, cx, cy: pixels; the centre of the first pixel is
+    at (0, 0). The coefficients are in the order k1, k2, p1, p2, k3, k4, k5, k6.
+    """
+
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+
+    model: ClassVar[str] = 'rational_polynomial'
+    ros_model: ClassVar[str] = 'rational_polynomial'
+    given_only: ClassVar[bool] = True
+    colmap: ClassVar[ColmapModel] = ColmapModel('FULL_OPENCV', 12, tuple(range(12)))
+    spread: ClassVar[tuple[float, ...]] = (1.0, 1.0, 1e-3, 1e-3, 0.1, 1.0, 1.0, 0.1)
+
+    def ros_distortion(self) -> list[float]:
+        """Return k1, k2, p1, p2, k3, k4, k5, k6, the order of ROS and OpenCV."""
+        return [float(value) for value in self.params[4:]]
+
+    def _stretch(self, square: Floats) -> Floats:
+        above, below = self._polynomials
+        return np.asarray(above(square) / below(square))
+
+    @cached_property
+    def fold(self) -> float:
+        """Return the undistorted radius at which the model folds over, or has a pole."""
+        above, below = self._polynomials
+        square = Polynomial([0.0, 1.0])
+        # of radius times above / below: where its slope is 0, by the squared radius
+        slope = (above + 2 * square * above.deriv()) * below - 2 * square * above * below.deriv()
+        roots = np.concatenate([each.trim(NOTHING).roots() for each in (slope, below)])
+        real = roots[np.abs(roots.imag) < 1e-9].real
+        return float(np.sqrt(min([WIDEST**2, *real[real > 0]])))
+
+    @cached_property
+    def _polynomials(self) -> tuple[Polynomial, Polynomial]:
+        return (Polynomial([1.0, self.k1, self.k2, self.k3]),
+                Polynomial([1.0, self.k4, self.k5, self.k6]))
 
 
 def _unit(xy: Floats) -> Floats:
