@@ -11,7 +11,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.bag_storage import CURE, Bag, Topic, open_bag
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.source import FrameSource, Picture, Reading
-from dashcalib_ros.input.stamps import RECORDED, StampGate
+from dashcalib_ros.input.stamps import StampGate
 
 
 class BagSource(FrameSource):
@@ -42,7 +42,7 @@ class BagSource(FrameSource):
         return None if first is None else first.receive_ns
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
-        gate, depth = StampGate(RECORDED), BitDepth()
+        gate, depth = StampGate(), BitDepth()
         damage: list[str] = []
         first_ns: int | None = None
         try:

@@ -102,7 +102,7 @@ def _expanded(text: str) -> _Group:
     if path.exists() or not glob.has_magic(text):
         return _Group(text, (path,))
     found = sorted(named_like(text), key=lambda each: by_name(str(each)))
-    known = tuple(each for each in found if _kind_of(each) is not None)
+    known = tuple(each for each in found if _opener_of(each) is not None)
     if not known:
         raise InputError(_unknown(found[0]) if found else
                          f'no file is named like {text}: check the pattern')
@@ -202,24 +202,12 @@ def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
     try:
         if not place.is_dir():
             _check_readable(place)
-        kind = _kind_of(place)
-        if kind is None:
+        opener = _opener_of(place)
+        if opener is None:
             raise InputError(_unknown(place))
-        return kind.open(place, topic, fps)
+        return opener(place, topic, fps)
     except OSError as error:
         raise InputError(os_error(place, error)) from error
-
-
-@dataclass(frozen=True)
-class InputKind:
-    """A kind of input: fits() decides by the path, open() returns the images.
-
-    open: takes the path, the topic and the rate, as open_frames() does; loads its libraries.
-    """
-
-    name: str
-    fits: Callable[[Path], bool]
-    open: Callable[[Path, str | None, float | None], FrameSource]
 
 
 def fits_bag(path: Path) -> bool:
@@ -250,16 +238,16 @@ def _is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
-#: the first that fits is taken: a folder with a bag in it is no folder of images
-KINDS = (
-    InputKind('bag', fits_bag, _open_bag),
-    InputKind('video', _is_video, _open_video),
-    InputKind('folder of images', Path.is_dir, _open_folder),
-)
+Opener = Callable[[Path, str | None, float | None], FrameSource]
+#: the kinds of inputs: whether a path is one, and what opens it (path, topic and rate, as
+#: open_frames() has them; it loads its libraries). The first that fits is taken: a folder with a
+#: bag in it is no folder of images
+KINDS: tuple[tuple[Callable[[Path], bool], Opener], ...] = (
+    (fits_bag, _open_bag), (_is_video, _open_video), (Path.is_dir, _open_folder))
 
 
-def _kind_of(path: Path) -> InputKind | None:
-    return next((kind for kind in KINDS if kind.fits(path)), None)
+def _opener_of(path: Path) -> Opener | None:
+    return next((opener for fits, opener in KINDS if fits(path)), None)
 
 
 def _check_recorded(text: str) -> None:

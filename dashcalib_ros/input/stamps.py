@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import statistics
 from collections import deque
-from dataclasses import dataclass
 
 SECOND_NS = 1_000_000_000
 # a stamp further back means a clock that was set back (a bag that loops), not a late image
@@ -21,48 +20,30 @@ def least_step_ns(rate: float) -> float:
     return (1 - EARLY) * 1e9 / rate
 
 
-@dataclass(frozen=True)
-class StampPolicy:
-    """What a gate does differently for recordings and live streams.
-
-    shift: after the clock was set back, later stamps are shifted so that time goes on; else they
-    stay as they are: the core then begins its tracking anew and keeps its turns.
-    skip_zero: an image without a stamp is left out where others have one, also if the first stamp
-    comes late; else the first image decides whether stamps or times of reception are used.
-    rate: Hz that images are thinned to, as in MotionEstimator, but before they are decoded; None:
-    all are used.
-    """
-
-    shift: bool
-    skip_zero: bool
-    rate: float | None = None
-
-
-RECORDED = StampPolicy(shift=True, skip_zero=False)
-
-
-def live(rate: float) -> StampPolicy:
-    """Return the policy of a live stream that is thinned to a rate in Hz."""
-    return StampPolicy(shift=False, skip_zero=True, rate=rate)
-
-
 class StampGate:
     """Gives each image of a stream its time, and leaves out those that cannot be used.
 
     The time is the header's stamp; for drivers that set no stamps it is the time of reception. An
     image that is not later than the one before is a repetition or came late: it is left out.
 
+    rate: Hz, of a live stream, whose images are thinned to it as in MotionEstimator, but before
+    they are decoded; None: a recording, of which all are used. After the clock was set back, a
+    recording's later stamps are shifted so that time goes on; a live stream's stay as they are:
+    the core then begins its tracking anew and keeps its turns. In a live stream an image without a
+    stamp is left out where others have one, also if the first stamp comes late; in a recording the
+    first image decides whether stamps or times of reception are used.
+
     unstamped: times of reception are used. repeated: number of images left out as not later than
     the one before; zero: of those left out as without a stamp. set_back: how often the clock was
     set back, and furthest_back_ns by how much at the most. lost: images missing between stamps.
     """
 
-    def __init__(self, policy: StampPolicy) -> None:
-        self.policy = policy
+    def __init__(self, rate: float | None = None) -> None:
+        self._live = rate is not None
         self.unstamped = False
         self.repeated = self.zero = self.lost = self.set_back = 0
         self.furthest_back_ns = 0
-        self._least_ns = least_step_ns(policy.rate) if policy.rate else 0.0
+        self._least_ns = least_step_ns(rate) if rate else 0.0
         self._steps: deque[int] = deque(maxlen=31)
         self.forget()
 
@@ -110,7 +91,7 @@ class StampGate:
         if step < -SET_BACK_NS:
             self.set_back += 1
             self.furthest_back_ns = max(self.furthest_back_ns, -step)
-            if not self.policy.shift:
+            if self._live:
                 self._last = now
                 return now
             self._shift += self._step - step
@@ -126,7 +107,7 @@ class StampGate:
     def _choose_clock(self, header_ns: int) -> bool:
         """Decide between stamps and times of reception; return False to leave the image out."""
         begun = self._last is not None
-        if begun and not self.policy.skip_zero:
+        if begun and not self._live:
             return True
         if begun and header_ns == 0 and not self.unstamped:
             return False

@@ -19,7 +19,7 @@ from av.video.reformatter import ColorRange, VideoReformatter
 from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.source import FrameSource, Picture, Reading
-from dashcalib_ros.input.stamps import RECORDED, SECOND_NS, StampGate
+from dashcalib_ros.input.stamps import SECOND_NS, StampGate
 from dashcalib_ros.limits import check_pixels
 
 # FFmpeg's names; it would also play text, and scripts that name other files
@@ -90,7 +90,7 @@ class VideoSource(FrameSource):
         return None if created.year <= 2000 else round(created.timestamp()) * SECOND_NS
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
-        gate, picture = StampGate(RECORDED), _Picture()
+        gate, picture = StampGate(), _Picture()
         read, index = self._before(start_ns) if start_ns else (0, 0)
         reading.images = index
         with _opened(self._path) as (container, stream):

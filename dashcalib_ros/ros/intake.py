@@ -11,7 +11,7 @@ from typing import Any
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.decode import message_size
-from dashcalib_ros.input.stamps import StampGate, live
+from dashcalib_ros.input.stamps import StampGate
 from dashcalib_ros.ros.complaints import Complaints
 from dashcalib_ros.ros.detecting import whole
 from dashcalib_ros.ros.stream import Source, SourceWatch
@@ -44,7 +44,7 @@ class Intake:
         self._complaints = complaints
         self._changed = changed
         self._watch: SourceWatch[Source] = SourceWatch()
-        self._stamps = StampGate(live(rate))
+        self._stamps = StampGate(rate)
         self._last: float | None = None
 
     @property

@@ -11,7 +11,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.decode import BitDepth, decode, message_size
 from dashcalib_ros.input.header import encoded_size
 from dashcalib_ros.input.source import LAST_NS, Frame, by_name, is_bag_file
-from dashcalib_ros.input.stamps import RECORDED, StampGate, live
+from dashcalib_ros.input.stamps import StampGate
 
 QUICK = settings(derandomize=True, deadline=None, max_examples=150, database=None)
 STARTS = (b'', b'\xff\xd8', b'\xff\xd8\xff\xc0\0\x11\x08', b'\x89PNG\r\n\x1a\n', b'BM', b'II*\0',
@@ -58,7 +58,7 @@ def test_a_raw_message_of_any_fields(encoding: str, width: int, height: int, ste
 @QUICK
 @given(st.lists(st.tuples(STAMPS, STAMPS), max_size=40))
 def test_stamps_of_a_recording_increase(stamps: list[tuple[int, int]]) -> None:
-    gate = StampGate(RECORDED)
+    gate = StampGate()
     used = [time for each in stamps if (time := gate.take(*each)) is not None]
     assert used == sorted(set(used))
     assert all('\n' not in line for line in gate.warnings())
@@ -68,7 +68,7 @@ def test_stamps_of_a_recording_increase(stamps: list[tuple[int, int]]) -> None:
 @given(st.lists(st.tuples(STAMPS, STAMPS), max_size=40), st.floats(0.1, 100))
 def test_a_live_gate_gives_the_stamps_it_was_given(stamps: list[tuple[int, int]],
                                                    rate: float) -> None:
-    gate = StampGate(live(rate))
+    gate = StampGate(rate)
     for header_ns, received_ns in stamps:
         assert gate.take(header_ns, received_ns) in (None, header_ns, received_ns)
 

@@ -7,14 +7,14 @@ import pytest
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import MotionEstimator
 from dashcalib_ros.input import Frame
-from dashcalib_ros.input.stamps import RECORDED, StampGate, StampPolicy, live
+from dashcalib_ros.input.stamps import StampGate
 
 SECOND = 10**9
 START = 1_767_614_400 * SECOND
 
 
 def taken(*stamps):
-    watch = StampGate(StampPolicy(shift=False, skip_zero=True))
+    watch = StampGate(1e9)
     return watch, [watch.take(stamp, 77 + n) for n, stamp in enumerate(stamps)]
 
 
@@ -62,7 +62,7 @@ def test_one_zero_among_stamps_is_left_out():
 def test_thinning_takes_what_the_motion_estimator_takes(rate):
     rng = np.random.default_rng(int(rate))
     config = Config()
-    gate, estimator = StampGate(live(config.motion.rate)), MotionEstimator(config.motion)
+    gate, estimator = StampGate(config.motion.rate), MotionEstimator(config.motion)
     image = np.zeros((48, 64), np.uint8)
     stamps = [START + round(n * SECOND / rate + rng.uniform(-5e6, 5e6)) for n in range(60)]
     stamps += [stamp - 3000 * SECOND for stamp in stamps]  # a bag that loops
@@ -73,7 +73,7 @@ def test_thinning_takes_what_the_motion_estimator_takes(rate):
 
 
 def test_a_recording_goes_on_where_its_clock_is_set_back():
-    gate = StampGate(RECORDED)
+    gate = StampGate()
     stamps = [gate.take(hour * 3600 * SECOND + tenth * SECOND // 10, 0)
               for hour, tenth in ((5, 0), (5, 1), (4, 0), (4, 1), (4, 3))]
     steps = np.diff(np.array(stamps, np.int64)) // (SECOND // 10)
@@ -83,14 +83,14 @@ def test_a_recording_goes_on_where_its_clock_is_set_back():
 
 
 def test_a_recording_without_stamps_keeps_to_the_times_of_reception():
-    gate = StampGate(RECORDED)
+    gate = StampGate()
     assert [gate.take(0, 5), gate.take(START, 6), gate.take(0, 7)] == [5, 6, 7]
     assert gate.warnings() == [
         'the image headers have no stamps: the times of reception were used']
 
 
 def test_a_live_stream_begins_anew_and_keeps_its_counts():
-    gate = StampGate(live(10.0))
+    gate = StampGate(10.0)
     assert [gate.take(START, 0), gate.take(START, 0), gate.take(0, 0)] == [START, None, None]
     gate.forget()
     assert gate.take(START - 10 * SECOND, 0) == START - 10 * SECOND
