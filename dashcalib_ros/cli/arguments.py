@@ -1,17 +1,22 @@
-"""The arguments of every command."""
+"""The arguments and the exit codes of every command."""
 from __future__ import annotations
 
 import argparse
-import importlib
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from dashcalib_ros.cli.values import crop, path_or, positive, seconds, size
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import write_stdout
 
 PROGRAM = 'dashcalib'
+# exit codes
+ACCEPTED = 0
+WRONG = 1  # of check: the calibration does not explain the drive
+BAD_INPUT = 2  # or bad usage: one line on stderr says what and the cure
+NOT_ENOUGH = 3  # weak or refused: the input was fine, the evidence was not enough
+INTERRUPTED = 130  # Ctrl-C or SIGTERM, as shells have it
 INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, or a folder of images; '
               "several of one camera, in this order; or a folder of videos, or a pattern "
               "('clips/*.mp4'): bags by their time, all else by name")
@@ -27,6 +32,11 @@ BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera refused; 3 s
                    '2 bad manifest or usage')
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
 KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'rays', 'maps')
+
+
+def exit_code(verdict: str) -> int:
+    """Return the exit code of a verdict."""
+    return ACCEPTED if verdict == 'accepted' else NOT_ENOUGH
 
 
 class UsageError(DashcalibError):
@@ -51,6 +61,13 @@ class Parser(argparse.ArgumentParser):
         """Raise UsageError: one line that names --help."""
         raise UsageError(f'{message}; see {self.prog} --help')
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Parse them all: what a command does not know must name that command's --help."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f'unrecognized arguments: {" ".join(unknown)}')
+        return found, []
+
     def print_help(self, file: Any = None) -> None:
         """Print the help on stdout. Raises OutputError where it cannot."""
         write_stdout(self.format_help().rstrip('\n'))
@@ -74,7 +91,7 @@ class Version(argparse.Action):
 
 
 def make_parser() -> Parser:
-    """Return the parser; the parsed arguments have the function to call with them as `command`."""
+    """Return the parser; the parsed arguments have the command's name as `command`."""
     parser = Parser(
         prog=PROGRAM, epilog=f'{PROGRAM} COMMAND --help tells more\n{EXIT_HELP}',
         description='Calibrates a dashcam from the turns the car takes anyway.')
@@ -227,16 +244,8 @@ def _command(commands: Any, name: str, summary: str, description: str, example: 
              exit_codes: str = SHORT_EXIT_HELP) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         name, help=summary, description=description, epilog=f'example: {example}\n{exit_codes}')
-    parser.set_defaults(command=_lazily(name))
+    parser.set_defaults(command=name)
     return parser
-
-
-def _lazily(name: str) -> Callable[[argparse.Namespace], int]:
-    """Return the command's function, which imports its module, and numpy's, only when called."""
-    def command(args: argparse.Namespace) -> int:
-        code: int = getattr(importlib.import_module(f'dashcalib_ros.cli.{name}'), name)(args)
-        return code
-    return command
 
 
 def _add_drive_arguments(parser: argparse.ArgumentParser, count: str = '+', more: str = ''
@@ -293,3 +302,53 @@ def _add_verbose(parser: argparse.ArgumentParser) -> None:
 def _add_out(parser: argparse.ArgumentParser, default: str, cure: str) -> None:
     parser.add_argument('--out', type=path_or(cure), default=Path(default), metavar='DIR',
                         help=f'where the results go (default: ./{default})')
+
+
+def size(text: str) -> tuple[int, int]:
+    """Return a size that is given as WxH."""
+    width, height = _whole_numbers(text, 'x', 2, '1280x720')
+    return width, height
+
+
+def crop(text: str) -> list[int]:
+    """Return a part of the picture that is given as X,Y,W,H."""
+    return _whole_numbers(text, ',', 4, '0,100,1280,520')
+
+
+def _whole_numbers(text: str, between: str, count: int, like: str) -> list[int]:
+    parts = text.lower().split(between)
+    if len(parts) != count or not all(part.strip().isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f'{text!r} is not like {like}')
+    return [int(part) for part in parts]
+
+
+def path_or(cure: str) -> Callable[[str], Path]:
+    """Return a type of argument: a path that is not - (standard output elsewhere)."""
+    def path(text: str) -> Path:
+        if text == '-':
+            raise argparse.ArgumentTypeError(f'it cannot be -: {cure}')
+        return Path(text)
+    return path
+
+
+def positive(text: str) -> float:
+    """Return a number above 0."""
+    value = _number(text)
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f'must be a positive number, not {text!r}')
+    return value
+
+
+def seconds(text: str) -> float:
+    """Return a number of seconds."""
+    value = _number(text)
+    if not (math.isfinite(value) and value >= 0):
+        raise argparse.ArgumentTypeError(f'must be 0 or more seconds, not {text!r}')
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

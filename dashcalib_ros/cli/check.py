@@ -9,10 +9,8 @@ from rich.text import Text
 
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.arguments import UsageError
-from dashcalib_ros.cli.drive import feed, open_calibrator, open_drive
-from dashcalib_ros.cli.settings import read_config
+from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
+from dashcalib_ros.cli.drive import feed, open_calibrator, open_drive, read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
 from dashcalib_ros.errors import counted
 from dashcalib_ros.input.inputs import fits_bag
@@ -23,6 +21,7 @@ from dashcalib_ros.report.camera_file import load_with_faults
 from dashcalib_ros.report.tables import TextTable, labelled
 
 COLOURS = {'right': 'bold green', 'wrong': 'bold red', 'cannot tell': 'bold yellow'}
+EXIT_CODES = {'right': ACCEPTED, 'wrong': WRONG, 'cannot tell': NOT_ENOUGH}
 # what is said of the poses, by its name in the JSON
 MEASURED = {'rotation_deg': ('rotation missed, degrees', 1.0),
             'rotation_deg_per_100m': ('the same, in 100 m', 1.0),
@@ -68,7 +67,7 @@ def check(args: argparse.Namespace) -> int:
             write_text(args.out / name, text)
         if not args.json:
             show_text(f'written: {args.out / "paths.svg"}, and beside it the paths for evo')
-    return exit_codes.of_answer(found.answer)
+    return EXIT_CODES[found.answer]
 
 
 def _changes(calibrator: Calibrator, given: Camera, calibration: Calibration) -> list[str]:

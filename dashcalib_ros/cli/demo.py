@@ -13,10 +13,9 @@ from time import perf_counter
 from rich.text import Text
 
 from dashcalib_ros.camera import Radial, camera_of
-from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.drive import calibrate
+from dashcalib_ros.cli.arguments import exit_code
+from dashcalib_ros.cli.drive import calibrate, read_config
 from dashcalib_ros.cli.run import files_line, now, set_aside_lines
-from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.errors import OutputError
@@ -57,7 +56,7 @@ def demo(args: argparse.Namespace) -> int:
     screen.show(Text(files_line(out, files)))
     screen.show(Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'))
     screen.show(next_step(calibration.verdict))
-    return exit_codes.of_verdict(calibration.verdict.level)
+    return exit_code(calibration.verdict.level)
 
 
 @contextmanager

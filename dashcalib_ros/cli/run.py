@@ -8,9 +8,8 @@ from pathlib import Path
 
 from rich.text import Text
 
-from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.drive import calibrate, open_drive
-from dashcalib_ros.cli.settings import read_config
+from dashcalib_ros.cli.arguments import exit_code
+from dashcalib_ros.cli.drive import calibrate, open_drive, read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, show_text, warn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import FrameSource
@@ -42,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     if args.write_bag is not None:
         _write_bag(args, str(source.topic), calibration, screen)
     screen.show(next_step(calibration.verdict))
-    return exit_codes.of_verdict(calibration.verdict.level)
+    return exit_code(calibration.verdict.level)
 
 
 def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:

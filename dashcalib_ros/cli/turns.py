@@ -7,9 +7,8 @@ from typing import Any
 
 from rich.text import Text
 
-from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.drive import feed, open_drive
-from dashcalib_ros.cli.settings import read_config
+from dashcalib_ros.cli.arguments import ACCEPTED
+from dashcalib_ros.cli.drive import feed, open_drive, read_config
 from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
 from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
@@ -38,12 +37,12 @@ def turns(args: argparse.Namespace) -> int:
         show_text(json.dumps(plain_values({
             'input': source.name, 'frames': frames, 'turns': found,
             'warnings': (*source.warnings, *detection.warnings())}), indent=2, allow_nan=False))
-        return exit_codes.ACCEPTED
+        return ACCEPTED
     if found:
         show(TextTable(COLUMNS, [_cells(row, detection.start_s) for row in found]))
         show(Text(PROMINENCE))
     show(Text(_conclusion(len(found), config.turns.wanted, frames)))
-    return exit_codes.ACCEPTED
+    return ACCEPTED
 
 
 def _conclusion(found: int, wanted: int, frames: int) -> str:

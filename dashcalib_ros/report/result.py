@@ -1,11 +1,11 @@
-"""result.json: a calibration as strict JSON, the contract other programs rely on."""
+"""result.json: a calibration as strict JSON, the contract other programs rely on; and a check."""
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from dashcalib_ros.camera.field import BASIS, Field
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import Calibration, Check, Odometry, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.limits import JSON_BYTES, parse_yaml, read_text
 from dashcalib_ros.limits import parse_json as parse_any_json
@@ -72,9 +72,11 @@ def load_result(path: str | Path) -> dict[str, Any]:
 
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Read a calibration from result.json, its folder, or calibration.yaml; see Calibration.load.
+    """Read what save() and `dashcalib run` write: a result.json, its folder, calibration.yaml.
 
-    Raises InputError.
+    A result.json has everything but the mask, the turning magnitudes and what the report draws; a
+    calibration.yaml has camera, sigma, verdict and versions. Settings that this version does not
+    know are left out. Raises InputError; load_camera() reads other files.
     """
     place = Path(path)
     place = place / 'result.json' if place.is_dir() else place
@@ -190,3 +192,22 @@ def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
     # a stored turn's id has a meaning in this run only
     return {('stamp' if key == 'stamp_s' else key): item for key, item in values.items()
             if key != 'id'}
+
+
+def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None
+                ) -> dict[str, Any]:
+    """Return what a drive says of a given calibration as types of strict JSON.
+
+    changes: of the camera during the drive, in words. motion: the comparison with true poses.
+    """
+    values: dict[str, Any] = plain_values(found) | {'changes': list(changes)}
+    if motion is not None:
+        values |= motion.medians()
+        values['turns'] = [{'center': turn.turn.number, 'true_deg': turn.angle_deg,
+                            'length_m': turn.length_m,
+                            'rotation_deg': {name: turn.rotation_deg(name)
+                                             for name in motion.names},
+                            'scale_drift': {name: turn.scale_drift(name)
+                                            for name in motion.names}}
+                           for turn in motion.turns]
+    return values

@@ -23,7 +23,7 @@ from dashcalib_ros.report import (
     mapping_error,
     result_json,
 )
-from dashcalib_ros.report.difference_page import difference_html
+from dashcalib_ros.report.page import difference_html
 from dashcalib_ros.solve.knowledge import PictureSigma
 
 SIZE = (1242, 375)
