@@ -14,7 +14,15 @@ from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary
 from dashcalib_ros.judge.agreement import focal_disagreement, leverages
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.judge.verdict import profile_contrast
+from dashcalib_ros.judge.verdict import (
+    Rule,
+    flat_profile,
+    one_turn_dominates,
+    other_camera,
+    profile_contrast,
+    sigma_too_large,
+    turns_disagree,
+)
 from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 
@@ -217,21 +225,20 @@ def checks(calibration: Calibration) -> tuple[Check, ...]:
 
 
 def _of_solution(solution: Solution, needed: VerdictConfig) -> list[Check]:
-    contrast, spread = profile_contrast(solution), focal_disagreement(solution)
-    sigma = float(solution.sigma[0] / solution.camera.fx)
+    def check(name: str, found: str, limit: str, rule: Rule) -> Check:
+        return Check(name, found, limit, rule(solution, needed) is None)
+
     share = max(leverages(solution).values(), default=1.0)
-    misfit = max(solution.misfits.values(), default=0.0)
     return [
-        Check('rise of the error when the focal length is 20 % off',
-              f'{100 * max(contrast, 0.0):.1f} %', f'at least {100 * needed.min_contrast:.0f} %',
-              contrast >= needed.min_contrast),
-        Check('uncertainty of fx', f'{100 * sigma:.2g} %',
-              f'at most {100 * needed.max_sigma:.3g} %', sigma <= needed.max_sigma),
-        Check('scatter of fx between the turns', f'{100 * spread:.2g} %',
-              f'at most {100 * needed.max_disagreement:.3g} %',
-              spread <= needed.max_disagreement),
-        Check('share of the turn that knows most of fx', f'{100 * min(share, 1.0):.0f} %',
-              f'at most {100 * needed.max_leverage:.0f} %',
-              len(solution.scenes) < 2 or share <= needed.max_leverage),
-        Check('a turn’s error, over that with a camera of its own', f'{misfit:.2g} times',
-              f'at most {needed.max_misfit:.2g} times', misfit <= needed.max_misfit)]
+        check('rise of the error when the focal length is 20 % off',
+              f'{100 * max(profile_contrast(solution), 0.0):.1f} %',
+              f'at least {100 * needed.min_contrast:.0f} %', flat_profile),
+        check('uncertainty of fx', f'{100 * float(solution.sigma[0] / solution.camera.fx):.2g} %',
+              f'at most {100 * needed.max_sigma:.3g} %', sigma_too_large),
+        check('scatter of fx between the turns', f'{100 * focal_disagreement(solution):.2g} %',
+              f'at most {100 * needed.max_disagreement:.3g} %', turns_disagree),
+        check('share of the turn that knows most of fx', f'{100 * min(share, 1.0):.0f} %',
+              f'at most {100 * needed.max_leverage:.0f} %', one_turn_dominates),
+        check('a turn’s error, over that with a camera of its own',
+              f'{max(solution.misfits.values(), default=0.0):.2g} times',
+              f'at most {needed.max_misfit:.2g} times', other_camera)]
