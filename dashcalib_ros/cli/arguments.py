@@ -30,8 +30,20 @@ SHORT_EXIT_HELP = 'exit codes: 0 done; 2 bad input or usage'
 CHECK_EXIT_HELP = 'exit codes: 0 right; 1 wrong; 3 the drive cannot tell; 2 bad input or usage'
 BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera refused; 3 some were not; '
                    '2 bad manifest or usage')
+# the names of models and exports are not taken from their tables: that would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
 KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'rays', 'maps')
+
+SHARED: dict[str, dict[str, Any]] = {
+    '--config': {'type': Path, 'metavar': 'YAML', 'help': 'settings from a file'},
+    '--set': {'action': 'append', 'default': [], 'metavar': 'KEY=VALUE',
+              'help': 'one setting, over those of --config; may be repeated'},
+    '--model': {'metavar': 'NAME', 'help': 'of the lens: radial, brown, fisheye, or auto: the one '
+                                           'that the turns prove (default)'},
+    '--seed': {'type': int, 'metavar': 'S', 'help': 'same input and seed: same result'},
+    '--quiet': {'action': 'store_true',
+                'help': 'no progress and no summary: only warnings and errors'},
+    '--verbose': {'action': 'store_true', 'help': "show COLMAP's own log"}}
 
 
 def exit_code(verdict: str) -> int:
@@ -96,7 +108,8 @@ def make_parser() -> Parser:
         prog=PROGRAM, epilog=f'{PROGRAM} COMMAND --help tells more\n{EXIT_HELP}',
         description='Calibrates a dashcam from the turns the car takes anyway.')
     parser.add_argument('--version', action=Version)
-    commands = parser.add_subparsers(metavar='COMMAND', required=True, parser_class=Parser)
+    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True,
+                                     parser_class=Parser)
     _add_run(commands)
     _add_turns(commands)
     _add_demo(commands)
@@ -114,8 +127,7 @@ def _add_run(commands: Any) -> None:
         'Writes result.json, report.html and, when accepted, calibration.yaml to DIR.',
         "dashcalib run 'clips/*.mp4' --out calibration", EXIT_HELP)
     _add_drive_arguments(parser)
-    _add_model(parser)
-    _add_seed(parser)
+    _add_shared(parser, '--model', '--seed')
     parser.add_argument('--threads', type=int, metavar='N',
                         help='processes that reconstruct turns side by side; the result is the '
                              'same with any')
@@ -126,8 +138,7 @@ def _add_run(commands: Any) -> None:
                                     '--json - prints result.json')
     parser.add_argument('--json', choices=('-',), metavar='-',
                         help='print result.json on stdout, all else on stderr')
-    _add_quiet(parser)
-    _add_verbose(parser)
+    _add_shared(parser, '--quiet', '--verbose')
 
 
 def _add_turns(commands: Any) -> None:
@@ -136,7 +147,7 @@ def _add_turns(commands: Any) -> None:
                       'dashcalib turns drive.mp4 --start 60 --duration 300')
     _add_drive_arguments(parser)
     parser.add_argument('--json', action='store_true', help='print JSON')
-    _add_quiet(parser, 'no progress')
+    parser.add_argument('--quiet', action='store_true', help='no progress')
     # they were taken here before, and change nothing
     parser.add_argument('--seed', type=int, help=argparse.SUPPRESS)
     parser.add_argument('--verbose', action='store_true', help=argparse.SUPPRESS)
@@ -147,12 +158,10 @@ def _add_demo(commands: Any) -> None:
                       'Renders a drive with a known lens into a ROS 2 bag, calibrates that and '
                       'compares the result with the truth.',
                       'dashcalib demo --keep-bag --out demo', EXIT_HELP)
-    _add_model(parser)
-    _add_seed(parser)
+    _add_shared(parser, '--model', '--seed')
     _add_out(parser, 'demo', 'the results are several files: give a folder')
     parser.add_argument('--keep-bag', action='store_true', help='leave the bag in DIR/bag')
-    _add_quiet(parser)
-    _add_verbose(parser)
+    _add_shared(parser, '--quiet', '--verbose')
 
 
 def _add_compare(commands: Any) -> None:
@@ -173,14 +182,13 @@ def _add_export(commands: Any) -> None:
                       'dashcalib export calibration --to colmap --out cameras.txt')
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
                         help=CALIBRATION_HELP)
-    # the names are not taken from the table of exports: that would load numpy and OpenCV
     kind = parser.add_argument('--to', required=True, metavar='KIND',
                                help=f'{", ".join(KINDS[:-1])} or {KINDS[-1]}')
     _completed(kind, KINDS)
     view = parser.add_mutually_exclusive_group()
-    view.add_argument('--size', type=size, metavar='WxH',
+    view.add_argument('--size', type=whole_numbers('x', 2, '1280x720'), metavar='WxH',
                       help='for pictures that were resized to this')
-    view.add_argument('--crop', type=crop, metavar='X,Y,W,H',
+    view.add_argument('--crop', type=whole_numbers(',', 4, '0,100,1280,520'), metavar='X,Y,W,H',
                       help='for this part of the pictures')
     parser.add_argument('--out', type=path_or('leave --out away for standard output'),
                         metavar='FILE', help='default: standard output')
@@ -194,16 +202,15 @@ def _add_check(commands: Any) -> None:
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
                         help=CALIBRATION_HELP)
     _add_drive_arguments(parser, '*', 'left away: the bag that CALIBRATION is; else: ')
-    _add_model(parser)
-    _add_seed(parser)
+    _add_shared(parser, '--model', '--seed')
     parser.add_argument('--poses', type=Path, metavar='FILE',
                         help="true poses, in KITTI's or TUM's format: compare the rotation and "
                              'the scale that each camera finds with them')
     parser.add_argument('--out', type=path_or('--out is a folder'), metavar='DIR',
                         help='with --poses: write a plot of the paths, and the paths for evo')
     parser.add_argument('--json', action='store_true', help='print JSON')
-    _add_quiet(parser, 'no progress')
-    _add_verbose(parser)
+    parser.add_argument('--quiet', action='store_true', help='no progress')
+    _add_shared(parser, '--verbose')
 
 
 def _add_batch(commands: Any) -> None:
@@ -228,10 +235,7 @@ def _add_batch(commands: Any) -> None:
     where.add_argument('--shard', metavar='I/N',
                        help='do the I-th of N parts, with one process and without Ray; a run '
                             'without --shard then makes the tables')
-    _add_settings(parser)
-    _add_model(parser)
-    _add_seed(parser)
-    _add_quiet(parser)
+    _add_shared(parser, '--config', '--set', '--model', '--seed', '--quiet')
 
 
 def _count(text: str) -> int:
@@ -244,7 +248,6 @@ def _command(commands: Any, name: str, summary: str, description: str, example: 
              exit_codes: str = SHORT_EXIT_HELP) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         name, help=summary, description=description, epilog=f'example: {example}\n{exit_codes}')
-    parser.set_defaults(command=name)
     return parser
 
 
@@ -252,11 +255,11 @@ def _add_drive_arguments(parser: argparse.ArgumentParser, count: str = '+', more
                          ) -> None:
     parser.add_argument('input', metavar='INPUT', nargs=count, help=more + INPUT_HELP)
     parser.add_argument('--topic', metavar='T', help="the bag's image topic")
-    parser.add_argument('--fps', type=positive, metavar='F',
+    parser.add_argument('--fps', type=POSITIVE, metavar='F',
                         help='rate of a video or image folder')
-    parser.add_argument('--start', type=seconds, default=0.0, metavar='S',
+    parser.add_argument('--start', type=SECONDS, default=0.0, metavar='S',
                         help='leave out the first S seconds of the drive')
-    parser.add_argument('--duration', type=positive, metavar='S',
+    parser.add_argument('--duration', type=POSITIVE, metavar='S',
                         help='use S seconds of the drive')
     parser.add_argument('--turns', type=int, metavar='N', help='how many turns are wanted')
     parser.add_argument('--mask', type=Path, metavar='PNG',
@@ -264,21 +267,15 @@ def _add_drive_arguments(parser: argparse.ArgumentParser, count: str = '+', more
     parser.add_argument('--segmentation', metavar='MODEL.onnx',
                         help='a segmentation network that finds the own car, used in addition to '
                              'the automatic mask')
-    _add_settings(parser)
+    _add_shared(parser, '--config', '--set')
 
 
-def _add_settings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--config', type=Path, metavar='YAML', help='settings from a file')
-    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
-                        help='one setting, over those of --config; may be repeated')
-
-
-def _add_model(parser: argparse.ArgumentParser) -> None:
-    # the names are not taken from the table of models: that would load numpy and OpenCV
-    model = parser.add_argument('--model', metavar='NAME',
-                                help='of the lens: radial, brown, fisheye, or auto: the one that '
-                                     'the turns prove (default)')
-    _completed(model, MODELS)
+def _add_shared(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add options that several commands have."""
+    for name in names:
+        action = parser.add_argument(name, **SHARED[name])
+        if name == '--model':
+            _completed(action, MODELS)
 
 
 def _completed(action: argparse.Action, names: Sequence[str]) -> None:
@@ -286,40 +283,36 @@ def _completed(action: argparse.Action, names: Sequence[str]) -> None:
     action.completer = lambda **_: names  # type: ignore[attr-defined]
 
 
-def _add_seed(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--seed', type=int, metavar='S', help='same input and seed: same result')
-
-
-def _add_quiet(parser: argparse.ArgumentParser, what: str = 'no progress and no summary: only '
-                                                            'warnings and errors') -> None:
-    parser.add_argument('--quiet', action='store_true', help=what)
-
-
-def _add_verbose(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--verbose', action='store_true', help="show COLMAP's own log")
-
-
 def _add_out(parser: argparse.ArgumentParser, default: str, cure: str) -> None:
     parser.add_argument('--out', type=path_or(cure), default=Path(default), metavar='DIR',
                         help=f'where the results go (default: ./{default})')
 
 
-def size(text: str) -> tuple[int, int]:
-    """Return a size that is given as WxH."""
-    width, height = _whole_numbers(text, 'x', 2, '1280x720')
-    return width, height
+def whole_numbers(between: str, count: int, like: str) -> Callable[[str], tuple[int, ...]]:
+    """Return a type of argument: so many whole numbers, such as a size or a part of a picture."""
+    def numbers(text: str) -> tuple[int, ...]:
+        parts = text.lower().split(between)
+        if len(parts) != count or not all(part.strip().isdecimal() for part in parts):
+            raise argparse.ArgumentTypeError(f'{text!r} is not like {like}')
+        return tuple(int(part) for part in parts)
+    return numbers
 
 
-def crop(text: str) -> list[int]:
-    """Return a part of the picture that is given as X,Y,W,H."""
-    return _whole_numbers(text, ',', 4, '0,100,1280,520')
+def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
+    """Return a type of argument: a finite number that fits. what: it must be."""
+    def value(text: str) -> float:
+        try:
+            found = float(text)
+        except ValueError:
+            found = math.nan
+        if not (math.isfinite(found) and fits(found)):
+            raise argparse.ArgumentTypeError(f'must be {what}, not {text!r}')
+        return found
+    return value
 
 
-def _whole_numbers(text: str, between: str, count: int, like: str) -> list[int]:
-    parts = text.lower().split(between)
-    if len(parts) != count or not all(part.strip().isdecimal() for part in parts):
-        raise argparse.ArgumentTypeError(f'{text!r} is not like {like}')
-    return [int(part) for part in parts]
+SECONDS = number('0 or more seconds', lambda value: value >= 0)
+POSITIVE = number('a positive number', lambda value: value > 0)
 
 
 def path_or(cure: str) -> Callable[[str], Path]:
@@ -329,26 +322,3 @@ def path_or(cure: str) -> Callable[[str], Path]:
             raise argparse.ArgumentTypeError(f'it cannot be -: {cure}')
         return Path(text)
     return path
-
-
-def positive(text: str) -> float:
-    """Return a number above 0."""
-    value = _number(text)
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f'must be a positive number, not {text!r}')
-    return value
-
-
-def seconds(text: str) -> float:
-    """Return a number of seconds."""
-    value = _number(text)
-    if not (math.isfinite(value) and value >= 0):
-        raise argparse.ArgumentTypeError(f'must be 0 or more seconds, not {text!r}')
-    return value
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

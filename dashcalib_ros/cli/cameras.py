@@ -5,11 +5,12 @@ import argparse
 import json
 
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
-from dashcalib_ros.cli.terminal import show, show_text, warn
+from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.report import compare as compare_cameras
 from dashcalib_ros.report import load_camera, write_text
 from dashcalib_ros.report.export import WITH_FIELD, cropped, exported, resized
 from dashcalib_ros.report.tables import comparison
+from dashcalib_ros.standard_streams import write_stdout
 
 
 def compare(args: argparse.Namespace) -> int:
@@ -19,11 +20,11 @@ def compare(args: argparse.Namespace) -> int:
         from dashcalib_ros.report.difference_page import difference_html
         write_text(args.html, difference_html(found))
     if args.json:
-        show_text(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        write_stdout(json.dumps(found.as_dict(), indent=2, allow_nan=False))
     else:
         show(comparison(found))
         if args.html is not None:
-            show_text(f'written: {args.html}, a map of the difference')
+            write_stdout(f'written: {args.html}, a map of the difference')
     return ACCEPTED
 
 
@@ -50,5 +51,5 @@ def export(args: argparse.Namespace) -> int:
     elif isinstance(text, bytes):
         raise UsageError(f'--to {args.to} is no text; add --out {args.to}.npz')
     else:
-        show_text(text.rstrip('\n'))
+        write_stdout(text.rstrip('\n'))
     return ACCEPTED

@@ -18,6 +18,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError, counted, shortened
 from dashcalib_ros.input import FrameSource
 from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.input.mask_file import read_mask
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.recorded import Taker, pushed, with_source
@@ -77,9 +78,10 @@ def _numbers(value: Any) -> Any:
     return value
 
 
-def open_drive(args: argparse.Namespace) -> FrameSource:
-    """Open what the arguments name. Raises InputError."""
-    return open_frames(args.input, args.topic, args.fps, args.start, args.duration)
+def open_drive(args: argparse.Namespace) -> tuple[FrameSource, Mask | None]:
+    """Open the drive and the mask that the arguments name. Raises InputError."""
+    mask = None if args.mask is None else read_mask(args.mask)
+    return open_frames(args.input, args.topic, args.fps, args.start, args.duration), mask
 
 
 @contextmanager

@@ -10,21 +10,20 @@ from rich.text import Text
 
 from dashcalib_ros.cli.arguments import exit_code
 from dashcalib_ros.cli.drive import calibrate, open_drive, read_config
-from dashcalib_ros.cli.terminal import Screen, Stages, show_text, warn
+from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import FrameSource
-from dashcalib_ros.input.mask_file import read_mask
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report import Written, output_folder, result_json, write_results
 from dashcalib_ros.report.files import ACCEPTED
 from dashcalib_ros.report.tables import conclusion, next_step, summary
+from dashcalib_ros.standard_streams import write_stdout
 
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate, write the results, show them; return the verdict's exit code."""
     config = read_config(args)
-    mask = None if args.mask is None else read_mask(args.mask)
-    source = open_drive(args)
+    source, mask = open_drive(args)
     if args.write_bag is not None:
         _check_bag(args, source)
     with output_folder(args.out):
@@ -33,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
         written = write_results(calibration, args.out, created=now())
     warn((*calibration.warnings, *set_aside_lines(written)))
     if args.json:
-        show_text(result_json(calibration).rstrip('\n'))
+        write_stdout(result_json(calibration).rstrip('\n'))
     screen = Screen(args.quiet, to_stderr=bool(args.json))
     screen.show(conclusion(calibration.verdict))
     screen.show(summary(calibration))

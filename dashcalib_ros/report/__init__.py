@@ -17,14 +17,13 @@ from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.result import (
     answer_dict,
     load_calibration,
-    load_result,
     result_dict,
     result_json,
 )
 
 __all__ = ['Calibration', 'NamedCamera', 'Written', 'answer_dict', 'calibrated_camera',
            'calibration_yaml', 'check_writable', 'compare', 'load_calibration', 'load_camera',
-           'load_result', 'output_folder', 'report_html', 'result_dict', 'result_json',
+           'output_folder', 'report_html', 'result_dict', 'result_json',
            'set_aside', 'write_results', 'write_text']
 
 # a result's files are written and read here: judge/, which makes the result, knows no files

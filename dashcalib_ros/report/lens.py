@@ -62,44 +62,34 @@ class Slider:
     caption: str
 
 
-@dataclass(frozen=True)
-class Lens:
-    """What there is to see of the lens."""
-
-    sigma: Drawing | None
-    slider: Slider | None
-
-
-def lens_of(c: Calibration) -> Lens:
-    """Return the uncertainty over the picture, and a picture without distortion."""
-    material = c.material
-    if material is None or c.camera is None or material.solution is None:
-        return Lens(None, None)
-    found = material.solution.sigma_map
-    sigma = None
-    if c.sigma_px is not None and np.isfinite(found.sigma).all():
-        sigma = Drawing(
-            'Uncertainty over the picture', sigma_svg(found, c.image_size, material.px),
-            f'By how many pixels this camera may be off, one sigma: {c.sigma_px.rms:.2f} px over '
-            f'the picture (RMS), {c.sigma_px.worst:.2f} px at the worst.')
-    return Lens(sigma, _slider(c, material))
+def uncertainty_of(c: Calibration) -> Drawing | None:
+    """Return the uncertainty over the picture; None where it is not known."""
+    if c.material is None or c.camera is None or c.material.solution is None:
+        return None
+    found = c.material.solution.sigma_map
+    if c.sigma_px is None or not np.isfinite(found.sigma).all():
+        return None
+    return Drawing(
+        'Uncertainty over the picture', sigma_svg(found, c.image_size, c.material.px),
+        f'By how many pixels this camera may be off, one sigma: {c.sigma_px.rms:.2f} px over '
+        f'the picture (RMS), {c.sigma_px.worst:.2f} px at the worst.')
 
 
-def _slider(c: Calibration, material: Material) -> Slider | None:
-    """Return the picture of the turn that shows most, of this drive."""
-    turns = [turn for turn in c.turns if turn.id in material.pictures]
+def slider_of(c: Calibration) -> Slider | None:
+    """Return the picture of the turn that shows most, of this drive, without distortion."""
+    pictures = {} if c.material is None or c.material.solution is None else c.material.pictures
+    turns = [turn for turn in c.turns if turn.id in pictures]
     if not turns or c.camera is None:
         return None
     best = max(turns, key=lambda turn: (turn.used, turn.prominence))
-    image = material.pictures[best.id].image
+    image = pictures[best.id].image
     height, width = image.shape[:2]
     camera = c.camera.resized(width / c.image_size[0], (width, height))
     straight, bent_grid, straight_grid, moved = undistorted(image, camera, c.config.rectified)
     moved *= c.image_size[0] / width
-    caption = 'The orange grid is of the same rays on both sides. '
-    caption += f'The lens moves points by up to {moved:.0f} px.'
     return Slider(jpeg_data_uri(image), jpeg_data_uri(straight), bent_grid, straight_grid, width,
-                  height, caption)
+                  height, f'The orange grid is of the same rays on both sides. The lens moves '
+                          f'points by up to {moved:.0f} px.')
 
 
 def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:

@@ -16,7 +16,14 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report.charts import magnitude_svg, mask_data_uri, segments
 from dashcalib_ros.report.compare import Comparison, answers, compare, comparison_rows
-from dashcalib_ros.report.lens import WIDTH, Drawing, evidence_of, lens_of, sigma_svg
+from dashcalib_ros.report.lens import (
+    WIDTH,
+    Drawing,
+    evidence_of,
+    sigma_svg,
+    slider_of,
+    uncertainty_of,
+)
 from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
 from dashcalib_ros.report.turns import turn_rows, turn_sections
 from dashcalib_ros.report.wording import (
@@ -59,7 +66,8 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
         checks=checks(c), parameters=parameter_rows(c), removed=removed_effects(c),
         truth=[] if against is None else _truth_rows(against),
         truth_px='' if against is None else optional(against.mapping_px, 2, ' px'),
-        snippets=_snippets(c, calibration_file), lens=lens_of(c),
+        snippets=_snippets(c, calibration_file),
+        uncertainty=uncertainty_of(c), slider=slider_of(c),
         drive='' if c.magnitudes is None else magnitude_svg(c.magnitudes, c.turns,
                                                             c.start_s or None),
         turns=turn_sections(c, mask_id), rows=turn_rows(c),
