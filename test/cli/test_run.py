@@ -85,7 +85,8 @@ def test_the_result_is_complete(rendered, calibrated):
 
 def test_the_same_input_and_seed_give_the_same_result(demo, calibrated):
     """The demo calibrates the same bag, in a process of its own."""
-    first, second = (json.loads((out / 'result.json').read_text('utf-8')) for out in (demo[1], calibrated[1]))
+    first, second = (json.loads((out / 'result.json').read_text('utf-8'))
+                     for out in (demo[1], calibrated[1]))
     for key in ('intrinsics', 'sigma', 'turns', 'verdict', 'reasons', 'reprojection_error_px'):
         assert first[key] == second[key], key
 
