@@ -36,14 +36,10 @@ def export(args: argparse.Namespace) -> int:
         camera = resized(camera, args.size)
     if args.crop is not None:
         camera = cropped(camera, *args.crop)
-    text: str | bytes
-    if found.field is not None and args.to in WITH_FIELD:
-        if camera is not found.camera:
-            raise UsageError('the field over the picture holds for the whole one; leave --size '
-                             'and --crop away')
-        text = WITH_FIELD[args.to](camera, found.field)
-    else:
-        text = exported(camera, args.to)
+    if found.field is not None and args.to in WITH_FIELD and camera is not found.camera:
+        raise UsageError('the field over the picture holds for the whole one; leave --size and '
+                         '--crop away')
+    text = exported(camera, args.to, found.field)
     if found.verdict == 'weak':
         warn([f'{found.name} is weak: look at its sigmas before you use it'])
     if args.out is not None:

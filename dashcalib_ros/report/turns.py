@@ -112,17 +112,12 @@ def _section(turn: AnySummary, c: Calibration, material: Material,
     drawn, magnified = ('', 0)
     if picture is not None:
         drawn, magnified = picture_svg(picture, scene, camera, mask_id)
+    kind = 'Stored turn' if isinstance(turn, StoredTurnSummary) else 'Turn'
     return TurnSection(
-        _title(turn, c), _facts(turn, scene, c), turn.used, turn.unused_because, drawn,
+        f'{kind} {names(c)[turn.id]}', _facts(turn, scene, c), turn.used, turn.unused_because, drawn,
         None if picture is None else picture.frame, magnified,
         '' if scene is None else view_svg(scene, None if picture is None else picture.frame),
         '' if of_fx is None or turn.id not in of_fx.alone else _said(turn.id, of_fx))
-
-
-def _title(turn: AnySummary, c: Calibration) -> str:
-    if isinstance(turn, StoredTurnSummary):
-        return f'Stored turn {names(c)[turn.id]}'
-    return f'Turn {names(c)[turn.id]}'
 
 
 def _facts(turn: AnySummary, scene: Scene | None, c: Calibration) -> tuple[str, ...]:
