@@ -9,6 +9,7 @@ from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.report import compare as compare_cameras
 from dashcalib_ros.report import load_camera, write_text
 from dashcalib_ros.report.export import WITH_FIELD, cropped, exported, resized
+from dashcalib_ros.report.page import difference_html
 from dashcalib_ros.report.tables import comparison
 from dashcalib_ros.standard_streams import write_stdout
 
@@ -17,7 +18,6 @@ def compare(args: argparse.Namespace) -> int:
     """Show the differences of A from B, and whether they matter."""
     found = compare_cameras(load_camera(args.a), load_camera(args.b))
     if args.html is not None:
-        from dashcalib_ros.report.difference_page import difference_html
         write_text(args.html, difference_html(found))
     if args.json:
         write_stdout(json.dumps(found.as_dict(), indent=2, allow_nan=False))

@@ -114,8 +114,8 @@ def _section(turn: AnySummary, c: Calibration, material: Material,
         drawn, magnified = picture_svg(picture, scene, camera, mask_id)
     kind = 'Stored turn' if isinstance(turn, StoredTurnSummary) else 'Turn'
     return TurnSection(
-        f'{kind} {names(c)[turn.id]}', _facts(turn, scene, c), turn.used, turn.unused_because, drawn,
-        None if picture is None else picture.frame, magnified,
+        f'{kind} {names(c)[turn.id]}', _facts(turn, scene, c), turn.used, turn.unused_because,
+        drawn, None if picture is None else picture.frame, magnified,
         '' if scene is None else view_svg(scene, None if picture is None else picture.frame),
         '' if of_fx is None or turn.id not in of_fx.alone else _said(turn.id, of_fx))
 

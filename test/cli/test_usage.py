@@ -53,6 +53,12 @@ def test_help_names_the_exit_codes(command):
     assert max(map(len, done.stdout.splitlines())) <= 80
 
 
+def test_an_unknown_argument_names_the_help_of_its_command():
+    done = dashcalib('demo', 'extra')
+    assert_one_line_error(done)
+    assert 'extra; see dashcalib demo --help' in done.stderr
+
+
 def test_help_imports_nothing_heavy():
     code = ('import sys; from dashcalib_ros.cli import main; before = main(["run", "--help"]); '
             f'print(before, [name for name in {HEAVY} if name in sys.modules])')
