@@ -79,6 +79,8 @@ def module_graph(package: Path) -> dict[str, set[str]]:
         for name, _ in imports(path):
             # the name of a module, or of something in it
             owner = next((each for each in (name, name.rpartition('.')[0]) if each in modules), '')
+            # mypy says nothing of a module that is not there
+            assert owner or name.count('.') < 2 or not name.startswith(f'{package.name}.'), name
             found |= {owner} - {'', module}
         if module in modules:
             graph[module] = found
