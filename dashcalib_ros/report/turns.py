@@ -59,42 +59,37 @@ def turn_sections(c: Calibration, mask_id: str | None) -> list[TurnSection]:
     """Return a section for each turn of which there is anything to see."""
     if c.material is None:
         return []
-    said = _said_of_fx(c, c.material)
-    found = [_section(turn, c, c.material, said, mask_id) for turn in c.all_turns]
+    alone, solution = _fx_alone(c), c.material.solution
+    shares = leverages(solution) if alone and solution is not None else {}
+    said = {turn: _said(fx, sigma, shares.get(turn, 0.0)) for turn, (fx, sigma) in alone.items()}
+    found = [_section(turn, c, c.material, said.get(turn.id, ''), mask_id)
+             for turn in c.all_turns]
     return [each for each in found if each.picture or each.view]
 
 
-@dataclass(frozen=True)
-class _SaidOfFx:
-    """What each turn says of fx, px of the input, and its share in what is known of it.
+def _fx_alone(c: Calibration) -> dict[TurnId, tuple[float, float]]:
+    """Return what each turn alone says of fx, and its sigma, px of the input.
 
-    joint: fx of all turns, with its sigma.
+    Nothing of a refused calibration, which has no numbers.
     """
-
-    alone: dict[TurnId, tuple[float, float]]
-    shares: dict[TurnId, float]
-    joint: tuple[float, float]
-
-
-def _said_of_fx(c: Calibration, material: Material) -> _SaidOfFx | None:
-    """Return what the turns say of fx; None of a refused calibration, which has no numbers."""
-    solution, sigma = material.solution, (c.sigma or {}).get('fx', math.nan)
-    if c.camera is None or solution is None or not 0 < sigma < math.inf:
-        return None
-    alone = {turn: (found.fx * material.px, found.sigma * material.px)
+    sigma = (c.sigma or {}).get('fx', math.nan)
+    if c.camera is None or c.material is None or not 0 < sigma < math.inf:
+        return {}
+    solution = c.material.solution
+    if solution is None:
+        return {}
+    alone = {turn: (found.fx * c.material.px, found.sigma * c.material.px)
              for turn, found in focal_alone(solution).items()}
-    if not np.isfinite(list(alone.values())).all():
-        return None
-    return _SaidOfFx(alone, leverages(solution), (c.camera.fx, sigma))
+    return alone if np.isfinite(list(alone.values())).all() else {}
 
 
 def focal_by_turn(c: Calibration) -> str:
     """Return the plot of what all turns say of fx, '' where there is none."""
-    said = None if c.material is None else _said_of_fx(c, c.material)
-    if said is None:
+    alone = _fx_alone(c)
+    if not alone or c.camera is None or c.sigma is None:
         return ''
-    return estimates_svg([(f'turn {name}', *said.alone[turn]) for turn, name in names(c).items()
-                          if turn in said.alone], said.joint)
+    return estimates_svg([(f'turn {name}', *alone[turn]) for turn, name in names(c).items()
+                          if turn in alone], (c.camera.fx, c.sigma['fx']))
 
 
 def names(c: Calibration) -> dict[TurnId, str]:
@@ -104,7 +99,7 @@ def names(c: Calibration) -> dict[TurnId, str]:
 
 
 def _section(turn: AnySummary, c: Calibration, material: Material,
-             of_fx: _SaidOfFx | None, mask_id: str | None) -> TurnSection:
+             alone: str, mask_id: str | None) -> TurnSection:
     scene, picture = material.scenes.get(turn.id), material.pictures.get(turn.id)
     camera = None
     if scene is not None and turn.used and material.solution is not None:
@@ -117,7 +112,7 @@ def _section(turn: AnySummary, c: Calibration, material: Material,
         f'{kind} {names(c)[turn.id]}', _facts(turn, scene, c), turn.used, turn.unused_because,
         drawn, None if picture is None else picture.frame, magnified,
         '' if scene is None else view_svg(scene, None if picture is None else picture.frame),
-        '' if of_fx is None or turn.id not in of_fx.alone else _said(turn.id, of_fx))
+        alone)
 
 
 def _facts(turn: AnySummary, scene: Scene | None, c: Calibration) -> tuple[str, ...]:
@@ -131,10 +126,10 @@ def _facts(turn: AnySummary, scene: Scene | None, c: Calibration) -> tuple[str, 
     return tuple(facts)
 
 
-def _said(turn: TurnId, of_fx: _SaidOfFx) -> str:
-    share = min(max(100 * of_fx.shares.get(turn, 0.0), 0.0), 100.0)
-    return (f'Alone it says fx {with_sigma(*of_fx.alone[turn])}, and gives '
-            f'{f"{share:.0f}" if share >= 1 else "less than 1"} % of what is known of fx.')
+def _said(fx: float, sigma: float, share: float) -> str:
+    percent = min(max(100 * share, 0.0), 100.0)
+    return (f'Alone it says fx {with_sigma(fx, sigma)}, and gives '
+            f'{f"{percent:.0f}" if percent >= 1 else "less than 1"} % of what is known of fx.')
 
 
 def turn_rows(c: Calibration) -> list[dict[str, str]]:

@@ -87,7 +87,7 @@ def test_every_unused_turn_has_its_reason(drawn, text):
 
 def test_a_turn_that_contradicts_the_others_says_so():
     found = solution()
-    left = dataclasses.replace(found, scenes=found.scenes[:2], parts=found.parts[:2],
+    left = dataclasses.replace(found, scenes=found.scenes[:2], known=found.known.of(range(2)),
                                misfits={**found.misfits, found.scenes[2].turn: 7.0})
     *_, contradicts, _, _ = drawn_calibration(left).turns
     assert not contradicts.used and 'does not explain it' in contradicts.unused_because
