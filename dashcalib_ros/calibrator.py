@@ -19,7 +19,6 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.judge import (
-    Calibration,
     Check,
     Monitor,
     Odometry,
@@ -30,6 +29,7 @@ from dashcalib_ros.judge import (
 )
 from dashcalib_ros.judge.agreement import earlier_of_another_camera, evidence_of
 from dashcalib_ros.judge.conclude import CONTRADICTS, Evidence, evidence_of_detection
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.status import Status, View

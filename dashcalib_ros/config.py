@@ -215,9 +215,9 @@ class VerdictConfig:
     refused_yaw_deg: float = expert(
         10.0, 'degrees over all turns; less is refused', 0.0, 1000.0)
     min_contrast: float = expert(
-        0.05, 'relative rise of the error 25 % off the focal length; less is weak', 0.0, 10.0)
+        0.05, 'relative rise of the error 20 % off the focal length; less is weak', 0.0, 10.0)
     refused_contrast: float = expert(
-        0.01, 'the same; less is refused', 0.0, 10.0)
+        0.01, 'relative rise of the error; less is refused', 0.0, 10.0)
     refused_sigma: float = expert(0.1, 'sigma of fx, of fx; more is refused', 0.0, 1.0)
     max_roll_deg: float = expert(
         45.0, 'degrees; pictures turned more are weak; 180 for a camera mounted so', 0.0, 180.0)

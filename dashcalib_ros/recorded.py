@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +15,13 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import Turn
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input import FrameSource
+from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.input.inputs import Paths, open_frames
-from dashcalib_ros.judge import Calibration, Check
+from dashcalib_ros.judge import Check
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
@@ -83,12 +85,31 @@ def _fed(source: FrameSource, config: Config | None, mask: MaskOrPath, tell: Pro
     """Give a calibrator that has taken every frame of the drive."""
     valid = _valid(mask)
     with Calibrator(config, valid) as calibrator:
-        for number, frame in enumerate(source, 1):
-            if number == 1:
-                check_mask(valid, frame.size)
-            calibrator.push(frame)
-            tell('reading', min(number / source.count, 1.0) if source.count else 0.0)
+        for frames in pushed(calibrator, source, valid):
+            tell('reading', min(frames / source.count, 1.0) if source.count else 0.0)
         yield calibrator
+
+
+class Taker(Protocol):
+    """What frames are pushed into: a Calibrator or a Detection."""
+
+    def push(self, frame: Frame) -> object:
+        """Take the next frame."""
+
+    def turns(self) -> tuple[Turn, ...]:
+        """Return the turns found so far."""
+
+
+def pushed(taker: Taker, source: FrameSource, mask: Mask | None) -> Iterator[int]:
+    """Push every frame of the drive; yield after each how many there were.
+
+    Raises InputError for a mask of another size.
+    """
+    for number, frame in enumerate(source, 1):
+        if number == 1:
+            check_mask(mask, frame.size)
+        taker.push(frame)
+        yield number
 
 
 def _valid(mask: MaskOrPath) -> Mask | None:

@@ -12,7 +12,6 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from dashcalib_ros.reconstruct.scene_file import (
     decoded,
     encoded,
 )
+from dashcalib_ros.whole_files import write_whole
 
 # s; temporary files older than this are left over from a killed process
 ABANDONED_S = 3600.0
@@ -213,18 +213,8 @@ class TurnStore:
     def _write(self, turn: StoredTurn) -> str:
         assert self._origin is not None
         name = f'turn-{secrets.token_hex(8)}{SUFFIX}'
-        data = encoded(SceneFile(self._origin, (turn,), 1))
         self._folder.mkdir(parents=True, exist_ok=True)
-        temporary = self._folder / f'.{name}.tmp'
-        try:
-            with temporary.open('xb') as stream:
-                stream.write(data)
-                stream.flush()
-                os.fsync(stream.fileno())
-            temporary.replace(self._folder / name)
-        finally:
-            with suppress(OSError):
-                temporary.unlink()
+        write_whole(self._folder / name, encoded(SceneFile(self._origin, (turn,), 1)))
         self._known[name] = self._origin, turn.prominence
         return name
 

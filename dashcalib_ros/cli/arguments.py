@@ -1,17 +1,22 @@
-"""The arguments of every command."""
+"""The arguments and the exit codes of every command."""
 from __future__ import annotations
 
 import argparse
-import importlib
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from dashcalib_ros.cli.values import crop, path_or, positive, seconds, size
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import write_stdout
 
 PROGRAM = 'dashcalib'
+# exit codes
+ACCEPTED = 0
+WRONG = 1  # of check: the calibration does not explain the drive
+BAD_INPUT = 2  # or bad usage: one line on stderr says what and the cure
+NOT_ENOUGH = 3  # weak or refused: the input was fine, the evidence was not enough
+INTERRUPTED = 130  # Ctrl-C or SIGTERM, as shells have it
 INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, or a folder of images; '
               "several of one camera, in this order; or a folder of videos, or a pattern "
               "('clips/*.mp4'): bags by their time, all else by name")
@@ -25,8 +30,25 @@ SHORT_EXIT_HELP = 'exit codes: 0 done; 2 bad input or usage'
 CHECK_EXIT_HELP = 'exit codes: 0 right; 1 wrong; 3 the drive cannot tell; 2 bad input or usage'
 BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera refused; 3 some were not; '
                    '2 bad manifest or usage')
+# the names of models and exports are not taken from their tables: that would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
 KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'rays', 'maps')
+
+SHARED: dict[str, dict[str, Any]] = {
+    '--config': {'type': Path, 'metavar': 'YAML', 'help': 'settings from a file'},
+    '--set': {'action': 'append', 'default': [], 'metavar': 'KEY=VALUE',
+              'help': 'one setting, over those of --config; may be repeated'},
+    '--model': {'metavar': 'NAME', 'help': 'of the lens: radial, brown, fisheye, or auto: the one '
+                                           'that the turns prove (default)'},
+    '--seed': {'type': int, 'metavar': 'S', 'help': 'same input and seed: same result'},
+    '--quiet': {'action': 'store_true',
+                'help': 'no progress and no summary: only warnings and errors'},
+    '--verbose': {'action': 'store_true', 'help': "show COLMAP's own log"}}
+
+
+def exit_code(verdict: str) -> int:
+    """Return the exit code of a verdict."""
+    return ACCEPTED if verdict == 'accepted' else NOT_ENOUGH
 
 
 class UsageError(DashcalibError):
@@ -51,6 +73,13 @@ class Parser(argparse.ArgumentParser):
         """Raise UsageError: one line that names --help."""
         raise UsageError(f'{message}; see {self.prog} --help')
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Parse them all: what a command does not know must name that command's --help."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f'unrecognized arguments: {" ".join(unknown)}')
+        return found, []
+
     def print_help(self, file: Any = None) -> None:
         """Print the help on stdout. Raises OutputError where it cannot."""
         write_stdout(self.format_help().rstrip('\n'))
@@ -74,12 +103,13 @@ class Version(argparse.Action):
 
 
 def make_parser() -> Parser:
-    """Return the parser; the parsed arguments have the function to call with them as `command`."""
+    """Return the parser; the parsed arguments have the command's name as `command`."""
     parser = Parser(
         prog=PROGRAM, epilog=f'{PROGRAM} COMMAND --help tells more\n{EXIT_HELP}',
         description='Calibrates a dashcam from the turns the car takes anyway.')
     parser.add_argument('--version', action=Version)
-    commands = parser.add_subparsers(metavar='COMMAND', required=True, parser_class=Parser)
+    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True,
+                                     parser_class=Parser)
     _add_run(commands)
     _add_turns(commands)
     _add_demo(commands)
@@ -97,8 +127,7 @@ def _add_run(commands: Any) -> None:
         'Writes result.json, report.html and, when accepted, calibration.yaml to DIR.',
         "dashcalib run 'clips/*.mp4' --out calibration", EXIT_HELP)
     _add_drive_arguments(parser)
-    _add_model(parser)
-    _add_seed(parser)
+    _add_shared(parser, '--model', '--seed')
     parser.add_argument('--threads', type=int, metavar='N',
                         help='processes that reconstruct turns side by side; the result is the '
                              'same with any')
@@ -109,8 +138,7 @@ def _add_run(commands: Any) -> None:
                                     '--json - prints result.json')
     parser.add_argument('--json', choices=('-',), metavar='-',
                         help='print result.json on stdout, all else on stderr')
-    _add_quiet(parser)
-    _add_verbose(parser)
+    _add_shared(parser, '--quiet', '--verbose')
 
 
 def _add_turns(commands: Any) -> None:
@@ -119,7 +147,7 @@ def _add_turns(commands: Any) -> None:
                       'dashcalib turns drive.mp4 --start 60 --duration 300')
     _add_drive_arguments(parser)
     parser.add_argument('--json', action='store_true', help='print JSON')
-    _add_quiet(parser, 'no progress')
+    parser.add_argument('--quiet', action='store_true', help='no progress')
     # they were taken here before, and change nothing
     parser.add_argument('--seed', type=int, help=argparse.SUPPRESS)
     parser.add_argument('--verbose', action='store_true', help=argparse.SUPPRESS)
@@ -130,12 +158,10 @@ def _add_demo(commands: Any) -> None:
                       'Renders a drive with a known lens into a ROS 2 bag, calibrates that and '
                       'compares the result with the truth.',
                       'dashcalib demo --keep-bag --out demo', EXIT_HELP)
-    _add_model(parser)
-    _add_seed(parser)
+    _add_shared(parser, '--model', '--seed')
     _add_out(parser, 'demo', 'the results are several files: give a folder')
     parser.add_argument('--keep-bag', action='store_true', help='leave the bag in DIR/bag')
-    _add_quiet(parser)
-    _add_verbose(parser)
+    _add_shared(parser, '--quiet', '--verbose')
 
 
 def _add_compare(commands: Any) -> None:
@@ -156,14 +182,13 @@ def _add_export(commands: Any) -> None:
                       'dashcalib export calibration --to colmap --out cameras.txt')
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
                         help=CALIBRATION_HELP)
-    # the names are not taken from the table of exports: that would load numpy and OpenCV
     kind = parser.add_argument('--to', required=True, metavar='KIND',
                                help=f'{", ".join(KINDS[:-1])} or {KINDS[-1]}')
     _completed(kind, KINDS)
     view = parser.add_mutually_exclusive_group()
-    view.add_argument('--size', type=size, metavar='WxH',
+    view.add_argument('--size', type=whole_numbers('x', 2, '1280x720'), metavar='WxH',
                       help='for pictures that were resized to this')
-    view.add_argument('--crop', type=crop, metavar='X,Y,W,H',
+    view.add_argument('--crop', type=whole_numbers(',', 4, '0,100,1280,520'), metavar='X,Y,W,H',
                       help='for this part of the pictures')
     parser.add_argument('--out', type=path_or('leave --out away for standard output'),
                         metavar='FILE', help='default: standard output')
@@ -177,16 +202,15 @@ def _add_check(commands: Any) -> None:
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
                         help=CALIBRATION_HELP)
     _add_drive_arguments(parser, '*', 'left away: the bag that CALIBRATION is; else: ')
-    _add_model(parser)
-    _add_seed(parser)
+    _add_shared(parser, '--model', '--seed')
     parser.add_argument('--poses', type=Path, metavar='FILE',
                         help="true poses, in KITTI's or TUM's format: compare the rotation and "
                              'the scale that each camera finds with them')
     parser.add_argument('--out', type=path_or('--out is a folder'), metavar='DIR',
                         help='with --poses: write a plot of the paths, and the paths for evo')
     parser.add_argument('--json', action='store_true', help='print JSON')
-    _add_quiet(parser, 'no progress')
-    _add_verbose(parser)
+    parser.add_argument('--quiet', action='store_true', help='no progress')
+    _add_shared(parser, '--verbose')
 
 
 def _add_batch(commands: Any) -> None:
@@ -211,10 +235,7 @@ def _add_batch(commands: Any) -> None:
     where.add_argument('--shard', metavar='I/N',
                        help='do the I-th of N parts, with one process and without Ray; a run '
                             'without --shard then makes the tables')
-    _add_settings(parser)
-    _add_model(parser)
-    _add_seed(parser)
-    _add_quiet(parser)
+    _add_shared(parser, '--config', '--set', '--model', '--seed', '--quiet')
 
 
 def _count(text: str) -> int:
@@ -227,27 +248,18 @@ def _command(commands: Any, name: str, summary: str, description: str, example: 
              exit_codes: str = SHORT_EXIT_HELP) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         name, help=summary, description=description, epilog=f'example: {example}\n{exit_codes}')
-    parser.set_defaults(command=_lazily(name))
     return parser
-
-
-def _lazily(name: str) -> Callable[[argparse.Namespace], int]:
-    """Return the command's function, which imports its module, and numpy's, only when called."""
-    def command(args: argparse.Namespace) -> int:
-        code: int = getattr(importlib.import_module(f'dashcalib_ros.cli.{name}'), name)(args)
-        return code
-    return command
 
 
 def _add_drive_arguments(parser: argparse.ArgumentParser, count: str = '+', more: str = ''
                          ) -> None:
     parser.add_argument('input', metavar='INPUT', nargs=count, help=more + INPUT_HELP)
     parser.add_argument('--topic', metavar='T', help="the bag's image topic")
-    parser.add_argument('--fps', type=positive, metavar='F',
+    parser.add_argument('--fps', type=POSITIVE, metavar='F',
                         help='rate of a video or image folder')
-    parser.add_argument('--start', type=seconds, default=0.0, metavar='S',
+    parser.add_argument('--start', type=SECONDS, default=0.0, metavar='S',
                         help='leave out the first S seconds of the drive')
-    parser.add_argument('--duration', type=positive, metavar='S',
+    parser.add_argument('--duration', type=POSITIVE, metavar='S',
                         help='use S seconds of the drive')
     parser.add_argument('--turns', type=int, metavar='N', help='how many turns are wanted')
     parser.add_argument('--mask', type=Path, metavar='PNG',
@@ -255,21 +267,15 @@ def _add_drive_arguments(parser: argparse.ArgumentParser, count: str = '+', more
     parser.add_argument('--segmentation', metavar='MODEL.onnx',
                         help='a segmentation network that finds the own car, used in addition to '
                              'the automatic mask')
-    _add_settings(parser)
+    _add_shared(parser, '--config', '--set')
 
 
-def _add_settings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--config', type=Path, metavar='YAML', help='settings from a file')
-    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
-                        help='one setting, over those of --config; may be repeated')
-
-
-def _add_model(parser: argparse.ArgumentParser) -> None:
-    # the names are not taken from the table of models: that would load numpy and OpenCV
-    model = parser.add_argument('--model', metavar='NAME',
-                                help='of the lens: radial, brown, fisheye, or auto: the one that '
-                                     'the turns prove (default)')
-    _completed(model, MODELS)
+def _add_shared(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add options that several commands have."""
+    for name in names:
+        action = parser.add_argument(name, **SHARED[name])
+        if name == '--model':
+            _completed(action, MODELS)
 
 
 def _completed(action: argparse.Action, names: Sequence[str]) -> None:
@@ -277,19 +283,42 @@ def _completed(action: argparse.Action, names: Sequence[str]) -> None:
     action.completer = lambda **_: names  # type: ignore[attr-defined]
 
 
-def _add_seed(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--seed', type=int, metavar='S', help='same input and seed: same result')
-
-
-def _add_quiet(parser: argparse.ArgumentParser, what: str = 'no progress and no summary: only '
-                                                            'warnings and errors') -> None:
-    parser.add_argument('--quiet', action='store_true', help=what)
-
-
-def _add_verbose(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--verbose', action='store_true', help="show COLMAP's own log")
-
-
 def _add_out(parser: argparse.ArgumentParser, default: str, cure: str) -> None:
     parser.add_argument('--out', type=path_or(cure), default=Path(default), metavar='DIR',
                         help=f'where the results go (default: ./{default})')
+
+
+def whole_numbers(between: str, count: int, like: str) -> Callable[[str], tuple[int, ...]]:
+    """Return a type of argument: so many whole numbers, such as a size or a part of a picture."""
+    def numbers(text: str) -> tuple[int, ...]:
+        parts = text.lower().split(between)
+        if len(parts) != count or not all(part.strip().isdecimal() for part in parts):
+            raise argparse.ArgumentTypeError(f'{text!r} is not like {like}')
+        return tuple(int(part) for part in parts)
+    return numbers
+
+
+def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
+    """Return a type of argument: a finite number that fits. what: it must be."""
+    def value(text: str) -> float:
+        try:
+            found = float(text)
+        except ValueError:
+            found = math.nan
+        if not (math.isfinite(found) and fits(found)):
+            raise argparse.ArgumentTypeError(f'must be {what}, not {text!r}')
+        return found
+    return value
+
+
+SECONDS = number('0 or more seconds', lambda value: value >= 0)
+POSITIVE = number('a positive number', lambda value: value > 0)
+
+
+def path_or(cure: str) -> Callable[[str], Path]:
+    """Return a type of argument: a path that is not - (standard output elsewhere)."""
+    def path(text: str) -> Path:
+        if text == '-':
+            raise argparse.ArgumentTypeError(f'it cannot be -: {cure}')
+        return Path(text)
+    return path

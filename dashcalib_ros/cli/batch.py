@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 from rich.text import Text
 
-from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.settings import read_config
+from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH
+from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import counted
@@ -55,7 +55,7 @@ def batch(args: argparse.Namespace) -> int:
     name = EFFORT if shard is None else f'effort-{shard[0]}-of-{shard[1]}.json'
     Folder(args.out).write(name, progress.effort_json())
     _summarise(fleet, args.out, progress.screen)
-    return exit_codes.ACCEPTED if fleet.all_well else exit_codes.NOT_ENOUGH
+    return ACCEPTED if fleet.all_well else NOT_ENOUGH
 
 
 def _engine(args: argparse.Namespace, config: Config) -> Engine:

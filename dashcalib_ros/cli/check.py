@@ -9,20 +9,19 @@ from rich.text import Text
 
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.arguments import UsageError
-from dashcalib_ros.cli.drive import feed, open_calibrator, open_drive
-from dashcalib_ros.cli.settings import read_config
-from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
+from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
+from dashcalib_ros.cli.drive import feed, open_calibrator, open_drive, read_config
+from dashcalib_ros.cli.terminal import Stages, show, warn
 from dashcalib_ros.errors import counted
-from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.judge import Calibration, Check, Odometry, path_files, read_poses, with_faults
 from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.camera_file import load_with_faults
 from dashcalib_ros.report.tables import TextTable, labelled
+from dashcalib_ros.standard_streams import write_stdout
 
 COLOURS = {'right': 'bold green', 'wrong': 'bold red', 'cannot tell': 'bold yellow'}
+EXIT_CODES = {'right': ACCEPTED, 'wrong': WRONG, 'cannot tell': NOT_ENOUGH}
 # what is said of the poses, by its name in the JSON
 MEASURED = {'rotation_deg': ('rotation missed, degrees', 1.0),
             'rotation_deg_per_100m': ('the same, in 100 m', 1.0),
@@ -47,8 +46,7 @@ def check(args: argparse.Namespace) -> int:
         if poses is None:
             raise UsageError('--out is for the paths that --poses compares; add --poses FILE')
         check_writable(args.out)
-    mask = None if args.mask is None else read_mask(args.mask)
-    source = open_drive(args)
+    source, mask = open_drive(args)
     motion = None
     with open_calibrator(config, mask, args.verbose) as calibrator, Stages(args.quiet) as stages:
         feed(calibrator, source, mask, stages)
@@ -60,15 +58,15 @@ def check(args: argparse.Namespace) -> int:
             motion = calibrator.odometry(given, calibration, poses, stages.show)
     warn((*source.warnings, *calibration.warnings))
     if args.json:
-        show_text(json.dumps(answer_dict(found, changes, motion), indent=2, allow_nan=False))
+        write_stdout(json.dumps(answer_dict(found, changes, motion), indent=2, allow_nan=False))
     else:
         _show(found, motion, changes)
     if motion is not None and args.out is not None:
         for name, text in path_files(motion).items():
             write_text(args.out / name, text)
         if not args.json:
-            show_text(f'written: {args.out / "paths.svg"}, and beside it the paths for evo')
-    return exit_codes.of_answer(found.answer)
+            write_stdout(f'written: {args.out / "paths.svg"}, and beside it the paths for evo')
+    return EXIT_CODES[found.answer]
 
 
 def _changes(calibrator: Calibrator, given: Camera, calibration: Calibration) -> list[str]:

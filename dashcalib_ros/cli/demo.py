@@ -13,15 +13,13 @@ from time import perf_counter
 from rich.text import Text
 
 from dashcalib_ros.camera import Radial, camera_of
-from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.drive import calibrate
+from dashcalib_ros.cli.arguments import exit_code
+from dashcalib_ros.cli.drive import calibrate, read_config
 from dashcalib_ros.cli.run import files_line, now, set_aside_lines
-from dashcalib_ros.cli.settings import read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.errors import OutputError
 from dashcalib_ros.input.inputs import open_frames
-from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report import (
     NamedCamera,
     calibrated_camera,
@@ -45,19 +43,25 @@ def demo(args: argparse.Namespace) -> int:
             render_to_bag(drive, bag)
             calibration = calibrate(open_frames(bag), config, None, args.verbose, stages)
         calibration = dataclasses.replace(calibration, input_name=f'demo drive {config.seed}')
-        written = write_results(calibration, out, created=now(),
-                                truth=_true_camera(drive.truth, calibration.image_size))
-        truth = _write_truth(out, drive.truth, calibration.image_size)
+        size = calibration.image_size
+        truth = NamedCamera('truth', camera_of(Radial.model, size, list(drive.truth.values())))
+        written = write_results(calibration, out, created=now(), truth=truth)
+        values = {**drive.truth, 'width': size[0], 'height': size[1]}
+        write_text(out / TRUTH, json.dumps(values, allow_nan=False) + '\n')
     warn((*calibration.warnings, *set_aside_lines(written)))
-    files = [*written.files, truth, *([out / 'bag'] if args.keep_bag else [])]
+    files = [*written.files, out / TRUTH, *([out / 'bag'] if args.keep_bag else [])]
     screen = Screen(args.quiet)
     screen.show(conclusion(calibration.verdict))
     screen.show(summary(calibration))
-    _show_errors(calibration, drive.truth, screen)
+    if calibration.camera is None:
+        screen.show(Text('no estimate to compare with the truth'))
+    else:
+        screen.show(Text('\nagainst the truth'))
+        screen.show(against_truth(compare(calibrated_camera(calibration), truth)))
     screen.show(Text(files_line(out, files)))
     screen.show(Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'))
     screen.show(next_step(calibration.verdict))
-    return exit_codes.of_verdict(calibration.verdict.level)
+    return exit_code(calibration.verdict.level)
 
 
 @contextmanager
@@ -69,23 +73,3 @@ def _bag_path(out: Path, keep: bool) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory(prefix='dashcalib-demo-') as folder:
         yield Path(folder) / 'bag'
-
-
-def _write_truth(out: Path, truth: dict[str, float], size: tuple[int, int]) -> Path:
-    path = out / TRUTH
-    values = {**truth, 'width': size[0], 'height': size[1]}
-    write_text(path, json.dumps(values, allow_nan=False) + '\n')
-    return path
-
-
-def _true_camera(truth: dict[str, float], size: tuple[int, int]) -> NamedCamera:
-    return NamedCamera('truth', camera_of(Radial.model, size, list(truth.values())))
-
-
-def _show_errors(calibration: Calibration, truth: dict[str, float], screen: Screen) -> None:
-    if calibration.camera is None:
-        screen.show(Text('no estimate to compare with the truth'))
-        return
-    reference = _true_camera(truth, calibration.image_size)
-    screen.show(Text('\nagainst the truth'))
-    screen.show(against_truth(compare(calibrated_camera(calibration), reference)))

@@ -1,29 +1,87 @@
-"""Feeding a drive to the calibrator, which is closed in any case."""
+"""From a command's arguments to its settings and its drive, which goes to the calibrator."""
 from __future__ import annotations
 
 import argparse
+import re
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.camera import searched
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect import Turn
-from dashcalib_ros.errors import counted
-from dashcalib_ros.input import Frame, FrameSource
-from dashcalib_ros.input.decode import check_mask
+from dashcalib_ros.errors import ConfigError, InputError, counted, shortened
+from dashcalib_ros.input import FrameSource
+from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.recorded import with_source
+from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
+from dashcalib_ros.recorded import Taker, pushed, with_source
+
+# --turns sets both, so that exactly this number of turns is used
+FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads': ('threads',),
+         'segmentation': ('mask.segmentation',), 'model': ('model',)}
+EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+')  # 1e-3, a word to YAML 1.1
 
 
-def open_drive(args: argparse.Namespace) -> FrameSource:
-    """Open what the arguments name. Raises InputError."""
-    return open_frames(args.input, args.topic, args.fps, args.start, args.duration)
+def read_config(args: argparse.Namespace) -> Config:
+    """Return the settings from --config, --set, and --turns and the like; later ones count."""
+    path: Path | None = getattr(args, 'config', None)
+    config = Config() if path is None else Config.from_mapping(_read_yaml(path))
+    changes = parse_settings(getattr(args, 'set', []))
+    changes.update({name: getattr(args, flag) for flag, names in FLAGS.items() for name in names
+                    if getattr(args, flag, None) is not None})
+    config = config.replace(changes)
+    searched(config.model)  # raises for a model that there is not, before anything is begun
+    return config
+
+
+def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
+    """Parse KEY=VALUE pairs; values are YAML. Raises ConfigError."""
+    changes: dict[str, Any] = {}
+    for pair in pairs:
+        key, equals, text = pair.partition('=')
+        if not equals or not key.strip():
+            raise ConfigError(f'--set needs KEY=VALUE (turns.wanted=4), not {shortened(pair)!r}')
+        what = f'--set {shortened(pair)}: the value'
+        try:
+            changes[key.strip()] = _numbers(parse_yaml(text, what))
+        except InputError as error:
+            raise ConfigError(f'{error}; write a plain number, true or false') from error
+    return changes
+
+
+def _read_yaml(path: Path) -> Mapping[str, Any]:
+    try:
+        what = f'the configuration {path}'
+        data = parse_yaml(read_text(path, YAML_BYTES, what), what)
+    except InputError as error:
+        raise ConfigError(f'{error}; write lines like turns.wanted: 4') from error
+    if data is None:
+        return {}
+    if not isinstance(data, Mapping):
+        raise ConfigError(f'the configuration {path} has no settings; '
+                          'write lines like turns.wanted: 4')
+    return {key: _numbers(value) for key, value in data.items()}
+
+
+def _numbers(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _numbers(item) for key, item in value.items()}
+    if isinstance(value, str) and EXPONENT.fullmatch(value):
+        return float(value)
+    return value
+
+
+def open_drive(args: argparse.Namespace) -> tuple[FrameSource, Mask | None]:
+    """Open the drive and the mask that the arguments name. Raises InputError."""
+    mask = None if args.mask is None else read_mask(args.mask)
+    return open_frames(args.input, args.topic, args.fps, args.start, args.duration), mask
 
 
 @contextmanager
@@ -37,28 +95,13 @@ def open_calibrator(config: Config, mask: Mask | None, verbose: bool) -> Iterato
             calibrator.close()
 
 
-class Taker(Protocol):
-    """What frames are pushed into: a Calibrator or a Detection."""
-
-    def push(self, frame: Frame) -> object:
-        """Take the next frame."""
-
-    def turns(self) -> tuple[Turn, ...]:
-        """Return the turns found so far."""
-
-
 def feed(taker: Taker, source: FrameSource, mask: Mask | None, stages: Stages) -> int:
     """Push every frame of the drive; return how many there were."""
     frames = 0
     stages.show('reading', None)
-    for frame in source:
-        if not frames:
-            check_mask(mask, frame.size)
-        taker.push(frame)
-        frames += 1
-        count = len(taker.turns())
+    for frames in pushed(taker, source, mask):
         stages.show('reading', frames / source.count if source.count else None,
-                    f'frame {frames}, {counted(count, "turn")}')
+                    f'frame {frames}, {counted(len(taker.turns()), "turn")}')
     return frames
 
 

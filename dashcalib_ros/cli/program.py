@@ -8,12 +8,18 @@ import signal
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from typing import Any
 
-from dashcalib_ros.cli.arguments import PROGRAM, make_parser
-from dashcalib_ros.cli.exit_codes import BAD_INPUT, INTERRUPTED
+from dashcalib_ros.cli.arguments import BAD_INPUT, INTERRUPTED, PROGRAM, make_parser
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import folded, open_closed_streams, write_stderr
+
+# imported only when they are called: --help must not wait for numpy and OpenCV
+COMMANDS = {'run': 'dashcalib_ros.cli.run', 'turns': 'dashcalib_ros.cli.turns',
+            'demo': 'dashcalib_ros.cli.demo', 'compare': 'dashcalib_ros.cli.cameras',
+            'export': 'dashcalib_ros.cli.cameras', 'check': 'dashcalib_ros.cli.check',
+            'batch': 'dashcalib_ros.cli.batch'}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,7 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _complete(parser)
         args = parser.parse_args(argv)
         with _sigterm_like_ctrl_c():
-            code: int = args.command(args)
+            command = getattr(import_module(COMMANDS[args.command]), args.command)
+            code: int = command(args)
             return code
     except SystemExit as end:  # argparse's way to end after --help and --version
         return end.code if isinstance(end.code, int) else BAD_INPUT

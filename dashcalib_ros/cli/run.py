@@ -8,24 +8,22 @@ from pathlib import Path
 
 from rich.text import Text
 
-from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.drive import calibrate, open_drive
-from dashcalib_ros.cli.settings import read_config
-from dashcalib_ros.cli.terminal import Screen, Stages, show_text, warn
+from dashcalib_ros.cli.arguments import exit_code
+from dashcalib_ros.cli.drive import calibrate, open_drive, read_config
+from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import FrameSource
-from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report import Written, output_folder, result_json, write_results
 from dashcalib_ros.report.files import ACCEPTED
 from dashcalib_ros.report.tables import conclusion, next_step, summary
+from dashcalib_ros.standard_streams import write_stdout
 
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate, write the results, show them; return the verdict's exit code."""
     config = read_config(args)
-    mask = None if args.mask is None else read_mask(args.mask)
-    source = open_drive(args)
+    source, mask = open_drive(args)
     if args.write_bag is not None:
         _check_bag(args, source)
     with output_folder(args.out):
@@ -34,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
         written = write_results(calibration, args.out, created=now())
     warn((*calibration.warnings, *set_aside_lines(written)))
     if args.json:
-        show_text(result_json(calibration).rstrip('\n'))
+        write_stdout(result_json(calibration).rstrip('\n'))
     screen = Screen(args.quiet, to_stderr=bool(args.json))
     screen.show(conclusion(calibration.verdict))
     screen.show(summary(calibration))
@@ -42,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     if args.write_bag is not None:
         _write_bag(args, str(source.topic), calibration, screen)
     screen.show(next_step(calibration.verdict))
-    return exit_codes.of_verdict(calibration.verdict.level)
+    return exit_code(calibration.verdict.level)
 
 
 def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:

@@ -39,15 +39,7 @@ def show(renderable: RenderableType, to_stderr: bool = False) -> None:
                       color_system='auto' if terminal else None)
     console.print(renderable)
     plain = '\n'.join(line.rstrip() for line in text.getvalue().splitlines())
-    if to_stderr:
-        write_stderr(plain)
-    else:
-        show_text(plain)
-
-
-def show_text(text: str) -> None:
-    """Print text on stdout. Raises OutputError where it is closed or full."""
-    write_stdout(text)
+    (write_stderr if to_stderr else write_stdout)(plain)
 
 
 class Screen:

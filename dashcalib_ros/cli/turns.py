@@ -7,16 +7,15 @@ from typing import Any
 
 from rich.text import Text
 
-from dashcalib_ros.cli import exit_codes
-from dashcalib_ros.cli.drive import feed, open_drive
-from dashcalib_ros.cli.settings import read_config
-from dashcalib_ros.cli.terminal import Stages, show, show_text, warn
+from dashcalib_ros.cli.arguments import ACCEPTED
+from dashcalib_ros.cli.drive import feed, open_drive, read_config
+from dashcalib_ros.cli.terminal import Stages, show, warn
 from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import counted
-from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.tables import TextTable
+from dashcalib_ros.standard_streams import write_stdout
 
 COLUMNS = ('at s', 'frame', 'from', 'to', 'images', 'prominence')
 PROMINENCE = ('prominence: how far a turn stands out from the driving before and after it, as a '
@@ -26,8 +25,7 @@ PROMINENCE = ('prominence: how far a turn stands out from the driving before and
 def turns(args: argparse.Namespace) -> int:
     """List the turns found, best first. The exit code is 0, also if there are none."""
     config = read_config(args)
-    mask = None if args.mask is None else read_mask(args.mask)
-    source = open_drive(args)
+    source, mask = open_drive(args)
     detection = Detection(config, mask)
     with Stages(args.quiet) as stages:
         frames = feed(detection, source, mask, stages)
@@ -35,15 +33,15 @@ def turns(args: argparse.Namespace) -> int:
     found = [_row(turn) for turn in detection.turns()]
     warn((*source.warnings, *detection.warnings()))
     if args.json:
-        show_text(json.dumps(plain_values({
+        write_stdout(json.dumps(plain_values({
             'input': source.name, 'frames': frames, 'turns': found,
             'warnings': (*source.warnings, *detection.warnings())}), indent=2, allow_nan=False))
-        return exit_codes.ACCEPTED
+        return ACCEPTED
     if found:
         show(TextTable(COLUMNS, [_cells(row, detection.start_s) for row in found]))
         show(Text(PROMINENCE))
     show(Text(_conclusion(len(found), config.turns.wanted, frames)))
-    return exit_codes.ACCEPTED
+    return ACCEPTED
 
 
 def _conclusion(found: int, wanted: int, frames: int) -> str:

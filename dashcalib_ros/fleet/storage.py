@@ -22,7 +22,7 @@ from dashcalib_ros.errors import InputError, OutputError, one_line
 from dashcalib_ros.fleet.extra import needs
 from dashcalib_ros.input.inputs import named_like
 from dashcalib_ros.limits import CLIP_BYTES, CLIP_FILES, check_file, read_file
-from dashcalib_ros.report import write_whole
+from dashcalib_ros.whole_files import write_whole
 
 URL = re.compile(r'[a-z][a-z0-9+.-]+://')
 

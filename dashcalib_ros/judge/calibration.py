@@ -6,9 +6,8 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as default
-from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -184,6 +183,15 @@ class Calibration:
     start_s: float = 0.0
     material: Material | None = default(default=None, compare=False)
 
+    if TYPE_CHECKING:
+        # report/, where files are read and written, adds them: see report/__init__.py
+        @staticmethod
+        def load(path: str | os.PathLike[str]) -> Calibration:
+            """Read what save() and `dashcalib run` write."""
+
+        def save(self, folder: str | os.PathLike[str] = 'calibration') -> tuple[Path, ...]:
+            """Write what `dashcalib run` writes."""
+
     def __repr__(self) -> str:
         """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
         if self.camera is None:
@@ -199,17 +207,6 @@ class Calibration:
         """Return what must stand wherever the numbers stand; '' where nothing must."""
         lone = self.camera is not None and self.turns_used == 1
         return 'from one turn alone, which nothing confirms' if lone else ''
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Calibration:
-        """Read what save() and `dashcalib run` write: a result.json, its folder, calibration.yaml.
-
-        A result.json has everything but the mask, the turning magnitudes and what the report
-        draws; a calibration.yaml has camera, sigma, verdict and versions. Settings that this
-        version does not know are left out. Raises InputError; load_camera() reads other files.
-        """
-        loaded: Calibration = import_module('dashcalib_ros.report').load_calibration(path)
-        return loaded
 
     @property
     def K(self) -> Floats:  # noqa: N802, the field's name for it
@@ -271,17 +268,6 @@ class Calibration:
         if covariance.shape != (len(camera.params),) * 2:
             raise InputError(UNKNOWN_COVARIANCE)
         return camera, covariance
-
-    def save(self, folder: str | os.PathLike[str] = 'calibration') -> tuple[Path, ...]:
-        """Write what `dashcalib run` writes into a folder, and return the files' paths.
-
-        These are result.json, report.html and calibration.yaml (calibration.weak.yaml where it is
-        weak, none where it is refused). Raises OutputError, which tells what to do.
-        """
-        # report/ is built on this room: it is loaded at the first use, as the package's names are
-        write_results = import_module('dashcalib_ros.report').write_results
-        files: tuple[Path, ...] = write_results(self, folder).files
-        return files
 
     def rays(self, pixels: npt.ArrayLike) -> Floats:
         """Return the unit viewing rays (..., 3) of pixels (..., 2); x right, y down, z forward.

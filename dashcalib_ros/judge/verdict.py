@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -53,11 +54,11 @@ def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
     lines: what straight lines say of it, if there are enough of them. outlook: to tell what one
     more turn would bring, where only knowledge is missing.
     """
-    findings = [found for rule in RULES if (found := rule(solution, config)) is not None]
-    against = None if lines is None else _lines_disagree(lines, solution, config)
-    findings += [against] if against is not None else []
+    of_lines = () if lines is None else (partial(_lines_disagree, lines),)
+    findings = [found for rule in (*RULES, *of_lines)
+                if (found := rule(solution, config)) is not None]
     findings.sort(key=lambda found: (not found.cause, found.level != 'refused'))
-    if findings and outlook and against is None and lacks_knowledge_only(solution, config):
+    if findings and outlook and lacks_knowledge_only(solution, config, of_lines):
         more = next_turn(solution)
         findings[0] = replace(findings[0], cure=findings[0].cure + (more and f' ({more})'))
     return verdict_of(findings)
@@ -73,13 +74,15 @@ def verdict_of(findings: Sequence[Finding]) -> Verdict:
                    tuple(dict.fromkeys(found.cure for found in findings)))
 
 
-def lacks_knowledge_only(solution: Solution, config: VerdictConfig) -> bool:
+def lacks_knowledge_only(solution: Solution, config: VerdictConfig,
+                         witnesses: Sequence[Rule] = ()) -> bool:
     """Return whether nothing contradicts a solution: where it is weak, its turns know too little.
 
-    Another focal length may explain them as well, but not clearly better.
+    Another focal length may explain them as well, but not clearly better. witnesses: the rules of
+    what is not in the solution.
     """
     return (profile_contrast(solution) > -config.min_contrast
-            and not any(rule(solution, config) for rule in SOUND))
+            and not any(rule(solution, config) for rule in (*SOUND, *witnesses)))
 
 
 def _too_few_turns(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -99,7 +102,7 @@ def _too_little_yaw(solution: Solution, config: VerdictConfig) -> Finding | None
         'drive sharper turns, as at crossings')
 
 
-def _flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
+def flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
     """The cost must rise on both sides of its minimum, or the focal length is not observable."""
     contrast = profile_contrast(solution)
     return _graded(
@@ -136,7 +139,8 @@ def _far_from_profile(solution: Solution, config: VerdictConfig) -> Finding | No
                    'record another drive, with sharper turns and less traffic')
 
 
-def _sigma_too_large(solution: Solution, config: VerdictConfig) -> Finding | None:
+def sigma_too_large(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """Fx must be known well enough; a sigma that is not known is none."""
     relative = float(solution.sigma[0] / solution.camera.fx)
     known = f'to {100 * relative:.1f} % only' if np.isfinite(relative) else 'not at all'
     return _graded(
@@ -145,7 +149,7 @@ def _sigma_too_large(solution: Solution, config: VerdictConfig) -> Finding | Non
         'drive more turns, or sharper ones')
 
 
-def _one_turn_dominates(solution: Solution, config: VerdictConfig) -> Finding | None:
+def one_turn_dominates(solution: Solution, config: VerdictConfig) -> Finding | None:
     """If one turn gives nearly all information about fx, the others cannot confirm it."""
     shares = leverages(solution)
     turn = max(shares, key=lambda turn: shares[turn])
@@ -156,7 +160,7 @@ def _one_turn_dominates(solution: Solution, config: VerdictConfig) -> Finding | 
                            f'focal length', 'drive another turn that is as sharp')
 
 
-def _turns_disagree(solution: Solution, config: VerdictConfig) -> Finding | None:
+def turns_disagree(solution: Solution, config: VerdictConfig) -> Finding | None:
     """Compare the values of fx that the turns would give separately."""
     spread = focal_disagreement(solution)
     if spread <= config.max_disagreement:
@@ -166,7 +170,8 @@ def _turns_disagree(solution: Solution, config: VerdictConfig) -> Finding | None
                    'check that nobody moved or zoomed the camera, and avoid heavy traffic')
 
 
-def _other_camera(solution: Solution, config: VerdictConfig) -> Finding | None:
+def other_camera(solution: Solution, config: VerdictConfig) -> Finding | None:
+    """No turn may ask for a camera of its own."""
     turns = sorted(turns_of_another_camera(solution.misfits, config))
     if not turns:
         return None
@@ -320,14 +325,19 @@ def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
 
 def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> Finding | None:
     """Poles and the edges of houses must be straight: nothing of this comes from motion."""
-    moved = lines.picture_px / solution.camera.image_size[0]
-    if not (lines.sigmas > config.max_line_sigmas and moved > config.max_line_move):
+    if not lines_contradict(lines, solution.camera.image_size[0], config):
         return None
     return Finding('weak', f'poles and the edges of houses are not straight with this distortion '
                            f'({lines.lines} upright lines ask for k1 {lines.k1:+.3f}, '
                            f'{lines.sigmas:.0f} times what both may be off)',
                    'look for a curved windscreen or cover before the lens, try another --model, '
                    'or drive more turns')
+
+
+def lines_contradict(lines: Bend, width: int, config: VerdictConfig) -> bool:
+    """Return whether straight lines contradict a camera of pictures of this width, px."""
+    return (lines.sigmas > config.max_line_sigmas
+            and lines.picture_px / width > config.max_line_move)
 
 
 def _graded(refused: bool, weak: bool, what: str, cure: str) -> Finding | None:
@@ -340,10 +350,10 @@ def _graded(refused: bool, weak: bool, what: str, cure: str) -> Finding | None:
 Rule = Callable[[Solution, VerdictConfig], Finding | None]
 # whether the turns know enough: where they do not, a fleet's prior may help
 ENOUGH: tuple[Rule, ...] = (
-    _too_few_turns, _too_little_yaw, _flat_profile, _far_from_profile, _sigma_too_large,
-    _one_turn_dominates)
+    _too_few_turns, _too_little_yaw, flat_profile, _far_from_profile, sigma_too_large,
+    one_turn_dominates)
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
-    _turns_disagree, _other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,
+    turns_disagree, other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,
     _folds_over, _other_model, _other_kind, _turned_pictures)
 RULES = (*ENOUGH, *SOUND)

@@ -8,6 +8,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.check import Check
+from dashcalib_ros.judge.verdict import lines_contradict
 
 
 def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int, int],
@@ -24,8 +25,7 @@ def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int,
     if said is None:
         return found
     said = said.resized(scale.px)
-    against = (said.sigmas > config.verdict.max_line_sigmas
-               and said.picture_px / image_size[0] > config.verdict.max_line_move)
+    against = lines_contradict(said, image_size[0], config.verdict)
     answer = 'cannot tell' if against and found.answer == 'right' else found.answer
     return replace(found, answer=answer, reasons=(*found.reasons, _text(said, against)),
                    straight_lines=said)

@@ -20,7 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from dashcalib_ros.camera import FISHEYE, MODELS, Camera, Radial, camera_from_ros, ros_faults
+from dashcalib_ros.camera import (
+    FISHEYE,
+    MODELS,
+    Brown,
+    Camera,
+    Fisheye,
+    Radial,
+    Rational,
+    camera_from_ros,
+    ros_faults,
+)
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.input.bag_write import first_camera_info
@@ -60,8 +70,8 @@ KNOWN = ('a result.json (or its folder), a camera_info YAML, a file of OpenCV, K
 # ROS's distortion models; RATIONAL has all pinholes in it
 PLUMB_BOB, RATIONAL, EQUIDISTANT = 'plumb_bob', 'rational_polynomial', 'equidistant'
 # the coefficients by name, in the order of D
-TERMS = {RATIONAL: ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6'),
-         PLUMB_BOB: ('k1', 'k2', 'p1', 'p2', 'k3'), EQUIDISTANT: ('k1', 'k2', 'k3', 'k4')}
+TERMS = {RATIONAL: Rational.names()[4:], PLUMB_BOB: Brown.names()[4:],
+         EQUIDISTANT: Fisheye.names()[4:]}
 # COLMAP's models, by their number: name, focal lengths, our distortion model, coefficients; None
 # where no model here is the same
 COLMAP = (('SIMPLE_PINHOLE', 1, PLUMB_BOB, 0), ('PINHOLE', 2, PLUMB_BOB, 0),
@@ -73,8 +83,7 @@ COLMAP = (('SIMPLE_PINHOLE', 1, PLUMB_BOB, 0), ('PINHOLE', 2, PLUMB_BOB, 0),
 KALIBR = {'radtan': PLUMB_BOB, 'equidistant': EQUIDISTANT, 'equi': EQUIDISTANT, 'none': PLUMB_BOB}
 OPENSFM = {'perspective': PLUMB_BOB, 'simple_radial': PLUMB_BOB, 'radial': PLUMB_BOB,
            'brown': PLUMB_BOB, 'fisheye': EQUIDISTANT, 'fisheye_opencv': EQUIDISTANT}
-NERFSTUDIO = {'SIMPLE_PINHOLE': PLUMB_BOB, 'PINHOLE': PLUMB_BOB, 'SIMPLE_RADIAL': PLUMB_BOB,
-              'RADIAL': PLUMB_BOB, 'OPENCV': PLUMB_BOB, 'OPENCV_FISHEYE': EQUIDISTANT}
+NERFSTUDIO = {name: kind for name, _, kind, _ in COLMAP[:6]}
 MRCAL = {'LENSMODEL_PINHOLE': PLUMB_BOB, 'LENSMODEL_OPENCV4': PLUMB_BOB,
          'LENSMODEL_OPENCV5': PLUMB_BOB, 'LENSMODEL_OPENCV8': RATIONAL,
          'LENSMODEL_OPENCV12': RATIONAL}
@@ -106,27 +115,28 @@ def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedC
 
 def load_with_faults(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
     """Read a camera as load_camera() does; what stands wrong beside it is in its faults."""
-    place, name = _place(path, name)
+    text = os.fspath(path)
+    before, _, after = text.rpartition(':')
+    # lexists() takes any text, also one that is too long for a name
+    if name is None and before and os.path.lexists(before) and not os.path.lexists(text):
+        text, name = before, after
+    place = Path(text)
     try:
-        return _loaded(place, name)
+        if fits_bag(place):
+            topic, message = first_camera_info(place, name)
+            return camera_of_message(message, f'{place}:{topic}')
+        if place.is_dir():
+            inside = [place / each for each in IN_FOLDER if (place / each).exists()]
+            if not inside:
+                raise InputError(f'{place} is a folder without a calibration; give {KNOWN}')
+            place = inside[0]
+        if place.suffix == '.npz':
+            return _chosen(_cameras_of(_arrays(place), place), name, place)
+        if place.suffix == '.bin':
+            return _chosen(_colmap_binary(place), name, place)
+        return parse_camera(read_text(place, JSON_BYTES), place, name)
     except OSError as error:
         raise InputError(os_error(place, error)) from error
-
-
-def _loaded(place: Path, name: str | None) -> NamedCamera:
-    if fits_bag(place):
-        topic, message = first_camera_info(place, name)
-        return camera_of_message(message, f'{place}:{topic}')
-    if place.is_dir():
-        inside = [place / each for each in IN_FOLDER if (place / each).exists()]
-        if not inside:
-            raise InputError(f'{place} is a folder without a calibration; give {KNOWN}')
-        place = inside[0]
-    if place.suffix == '.npz':
-        return _chosen(_cameras_of(_arrays(place), place), name, place)
-    if place.suffix == '.bin':
-        return _chosen(_colmap_binary(place), name, place)
-    return parse_camera(read_text(place, JSON_BYTES), place, name)
 
 
 def parse_camera(text: str, path: str | Path, name: str | None = None) -> NamedCamera:
@@ -136,38 +146,21 @@ def parse_camera(text: str, path: str | Path, name: str | None = None) -> NamedC
 
 def camera_of_message(message: Any, name: str) -> NamedCamera:
     """Return the camera of a CameraInfo of ROS 1 or 2. Raises InputError where there is none."""
-    k, d = ([float(value) for value in getattr(message, key, getattr(message, key.upper(), ()))]
-            for key in 'kd')
+    k, d, r, p = ([float(value) for value in getattr(message, key,
+                                                     getattr(message, key.upper(), ()))]
+                  for key in 'kdrp')
     size, roi = (int(message.width), int(message.height)), message.roi
     cut = (roi.x_offset, roi.y_offset, roi.width, roi.height) not in ((0, 0, 0, 0), (0, 0, *size))
     if cut or max(message.binning_x, message.binning_y) > 1:
         raise InputError(f'{name} has binning or a region of interest: give the calibration of '
                          f'the images as they are')
-    r, p = ([float(value) for value in getattr(message, key, getattr(message, key.upper(), ()))]
-            for key in 'rp')
     if not k or not k[0] > 0:
         raise InputError(f'{name} is uncalibrated: K[0] is not positive; give the driver a '
                          f'calibration')
     if not np.isfinite([*k, *d, *r, *p]).all():
         raise InputError(f'{name} has numbers that are not finite; give a calibration')
-    camera = _camera(size, _plain_matrix(k), str(message.distortion_model), d, name)
+    camera = _camera(size, _view(k), str(message.distortion_model), d, name)
     return NamedCamera(name, camera, faults=ros_faults(camera, k, r, p))
-
-
-def _place(path: str | os.PathLike[str], name: str | None) -> tuple[Path, str | None]:
-    """Return the file, and the camera's name, which may stand behind it: FILE:NAME."""
-    text = os.fspath(path)
-    before, _, after = text.rpartition(':')
-    if name is None and before and _exists(before) and not _exists(text):
-        return Path(before), after
-    return Path(text), name
-
-
-def _exists(path: str) -> bool:
-    try:
-        return Path(path).exists()
-    except (OSError, ValueError):  # a name that is too long, or has a zero byte
-        return False
 
 
 def _chosen(cameras: Mapping[str, Reader], name: str | None, path: str | Path) -> NamedCamera:
@@ -235,24 +228,21 @@ def _cameras_of(data: Any, path: Path) -> Mapping[str, Reader]:
     raise InputError(f'{path} is no camera calibration known here; give {KNOWN}')
 
 
-def _camera(size: Sequence[Any], k: Sequence[float], kind: str, d: Sequence[float],
+def _camera(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequence[float],
             path: str | Path) -> Camera:
-    """Return the simplest camera with these values, checked."""
-    check_focal(k[0], k[4], path)
+    """Return the simplest camera with these values, checked. view: fx, fy, cx, cy."""
+    fx, fy, cx, cy = view
+    check_focal(fx, fy, path)
     width, height = read_size(*size, path=path)
     try:
-        return camera_from_ros((width, height), kind, k, d)
+        return camera_from_ros((width, height), kind, [fx, 0, cx, 0, fy, cy, 0, 0, 1], d)
     except InputError as error:
         raise InputError(f'{path}: {error}') from error
 
 
-def _plain_matrix(k: Sequence[float]) -> list[float]:
-    """Return K without what no model here has; ros_faults() names that."""
-    return _matrix(k[0], k[4], k[2], k[5])
-
-
-def _matrix(fx: float, fy: float, cx: float, cy: float) -> list[float]:
-    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+def _view(k: Sequence[float]) -> list[float]:
+    """Return fx, fy, cx, cy of K (9,); ros_faults() names what else it says."""
+    return [k[0], k[4], k[2], k[5]]
 
 
 def _model(models: Mapping[str, str], name: Any, what: str, path: Path) -> str:
@@ -317,7 +307,7 @@ def _opencv(data: Data, keys: Mapping[str, str], path: Path) -> NamedCamera:
             raise InputError(f'{path} has 4 distortion coefficients, which may be a fisheye\'s; '
                              f'add a line distortion_model: {PLUMB_BOB}, or {EQUIDISTANT}')
         kind = EQUIDISTANT if fisheye else PLUMB_BOB if len(d) <= 5 else RATIONAL
-    camera = _camera(size, _plain_matrix(k), str(kind), d, path)
+    camera = _camera(size, _view(k), str(kind), d, path)
     r, p = (_values(data, key, count, path) if key in data else None
             for key, count in (('rectification_matrix', 9), ('projection_matrix', 12)))
     own = data.get('dashcalib')
@@ -334,7 +324,7 @@ def _kalibr(data: Data, path: Path) -> Camera:
                          f'calibrate with --models pinhole-radtan, or pinhole-equi')
     kind = _model(KALIBR, data.get('distortion_model'), 'the distortion model', path)
     return _camera(_pair(data, 'resolution', path),
-                   _matrix(*_values(data, 'intrinsics', 4, path)), kind,
+                   _values(data, 'intrinsics', 4, path), kind,
                    _numbers(data['distortion_coeffs'], 'distortion_coeffs', path), path)
 
 
@@ -358,7 +348,7 @@ def _colmap(values: Sequence[Any], path: Path) -> Camera:
                          f'{len(params)}; write it anew')
     cx, cy = (value - HALF_PIXEL for value in params[focals:focals + 2])
     return _camera([int(side) if str(side).isdecimal() else side for side in size],
-                   _matrix(params[0], params[focals - 1], cx, cy), kind, params[focals + 2:], path)
+                   [params[0], params[focals - 1], cx, cy], kind, params[focals + 2:], path)
 
 
 def _colmap_binary(path: Path) -> Mapping[str, Reader]:
@@ -385,10 +375,10 @@ def _nerfstudio(data: Data, path: Path) -> Camera:
         fx = read_number(data, 'fl_x', path)
     else:
         fx = width / 2 / math.tan(read_number(data, 'camera_angle_x', path) / 2)
-    k = _matrix(fx, read_number(data, 'fl_y', path, fx),
-                read_number(data, 'cx', path, width / 2) - HALF_PIXEL,
-                read_number(data, 'cy', path, height / 2) - HALF_PIXEL)
-    return _camera((width, height), k, kind, _coefficients(data, kind, path), path)
+    view = [fx, read_number(data, 'fl_y', path, fx),
+            read_number(data, 'cx', path, width / 2) - HALF_PIXEL,
+            read_number(data, 'cy', path, height / 2) - HALF_PIXEL]
+    return _camera((width, height), view, kind, _coefficients(data, kind, path), path)
 
 
 def _opensfm(data: Data, path: Path) -> Camera:
@@ -400,7 +390,7 @@ def _opensfm(data: Data, path: Path) -> Camera:
               for key in ('focal_x', 'focal_y'))
     cx, cy = (longer * read_number(data, key, path, 0.0) + side / 2 - HALF_PIXEL
               for key, side in zip(('c_x', 'c_y'), size, strict=True))
-    return _camera(size, _matrix(fx, fy, cx, cy), kind, _coefficients(data, kind, path), path)
+    return _camera(size, [fx, fy, cx, cy], kind, _coefficients(data, kind, path), path)
 
 
 def _mrcal(text: str, path: Path) -> Camera:
@@ -412,7 +402,7 @@ def _mrcal(text: str, path: Path) -> Camera:
     values = _numbers(data.get('intrinsics'), 'intrinsics', path)
     if len(values) < 4:
         raise InputError(f'{path}: intrinsics must have 4 numbers or more')
-    return _camera(_pair(data, 'imagersize', path), _matrix(*values[:4]), kind, values[4:], path)
+    return _camera(_pair(data, 'imagersize', path), values[:4], kind, values[4:], path)
 
 
 def _plain(data: Data, path: Path) -> NamedCamera:
@@ -429,9 +419,9 @@ def _plain(data: Data, path: Path) -> NamedCamera:
             PLUMB_BOB if name == PLUMB_BOB else RATIONAL)
     for needed in Radial.names()[4:]:
         read_number(data, needed, path)
-    camera = _camera((data.get('width'), data.get('height')), _matrix(
-        *(read_number(data, key, path) for key in Radial.names()[:4])), kind,
-        _coefficients(data, kind, path), path)
+    camera = _camera((data.get('width'), data.get('height')),
+                     [read_number(data, key, path) for key in Radial.names()[:4]], kind,
+                     _coefficients(data, kind, path), path)
     return NamedCamera(str(path), camera, read_sigma(data.get('sigma'), camera))
 
 

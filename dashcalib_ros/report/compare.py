@@ -11,8 +11,10 @@ from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.judge.difference import Difference as WholeDifference
 from dashcalib_ros.judge.difference import difference_between
+from dashcalib_ros.judge.wording import answers_of
 from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.report.wording import digits_of, number, optional
 
 
 @dataclass(frozen=True)
@@ -95,3 +97,28 @@ def _difference(name: str, a: NamedCamera, b: NamedCamera) -> Difference:
     return Difference(name, value, reference, difference,
                       100 * difference / abs(reference) if reference else None,
                       sigma, difference / sigma if sigma else None)
+
+
+def comparison_rows(found: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return the head and the rows of the parameters of both."""
+    known = any(d.z is not None for d in found.differences)
+    rows = [difference_row(d)[:None if known else -1] for d in found.differences]
+    return ('', 'A', 'B', 'A - B', 'of B', 'sigmas')[:None if known else -1], rows
+
+
+def answers(found: Comparison) -> list[str]:
+    """Return how far both are apart, whether that can be told, and whether it matters."""
+    whose = ' and '.join(side for side, camera in (('A', found.a), ('B', found.b))
+                         if camera.sigma_px is not None)
+    lines = list(answers_of(found.whole, whose))
+    if found.unseen and found.whole.apart is not None:
+        lines[0] += (f', without the {100 * found.unseen:.0f} % of the picture that the '
+                     f'{found.a.camera.model} model cannot see')
+    return lines
+
+
+def difference_row(d: Difference) -> tuple[str, ...]:
+    """Return a parameter's name, both values, their difference, in percent and in sigmas."""
+    digits = max(4, digits_of(d.name))
+    return (d.name, number(d.name, d.a), number(d.name, d.b), f'{d.difference:+.{digits}f}',
+            '-' if d.percent is None else f'{d.percent:+.3f} %', optional(d.z, 1))

@@ -29,14 +29,16 @@ from dashcalib_ros.report.camera_yaml import camera_info_yaml
 ROUNDING_PX = 1.0
 
 
-def exported(camera: Camera, kind: str) -> str | bytes:
+def exported(camera: Camera, kind: str, field: Field | None = None) -> str | bytes:
     """Return the content of a camera file of one of EXPORTS: text, or bytes of an .npz.
 
-    Raises ConfigError for a kind that there is not, and for a lens that it cannot describe.
+    field: what the camera leaves over; WITH_FIELD has the kinds that can tell it, the others
+    leave it out. Raises ConfigError for a kind that there is not, and for a lens that it cannot
+    describe.
     """
     if kind not in EXPORTS:
         raise ConfigError(f'there is no export to {kind!r}; choose one of {", ".join(EXPORTS)}')
-    return EXPORTS[kind](camera)
+    return WITH_FIELD[kind](camera, field) if kind in WITH_FIELD else EXPORTS[kind](camera)
 
 
 def resized(camera: Camera, size: tuple[int, int]) -> Camera:

@@ -2,16 +2,12 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
-import re
-import secrets
 import stat
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.judge import Calibration
@@ -20,6 +16,7 @@ from dashcalib_ros.report.camera_yaml import CAMERA_NAME, calibration_yaml
 from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.result import result_json
+from dashcalib_ros.whole_files import prepared, remove_leftovers, sync, write_whole
 
 ACCEPTED = 'calibration.yaml'
 WEAK = 'calibration.weak.yaml'
@@ -39,7 +36,8 @@ class Written:
     set_aside: Path | None = None
 
 
-def write_results(calibration: Calibration, out_dir: str | Path, camera_name: str = CAMERA_NAME,
+def write_results(calibration: Calibration, out_dir: str | os.PathLike[str],
+                  camera_name: str = CAMERA_NAME,
                   created: str | None = None, truth: NamedCamera | None = None) -> Written:
     """Write the result's files into out_dir, which is made if needed, and return their paths.
 
@@ -59,17 +57,27 @@ def write_results(calibration: Calibration, out_dir: str | Path, camera_name: st
     texts[REPORT] = report_html(calibration, truth, folder / name)
     with _output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with _prepared(folder, {name: text.encode('utf-8', 'replace')
-                                for name, text in texts.items()}) as prepared:
+        with prepared(folder, {name: text.encode('utf-8', 'replace')
+                                for name, text in texts.items()}) as temporary:
             moved = None
             if ACCEPTED not in texts or not _is_ours(folder / ACCEPTED):
                 moved = set_aside(folder / ACCEPTED)
-            for name, temporary in prepared.items():
-                temporary.replace(folder / name)
+            for name, path in temporary.items():
+                path.replace(folder / name)
             if WEAK not in texts:
                 (folder / WEAK).unlink(missing_ok=True)
-            _sync(folder)
+            sync(folder)
     return Written(tuple(folder / name for name in texts), moved)
+
+
+def save(calibration: Calibration, folder: str | os.PathLike[str] = 'calibration'
+         ) -> tuple[Path, ...]:
+    """Write what `dashcalib run` writes into a folder, and return the files' paths.
+
+    These are result.json, report.html and calibration.yaml (calibration.weak.yaml where it is
+    weak, none where it is refused). Raises OutputError, which tells what to do.
+    """
+    return write_results(calibration, folder).files
 
 
 def write_text(path: str | Path, text: str | bytes) -> None:
@@ -77,13 +85,7 @@ def write_text(path: str | Path, text: str | bytes) -> None:
     path = Path(path)
     with _output_errors(path.parent):
         write_whole(path, text if isinstance(text, bytes) else text.encode('utf-8', 'replace'))
-        _sync(path.parent)
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write one file, completely or not at all. Raises OSError."""
-    with _prepared(path.parent, {path.name: data}) as prepared:
-        prepared[path.name].replace(path)
+        sync(path.parent)
 
 
 def set_aside(path: Path) -> Path | None:
@@ -106,7 +108,7 @@ def set_aside(path: Path) -> Path | None:
     except OSError as error:
         raise OutputError(f'{path} could not be moved aside: {error.strerror or error}; move it '
                           f'yourself, or allow writing to {path.parent}') from error
-    _sync(path.parent)
+    sync(path.parent)
     return target
 
 
@@ -123,21 +125,7 @@ def _new_backup(path: Path) -> Path:
             number += 1
 
 
-def remove_leftovers(folder: Path, names: Collection[str]) -> None:
-    """Remove the temporary files of these names that killed processes left in a folder.
-
-    A running process has its own files locked: they stay.
-    """
-    ours = re.compile(rf'\.({"|".join(map(re.escape, names))})\.[0-9a-f]{{8}}\.tmp')
-    with suppress(OSError):
-        for path in list(folder.iterdir()):
-            if ours.fullmatch(path.name) and path.is_file() and not path.is_symlink():
-                with suppress(OSError), path.open('r+b') as stream:
-                    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    path.unlink()
-
-
-def check_writable(out_dir: str | Path) -> None:
+def check_writable(out_dir: str | os.PathLike[str]) -> None:
     """Make out_dir if needed and try to write there, before a long run and not after it.
 
     Temporary files of a killed run are removed. Raises OutputError.
@@ -146,12 +134,12 @@ def check_writable(out_dir: str | Path) -> None:
     with _output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder, NAMES)
-        with _prepared(folder, {PROBE: b'yes\n'}):
+        with prepared(folder, {PROBE: b'yes\n'}):
             pass
 
 
 @contextmanager
-def output_folder(out_dir: str | Path) -> Iterator[Path]:
+def output_folder(out_dir: str | os.PathLike[str]) -> Iterator[Path]:
     """Check the folder first; remove it if the work inside fails and it is new and empty."""
     folder = Path(out_dir)
     existed = folder.exists()
@@ -163,42 +151,6 @@ def output_folder(out_dir: str | Path) -> Iterator[Path]:
             with suppress(OSError):
                 folder.rmdir()
         raise
-
-
-@contextmanager
-def _prepared(folder: Path, contents: Mapping[str, bytes]) -> Iterator[dict[str, Path]]:
-    """Write each content to a temporary file beside its final place.
-
-    Those left are removed, and those of the same names that killed processes left.
-    """
-    temporary: dict[str, Path] = {}
-    remove_leftovers(folder, contents)
-    with ExitStack() as stack:
-        for name, content in contents.items():
-            if (folder / name).is_dir():
-                raise IsADirectoryError(errno.EISDIR, f'{name} is a folder there')
-            temporary[name], stream = stack.enter_context(_temporary_file(folder, name))
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        yield temporary
-
-
-@contextmanager
-def _temporary_file(folder: Path, name: str) -> Iterator[tuple[Path, BinaryIO]]:
-    """Open a new file and lock it; at the end, remove it if it is still there."""
-    while True:
-        path = folder / f'.{name}.{secrets.token_hex(4)}.tmp'
-        try:
-            with path.open('xb') as stream:
-                with suppress(OSError):  # not every file system has locks
-                    fcntl.flock(stream, fcntl.LOCK_EX)
-                # another process may have removed it as a leftover before it was locked
-                if os.fstat(stream.fileno()).st_nlink:
-                    yield path, stream
-                    return
-        finally:
-            path.unlink(missing_ok=True)
 
 
 def _is_ours(path: Path) -> bool:
@@ -226,13 +178,3 @@ def _cure(error: OSError) -> str:
     if error.errno in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR):
         return 'something else has that name: move it or choose another output folder'
     return 'choose another output folder'
-
-
-def _sync(folder: Path) -> None:
-    """Make the renames in folder survive a power failure, where the system can."""
-    with suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

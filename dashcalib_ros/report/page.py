@@ -1,4 +1,4 @@
-"""report.html: the calibration on one page, without references to other files."""
+"""report.html and the page of two calibrations, each complete without other files."""
 from __future__ import annotations
 
 import json
@@ -6,21 +6,29 @@ from collections.abc import Mapping
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.report.checks import checks
-from dashcalib_ros.report.compare import compare
-from dashcalib_ros.report.figures import magnitude_svg, mask_data_uri
-from dashcalib_ros.report.lens_sections import evidence_of, lens_of
+from dashcalib_ros.report.charts import magnitude_svg, mask_data_uri, segments
+from dashcalib_ros.report.compare import Comparison, answers, compare, comparison_rows
+from dashcalib_ros.report.lens import (
+    WIDTH,
+    Drawing,
+    evidence_of,
+    sigma_svg,
+    slider_of,
+    uncertainty_of,
+)
 from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
-from dashcalib_ros.report.turn_sections import turn_rows, turn_sections
-from dashcalib_ros.report.usage import field_of_view, snippets
+from dashcalib_ros.report.turns import turn_rows, turn_sections
 from dashcalib_ros.report.wording import (
     ADVICE,
+    checks,
     digits_of,
     key_figures,
     next_steps,
@@ -30,10 +38,12 @@ from dashcalib_ros.report.wording import (
     removed_effects,
     run_facts,
 )
+from dashcalib_ros.solve.knowledge import SigmaMap
 
 if TYPE_CHECKING:
     import jinja2
 
+LONGEST = 22.0  # px of the drawing; of an arrow
 # the mask's element in the page; pictures refer to it
 MASK_ID = 'mask'
 
@@ -45,20 +55,35 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
     truth: to compare with, where it is known. calibration_file: where the camera is written.
     """
     c = calibration
-    mask = c.mask is not None and not bool(c.mask.all())
-    mask_id = MASK_ID if mask else None
+    mask = None if c.mask is None or c.mask.all() else c.mask
+    mask_id = None if mask is None else MASK_ID
+    against = (None if truth is None or c.camera is None
+               else compare(calibrated_camera(c), truth))
+    settings, defaults = c.config.flat(), Config().flat()
     return template('report.html').render(
         c=c, title=f'Calibration of {c.input_name}' if c.input_name else 'Calibration',
-        headline=ADVICE[c.verdict.level], figures=key_figures(c, _field_of_view(c)),
-        steps=next_steps(c), checks=checks(c), parameters=parameter_rows(c),
-        removed=removed_effects(c),
-        truth=_truth_rows(c, truth), truth_px=_truth_px(c, truth),
-        snippets=_snippets(c, calibration_file), lens=lens_of(c),
-        drive=_drive(c), turns=turn_sections(c, mask_id), rows=turn_rows(c),
+        headline=ADVICE[c.verdict.level], figures=key_figures(c), steps=next_steps(c),
+        checks=checks(c), parameters=parameter_rows(c), removed=removed_effects(c),
+        truth=[] if against is None else _truth_rows(against),
+        truth_px='' if against is None else optional(against.mapping_px, 2, ' px'),
+        snippets=_snippets(c, calibration_file),
+        uncertainty=uncertainty_of(c), slider=slider_of(c),
+        drive='' if c.magnitudes is None else magnitude_svg(c.magnitudes, c.turns,
+                                                            c.start_s or None),
+        turns=turn_sections(c, mask_id), rows=turn_rows(c),
         evidence=evidence_of(c, mask_id), facts=run_facts(c),
-        mask=mask_data_uri(c.mask) if mask and c.mask is not None else '', mask_id=MASK_ID,
+        mask='' if mask is None else mask_data_uri(mask), mask_id=MASK_ID,
         masked=0.0 if c.mask is None else 100 * (1 - float(np.mean(c.mask))),
-        changed=_changed(c.config), settings=_text(c.config.flat()), versions=_text(c.versions))
+        changed={key: value for key, value in settings.items() if value != defaults[key]},
+        settings=_text(settings), versions=_text(c.versions))
+
+
+def difference_html(found: Comparison) -> str:
+    """Return a page of two calibrations: where in the picture they differ, and beyond chance."""
+    head, rows = comparison_rows(found)
+    return template('compare.html').render(
+        sides=(('A', found.a), ('B', found.b)), answers=answers(found),
+        head=head, rows=rows, maps=_maps(found))
 
 
 def page_style() -> str:
@@ -78,44 +103,74 @@ def template(name: str) -> jinja2.Template:
     return environment.get_template(name)
 
 
-def _field_of_view(c: Calibration) -> Any:
-    return None if c.camera is None else field_of_view(c.camera)
-
-
-def _drive(c: Calibration) -> str:
-    if c.magnitudes is None:
-        return ''
-    return magnitude_svg(c.magnitudes, c.turns, c.start_s if c.start_s else None)
-
-
-def _snippets(c: Calibration, path: Path | None) -> Any:
-    if c.camera is None or not np.isfinite(c.camera.params).all():
-        return ()
-    name = 'calibration.yaml' if c.verdict.level == 'accepted' else 'calibration.weak.yaml'
-    return snippets(c.camera, (path or Path(name)).absolute())
-
-
-def _truth_rows(c: Calibration, truth: NamedCamera | None) -> list[tuple[str, ...]]:
-    if truth is None or c.camera is None:
-        return []
-    return [(d.name, number(d.name, d.b),
-             f'{d.difference:+.{digits_of(d.name)}f}',
+def _truth_rows(against: Comparison) -> list[tuple[str, ...]]:
+    return [(d.name, number(d.name, d.b), f'{d.difference:+.{digits_of(d.name)}f}',
              '' if d.percent is None else f'{d.percent:+.2f} %', optional(d.z, 1))
-            for d in compare(calibrated_camera(c), truth).differences]
-
-
-def _truth_px(c: Calibration, truth: NamedCamera | None) -> str:
-    if truth is None or c.camera is None:
-        return ''
-    return optional(compare(calibrated_camera(c), truth).mapping_px, 2, ' px')
-
-
-def _changed(config: Config) -> dict[str, Any]:
-    """Return the settings that are not the defaults."""
-    defaults = Config().flat()
-    return {key: value for key, value in config.flat().items() if value != defaults[key]}
+            for d in against.differences]
 
 
 def _text(values: Mapping[str, Any]) -> str:
     return '\n'.join(f'{key}: {value if isinstance(value, str) else json.dumps(value)}'
                      for key, value in values.items())
+
+
+def _snippets(c: Calibration, path: Path | None) -> list[tuple[str, str, str]]:
+    """Return how ROS drivers, OpenCV and COLMAP take the camera: an id, what for, text to copy."""
+    if c.camera is None or not np.isfinite(c.camera.params).all():
+        return []
+    name = 'calibration.yaml' if c.verdict.level == 'accepted' else 'calibration.weak.yaml'
+    url = (path or Path(name)).absolute().as_uri()
+    return [('use-ros', 'ROS 2 camera driver: the parameter', f'camera_info_url: {url}'),
+            ('use-opencv', 'OpenCV in Python', _opencv(c.camera)),
+            ('use-colmap', 'COLMAP', _colmap(c.camera))]
+
+
+def _opencv(camera: Camera) -> str:
+    fx, fy, cx, cy = (f'{value:.4f}' for value in camera.params[:4])
+    distortion = ', '.join(f'{value:.8g}' for value in camera.ros_distortion())
+    call = ('cv2.fisheye.undistortImage(image, K, D, Knew=K)' if camera.family == FISHEYE
+            else 'cv2.undistort(image, K, D)')
+    return ('import cv2\nimport numpy as np\n'
+            f'K = np.array([[{fx}, 0, {cx}], [0, {fy}, {cy}], [0, 0, 1]])\n'
+            f'D = np.array([{distortion}])\n'
+            f'straight = {call}')
+
+
+def _colmap(camera: Camera) -> str:
+    values = ','.join(f'{value:.10g}' for value in camera.colmap.values(camera.params))
+    return ('colmap feature_extractor --database_path database.db --image_path images '
+            '--ImageReader.single_camera 1 '
+            f'--ImageReader.camera_model {camera.colmap.name} '
+            f'--ImageReader.camera_params {quote(values)}')
+
+
+def _maps(found: Comparison) -> list[Drawing]:
+    """Return maps over the picture: pixels apart, their sigma, and the ratio, as far as known."""
+    whole, size = found.whole, found.b.image_size
+    if whole.apart is None:
+        return []
+    apart, lengths = whole.apart, whole.apart.lengths
+    scale = LONGEST / max(float(lengths.max()), 1e-12)
+    # every other one: a chessboard of them is dense enough
+    arrows = segments(apart.pixels[::2] * WIDTH / size[0], scale * apart.offsets[::2], 'arrow')
+    maps = [Drawing('Pixels apart', sigma_svg(SigmaMap(apart.pixels, lengths), size, 1.0,
+                                              'pixels apart over the picture', arrows),
+                    f'How far A sees a ray from where B sees it, px, the best common rotation '
+                    f'removed: {apart.rms:.2f} px over the picture (RMS), {apart.worst:.2f} px at '
+                    f'the worst. Arrows: from B to A, {scale * size[0] / WIDTH:.3g} times as long '
+                    f'as they are.')]
+    sigma = whole.sigma_map
+    if sigma is None:
+        return maps
+    at = {tuple(pixel): value for pixel, value in zip(sigma.pixels.tolist(), sigma.sigma,
+                                                       strict=True)}
+    ratio = np.array([length / at.get(tuple(pixel), np.nan) for pixel, length in zip(
+        apart.pixels.tolist(), lengths, strict=True)])
+    known = np.isfinite(ratio)
+    return [*maps, Drawing(
+        'Sigma of the difference', sigma_svg(sigma, size, 1.0),
+        'How far they may be apart by chance, px, one sigma of all that the files know.'),
+        Drawing('In sigmas', sigma_svg(SigmaMap(apart.pixels[known], ratio[known]), size, 1.0,
+                                       'sigmas apart over the picture'),
+                'The first map divided by the second: where it is well above 1, the difference '
+                'is more than chance.')]

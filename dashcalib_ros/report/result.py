@@ -1,11 +1,11 @@
-"""result.json: a calibration as strict JSON, the contract other programs rely on."""
+"""result.json: a calibration as strict JSON, the contract other programs rely on; and a check."""
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,9 @@ from dashcalib_ros.camera.field import BASIS, Field
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import Calibration, Check, Odometry, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.limits import JSON_BYTES, parse_yaml, read_text
-from dashcalib_ros.limits import parse_json as parse_any_json
+from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, read_text
 from dashcalib_ros.report.camera_file import parse_camera
 from dashcalib_ros.solve.cross_validation import LeftOut
 from dashcalib_ros.solve.knowledge import PictureSigma
@@ -66,21 +65,22 @@ def result_json(calibration: Calibration) -> str:
                       ensure_ascii=False) + '\n'
 
 
-def load_result(path: str | Path) -> dict[str, Any]:
-    """Read a result.json. Raises InputError if it is not one."""
-    return parse_result(read_text(Path(path), JSON_BYTES), path)
-
-
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Read a calibration from result.json, its folder, or calibration.yaml; see Calibration.load.
+    """Read what save() and `dashcalib run` write: a result.json, its folder, calibration.yaml.
 
-    Raises InputError.
+    A result.json has everything but the mask, the turning magnitudes and what the report draws; a
+    calibration.yaml has camera, sigma, verdict and versions. Settings that this version does not
+    know are left out. Raises InputError; load_camera() reads other files.
     """
     place = Path(path)
     place = place / 'result.json' if place.is_dir() else place
     text = read_text(place, JSON_BYTES)
     if text.lstrip().startswith('{'):
-        data: Mapping[str, Any] = parse_result(text, place)
+        data = parse_json(text, str(place))
+        missing = [key for key in ('verdict', 'image_size', 'intrinsics') if key not in data]
+        if missing:
+            raise InputError(f'{place} is no result.json of dashcalib: it has no {missing[0]!r}; '
+                             'give the file that dashcalib run wrote')
     else:
         data = parse_yaml(text, str(place))
         own = data.get('dashcalib') if isinstance(data, Mapping) else None
@@ -110,10 +110,11 @@ def _calibration(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
         TurnId.stored(place) if turn['center'] is None else TurnId.at(turn['center']),
         turn['px'], turn['sigma_px'], turn['others_sigma_px'])
         for place, turn in enumerate(data.get('held_out', ()))]
+    field, size = data.get('field'), (data['image_size'][0], data['image_size'][1])
     sigma = data.get('sigma')
     return Calibration(
         verdict=Verdict(data['verdict'], tuple(data['reasons'])),
-        image_size=(data['image_size'][0], data['image_size'][1]), camera=camera,
+        image_size=size, camera=camera,
         sigma=None if sigma is None else {name: math.nan if value is None else float(value)
                                           for name, value in sigma.items()},
         turns=tuple(TurnSummary(stamp_s=turn['stamp'],
@@ -126,35 +127,10 @@ def _calibration(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
         details=dict(data.get('details', {})), stored_turns=tuple(stored),
         rolling_shutter=made(Shutter, 'rolling_shutter'),
         sigma_px=made(PictureSigma, 'sigma_px'), stabiliser=made(Stabiliser, 'stabiliser'),
-        field=_field(data),
+        field=None if field is None else LensField(
+            Field(size, np.array(field['coefficients'], np.float64)), bool(field['used']),
+            field['rms_px'], field['worst_px'], field['sigma_px']),
         held_out=tuple(held_out), straight_lines=made(Bend, 'straight_lines'))
-
-
-def _field(data: Mapping[str, Any]) -> LensField | None:
-    found = data.get('field')
-    if found is None:
-        return None
-    width, height = data['image_size']
-    return LensField(Field((width, height), np.array(found['coefficients'], np.float64)),
-                     bool(found['used']), found['rms_px'], found['worst_px'], found['sigma_px'])
-
-
-def parse_result(text: str, path: str | Path) -> dict[str, Any]:
-    """Parse result.json's text; path is for messages only."""
-    data = parse_json(text, path)
-    missing = [key for key in ('verdict', 'image_size', 'intrinsics') if key not in data]
-    if missing:
-        raise InputError(f'{path} is no result.json of dashcalib: it has no {missing[0]!r}; '
-                         'give the file that dashcalib run wrote')
-    return data
-
-
-def parse_json(text: str, path: str | Path) -> dict[str, Any]:
-    """Parse the text of a JSON object; raises InputError."""
-    data = parse_any_json(text, str(path))
-    if not isinstance(data, dict):
-        raise InputError(f'{path} holds no JSON object; give a result.json or a truth file')
-    return data
 
 
 def plain_values(value: Any) -> Any:
@@ -190,3 +166,22 @@ def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
     # a stored turn's id has a meaning in this run only
     return {('stamp' if key == 'stamp_s' else key): item for key, item in values.items()
             if key != 'id'}
+
+
+def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None
+                ) -> dict[str, Any]:
+    """Return what a drive says of a given calibration as types of strict JSON.
+
+    changes: of the camera during the drive, in words. motion: the comparison with true poses.
+    """
+    values: dict[str, Any] = plain_values(found) | {'changes': list(changes)}
+    if motion is not None:
+        values |= motion.medians()
+        values['turns'] = [{'center': turn.turn.number, 'true_deg': turn.angle_deg,
+                            'length_m': turn.length_m,
+                            'rotation_deg': {name: turn.rotation_deg(name)
+                                             for name in motion.names},
+                            'scale_drift': {name: turn.scale_drift(name)
+                                            for name in motion.names}}
+                           for turn in motion.turns]
+    return values

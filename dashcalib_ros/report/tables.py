@@ -14,10 +14,8 @@ from rich.text import Text
 
 from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
-from dashcalib_ros.judge.wording import answers_of
-from dashcalib_ros.report.compare import Comparison, Difference
+from dashcalib_ros.report.compare import Comparison, answers, comparison_rows, difference_row
 from dashcalib_ros.report.wording import (
-    digits_of,
     lines_text,
     number,
     optional,
@@ -84,32 +82,14 @@ def comparison(found: Comparison) -> RenderableType:
     sides = Text('\n'.join(
         f'{side}: {camera.name}' + (f' ({camera.verdict})' if camera.verdict else '')
         for side, camera in (('A', found.a), ('B', found.b))))
-    return Group(sides, *answers(found), TextTable(*comparison_rows(found)))
-
-
-def comparison_rows(found: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return the head and the rows of the parameters of both."""
-    known = any(d.z is not None for d in found.differences)
-    rows = [_difference_row(d)[:None if known else -1] for d in found.differences]
-    return ('', 'A', 'B', 'A - B', 'of B', 'sigmas')[:None if known else -1], rows
-
-
-def answers(found: Comparison) -> list[Text]:
-    """Return how far both are apart, whether that can be told, and whether it matters."""
-    whose = ' and '.join(side for side, camera in (('A', found.a), ('B', found.b))
-                         if camera.sigma_px is not None)
-    lines = list(answers_of(found.whole, whose))
-    if found.unseen and found.whole.apart is not None:
-        lines[0] += (f', without the {100 * found.unseen:.0f} % of the picture that the '
-                     f'{found.a.camera.model} model cannot see')
-    return [Text(line) for line in lines]
+    return Group(sides, *map(Text, answers(found)), TextTable(*comparison_rows(found)))
 
 
 def against_truth(found: Comparison) -> RenderableType:
     """Return an estimate with its sigma beside the truth, and the mapping error."""
     rows = [(d.name, number(d.name, d.a),
              '-' if d.sigma is None else '± ' + number(d.name, d.sigma), number(d.name, d.b),
-             *_difference_row(d)[-2:]) for d in found.differences]
+             *difference_row(d)[-2:]) for d in found.differences]
     head = ('', 'estimate', 'sigma', 'truth', 'error', 'in sigmas')
     return Group(TextTable(head, rows), mapping_text(found))
 
@@ -153,12 +133,6 @@ class TextTable:
 
 def _width(column: Sequence[str]) -> int:
     return max(map(cell_len, column))
-
-
-def _difference_row(d: Difference) -> tuple[str, ...]:
-    digits = max(4, digits_of(d.name))
-    return (d.name, number(d.name, d.a), number(d.name, d.b), f'{d.difference:+.{digits}f}',
-            '-' if d.percent is None else f'{d.percent:+.3f} %', optional(d.z, 1))
 
 
 def _facts(c: Calibration) -> str:

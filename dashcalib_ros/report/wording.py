@@ -3,13 +3,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import numpy as np
+
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary
+from dashcalib_ros.judge.agreement import focal_disagreement, leverages
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.report.usage import FieldOfView
+from dashcalib_ros.judge.verdict import (
+    Rule,
+    flat_profile,
+    one_turn_dominates,
+    other_camera,
+    profile_contrast,
+    sigma_too_large,
+    turns_disagree,
+)
 from dashcalib_ros.solve.knowledge import PictureSigma
+from dashcalib_ros.solve.solution import Solution
 
 ADVICE = {
     'accepted': 'Good to use.',
@@ -88,7 +103,7 @@ def since_start(turn: TurnSummary, calibration: Calibration) -> str:
     return f'{turn.stamp_s - calibration.start_s:.1f}'
 
 
-def key_figures(c: Calibration, view: FieldOfView | None) -> list[tuple[str, str, str]]:
+def key_figures(c: Calibration) -> list[tuple[str, str, str]]:
     """Return the figures that matter most: a name, a value, and what belongs to it."""
     yaw = c.yaw_deg
     found = [('turns used', f'{c.turns_used}',
@@ -105,11 +120,26 @@ def key_figures(c: Calibration, view: FieldOfView | None) -> list[tuple[str, str
     front.append(('focal length fx', f'{c.camera.fx:.1f} px',
                   (f'± {sigma:.1f} px, {100 * sigma / c.camera.fx:.2f} %'
                    if math.isfinite(sigma) else 'uncertainty unknown') + lone))
-    if view is not None:
-        front.append(('field of view', optional(view.horizontal, 1, '°'),
-                      f'by {optional(view.vertical, 1, "°")}, '
-                      f'diagonal {optional(view.diagonal, 1, "°")}'))
+    across, down, diagonal = (optional(angle, 1, '°') for angle in field_of_view(c.camera))
+    front.append(('field of view', across, f'by {down}, diagonal {diagonal}'))
     return [*front, *found]
+
+
+def field_of_view(camera: Camera) -> tuple[float, float, float]:
+    """Return degrees from edge to edge through the picture's middle: horizontal, vertical.
+
+    Last comes the larger of both diagonals; NaN where not known. The two sides of one direction
+    may come to more than 180.
+    """
+    width, height = camera.image_size
+    left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5
+    x, y = (width - 1) / 2, (height - 1) / 2
+    ends = np.array([[(left, y), (right, y)], [(x, top), (x, bottom)],
+                     [(left, top), (right, bottom)], [(left, bottom), (right, top)]])
+    with np.errstate(all='ignore'):
+        off_axis = np.degrees(np.arccos(np.clip(camera.rays(ends)[..., 2], -1.0, 1.0)))
+        angles = off_axis.sum(axis=1)
+    return float(angles[0]), float(angles[1]), float(angles[2:].max())
 
 
 def next_steps(c: Calibration) -> list[str]:
@@ -169,3 +199,46 @@ def run_facts(c: Calibration) -> list[tuple[str, str]]:
 def optional(value: float | None, digits: int, unit: str = '') -> str:
     """Return a number with its unit, or a dash for one that is not known."""
     return '-' if value is None or not math.isfinite(value) else f'{value:.{digits}f}{unit}'
+
+
+@dataclass(frozen=True)
+class Check:
+    """One of the verdict's conditions, in words. passed: whether this drive meets it."""
+
+    name: str
+    found: str
+    needed: str
+    passed: bool
+
+
+def checks(calibration: Calibration) -> tuple[Check, ...]:
+    """Return the conditions that can be put in a number, those of the evidence first."""
+    needed = calibration.config.verdict
+    solution = None if calibration.material is None else calibration.material.solution
+    count = calibration.turns_used
+    yaw = calibration.yaw_deg
+    found = [Check('turns used', f'{count}', f'at least {needed.min_turns}',
+                   count >= needed.min_turns),
+             Check('yaw of these turns together', f'{yaw:.0f}°',
+                   f'at least {needed.min_yaw_deg:.0f}°', yaw >= needed.min_yaw_deg)]
+    return (*found, *([] if solution is None else _of_solution(solution, needed)))
+
+
+def _of_solution(solution: Solution, needed: VerdictConfig) -> list[Check]:
+    def check(name: str, found: str, limit: str, rule: Rule) -> Check:
+        return Check(name, found, limit, rule(solution, needed) is None)
+
+    share = max(leverages(solution).values(), default=1.0)
+    return [
+        check('rise of the error when the focal length is 20 % off',
+              f'{100 * max(profile_contrast(solution), 0.0):.1f} %',
+              f'at least {100 * needed.min_contrast:.0f} %', flat_profile),
+        check('uncertainty of fx', f'{100 * float(solution.sigma[0] / solution.camera.fx):.2g} %',
+              f'at most {100 * needed.max_sigma:.3g} %', sigma_too_large),
+        check('scatter of fx between the turns', f'{100 * focal_disagreement(solution):.2g} %',
+              f'at most {100 * needed.max_disagreement:.3g} %', turns_disagree),
+        check('share of the turn that knows most of fx', f'{100 * min(share, 1.0):.0f} %',
+              f'at most {100 * needed.max_leverage:.0f} %', one_turn_dominates),
+        check('a turn’s error, over that with a camera of its own',
+              f'{max(solution.misfits.values(), default=0.0):.2g} times',
+              f'at most {needed.max_misfit:.2g} times', other_camera)]

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.limits import YAML_BYTES, read_text
-from dashcalib_ros.report import remove_leftovers, set_aside, write_text
+from dashcalib_ros.report import set_aside, write_text
 from dashcalib_ros.ros.kept import Kept, Whose, implausible
+from dashcalib_ros.whole_files import remove_leftovers
 
 
 class Store:

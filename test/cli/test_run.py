@@ -19,7 +19,7 @@ from waiting import wait_for
 
 from dashcalib_ros.camera import Radial, camera_of
 from dashcalib_ros.demo import demo_drive
-from dashcalib_ros.report import NamedCamera, compare, load_camera, load_result
+from dashcalib_ros.report import NamedCamera, compare, load_camera
 
 COMMAND = (sys.executable, '-m', 'dashcalib_ros.cli')
 
@@ -74,7 +74,7 @@ def test_a_pipe_gets_plain_text_and_the_verdict_first(calibrated):
 
 
 def test_the_result_is_complete(rendered, calibrated):
-    result = load_result(calibrated[1] / 'result.json')
+    result = json.loads((calibrated[1] / 'result.json').read_text('utf-8'))
     assert sum(turn['used'] for turn in result['turns']) >= 2
     assert all(turn['first'] <= turn['center'] <= turn['last'] for turn in result['turns'])
     assert set(result['timing']) >= {'detect', 'calibrate', 'total'}
@@ -85,7 +85,8 @@ def test_the_result_is_complete(rendered, calibrated):
 
 def test_the_same_input_and_seed_give_the_same_result(demo, calibrated):
     """The demo calibrates the same bag, in a process of its own."""
-    first, second = (load_result(out / 'result.json') for out in (demo[1], calibrated[1]))
+    first, second = (json.loads((out / 'result.json').read_text('utf-8'))
+                     for out in (demo[1], calibrated[1]))
     for key in ('intrinsics', 'sigma', 'turns', 'verdict', 'reasons', 'reprojection_error_px'):
         assert first[key] == second[key], key
 
@@ -96,7 +97,7 @@ def test_turns_lists_those_that_a_run_would_use(rendered, calibrated):
     turns = json.loads(done.stdout)['turns']
     prominences = [turn['prominence'] for turn in turns]
     assert prominences == sorted(prominences, reverse=True)
-    run = load_result(calibrated[1] / 'result.json')['turns']
+    run = json.loads((calibrated[1] / 'result.json').read_text('utf-8'))['turns']
     assert {turn['center'] for turn in run} <= {turn['center'] for turn in turns}
 
 
@@ -112,7 +113,7 @@ def test_a_drive_that_stands_still_is_refused_with_the_reason(tmp_path):
     done = dashcalib('run', pictures(tmp_path / 'still', 60), '--fps', 10, '--out',
                      tmp_path / 'out')
     assert done.returncode == 3, done.stdout + done.stderr
-    result = load_result(tmp_path / 'out' / 'result.json')
+    result = json.loads((tmp_path / 'out' / 'result.json').read_text('utf-8'))
     assert result['verdict'] == 'refused' and result['reasons']
     assert result['intrinsics'] is None
     assert not (tmp_path / 'out' / 'calibration.yaml').exists()

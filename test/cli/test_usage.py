@@ -53,6 +53,12 @@ def test_help_names_the_exit_codes(command):
     assert max(map(len, done.stdout.splitlines())) <= 80
 
 
+def test_an_unknown_argument_names_the_help_of_its_command():
+    done = dashcalib('demo', 'extra')
+    assert_one_line_error(done)
+    assert 'extra; see dashcalib demo --help' in done.stderr
+
+
 def test_help_imports_nothing_heavy():
     code = ('import sys; from dashcalib_ros.cli import main; before = main(["run", "--help"]); '
             f'print(before, [name for name in {HEAVY} if name in sys.modules])')
@@ -249,14 +255,12 @@ def test_a_file_does_not_become_stdout(results):
 
 def test_an_interrupt_while_a_module_is_imported_has_its_own_exit_code(tmp_path):
     # dataclasses make their methods by exec() of a text; Python remembers an interrupt from there
+    (tmp_path / 'interrupting.py').write_text('exec("raise KeyboardInterrupt")')
     (tmp_path / 'interrupted.py').write_text(
-        'import argparse, sys\n'
+        'import sys\n'
         'from dashcalib_ros.cli import program\n'
-        'def command(args):\n'
-        '    exec("raise KeyboardInterrupt")\n'
-        'program.make_parser = lambda: argparse.ArgumentParser()\n'
-        'argparse.ArgumentParser.parse_args = lambda *_: argparse.Namespace(command=command)\n'
-        'sys.exit(program.main([]))\n')
+        'program.COMMANDS["demo"] = "interrupting"\n'
+        'sys.exit(program.main(["demo"]))\n')
     done = subprocess.run([sys.executable, '-m', 'interrupted'], cwd=tmp_path, timeout=60,
                           capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, 'dashcalib: error: interrupted\n')

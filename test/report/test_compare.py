@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial
+from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.report import (
     NamedCamera,
@@ -20,10 +21,9 @@ from dashcalib_ros.report import (
     calibration_yaml,
     compare,
     load_camera,
-    mapping_error,
     result_json,
 )
-from dashcalib_ros.report.difference_page import difference_html
+from dashcalib_ros.report.page import difference_html
 from dashcalib_ros.solve.knowledge import PictureSigma
 
 SIZE = (1242, 375)

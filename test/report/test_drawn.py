@@ -29,8 +29,8 @@ from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSumma
 from dashcalib_ros.judge.focal_by_turn import focal_alone, sigma_by_count
 from dashcalib_ros.recorded import with_source
 from dashcalib_ros.report import NamedCamera, report_html, write_results
-from dashcalib_ros.report.lens_figures import undistorted
-from dashcalib_ros.report.usage import field_of_view
+from dashcalib_ros.report.lens import undistorted
+from dashcalib_ros.report.wording import field_of_view
 
 
 @pytest.fixture(scope='module')
@@ -87,7 +87,7 @@ def test_every_unused_turn_has_its_reason(drawn, text):
 
 def test_a_turn_that_contradicts_the_others_says_so():
     found = solution()
-    left = dataclasses.replace(found, scenes=found.scenes[:2], parts=found.parts[:2],
+    left = dataclasses.replace(found, scenes=found.scenes[:2], known=found.known.of(range(2)),
                                misfits={**found.misfits, found.scenes[2].turn: 7.0})
     *_, contradicts, _, _ = drawn_calibration(left).turns
     assert not contradicts.used and 'does not explain it' in contradicts.unused_because
@@ -251,7 +251,6 @@ def test_the_grid_is_straight_where_the_picture_is_undistorted():
 def test_the_field_of_view_is_that_of_the_lens():
     plain = dataclasses.replace(EACH_MODEL['radial'], k1=0.0, k2=0.0, cx=620.5, cy=187.0,
                                 fx=621.0, fy=187.5)
-    view = field_of_view(plain)
-    assert view.horizontal == pytest.approx(90) and view.vertical == pytest.approx(90)
-    assert view.diagonal > 90
-    assert field_of_view(EACH_MODEL['fisheye']).horizontal > 150
+    across, down, diagonal = field_of_view(plain)
+    assert (across, down) == pytest.approx((90, 90)) and diagonal > 90
+    assert field_of_view(EACH_MODEL['fisheye'])[0] > 150

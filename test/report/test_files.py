@@ -111,9 +111,9 @@ def test_what_cannot_be_moved_is_an_error_and_leaves_no_empty_backup(tmp_path, m
 
 KILLED = '''
 import os, sys
-from dashcalib_ros.report import files
-files.os.fsync = lambda handle: os._exit(9)
-files.write_text(sys.argv[1], 'half')
+from dashcalib_ros.report import write_text
+os.fsync = lambda handle: os._exit(9)
+write_text(sys.argv[1], 'half')
 '''
 
 

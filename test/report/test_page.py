@@ -15,8 +15,7 @@ from rich.console import Console
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.report import report_html
-from dashcalib_ros.report.charts import log_ticks, ticks
-from dashcalib_ros.report.figures import magnitude_svg, mask_data_uri
+from dashcalib_ros.report.charts import log_ticks, magnitude_svg, mask_data_uri, ticks
 from dashcalib_ros.report.tables import summary
 from dashcalib_ros.solve.knowledge import PictureSigma
 

@@ -1,27 +1,34 @@
-"""What is drawn of the lens and of the evidence for it: maps over the picture, and plots."""
+"""What the page shows of the lens and of the evidence for it: maps over the picture, and plots."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Pixels
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.rectified import WIDEST, rectified_matrix
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.calibration import Material
+from dashcalib_ros.judge.focal_by_turn import sigma_by_count
 from dashcalib_ros.reconstruct.scene import Profile, Scene, residuals_px
 from dashcalib_ros.report.charts import (
     Axes,
     dots,
+    jpeg_data_uri,
     line,
     log_ticks,
+    png_data_uri,
     polyline,
     segments,
     svg,
     text,
     ticks,
 )
-from dashcalib_ros.report.figures import png_data_uri
+from dashcalib_ros.report.turns import focal_by_turn
 from dashcalib_ros.solve.knowledge import SigmaMap
+from dashcalib_ros.solve.solution import Solution
 
 WIDTH = 440  # px of a plot
 CELLS = 18  # columns of the maps of observations
@@ -29,6 +36,125 @@ FEWEST = 4  # observations of a cell whose mean residual is drawn
 GRID_LINES = 12  # over the picture's width
 # from little to much, BGR
 RAMP = np.array([(250, 243, 236), (238, 205, 160), (206, 148, 78), (142, 86, 34), (72, 38, 16)])
+BY_TURN = ('Each turn alone, one sigma. Last, and as a band: all together, with how much the '
+           'turns differ.')
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A drawing with its title, and what it tells."""
+
+    title: str
+    svg: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Slider:
+    """A picture as it is and without distortion, with the same grid. width, height: px."""
+
+    original: str
+    straight: str
+    bent_grid: str
+    straight_grid: str
+    width: int
+    height: int
+    caption: str
+
+
+def uncertainty_of(c: Calibration) -> Drawing | None:
+    """Return the uncertainty over the picture; None where it is not known."""
+    if c.material is None or c.camera is None or c.material.solution is None:
+        return None
+    found = c.material.solution.sigma_map
+    if c.sigma_px is None or not np.isfinite(found.sigma).all():
+        return None
+    return Drawing(
+        'Uncertainty over the picture', sigma_svg(found, c.image_size, c.material.px),
+        f'By how many pixels this camera may be off, one sigma: {c.sigma_px.rms:.2f} px over '
+        f'the picture (RMS), {c.sigma_px.worst:.2f} px at the worst.')
+
+
+def slider_of(c: Calibration) -> Slider | None:
+    """Return the picture of the turn that shows most, of this drive, without distortion."""
+    pictures = {} if c.material is None or c.material.solution is None else c.material.pictures
+    turns = [turn for turn in c.turns if turn.id in pictures]
+    if not turns or c.camera is None:
+        return None
+    best = max(turns, key=lambda turn: (turn.used, turn.prominence))
+    image = pictures[best.id].image
+    height, width = image.shape[:2]
+    camera = c.camera.resized(width / c.image_size[0], (width, height))
+    straight, bent_grid, straight_grid, moved = undistorted(image, camera, c.config.rectified)
+    moved *= c.image_size[0] / width
+    return Slider(jpeg_data_uri(image), jpeg_data_uri(straight), bent_grid, straight_grid, width,
+                  height, f'The orange grid is of the same rays on both sides. The lens moves '
+                          f'points by up to {moved:.0f} px.')
+
+
+def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
+    """Return the plots of the evidence; none where no turn was reconstructed."""
+    material = c.material
+    if material is None or not material.scenes:
+        return []
+    solution = material.solution
+    scenes = list(material.scenes.values()) if solution is None else list(solution.scenes)
+    drawings = [_profile(c, material, list(material.scenes.values()))]
+    if solution is not None and c.camera is not None and c.sigma is not None:
+        drawings += _growth(c, solution, material.px)
+        if by_turn := focal_by_turn(c):
+            drawings.append(Drawing('What each turn says of fx', by_turn, BY_TURN))
+    camera = None if solution is None else solution.camera
+    xy, residual = observations_of(scenes, camera)
+    if len(xy):
+        size = scenes[0].tracks.image_size
+        drawings += [_residuals(xy, residual, size, material.px), _coverage(xy, size, mask_id)]
+    return drawings
+
+
+def _profile(c: Calibration, material: Material, scenes: list[Scene]) -> Drawing:
+    solution, fx = material.solution, None if c.camera is None else c.camera.fx
+    if solution is not None and c.camera is not None:
+        # one kind of lens: the profiles of others mean something else
+        family = c.camera.family
+        each = [scene.starts[family].profile for scene in scenes if family in scene.starts]
+    else:
+        each = [scene.profile for scene in scenes]
+    each = [profile for profile in each if len(profile.ratios)]
+    if not each:
+        each = [scene.profile for scene in scenes]
+    total = None if solution is None else solution.coarse
+    caption = ('Each turn (thin) and all together (thick) were explained with the focal length '
+               'held fixed. A clear minimum means that the turns know it; a flat line means that '
+               'they do not.')
+    return Drawing('Focal profile', profile_svg(each, total, c.image_size[0], fx), caption)
+
+
+def _growth(c: Calibration, solution: Solution, px: float) -> list[Drawing]:
+    assert c.camera is not None
+    percent = [100 * sigma * px / c.camera.fx for sigma in sigma_by_count(solution)]
+    if not np.isfinite(percent).all() or not percent:
+        return []
+    return [Drawing('Uncertainty against number of turns', growth_svg(percent),
+                    'The most prominent turn first. One turn (grey) does not show how much turns '
+                    'differ; that comes in with the second, and few turns know it badly.')]
+
+
+def _residuals(xy: Floats, residual: Floats, size: tuple[int, int], px: float) -> Drawing:
+    drawn, magnified = residual_svg(xy, residual, size)
+    half = np.median(np.linalg.norm(residual, axis=1)) * px
+    return Drawing('Residuals over the picture', drawn,
+                   f'Half of the {len(residual):,} are below {half:.2f} px. Arrows: mean residual '
+                   f'of a cell, {magnified} times as long as it is; tint: how much residuals '
+                   'scatter there. Arrows that point the same way over a large part of the '
+                   'picture mean that the lens model does not fit there.')
+
+
+def _coverage(xy: Floats, size: tuple[int, int], mask_id: str | None) -> Drawing:
+    drawn, empty = coverage_svg(xy, size, mask_id)
+    caption = f'Where points were observed. {100 * empty:.0f} % of the picture has none'
+    return Drawing('Coverage', drawn, caption + (
+        '; what is tinted moves with the car and is not used.' if mask_id else '.'))
 
 
 def sigma_svg(found: SigmaMap, size: tuple[int, int], px: float,

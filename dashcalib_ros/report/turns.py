@@ -1,17 +1,23 @@
-"""What is drawn of one turn: its picture with tracks and residuals, and a view in space."""
+"""What the page shows of each turn: its tracks, a view in space, and what it says of fx."""
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import resized_pixels
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.judge import Calibration, TurnSummary
+from dashcalib_ros.judge.agreement import leverages
+from dashcalib_ros.judge.calibration import Material, StoredTurnSummary
+from dashcalib_ros.judge.focal_by_turn import focal_alone
 from dashcalib_ros.reconstruct.picture import TurnPicture
 from dashcalib_ros.reconstruct.scene import Scene, residuals_px
-from dashcalib_ros.report.charts import dots, line, segments, svg, text
-from dashcalib_ros.report.figures import jpeg_data_uri
+from dashcalib_ros.report.charts import dots, jpeg_data_uri, line, segments, svg, text
+from dashcalib_ros.report.wording import optional, since_start
 
 # keyframes before and after the picture whose observations are drawn as a track
 TRAIL = 4
@@ -27,6 +33,122 @@ POINTS = 1500
 # one stroke along all edges of a camera's pyramid, as wide as it is long
 FRUSTUM = np.array([(0, 0, 0), (-.5, -.5, 1), (.5, -.5, 1), (0, 0, 0), (.5, .5, 1), (-.5, .5, 1),
                     (0, 0, 0), (-.5, -.5, 1), (-.5, .5, 1), (.5, .5, 1), (.5, -.5, 1)])
+
+AnySummary = TurnSummary | StoredTurnSummary
+
+
+@dataclass(frozen=True)
+class TurnSection:
+    """A turn as the page shows it; SVG texts are '' where there is nothing to draw.
+
+    frame: of the picture; magnified: by how much its residuals are, 0 for none drawn. alone: what
+    it says of fx, in words.
+    """
+
+    name: str
+    facts: tuple[str, ...]
+    used: bool
+    unused_because: str | None
+    picture: str
+    frame: int | None
+    magnified: int
+    view: str
+    alone: str
+
+
+def turn_sections(c: Calibration, mask_id: str | None) -> list[TurnSection]:
+    """Return a section for each turn of which there is anything to see."""
+    if c.material is None:
+        return []
+    alone, solution = _fx_alone(c), c.material.solution
+    shares = leverages(solution) if alone and solution is not None else {}
+    said = {turn: _said(fx, sigma, shares.get(turn, 0.0)) for turn, (fx, sigma) in alone.items()}
+    found = [_section(turn, c, c.material, said.get(turn.id, ''), mask_id)
+             for turn in c.all_turns]
+    return [each for each in found if each.picture or each.view]
+
+
+def _fx_alone(c: Calibration) -> dict[TurnId, tuple[float, float]]:
+    """Return what each turn alone says of fx, and its sigma, px of the input.
+
+    Nothing of a refused calibration, which has no numbers.
+    """
+    sigma = (c.sigma or {}).get('fx', math.nan)
+    if c.camera is None or c.material is None or not 0 < sigma < math.inf:
+        return {}
+    solution = c.material.solution
+    if solution is None:
+        return {}
+    alone = {turn: (found.fx * c.material.px, found.sigma * c.material.px)
+             for turn, found in focal_alone(solution).items()}
+    return alone if np.isfinite(list(alone.values())).all() else {}
+
+
+def focal_by_turn(c: Calibration) -> str:
+    """Return the plot of what all turns say of fx, '' where there is none."""
+    alone = _fx_alone(c)
+    if not alone or c.camera is None or c.sigma is None:
+        return ''
+    return estimates_svg([(f'turn {name}', *alone[turn]) for turn, name in names(c).items()
+                          if turn in alone], (c.camera.fx, c.sigma['fx']))
+
+
+def names(c: Calibration) -> dict[TurnId, str]:
+    """Return the turns' short names: numbers in the order of time, s1, s2 for stored ones."""
+    own = {turn.id: str(n) for n, turn in enumerate(c.turns, 1)}
+    return own | {turn.id: f's{n}' for n, turn in enumerate(c.stored_turns, 1)}
+
+
+def _section(turn: AnySummary, c: Calibration, material: Material,
+             alone: str, mask_id: str | None) -> TurnSection:
+    scene, picture = material.scenes.get(turn.id), material.pictures.get(turn.id)
+    camera = None
+    if scene is not None and turn.used and material.solution is not None:
+        camera = material.solution.camera
+    drawn, magnified = ('', 0)
+    if picture is not None:
+        drawn, magnified = picture_svg(picture, scene, camera, mask_id)
+    kind = 'Stored turn' if isinstance(turn, StoredTurnSummary) else 'Turn'
+    return TurnSection(
+        f'{kind} {names(c)[turn.id]}', _facts(turn, scene, c), turn.used, turn.unused_because,
+        drawn, None if picture is None else picture.frame, magnified,
+        '' if scene is None else view_svg(scene, None if picture is None else picture.frame),
+        alone)
+
+
+def _facts(turn: AnySummary, scene: Scene | None, c: Calibration) -> tuple[str, ...]:
+    facts = ['of an earlier drive' if isinstance(turn, StoredTurnSummary)
+             else f'at {since_start(turn, c)} s, frames {turn.first} to {turn.last}']
+    if turn.yaw_deg is not None:
+        way = '' if scene is None else ' ' + direction(scene)
+        facts.append(f'{turn.yaw_deg:.0f}°{way}')
+    if turn.misfit is not None and turn.misfit > c.config.verdict.max_misfit:
+        facts.append(f'fits another camera: {turn.misfit:.1f} times the error of its own')
+    return tuple(facts)
+
+
+def _said(fx: float, sigma: float, share: float) -> str:
+    percent = min(max(100 * share, 0.0), 100.0)
+    return (f'Alone it says fx {with_sigma(fx, sigma)}, and gives '
+            f'{f"{percent:.0f}" if percent >= 1 else "less than 1"} % of what is known of fx.')
+
+
+def turn_rows(c: Calibration) -> list[dict[str, str]]:
+    """Return the table of all turns: name, time, frames, yaw, keyframes, error, why unused."""
+    short = names(c)
+    apart = {each.turn: f'{each.px:.3g} px, {each.sigmas:.1f} sigmas' for each in c.held_out}
+    rows = []
+    for turn in c.all_turns:
+        row = {'turn': short[turn.id], 'at': 'earlier', 'frames': '-',
+               'yaw': optional(turn.yaw_deg, 0, '°'), 'keyframes': str(turn.images),
+               'error': optional(turn.reprojection_error_px, 2, ' px'),
+               'held out': apart.get(turn.id, '-'),
+               'used': 'used' if turn.used else f'no: {turn.unused_because or "not needed"}'}
+        if isinstance(turn, TurnSummary):
+            row |= {'at': f'{since_start(turn, c)} s', 'frames': f'{turn.first} to {turn.last}',
+                    'keyframes': f'{turn.registered} of {turn.images}' if turn.registered else '-'}
+        rows.append(row)
+    return rows
 
 
 def picture_svg(picture: TurnPicture, scene: Scene | None, camera: Camera | None,

@@ -1,0 +1,51 @@
+"""dashcalib compare and export: calibrations of files, without a drive."""
+from __future__ import annotations
+
+import argparse
+import json
+
+from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
+from dashcalib_ros.cli.terminal import show, warn
+from dashcalib_ros.report import compare as compare_cameras
+from dashcalib_ros.report import load_camera, write_text
+from dashcalib_ros.report.export import WITH_FIELD, cropped, exported, resized
+from dashcalib_ros.report.page import difference_html
+from dashcalib_ros.report.tables import comparison
+from dashcalib_ros.standard_streams import write_stdout
+
+
+def compare(args: argparse.Namespace) -> int:
+    """Show the differences of A from B, and whether they matter."""
+    found = compare_cameras(load_camera(args.a), load_camera(args.b))
+    if args.html is not None:
+        write_text(args.html, difference_html(found))
+    if args.json:
+        write_stdout(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+    else:
+        show(comparison(found))
+        if args.html is not None:
+            write_stdout(f'written: {args.html}, a map of the difference')
+    return ACCEPTED
+
+
+def export(args: argparse.Namespace) -> int:
+    """Write the camera to --out, or to standard output."""
+    found = load_camera(args.calibration)
+    camera = found.camera
+    if args.size is not None:
+        camera = resized(camera, args.size)
+    if args.crop is not None:
+        camera = cropped(camera, *args.crop)
+    if found.field is not None and args.to in WITH_FIELD and camera is not found.camera:
+        raise UsageError('the field over the picture holds for the whole one; leave --size and '
+                         '--crop away')
+    text = exported(camera, args.to, found.field)
+    if found.verdict == 'weak':
+        warn([f'{found.name} is weak: look at its sigmas before you use it'])
+    if args.out is not None:
+        write_text(args.out, text)
+    elif isinstance(text, bytes):
+        raise UsageError(f'--to {args.to} is no text; add --out {args.to}.npz')
+    else:
+        write_stdout(text.rstrip('\n'))
+    return ACCEPTED
