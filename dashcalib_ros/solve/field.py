@@ -51,6 +51,14 @@ class FoundField:
         found, *_ = np.linalg.lstsq(self.basis, self.field.coefficients.ravel(), rcond=None)
         return np.asarray(found, np.float64)
 
+    def rms_over(self, camera: Camera) -> float:
+        """Return how large the field is, px RMS; one that is not confirmed as its prior says."""
+        if self.used:
+            return float(np.sqrt(np.mean(self.field.over(camera)**2)))
+        _, pixels = sensitivity(camera)
+        one = displacements(pixels, camera.image_size, self.basis)
+        return float(self.sigma_px * np.sqrt(np.mean(np.sum(one**2, axis=(1, 2)))))
+
     def columns(self, scene: Scene, camera: Camera) -> Floats:
         """Return (k, t, 2, f) derivatives of the observations by the field's free directions."""
         # where the points project to: the errors of observations would correlate with the terms

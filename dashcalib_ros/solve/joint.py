@@ -163,12 +163,11 @@ def _shared_with_field(fit: Fit) -> Floats:
     Where the lens ends and the field begins is agreed on, not measured: another calibration may
     have the same rays and another share of both. Over the picture it makes no difference.
     """
-    camera, field = fit.camera, fit.used_field
-    if field is None:
-        return np.zeros(len(camera.names()))
-    moves, _ = sensitivity(camera)
+    if fit.field is None:
+        return np.zeros(len(fit.camera.names()))
+    moves, _ = sensitivity(fit.camera)
     by_unit = np.sqrt(np.mean(np.sum(moves**2, axis=1), axis=0))
-    return np.asarray(np.sqrt(np.mean(field.over(camera)**2)) / by_unit)
+    return np.asarray(fit.field.rms_over(fit.camera) / by_unit)
 
 
 def _solution(fit: Fit, per_turn: Sequence[Scene], profiles: tuple[Profile, Profile],

@@ -123,7 +123,8 @@ def chosen_of(results: Sequence[Fit]) -> tuple[Fit, tuple[Candidate, ...]]:
         result.camera.model, sum(gains[best].values()) - sum(gains[n].values()),
         mapping_error(result.camera, chosen.camera), result is chosen,
         totals[n] / totals[best])
-        for n, result in enumerate(results))
+        for n, result in sorted(enumerate(results),
+                                key=lambda each: len(each[1].camera.names())))
 
 
 def with_few_tracks(fit: Fit) -> Fit:
