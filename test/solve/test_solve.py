@@ -695,3 +695,16 @@ def test_residuals_are_projected_minus_seen(good):
              + scene.structure.translations[k])
     np.testing.assert_allclose(residuals_px(scene, good.camera)[k, t],
                                good.camera.project(local) - scene.tracks.xy[k, t])
+
+
+def test_where_one_turn_knows_all_how_much_turns_differ_is_not_shown(no_profile):
+    """Sharp turns that agree show it; bends beside one sharp turn do not."""
+    config = CONFIG.replace({'intrinsics.one_turn_sigma': 0.0})
+    alike = scenes_of(4, tracks=110)
+    bends = [synthetic_turn(LENS, yaw, tracks=110, keyframes=14, noise_px=0.25, world=n).scene(
+        START, n) for n, yaw in enumerate((85.0, 9.0, -8.0), 10)]
+    ratios = [solved(scenes, CONFIG).sigma[0] / solved(scenes, config).sigma[0]
+              for scenes in (alike, bends)]
+    assert ratios[0] < 1.4 and ratios[1] > 1.6, ratios
+    relative = solved(bends, CONFIG).sigma[0] / LENS.fx
+    assert 0.004 < relative < 0.02
