@@ -14,7 +14,17 @@ import cv2
 import numpy as np
 import pytest
 from made_calibration import calibration_of
-from made_drives import drive, images, smooth, write_bag, write_folder, write_ros1, write_video
+from made_drives import (
+    START,
+    drive,
+    images,
+    info_of,
+    smooth,
+    write_bag,
+    write_folder,
+    write_ros1,
+    write_video,
+)
 
 from dashcalib_ros import stages
 from dashcalib_ros.calibrator import Calibrator
@@ -131,7 +141,8 @@ def inputs(tmp_path_factory):
     """Make a folder with small inputs by the names that the documents use."""
     place = tmp_path_factory.mktemp('documents')
     frames = drive(6, *SIZE)
-    write_bag(place / 'drive', images(frames))
+    write_bag(place / 'drive', [*images(frames, '/camera/image_raw'),
+                                  ('/camera/camera_info', START, info_of(CAMERA))])
     (place / 'drive.mcap').write_bytes(next((place / 'drive').glob('*.mcap')).read_bytes())
     write_ros1(place / 'drive.bag', frames)
     write_folder(place / 'images', frames)

@@ -49,7 +49,7 @@ class _Begun:
 
 def solve(per_turn: Sequence[Scene], config: Config,
           progress: Progress = lambda stage, done: None) -> Solution | None:
-    """Adjust all scenes with one shared camera; None if the shared camera explains none of them.
+    """Adjust all scenes with one shared camera; None if it explains none, or none determines it.
 
     per_turn: at least one scene, each as its turn was reconstructed. The minimum of the summed
     focal profile is the start; a scene with a camera far from it is chained anew, and one that the
@@ -83,7 +83,11 @@ def solve(per_turn: Sequence[Scene], config: Config,
     progress('trying other focal lengths', 0.0)
     around = profile_around(fit.scenes, fit.camera, start.profile, config)
     progress('estimating the uncertainty', 0.0)
-    return _solution(fit, per_turn, (start.profile, around), tried)
+    try:
+        return _solution(fit, per_turn, (start.profile, around), tried)
+    except np.linalg.LinAlgError:
+        # nothing limits a direction of the parameters: pictures that slide past show no depth
+        return None
 
 
 def _without_distortions(fit: Fit, scene: Scene) -> Scene:
