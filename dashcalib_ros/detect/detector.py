@@ -15,8 +15,8 @@ from dashcalib_ros.detect.peaks import Peak, PeakFinder
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
 
-# least prominences; at an edge of the drive a turn rises above this by one more, as nothing tells
-# how straight the car drove beyond. KITTI's raw drive begins in a turn of 46 degrees, with 24
+# least prominences; an edge of the drive may be a turn where the magnitude is higher, as nothing
+# tells how straight the car drove beyond. KITTI's raw drive begins in a turn of 46 degrees, with 24
 CUT_OFF = 3.0
 
 

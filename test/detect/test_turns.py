@@ -15,7 +15,7 @@ from dashcalib_ros.detect import TurnDetector
 from dashcalib_ros.detect.history import History
 from dashcalib_ros.detect.median import StreamingMedian
 from dashcalib_ros.detect.motion import Motion
-from dashcalib_ros.detect.peaks import PeakFinder
+from dashcalib_ros.detect.peaks import SEEN, PeakFinder
 from dashcalib_ros.input import Frame
 
 TINY = np.zeros((2, 2), np.uint8)
@@ -53,13 +53,15 @@ def test_peaks_equal_scipy(signal, min_prominence):
 
 @settings(max_examples=200, deadline=None)
 @given(SIGNALS.filter(len), st.sampled_from([0.1, 0.5, 1.0]), st.sampled_from([0.3, 1.5]))
-def test_with_a_rest_the_edges_are_as_low_as_that(signal, min_prominence, rest):
+def test_with_a_rest_a_part_of_the_height_at_the_edges_counts(signal, min_prominence, rest):
     finder, found = PeakFinder(min_prominence, rest), {}
     for value in signal:
         found |= {peak.position: peak.prominence for peak in finder.push(value)}
     for peak in [*finder.end(), *finder.finish()]:
         found[peak.position] = peak.prominence
-    low = [min(rest, signal[0]), *signal, min(rest, signal[-1])]
+    first, last = (value - SEEN * (value - rest) if value > rest else value
+                   for value in (signal[0], signal[-1]))
+    low = [first, *signal, last]
     positions, about = find_peaks(np.array(low, float), prominence=min_prominence)
     assert found == dict(zip((positions - 1).tolist(), about['prominences'], strict=True))
 
