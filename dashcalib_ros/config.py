@@ -188,6 +188,16 @@ class IntrinsicsConfig:
 
 
 @dataclass(frozen=True)
+class MountConfig:
+    """How the camera sits on the car."""
+
+    enabled: bool = setting(True, 'yaw, pitch and roll cost less than a second')
+    speed_kmh: float = setting(
+        0.0, 'on straight stretches, where it is constant and known: it tells the height above '
+             'the road; 0: not known', 0.0, 300.0)
+
+
+@dataclass(frozen=True)
 class LinesConfig:
     """Upright lines of the world: poles and the edges of houses, a second witness."""
 
@@ -345,6 +355,7 @@ class Config:
     scene: SceneConfig = field(default_factory=SceneConfig)
     intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
     lines: LinesConfig = field(default_factory=LinesConfig)
+    mount: MountConfig = field(default_factory=MountConfig)
     verdict: VerdictConfig = field(default_factory=VerdictConfig)
     monitor: MonitorConfig = field(default_factory=MonitorConfig)
     fleet: FleetConfig = field(default_factory=FleetConfig)

@@ -131,6 +131,10 @@ def _add_run(commands: Any) -> None:
     parser.add_argument('--threads', type=int, metavar='N',
                         help='processes that reconstruct turns side by side; the result is the '
                              'same with any')
+    parser.add_argument('--speed', type=POSITIVE, metavar='KMH',
+                        help='on straight stretches, constant: tells how high the camera sits')
+    parser.add_argument('--no-mount', action='store_false', default=None, dest='mount',
+                        help='do not say how the camera sits on the car')
     parser.add_argument('--write-bag', type=Path, metavar='OUT',
                         help='when accepted: write a copy of the one bag INPUT with a '
                              'camera_info for each image')

@@ -36,7 +36,8 @@ class DriveSpec:
     right alternate, 60 to 100 degrees, radius 8 to 14 m); 0 is a straight drive.
     straight_m: between turns. lead_m: before the first and after the last turn.
     speed_mps on straights, turn_speed_mps in turns, accel_mps2 between them.
-    height_m: of the camera. vibration_deg: RMS of pitch from the road; roll is 0.7 of it, and
+    height_m: of the camera; mount_deg: yaw, pitch and roll of its mounting at the most.
+    vibration_deg: RMS of pitch from the road; roll is 0.7 of it, and
     the body also dives when it brakes and leans in turns. 0 switches all of these off.
     noise: sigma in grey levels. blur: sigma in pixels. exposure_ms: how long each row is exposed;
     its time is the middle of that, and 0 has no motion blur. vignetting: of the light, lost in
@@ -56,6 +57,7 @@ class DriveSpec:
     turn_speed_mps: float = 5.0
     accel_mps2: float = 2.5
     height_m: float = 1.4
+    mount_deg: float = 1.0
     vibration_deg: float = 0.35
     seed: int = 0
     noise: float = 1.5

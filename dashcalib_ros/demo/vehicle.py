@@ -96,7 +96,7 @@ def ride_of(course: Course, spec: DriveSpec) -> Ride:
     lever = np.array([AHEAD_M, ASIDE_M, spec.height_m])
     if spec.kind == 'spin':
         lever[:2] = 0.0
-    return Ride(t, s, x, y, lift, yaw, pitch, roll, lever, _mount(rng))
+    return Ride(t, s, x, y, lift, yaw, pitch, roll, lever, _mount(rng, spec.mount_deg))
 
 
 def _timetable(course: Course, spec: DriveSpec) -> tuple[Floats, Floats]:
@@ -132,10 +132,10 @@ def _undulation(rng: np.random.Generator, s: Floats, rms: float) -> Floats:
     return np.asarray(total * rms / math.sqrt(3.5))
 
 
-def _mount(rng: np.random.Generator) -> Floats:
+def _mount(rng: np.random.Generator, most_deg: float) -> Floats:
     """Return (3, 3) body from camera: nearly straight ahead, as stuck on by hand."""
     axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    yaw, pitch, roll = np.radians(rng.uniform(-1.0, 1.0, 3))
+    yaw, pitch, roll = np.radians(most_deg * rng.uniform(-1.0, 1.0, 3))
     turned = _rotation_z(np.array([yaw])) @ _rotation_y(np.array([pitch]))
     return np.asarray((turned @ _rotation_x(np.array([roll])))[0] @ axes)
 

@@ -13,6 +13,7 @@ from dashcalib_ros.detect.detector import TurnDetector
 from dashcalib_ros.detect.edges import Lines
 from dashcalib_ros.detect.estimator import MotionEstimator
 from dashcalib_ros.detect.motion import TrackedPoints
+from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
@@ -107,6 +108,10 @@ class Detection:
     def lines(self) -> Lines:
         """Return the upright lines of the drive so far, in the resized images."""
         return self._lines.lines().within(self.valid())
+
+    def straights(self) -> Straights:
+        """Return pairs of images of straight driving, in px of the resized images."""
+        return self._motion.straights()
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings for the user, one line each."""

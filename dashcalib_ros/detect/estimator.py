@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from dashcalib_ros.detect.epipoles import epipoles_of, turning
 from dashcalib_ros.detect.mask import EgoMask
 from dashcalib_ros.detect.motion import Motion, TrackedPoints
 from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
+from dashcalib_ros.detect.straights import STRAIGHT, StraightCollector, Straights
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
@@ -74,6 +75,7 @@ class MotionEstimator:
         self._tracking = Tracking(config.forward_backward_px, window=9, levels=3, steps=12,
                                   step_px=0.02, border=5)
         self._shape: tuple[int, int] | None = None
+        self._straights = StraightCollector()
         self._reset()
 
     def push(self, frame: Frame) -> Motion | None:
@@ -107,6 +109,8 @@ class MotionEstimator:
             over_triplet = _median_shift(*_common(first, now))
             standing |= over_triplet < min(JITTER * self.config.standing_px, JITTER_GROWTH * moved)
         magnitude = 0.0 if standing else self._magnitude(first, middle)
+        if first is not None and 0 < magnitude < STRAIGHT and self._straights.wants(now.stamp_ns):
+            self._straights.push(first.stamp_ns, now.stamp_ns, *_common(first, now))
         if middle is not None and not standing:
             self._look_for_ego(image, middle, now)
             if self._segmented is not None and self._segmented.push(frame.image, frame.stamp_ns):
@@ -145,6 +149,12 @@ class MotionEstimator:
             before[here] = earlier.xy[there]
         factor = np.float32(self._factor)
         return TrackedPoints(*(resized_pixels(xy, factor) for xy in (before, now)))
+
+    def straights(self) -> Straights:
+        """Return pairs of images of straight driving, in px of the full image."""
+        found, factor = self._straights.straights(), np.float32(self._factor)
+        return replace(found, before=resized_pixels(found.before, factor),
+                       after=resized_pixels(found.after, factor))
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings about the masks for the user, one line each."""

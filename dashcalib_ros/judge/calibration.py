@@ -30,6 +30,8 @@ UNKNOWN_COVARIANCE = ('this calibration does not know how its parameters are cor
                       'calibrate the drive again')
 # after the point, in one line of text
 MOST_DIGITS = 9
+# an optical frame that looks ahead (z ahead, x to the right, y downwards) to the car's (REP-103)
+OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 Level = Literal['accepted', 'weak', 'refused']
 
 
@@ -119,6 +121,48 @@ class LensField:
 
 
 @dataclass(frozen=True)
+class Mount:
+    """How the camera sits on the car, relative to the direction of travel and to the road.
+
+    yaw_left_deg, pitch_up_deg: where the optical axis points; roll_right_deg: by how much the
+    camera is turned clockwise, as seen from behind; None where nothing tells it. height_m: above
+    the road; None where the speed is not known. sigma: by these four names. travel_px: the pixel
+    (u, v) in which the car travels, with its sigma: less than that of the angles, which have the
+    centre's, too. straight_m: of straight driving.
+    """
+
+    verdict: Literal['accepted', 'weak']
+    reasons: tuple[str, ...]
+    yaw_left_deg: float
+    pitch_up_deg: float
+    roll_right_deg: float | None
+    height_m: float | None
+    sigma: Mapping[str, float | None]
+    travel_px: tuple[float, float]
+    travel_sigma_px: float
+    straight_m: float
+
+    @property
+    def rotation(self) -> Floats:
+        """Return (3, 3): from the camera's optical frame to the car's (REP-103, REP-105).
+
+        The car's x points ahead, y to the left, z upwards; the camera's z ahead, x to the right, y
+        downwards. An unknown roll counts as 0.
+        """
+        from scipy.spatial.transform import Rotation
+        turned = Rotation.from_euler('ZYX', [
+            self.yaw_left_deg, -self.pitch_up_deg, self.roll_right_deg or 0.0], degrees=True)
+        return np.asarray(turned.as_matrix() @ OPTICAL)
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """Return the same rotation as (x, y, z, w): of the transform base_link -> optical frame."""
+        from scipy.spatial.transform import Rotation
+        x, y, z, w = Rotation.from_matrix(self.rotation).as_quat().tolist()
+        return x, y, z, w
+
+
+@dataclass(frozen=True)
 class Material:
     """What the report draws. px: of the input, in one pixel of the scenes.
 
@@ -151,6 +195,7 @@ class Calibration:
     mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
     rolling_shutter: the one that was found, and whose effect was removed; None for a global one.
     stabiliser: the one that was found, and whose effect was removed; None for a fixed picture.
+    mount: how the camera sits on the car; None where nothing tells it.
     field: what the camera leaves over; None: nothing speaks for one. camera is the best without.
     sigma_px: how far the whole camera may be off over the picture. held_out: what each turn says
     of the calibration without it, in the full-size images' pixels; () for fewer than three turns.
@@ -178,6 +223,7 @@ class Calibration:
     sigma_px: PictureSigma | None = None
     stabiliser: Stabiliser | None = None
     field: LensField | None = None
+    mount: Mount | None = None
     held_out: tuple[LeftOut, ...] = ()
     straight_lines: Bend | None = None
     start_s: float = 0.0

@@ -15,6 +15,7 @@ from dashcalib_ros.camera import AUTO
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import focal_disagreement
@@ -28,6 +29,7 @@ from dashcalib_ros.judge.calibration import (
     TurnSummary,
     Verdict,
 )
+from dashcalib_ros.judge.mount import mount_of
 from dashcalib_ros.judge.verdict import (
     STEADY,
     Finding,
@@ -60,7 +62,7 @@ class Evidence:
     turn. stored: the turns of earlier drives that were available. left_out: why turns were taken
     out, in words. pictures: of turns whose images are gone; None: the report is not wanted.
     start_s: stamp of the first image. lines: upright ones, in the resized images; None where they
-    were not looked for.
+    were not looked for. straights: pairs of images of straight driving, likewise.
     """
 
     image_size: tuple[int, int]
@@ -77,6 +79,7 @@ class Evidence:
     pictures: Mapping[TurnId, TurnPicture] | None = default(default_factory=dict)
     start_s: float = 0.0
     lines: Lines | None = None
+    straights: Straights | None = None
 
 
 def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] = (),
@@ -97,7 +100,7 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
         built={scene.turn: scene for scene in scenes if scene is not None},
         timing=dict(timing or {}), warnings=(*detection.warnings(), *warnings), stored=stored,
         left_out=left_out or {}, pictures=pictures, start_s=detection.start_s,
-        lines=detection.lines())
+        lines=detection.lines(), straights=detection.straights())
 
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
@@ -108,7 +111,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     verdict = (judge(solution, config.verdict, witness, True) if solution
                else _verdict_without_solution(evidence))
     camera = sigma = error = shutter = sigma_px = stabiliser = straight_lines = None
-    field = None
+    field = mount = None
     details: dict[str, object] = {}
     without: tuple[LeftOut, ...] = ()
     warnings = evidence.warnings
@@ -137,6 +140,9 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                              f'{field.worst_px:.1f} px), as by a windscreen or a rectification: '
                              f'camera_info cannot say that, and sigma over the picture allows '
                              f'for it; `dashcalib export --to rays` has it',)
+            if evidence.straights is not None and config.mount.enabled:
+                mount = mount_of(evidence.straights, evidence.lines, solution, verdict.level, px,
+                                 config.mount)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.crops:
@@ -153,7 +159,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         versions=_versions(), config=config, magnitudes=evidence.magnitudes,
         mask=_of_size(evidence.mask, evidence.image_size), held_out=without,
         details=details, rolling_shutter=shutter, stabiliser=stabiliser, sigma_px=sigma_px,
-        field=field, warnings=warnings, start_s=evidence.start_s,
+        field=field, mount=mount, warnings=warnings, start_s=evidence.start_s,
         straight_lines=straight_lines,
         material=_material(solution, evidence),
         stored_turns=tuple(_stored_summary(turn, evidence, solution) for turn in evidence.stored))

@@ -17,7 +17,13 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.judge import Calibration, Check, Odometry, TurnSummary, Verdict
-from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.judge.calibration import (
+    LensField,
+    Mount,
+    Shutter,
+    Stabiliser,
+    StoredTurnSummary,
+)
 from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, read_text
 from dashcalib_ros.report.camera_file import parse_camera
 from dashcalib_ros.solve.cross_validation import LeftOut
@@ -49,6 +55,7 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
             'rms_px': c.field.rms_px, 'worst_px': c.field.worst_px, 'used': c.field.used,
             'sigma_px': c.field.sigma_px, 'basis': BASIS,
             'coefficients': c.field.field.coefficients},
+        'mount': c.mount,
         'held_out': [_held_out_dict(turn) for turn in c.held_out],
         'straight_lines': c.straight_lines,
         'input': c.input_name,
@@ -130,7 +137,15 @@ def _calibration(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
         field=None if field is None else LensField(
             Field(size, np.array(field['coefficients'], np.float64)), bool(field['used']),
             field['rms_px'], field['worst_px'], field['sigma_px']),
+        mount=_mount(data.get('mount')),
         held_out=tuple(held_out), straight_lines=made(Bend, 'straight_lines'))
+
+
+def _mount(values: Mapping[str, Any] | None) -> Mount | None:
+    if values is None:
+        return None
+    u, v = values['travel_px']
+    return Mount(**{**values, 'reasons': tuple(values['reasons']), 'travel_px': (u, v)})
 
 
 def plain_values(value: Any) -> Any:

@@ -17,6 +17,7 @@ from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
 from dashcalib_ros.report.compare import Comparison, answers, comparison_rows, difference_row
 from dashcalib_ros.report.wording import (
     lines_text,
+    mount_text,
     number,
     optional,
     parameter_rows,
@@ -46,6 +47,8 @@ def summary(calibration: Calibration) -> RenderableType:
         parts.append(TextTable(('', 'estimate', 'sigma', 'relative'), parameter_rows(c)))
         if c.caveat:
             parts.append(Text(f'{c.caveat}\n'))
+    if c.mount is not None:
+        parts.append(Text(f'mounting {mount_text(c.mount)}'))
     if c.turns:
         parts.append(TextTable(TURNS, [_turn_row(turn, c.start_s) for turn in c.turns]))
     parts.append(Text(_facts(c)))

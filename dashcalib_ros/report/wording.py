@@ -13,7 +13,7 @@ from dashcalib_ros.detect import Bend
 from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary
 from dashcalib_ros.judge.agreement import focal_disagreement, leverages
-from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.judge.calibration import Mount, Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.judge.verdict import (
     Rule,
     flat_profile,
@@ -91,6 +91,24 @@ def lines_text(lines: Bend) -> str:
     """Return a line about what straight lines say of the distortion."""
     return (f'{lines.lines} upright lines, bent by {lines.bend_px:.2f} px: k1 off by '
             f'{lines.k1:+.4f} ± {lines.sigma:.4f}')
+
+
+def mount_text(mount: Mount) -> str:
+    """Return how the camera sits on the car, with its verdict."""
+    def angle(name: str, value: float | None, words: tuple[str, str]) -> str:
+        sigma = mount.sigma[name]
+        if value is None or sigma is None:
+            return f'{words[0]} unknown'
+        return f'{abs(value):.2f} ± {sigma:.2f} ° {words[value < 0]}'
+
+    parts = [angle('yaw_left_deg', mount.yaw_left_deg, ('to the left', 'to the right')),
+             angle('pitch_up_deg', mount.pitch_up_deg, ('upwards', 'downwards')),
+             angle('roll_right_deg', mount.roll_right_deg, ('rolled right', 'rolled left'))]
+    height = mount.sigma['height_m']
+    parts.append('height unknown without --speed' if mount.height_m is None or height is None
+                 else f'{mount.height_m:.2f} ± {height:.2f} m above the road')
+    return (f'{mount.verdict}: looks {", ".join(parts)}; it travels towards pixel '
+            f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± {mount.travel_sigma_px:.1f}')
 
 
 def picture_text(sigma: PictureSigma) -> str:

@@ -1,0 +1,343 @@
+"""How the camera sits on the car: yaw, pitch, roll and height, each with its sigma.
+
+Yaw and pitch are those of the direction of travel: of pairs of images on straight stretches, and
+of each turn's path where it does not bend. Roll is that of the plane of the path where it does
+not bend (a body leans in bends), and of upright lines. Height is how far the road of the own lane
+lies below, where speed is known. What the sources say is averaged; sigma grows where they differ.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.config import MountConfig
+from dashcalib_ros.detect import Lines
+from dashcalib_ros.detect.straights import Straights
+from dashcalib_ros.judge.calibration import Mount
+from dashcalib_ros.reconstruct.heading import MAD, heading
+from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.solve.solution import Solution
+
+# of a pair's poses: steps of Gauss-Newton, and the loss in px, narrowing to what tracks need
+STEPS, FIRST_PX, LAST_PX, NARROWING = 20, 3.0, 0.7, 0.8
+# radians; the farthest a step goes
+LONGEST_STEP = 0.1
+# degrees a second; beyond it a stretch is no straight one (openpilot's limit, too)
+STRAIGHT_DEG_S = 2.0
+# degrees; pairs that know their direction worse are left out, and what varies from pair to pair:
+# bumps, and tracks that share errors
+MOST_PAIR_SIGMA, PAIR_SCATTER_DEG = 1.0, 0.2
+# pairs are judged in so many blocks: neighbours share tracks and bumps
+BLOCKS, LEAST_PAIRS = 12, 8
+# degrees of yaw and of pitch; with more it is weak. openpilot's spread on one car is as large
+ACCEPTED_DEG = 0.2
+# degrees; what no source is better than: slopes, crowns and bumps, between places
+HEADING_FLOOR_DEG, ROLL_FLOOR_DEG = 0.1, 0.3
+# degrees of a turn's yaw whose path tells a plane; of its largest bend, below which it is straight
+LEAST_YAW_DEG, UNBENT = 30.0, 0.3
+# upright lines, and the loss in radians
+LEAST_LINES, LINE_LOSS = 100, 0.05
+# of the road's points: px of parallax, times the height to the side, of the logarithm of height
+LEAST_PARALLAX_PX, LANE, ROAD_SPREAD = 6.0, 2.5, 0.08
+LEAST_ROAD_POINTS = 60
+# of height: cambers and the load of the car
+HEIGHT_FLOOR = 0.01
+# m above the road, and m/s: where speed is unknown, straight_m assumes a camera that high
+USUAL_HEIGHT_M, USUAL_SPEED = 1.4, 10.0
+ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """What n pairs say. ahead: (n, 3) direction of travel halfway; sigma_deg, rate_deg_s: (n,).
+
+    points: (n, POINTS, 3) in units of the way between both images; NaN where unknown.
+    """
+
+    ahead: Floats
+    sigma_deg: Floats
+    rate_deg_s: Floats
+    points: Floats
+
+
+def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str, px: float,
+             config: MountConfig) -> Mount | None:
+    """Return how the camera sits on the car; None where nothing tells.
+
+    straights, lines: in the scenes' pixels. level: the lens's verdict; the mount's is never
+    better. px: of the input, in one pixel of the scenes.
+    """
+    camera = solution.camera
+    pairs = _fitted(camera, _without_field(straights, solution))
+    kept = (np.abs(pairs.rate_deg_s) < STRAIGHT_DEG_S) & (pairs.sigma_deg < MOST_PAIR_SIGMA)
+    roll = _roll(solution.scenes, lines, camera)
+    found = _heading(pairs, kept, straights, solution.scenes, np.radians(roll[0] if roll else 0.0))
+    if found is None:
+        return None
+    angles, sigma = found
+    ahead = _direction(angles, np.radians(roll[0] if roll else 0.0))
+    travel = camera.project(ahead[None])[0]
+    own = np.degrees(solution.sigma[2:4] / solution.camera.params[:2])
+    total = np.hypot(sigma, own)
+    down = _direction(np.array([0.0, 90.0]), np.radians(roll[0] if roll else 0.0))
+    speed = config.speed_kmh / 3.6
+    height = _height(pairs, kept, straights, _level(down, ahead), speed or None)
+    metres = float(straights.apart_s[kept].sum() / 2) * (
+        speed or (USUAL_SPEED if height is None else height[0]))
+    reasons = _reasons(level, total, own, metres)
+    return Mount(
+        verdict='weak' if reasons else 'accepted', reasons=reasons,
+        yaw_left_deg=float(angles[0]), pitch_up_deg=float(angles[1]),
+        roll_right_deg=None if roll is None else roll[0],
+        height_m=height[0] if height and speed else None,
+        sigma={'yaw_left_deg': float(total[0]), 'pitch_up_deg': float(total[1]),
+               'roll_right_deg': None if roll is None else roll[1],
+               'height_m': height[1] if height and speed else None},
+        travel_px=(float((travel[0] + 0.5) * px - 0.5), float((travel[1] + 0.5) * px - 0.5)),
+        travel_sigma_px=float(px * np.radians(np.hypot(*sigma)) * camera.fx / np.sqrt(2)),
+        straight_m=metres)
+
+
+def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[str, ...]:
+    """Return why a mount is weak. sigma, own: (2,) all of it, and what the lens's centre adds."""
+    found = []
+    if level != 'accepted':
+        found.append(f'the lens is {level}, and where the camera points is no better known: see '
+                     f'the reasons of the lens')
+    if max(sigma) > ACCEPTED_DEG:
+        cure = ('drive more turns, the centre of the picture is not known better'
+                if max(own) > ACCEPTED_DEG else 'drive straight on for longer')
+        found.append(f'yaw and pitch are known to {max(sigma):.2f} degrees after {metres:.0f} m '
+                     f'of straight driving, {ACCEPTED_DEG:g} or better needed: {cure}')
+    return tuple(found)
+
+
+def _without_field(straights: Straights, solution: Solution) -> Straights:
+    if solution.field is None or not solution.field.used:
+        return straights
+    ideal = solution.field.field.ideal
+    return Straights(np.asarray(ideal(straights.before), np.float32),
+                     np.asarray(ideal(straights.after), np.float32), straights.stamps_s,
+                     straights.apart_s)
+
+
+# -- pairs of images ---------------------------------------------------------------------------
+
+def _fitted(camera: Camera, straights: Straights) -> _Pairs:
+    """Return the poses of all pairs at once: robust Gauss-Newton from straight ahead."""
+    from scipy.spatial.transform import Rotation
+    first, second = (camera.rays(np.asarray(each, np.float64))
+                     for each in (straights.before, straights.after))
+    seen = np.isfinite(first).all(axis=-1) & np.isfinite(second).all(axis=-1)
+    first, second = (np.where(seen[..., None], rays, (0.0, 0.0, 1.0)) for rays in (first, second))
+    count, unit = len(straights), 1 / camera.fx
+    turned = np.tile(np.eye(3), (count, 1, 1))
+    # where the first image was taken, in the second one's frame
+    back = np.tile((0.0, 0.0, -1.0), (count, 1))
+    hessian, errors = np.tile(np.eye(5), (count, 1, 1)), np.zeros(seen.shape)
+    for step in range(STEPS):
+        moved, errors, slopes, tangents = _epipolar(turned, back, first, second)
+        loss = unit * max(LAST_PX, FIRST_PX * NARROWING**step)
+        weights = seen / (1 + (errors / loss)**2)
+        hessian = (np.einsum('np,npi,npj->nij', weights, slopes, slopes)
+                   + np.finfo(float).eps * np.eye(5))
+        score = np.einsum('np,npi,np->ni', weights, slopes, errors)
+        change = -np.linalg.solve(hessian, score[..., None])[..., 0]
+        length = np.maximum(np.linalg.norm(change, axis=1), np.finfo(float).tiny)
+        change *= np.minimum(1.0, LONGEST_STEP / length)[:, None]
+        turned = Rotation.from_rotvec(change[:, :3]).as_matrix() @ turned
+        back = back + np.einsum('nk,nki->ni', change[:, 3:], tangents)
+        back /= np.linalg.norm(back, axis=1)[:, None]
+    noise = MAD * np.array([np.median(np.abs(row[valid])) if valid.any() else np.inf
+                            for row, valid in zip(errors, seen, strict=True)])
+    variance = np.linalg.inv(hessian)[:, [3, 4], [3, 4]].mean(axis=1)
+    rotation = Rotation.from_matrix(turned)
+    vector = rotation.as_rotvec()
+    ahead = -(Rotation.from_rotvec(-vector / 2).apply(back))
+    # along a ray: first * depth, where its other ray passes it
+    across = np.cross(second, np.einsum('nij,npj->npi', turned, first))
+    square = np.maximum(np.sum(across**2, axis=-1), np.finfo(float).tiny)
+    depth = -np.sum(across * np.cross(second, back[:, None]), axis=-1) / square
+    known = seen & (depth > 0) & (np.sqrt(square) > LEAST_PARALLAX_PX * unit)
+    return _Pairs(ahead * np.sign(ahead[:, 2:]), np.degrees(noise * np.sqrt(variance)),
+                  np.degrees(vector[:, 1]) / straights.apart_s,
+                  np.where(known[..., None], depth[..., None] * first, np.nan))
+
+
+def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
+              ) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return turned rays, their errors, these errors' slopes by (turn, direction), tangents.
+
+    The error is the angle between a ray and the epipolar plane, averaged over both images.
+    """
+    moved = np.einsum('nij,npj->npi', turned, first)
+    normal = np.cross(back[:, None], moved)
+    other = np.cross(second, back[:, None])
+    size = np.maximum(np.sqrt((np.sum(normal**2, -1) + np.sum(other**2, -1)) / 2), 1e-3)
+    errors = np.sum(second * normal, axis=-1) / size
+    aside = np.cross(back, np.where(np.abs(back[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    aside /= np.linalg.norm(aside, axis=1)[:, None]
+    tangents = np.stack([aside, np.cross(back, aside)], axis=1)
+    slopes = np.concatenate([np.cross(moved, other), np.einsum(
+        'nki,npi->npk', tangents, np.cross(moved, second))], axis=-1)
+    return moved, errors, slopes / size[..., None], tangents
+
+
+# -- yaw and pitch -----------------------------------------------------------------------------
+
+def _heading(pairs: _Pairs, kept: Mask, straights: Straights, scenes: Sequence[Scene],
+             roll: float) -> tuple[Floats, Floats] | None:
+    """Return (2,) yaw and pitch, degrees, and their sigmas without those of the lens."""
+    values, sigmas = [], []
+    if kept.sum() >= LEAST_PAIRS:
+        angles = _angles(pairs.ahead[kept], roll)
+        weights = 1 / (pairs.sigma_deg[kept]**2 + PAIR_SCATTER_DEG**2)
+        rate = pairs.rate_deg_s[kept]
+        blocks = np.arange(len(weights)) * BLOCKS // len(weights)
+        without = np.array([_at_rest(angles[blocks != n], rate[blocks != n], weights[blocks != n])
+                            for n in range(blocks.max() + 1)])
+        count = len(without)
+        values.append(_at_rest(angles, rate, weights))
+        sigmas.append(np.sqrt((count - 1) / count * np.sum(
+            (without - without.mean(axis=0))**2, axis=0)))
+    for scene in scenes:
+        found = heading(scene)
+        if found is not None:
+            level = _angles(_direction(np.array([found.yaw_deg, found.pitch_deg]), 0.0)[None],
+                            roll)[0]
+            values.append(level)
+            sigmas.append(np.array([found.yaw_sigma_deg, found.pitch_sigma_deg]))
+    if not values:
+        return None
+    both = [_averaged(np.array(values)[:, n], np.array(sigmas)[:, n], HEADING_FLOOR_DEG)
+            for n in range(2)]
+    return np.array([value for value, _ in both]), np.array([sigma for _, sigma in both])
+
+
+def _at_rest(angles: Floats, rate: Floats, weights: Floats) -> Floats:
+    """Return robust yaw and pitch (2,): a camera ahead of the rear axle moves aside in a bend."""
+    found = []
+    for n, columns in ((0, np.column_stack([np.ones(len(rate)), rate])),
+                       (1, np.ones((len(rate), 1)))):
+        robust = weights
+        for _ in range(ROUNDS):
+            root = np.sqrt(robust)
+            line = np.linalg.lstsq(columns * root[:, None], angles[:, n] * root, rcond=None)[0]
+            errors = angles[:, n] - columns @ line
+            scatter = max(MAD * float(np.median(np.abs(errors))), np.finfo(float).eps)
+            robust = weights / (1 + (errors / (2 * scatter))**2)
+        found.append(float(line[0]))
+    return np.array(found)
+
+
+def _angles(ahead: Floats, roll: float) -> Floats:
+    """Return (n, 2) yaw to the left and pitch upwards, degrees, of an axis z; ahead: (n, 3)."""
+    x = np.cos(roll) * ahead[:, 0] - np.sin(roll) * ahead[:, 1]
+    y = np.sin(roll) * ahead[:, 0] + np.cos(roll) * ahead[:, 1]
+    return np.degrees(np.column_stack([np.arctan2(x, ahead[:, 2]), np.arcsin(np.clip(y, -1, 1))]))
+
+
+def _direction(angles: Floats, roll: float) -> Floats:
+    """Return the direction (3,) that has these angles (2,), degrees: the inverse of _angles()."""
+    yaw, pitch = np.radians(angles)
+    x, y, z = np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)
+    return np.array([np.cos(roll) * x + np.sin(roll) * y, np.cos(roll) * y - np.sin(roll) * x, z])
+
+
+def _averaged(values: Floats, sigmas: Floats, floor: float) -> tuple[float, float]:
+    """Return the weighted mean and its sigma, widened where the values differ by more."""
+    weights = 1 / (sigmas**2 + floor**2)
+    mean = float(weights @ values / weights.sum())
+    freedom = max(len(values) - 1, 1)
+    ratio = max(1.0, float(weights @ (values - mean)**2) / freedom)
+    return mean, float(np.sqrt(ratio / weights.sum()))
+
+
+# -- roll and height ---------------------------------------------------------------------------
+
+def _roll(scenes: Sequence[Scene], lines: Lines | None, camera: Camera
+          ) -> tuple[float, float] | None:
+    """Return the roll to the right and its sigma, degrees; None where nothing tells it."""
+    found = [each for scene in scenes if (each := _roll_of_path(scene)) is not None]
+    if lines is not None and len(lines) >= LEAST_LINES:
+        found.append(_roll_of_lines(lines, camera))
+    if not found:
+        return None
+    return _averaged(np.array(found), np.zeros(len(found)), ROLL_FLOOR_DEG)
+
+
+def _roll_of_path(scene: Scene) -> float | None:
+    """Return the roll against the plane of a turn's path, where it does not bend, degrees."""
+    structure = scene.structure
+    rotations = structure.rotations[structure.registered]
+    if abs(scene.yaw_deg) < LEAST_YAW_DEG:
+        return None
+    centres = -np.einsum('kji,kj->ki', rotations, structure.translations[structure.registered])
+    normal = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)[2][2]
+    up = rotations @ normal
+    up *= -np.sign(np.median(up[:, 1]))
+    steps = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)
+    length = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    bend = np.abs(steps[:, 0, 2]) / np.maximum(length, np.finfo(float).tiny)
+    at = np.concatenate([bend[:1], (bend[1:] + bend[:-1]) / 2, bend[-1:]])
+    straight = at < UNBENT * at.max()
+    if not straight.any():
+        return None
+    return float(np.median(np.degrees(np.arctan2(-up[straight, 0], -up[straight, 1]))))
+
+
+def _roll_of_lines(lines: Lines, camera: Camera) -> float:
+    """Return the roll at which upright lines are parallel to the vertical, degrees."""
+    rays = camera.rays(np.asarray(lines.points[:, [0, -1]], np.float64))
+    rays = rays[np.isfinite(rays).all(axis=(1, 2))]
+    normals = np.cross(rays[:, 0], rays[:, 1])
+    lengths = np.linalg.norm(normals, axis=1)
+    normals /= lengths[:, None]
+    upright, up = np.minimum(lengths / np.median(lengths), 3.0)**2, np.array([0.0, -1.0, 0.0])
+    for _ in range(ROUNDS):
+        errors = normals @ up
+        loss = min(MAD * float(np.median(np.abs(errors))) + np.finfo(float).eps, LINE_LOSS)
+        weights = upright / (1 + (errors / loss)**2)**2
+        up = np.linalg.eigh(normals.T * weights @ normals)[1][:, 0]
+        up *= -np.sign(up[1])
+    return float(np.degrees(np.arctan2(-up[0], -up[1])))
+
+
+def _level(down: Floats, ahead: Floats) -> Floats:
+    """Return the direction downwards (3,) that is at a right angle to the direction of travel."""
+    level = down - ahead * float(down @ ahead)
+    return np.asarray(level / np.linalg.norm(level))
+
+
+def _height(pairs: _Pairs, kept: Mask, straights: Straights, down: Floats, speed: float | None
+            ) -> tuple[float, float] | None:
+    """Return the height above the road of the own lane and its sigma, m.
+
+    speed: m/s; where it is None, the first value is the speed at which the camera is as high as
+    usual. None where the road is not seen.
+    """
+    points = pairs.points[kept]
+    depth = points @ down
+    with np.errstate(invalid='ignore'):
+        aside = np.linalg.norm(np.cross(points, pairs.ahead[kept][:, None]), axis=-1)
+        near = (depth > 0) & (np.sqrt(np.maximum(aside**2 - depth**2, 0)) < LANE * depth)
+    of_pair, place = np.nonzero(near)
+    seconds = straights.apart_s[kept][of_pair]
+    # the length of the way is the unit of a pair's points
+    logs = np.log(depth[of_pair, place] * seconds)
+    if len(logs) < LEAST_ROAD_POINTS:
+        return None
+    grid = np.linspace(*np.percentile(logs, (5, 95)), 200)
+    middle = float(grid[np.exp(-((grid[:, None] - logs) / ROAD_SPREAD)**2 / 2).sum(1).argmax()])
+    for _ in range(ROUNDS):
+        weights = np.exp(-((logs - middle) / ROAD_SPREAD)**2 / 2)
+        middle = float(weights @ logs / weights.sum())
+    if speed is None:
+        return USUAL_HEIGHT_M / float(np.exp(middle)), 0.0
+    height = speed * float(np.exp(middle))
+    return height, height * float(np.hypot(HEIGHT_FLOOR, ROAD_SPREAD / np.sqrt(
+        max(len(np.unique(of_pair[weights > 0.5])), 1))))

@@ -1,0 +1,152 @@
+#!/usr/bin/env python3
+"""How the camera sits on the car: what is found beside the truth.
+
+    python test/benchmark/mount.py [--data DIR] [--cache DIR] [--seeds N ...] [--out DIR] [--docs]
+
+Rendered: seven lenses, mounted by up to 4 degrees in each angle, 300 m of straights, a body that
+sways, leans and dives. Real: KITTI 03 and 07 beside the direction of travel of their poses, which
+have an error of their own (the sensor is elsewhere), and the nominal height of 1.65 m, with the
+poses' speed on straights.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from documents import write_table
+from drives import (
+    DEMO,
+    KITTI_RAW,
+    NARROW,
+    PINHOLE,
+    SHIFTED,
+    STREET,
+    VGA,
+    WIDE,
+    Setting,
+    drive_of,
+    pictures_of,
+)
+from measure import commit, complain, done, isolated, load, parser_with, save, table
+
+from dashcalib_ros import Calibrator, Config, open_frames
+from dashcalib_ros.demo import Drive
+from dashcalib_ros.judge import read_poses
+from dashcalib_ros.report.result import plain_values
+
+LENSES = {'demo': DEMO, 'KITTI raw': KITTI_RAW, '48 deg': NARROW, 'no distortion': PINHOLE,
+          'off-centre': SHIFTED, '640x480': VGA, '115 deg': WIDE}
+SPEC = replace(STREET, straight_m=50.0, lead_m=50.0, mount_deg=4.0)
+ANGLES = ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg')
+# images between two poses of a direction of travel; degrees a second; m
+APART, STRAIGHT, LEAST_M = 4, 2.0, 1.2
+FRAME_S, NOMINAL_M = 0.1036, 1.65
+
+
+def found(frames: Any, config: Config) -> dict[str, Any]:
+    """Calibrate; return the mount and the lens's verdict."""
+    with Calibrator(config) as calibrator:
+        for frame in frames:
+            calibrator.push(frame)
+        result = calibrator.calibrate()
+    return {'lens': result.verdict.level, 'mount': plain_values(result.mount)}
+
+
+def true_angles(drive: Drive) -> dict[str, float]:
+    """Return the angles of a rendered drive's mounting, degrees."""
+    mounted = drive.ride.mount
+    ahead, up = mounted[:, 2], mounted.T[:, 2]
+    return dict(zip(ANGLES, np.degrees([np.arctan2(ahead[1], ahead[0]), np.arcsin(ahead[2]),
+                                        np.arctan2(-up[0], -up[1])]).tolist(), strict=True))
+
+
+def by_poses(path: Path) -> tuple[dict[str, float], float]:
+    """Return yaw and pitch of the direction of travel on straights, degrees, and its speed."""
+    poses = read_poses(path)
+    half = poses.rotations[APART // 2:len(poses.rotations) - APART + APART // 2]
+    way = poses.positions[APART:] - poses.positions[:-APART]
+    length = np.linalg.norm(way, axis=1)
+    ahead = np.einsum('nji,nj->ni', half, way) / np.maximum(length, 1e-9)[:, None]
+    turned = np.einsum('nji,njk->nik', poses.rotations[:-APART], poses.rotations[APART:])
+    rate = np.degrees(np.arcsin(turned[:, 0, 2])) / (APART * FRAME_S)
+    straight = (np.abs(rate) < STRAIGHT) & (length > LEAST_M)
+    angles = np.degrees(np.column_stack([np.arctan2(ahead[:, 0], ahead[:, 2]),
+                                         np.arcsin(ahead[:, 1])]))[straight]
+    return (dict(zip(ANGLES, np.median(angles, axis=0).tolist(), strict=False)),
+            float(np.mean(length[straight]) / (APART * FRAME_S)))
+
+
+def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the tables."""
+    lines, offs, ratios = [], [], []
+    for name, row in rows.items():
+        mount, truth = row.get('mount'), row.get('truth', {})
+        if mount is None:
+            lines.append([name, row.get('lens', 'failed'), *[''] * 6])
+            continue
+        cells = []
+        for key in ANGLES:
+            value, sigma = mount[key], mount['sigma'][key]
+            if key in truth and value is not None:
+                off = value - truth[key]
+                cells.append(f'{off:+.2f} ({sigma:.2f})')
+                if row['rendered']:
+                    offs.append(abs(off))
+                    ratios.append(abs(off) / sigma)
+            else:
+                cells.append('' if value is None else f'({value:+.2f})')
+        height = mount['height_m']
+        lines.append([name, row['lens'], mount['verdict'], *cells,
+                      f'{mount["straight_m"]:.0f}', '' if height is None else f'{height:.3f}'])
+    text = table(['drive', 'lens', 'mount', 'yaw off, ° (σ)', 'pitch off', 'roll off',
+                  'straight m', 'height m'], lines)
+    if offs:
+        text = (f'Rendered, {len(offs)} angles: median {np.median(offs):.3f}°, worst '
+                f'{max(offs):.2f}°, within 2σ {np.mean(np.array(ratios) <= 2):.0%}, median of '
+                f'|error| / σ {np.median(ratios):.2f}.\n\n{text}')
+    return text
+
+
+def main() -> None:
+    """Measure."""
+    arguments = parser_with(__doc__, 'data', 'cache', 'seeds', 'out', 'docs',
+                            'again').parse_args()
+    path = arguments.out / 'mount.json'
+    rows = load(path)
+
+    def keep(name: str, outcome: Any, rendered: bool, truth: Mapping[str, float]) -> None:
+        rows[name] = {'commit': commit(), 'rendered': rendered, 'truth': truth,
+                      **(outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure]})}
+        save(path, rows)
+        complain(f'{name}: {rows[name]}')
+
+    with TemporaryDirectory() as passing:
+        for name in ('kitti03', 'kitti07') if arguments.data else ():
+            if done(rows.get(name)) and not arguments.again:
+                continue
+            folder = arguments.data / name
+            truth, speed = by_poses(folder / 'poses.txt')
+            pictures = open_frames(folder / ('bag' if name == 'kitti03' else 'images'),
+                                   fps=None if name == 'kitti03' else 1 / FRAME_S)
+            keep(name, isolated(found, pictures, Config().replace(
+                {'mount.speed_kmh': 3.6 * speed})), False, truth)
+        for seed in arguments.seeds:
+            for lens in LENSES:
+                name = f'{lens}, seed {seed}'
+                if done(rows.get(name)) and not arguments.again:
+                    continue
+                drive = drive_of(Setting(f'mount, {lens}', LENSES[lens], SPEC), seed)
+                pictures = pictures_of(drive, arguments.cache or Path(passing))
+                keep(name, isolated(found, pictures, Config(seed=seed)), True, true_angles(drive))
+    text = summary(rows)
+    print(text)
+    if arguments.docs:
+        write_table('mount', text, [row['commit'] for row in rows.values()])
+
+
+if __name__ == '__main__':
+    main()
