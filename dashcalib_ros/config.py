@@ -193,8 +193,8 @@ class MountConfig:
 
     enabled: bool = setting(True, 'yaw, pitch and roll cost less than a second')
     speed_kmh: float = setting(
-        0.0, 'on straight stretches, where it is constant and known: it tells the height above '
-             'the road; 0: not known', 0.0, 300.0)
+        0.0, 'km/h; constant on straight stretches: tells the height; 0 where it is unknown',
+        0.0, 300.0)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
 
 # least prominences; an edge of the drive may be a turn where the magnitude is higher, as nothing
-# tells how straight the car drove beyond. KITTI's raw drive begins in a turn of 46 degrees, with 24
+# tells how straight the car drove beyond. KITTI's raw drive begins in a turn, with 24
 CUT_OFF = 3.0
 
 

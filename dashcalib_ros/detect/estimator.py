@@ -16,8 +16,8 @@ from dashcalib_ros.detect.epipoles import epipoles_of, turning
 from dashcalib_ros.detect.mask import EgoMask
 from dashcalib_ros.detect.motion import Motion, TrackedPoints
 from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
-from dashcalib_ros.detect.straights import STRAIGHT, StraightCollector, Straights
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
+from dashcalib_ros.detect.straights import STRAIGHT, StraightCollector, Straights
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.scale import shrink_image

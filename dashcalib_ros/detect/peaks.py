@@ -4,7 +4,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-
 # of a turn that an edge cuts; so whole turns are better. 0.5 prefers a start at 12 degrees of yaw
 # to a turn of 46 in one of two real drives that have both
 SEEN = 0.25

@@ -156,7 +156,7 @@ class Mount:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """Return the same rotation as (x, y, z, w): of the transform base_link -> optical frame."""
+        """Return the same rotation as (x, y, z, w), as a transform base_link -> camera has it."""
         from scipy.spatial.transform import Rotation
         x, y, z, w = Rotation.from_matrix(self.rotation).as_quat().tolist()
         return x, y, z, w

@@ -8,7 +8,7 @@ lies below, where speed is known. What the sources say is averaged; sigma grows 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -120,9 +120,9 @@ def _without_field(straights: Straights, solution: Solution) -> Straights:
     if solution.field is None or not solution.field.used:
         return straights
     ideal = solution.field.field.ideal
-    return Straights(np.asarray(ideal(straights.before), np.float32),
-                     np.asarray(ideal(straights.after), np.float32), straights.stamps_s,
-                     straights.apart_s)
+    return replace(straights,
+                   before=np.asarray(ideal(straights.before.astype(np.float64)), np.float32),
+                   after=np.asarray(ideal(straights.after.astype(np.float64)), np.float32))
 
 
 # -- pairs of images ---------------------------------------------------------------------------
@@ -132,7 +132,7 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
     from scipy.spatial.transform import Rotation
     first, second = (camera.rays(np.asarray(each, np.float64))
                      for each in (straights.before, straights.after))
-    seen = np.isfinite(first).all(axis=-1) & np.isfinite(second).all(axis=-1)
+    seen = np.asarray(np.isfinite(first).all(axis=-1) & np.isfinite(second).all(axis=-1), bool)
     first, second = (np.where(seen[..., None], rays, (0.0, 0.0, 1.0)) for rays in (first, second))
     count, unit = len(straights), 1 / camera.fx
     turned = np.tile(np.eye(3), (count, 1, 1))
@@ -140,7 +140,7 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
     back = np.tile((0.0, 0.0, -1.0), (count, 1))
     hessian, errors = np.tile(np.eye(5), (count, 1, 1)), np.zeros(seen.shape)
     for step in range(STEPS):
-        moved, errors, slopes, tangents = _epipolar(turned, back, first, second)
+        errors, slopes, tangents = _epipolar(turned, back, first, second)
         loss = unit * max(LAST_PX, FIRST_PX * NARROWING**step)
         weights = seen / (1 + (errors / loss)**2)
         hessian = (np.einsum('np,npi,npj->nij', weights, slopes, slopes)
@@ -169,8 +169,8 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
 
 
 def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
-              ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return turned rays, their errors, these errors' slopes by (turn, direction), tangents.
+              ) -> tuple[Floats, Floats, Floats]:
+    """Return rays' errors, their slopes by (turn, direction), and the directions' tangents.
 
     The error is the angle between a ray and the epipolar plane, averaged over both images.
     """
@@ -184,7 +184,7 @@ def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
     tangents = np.stack([aside, np.cross(back, aside)], axis=1)
     slopes = np.concatenate([np.cross(moved, other), np.einsum(
         'nki,npi->npk', tangents, np.cross(moved, second))], axis=-1)
-    return moved, errors, slopes / size[..., None], tangents
+    return errors, slopes / size[..., None], tangents
 
 
 # -- yaw and pitch -----------------------------------------------------------------------------
@@ -238,7 +238,8 @@ def _angles(ahead: Floats, roll: float) -> Floats:
     """Return (n, 2) yaw to the left and pitch upwards, degrees, of an axis z; ahead: (n, 3)."""
     x = np.cos(roll) * ahead[:, 0] - np.sin(roll) * ahead[:, 1]
     y = np.sin(roll) * ahead[:, 0] + np.cos(roll) * ahead[:, 1]
-    return np.degrees(np.column_stack([np.arctan2(x, ahead[:, 2]), np.arcsin(np.clip(y, -1, 1))]))
+    return np.asarray(np.degrees(np.column_stack([
+        np.arctan2(x, ahead[:, 2]), np.arcsin(np.clip(y, -1, 1))])))
 
 
 def _direction(angles: Floats, roll: float) -> Floats:
@@ -331,7 +332,8 @@ def _height(pairs: _Pairs, kept: Mask, straights: Straights, down: Floats, speed
     logs = np.log(depth[of_pair, place] * seconds)
     if len(logs) < LEAST_ROAD_POINTS:
         return None
-    grid = np.linspace(*np.percentile(logs, (5, 95)), 200)
+    low, high = np.percentile(logs, (5, 95))
+    grid = np.linspace(low, high, 200)
     middle = float(grid[np.exp(-((grid[:, None] - logs) / ROAD_SPREAD)**2 / 2).sum(1).argmax()])
     for _ in range(ROUNDS):
         weights = np.exp(-((logs - middle) / ROAD_SPREAD)**2 / 2)

@@ -1,0 +1,153 @@
+"""How the camera sits on the car: made pairs of images, made turns, and what makes it weak."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_calibration import make_calibration
+from scipy.spatial.transform import Rotation
+from solving import LENS, scenes_of, solved
+
+from dashcalib_ros.config import MountConfig
+from dashcalib_ros.detect.straights import PAIRS, POINTS, StraightCollector
+from dashcalib_ros.judge.calibration import OPTICAL, Mount
+from dashcalib_ros.judge.mount import mount_of
+from dashcalib_ros.report import load_calibration, write_results
+
+HEIGHT_M, SPEED = 1.45, 12.0
+SPACING_S = 0.6
+
+
+@pytest.fixture(scope='module')
+def solution():
+    return solved(scenes_of(3))
+
+
+def mounted(yaw_left, pitch_up, roll_right):
+    """Return (3, 3): the car's frame from the camera's."""
+    return Rotation.from_euler('ZYX', [yaw_left, -pitch_up, roll_right],
+                               degrees=True).as_matrix() @ OPTICAL
+
+
+def pairs_of(mount, count=40, noise_px=0.2, still=0.0, seed=0):
+    """Drive straight on over a plane between houses; still: share of the points on the bonnet."""
+    rng = np.random.default_rng(seed)
+    collector = StraightCollector()
+    for n in range(count):
+        world = np.column_stack([rng.uniform(4, 40, 600), rng.uniform(-12, 12, 600),
+                                 rng.uniform(0, 6, 600) - HEIGHT_M])
+        world[:300, 1:] = np.column_stack([rng.uniform(-3, 3, 300), np.full(300, -HEIGHT_M)])
+        # nods from image to image, as a body does
+        nod = Rotation.from_euler('y', rng.normal(0, 0.2), degrees=True).as_matrix()
+        seen = []
+        for at, turned in ((0.0, np.eye(3)), (SPEED * SPACING_S, nod)):
+            rays = (world - [at, 0, 0]) @ turned @ mount
+            pixels = LENS.project(rays) + rng.normal(0, noise_px, (600, 2))
+            seen.append(np.where(rays[:, 2:] > 1, pixels, np.nan))
+        inside = [(each > 0).all(axis=1) & (each < [LENS.image_size]).all(axis=1) for each in seen]
+        before, after = (each[inside[0] & inside[1]] for each in seen)
+        fixed = rng.random(len(before)) < still
+        after[fixed] = before[fixed]
+        order = rng.permutation(len(before))
+        now = int(n * 1e9)
+        collector.push(now - int(SPACING_S * 1e9), now, before[order].astype(np.float32),
+                       after[order].astype(np.float32))
+    return collector.straights()
+
+
+@pytest.mark.parametrize('angles', [(0.0, 0.0, 0.0), (3.5, -2.0, 1.0), (-2.5, 3.0, -3.0)])
+def test_straights_tell_where_it_points(solution, angles):
+    known = replace(solution, camera=LENS, scenes=())
+    found = mount_of(pairs_of(mounted(*angles)), None, known, 'accepted', 1.0, MountConfig())
+    axis = np.degrees(np.arccos(np.clip(found.rotation[:, 2] @ mounted(*angles)[:, 2], -1, 1)))
+    # without a turn or lines roll is unknown, and counts as none
+    assert found.roll_right_deg is None and found.sigma['roll_right_deg'] is None
+    assert axis < 0.15 + np.sin(np.radians(abs(angles[2]))) * np.hypot(*angles[:2])
+    ahead = LENS.project(mounted(*angles).T[:, :1].T)[0]
+    assert np.hypot(*(ahead - found.travel_px)) < 3 * found.travel_sigma_px
+
+
+def test_points_that_stay_do_not_spoil_it(solution):
+    known = replace(solution, camera=LENS, scenes=())
+    found = mount_of(pairs_of(mounted(2.0, 1.0, 0.0), still=0.2), None, known, 'accepted', 1.0,
+                     MountConfig())
+    assert abs(found.yaw_left_deg - 2.0) < 0.15 and abs(found.pitch_up_deg - 1.0) < 0.15
+
+
+def test_height_needs_a_speed(solution):
+    known, pairs = replace(solution, camera=LENS, scenes=()), pairs_of(mounted(0.5, 0.5, 0.0))
+    without = mount_of(pairs, None, known, 'accepted', 1.0, MountConfig())
+    assert without.height_m is None and without.sigma['height_m'] is None
+    found = mount_of(pairs, None, known, 'accepted', 1.0, MountConfig(speed_kmh=3.6 * SPEED))
+    assert abs(found.height_m - HEIGHT_M) < 2 * found.sigma['height_m'] < 0.1
+    assert found.straight_m == pytest.approx(SPEED * SPACING_S / 2 * len(pairs), rel=0.3)
+    # an error of speed is one of height
+    fast = mount_of(pairs, None, known, 'accepted', 1.0, MountConfig(speed_kmh=4.0 * SPEED))
+    assert fast.height_m / found.height_m == pytest.approx(4.0 / 3.6)
+
+
+def test_turns_alone_tell_all_angles(solution):
+    none = StraightCollector().straights()
+    found = mount_of(none, None, solution, 'accepted', 1.0, MountConfig())
+    for key in ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg'):
+        assert abs(getattr(found, key)) < 2 * found.sigma[key] + 0.1, key
+    assert found.straight_m == 0.0
+
+
+def test_nothing_seen_is_no_mount(solution):
+    assert mount_of(StraightCollector().straights(), None, replace(solution, scenes=()),
+                    'accepted', 1.0, MountConfig()) is None
+
+
+def test_it_is_never_better_than_the_lens(solution):
+    pairs = pairs_of(mounted(1.0, 0.0, 0.0))
+    known = replace(solution, camera=LENS, scenes=())
+    assert mount_of(pairs, None, known, 'accepted', 1.0, MountConfig()).verdict == 'accepted'
+    weak = mount_of(pairs, None, known, 'weak', 1.0, MountConfig())
+    assert weak.verdict == 'weak' and 'the lens is weak' in weak.reasons[0]
+    # 5 px of cy are half a degree of pitch, but not of the pixel of travel
+    vague = np.array(solution.covariance)
+    vague[3, 3] = 5.0**2
+    found = mount_of(pairs, None, replace(known, covariance=vague), 'accepted', 1.0, MountConfig())
+    assert found.verdict == 'weak' and 'drive more turns' in found.reasons[0]
+    assert found.sigma['pitch_up_deg'] > np.degrees(5.0 / LENS.fy)
+    assert found.travel_sigma_px == weak.travel_sigma_px
+
+
+def test_few_straights_say_to_drive_on(solution):
+    known = replace(solution, camera=LENS, scenes=(), covariance=1e-4 * np.eye(6))
+    found = mount_of(pairs_of(mounted(0, 0, 0), count=10, noise_px=4.0), None, known, 'accepted',
+                     1.0, MountConfig())
+    assert found.verdict == 'weak' and 'drive straight on' in found.reasons[0]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.tuples(*[st.floats(-30, 30)] * 3))
+def test_the_quaternion_is_the_rotation(angles):
+    mount = Mount('accepted', (), *angles, None, {}, (1.0, 2.0), 0.5, 100.0)
+    assert np.allclose(Rotation.from_quat(mount.quaternion).as_matrix(), mounted(*angles))
+    # the optical axis of a camera that looks to the left goes to the car's left
+    left = np.sin(np.radians(angles[0])) * np.cos(np.radians(angles[1]))
+    assert mount.rotation[1, 2] == pytest.approx(left)
+
+
+def test_a_file_keeps_it(tmp_path):
+    mount = Mount('weak', ('thin',), 1.0, -0.5, None, None, {
+        'yaw_left_deg': 0.1, 'pitch_up_deg': 0.2, 'roll_right_deg': None, 'height_m': None},
+        (600.5, 170.25), 0.7, 273.0)
+    write_results(make_calibration(mount=mount), tmp_path)
+    assert load_calibration(tmp_path).mount == mount
+
+
+def test_the_pairs_of_a_long_drive_are_few_and_spread():
+    collector, points = StraightCollector(), np.zeros((200, 2), np.float32)
+    for n in range(20000):
+        if collector.wants(n * 100_000_000):
+            collector.push((n - 6) * 100_000_000, n * 100_000_000, points, points)
+    found = collector.straights()
+    assert PAIRS / 4 < len(found) <= PAIRS and found.before.shape == (len(found), POINTS, 2)
+    steps = np.diff(found.stamps_s)
+    assert steps.max() <= 2.1 * steps.min() and found.stamps_s[-1] > 1900
