@@ -237,8 +237,37 @@ def _save(figure: plt.Figure, name: str) -> None:
     path.write_text('\n'.join(line.rstrip() for line in path.read_text().splitlines()) + '\n')
 
 
+def mount() -> None:
+    """Draw what the angles of the mounting mean; nothing is measured."""
+    figure, panels = plt.subplots(1, 3, figsize=(9, 2.6), layout='constrained')
+    side = np.array([(0, .3), (.1, .75), (1.1, .85), (1.7, 1.4), (3, 1.4), (3.6, .85), (4.2, .7),
+                     (4.3, .3), (0, .3)])
+    above = np.array([(0, -.8), (4, -.8), (4.3, -.5), (4.3, .5), (4, .8), (0, .8), (0, -.8)])
+    behind = np.array([(-.9, .3), (-.9, .9), (-.7, 1.4), (.7, 1.4), (.9, .9), (.9, .3), (-.9, .3)])
+    for panel, outline, place, degrees, words in (
+            (panels[0], above, (3.0, 0.0), 20, 'yaw to the left (from above)'),
+            (panels[1], side, (3.05, 1.3), 15, 'pitch upwards; height (from the side)'),
+            (panels[2], behind, (0.0, 1.25), -15, 'roll to the right (from behind)')):
+        panel.plot(*outline.T, color='0.6')
+        reach, turned = 1.9 if panel is not panels[2] else 0.8, np.radians(degrees)
+        for angle, style in ((0.0, '--'), (turned, '-')):
+            ends = np.array([0.0 if panel is not panels[2] else -reach, reach])
+            panel.plot(place[0] + ends * np.cos(angle), place[1] + ends * np.sin(angle), style,
+                       color='tab:blue' if style == '-' else '0.4')
+        panel.plot(*place, 'o', color='tab:orange')
+        panel.set_title(words)
+        panel.set_aspect('equal')
+        panel.axis('off')
+    panels[1].plot((0, 5), (0, 0), color='0.4')
+    panels[1].annotate('', (2.7, 0), (2.7, 1.3), arrowprops={'arrowstyle': '<->'})
+    panels[0].text(4.4, -0.3, 'direction of travel', color='0.4')
+    figure.savefig(PLOTS / 'mount.svg', metadata={'Date': None})
+    plt.close(figure)
+
+
 def main() -> None:
     """Measure and draw."""
+    mount()
     report()
     if sys.argv[1:] == ['report']:
         return

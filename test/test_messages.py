@@ -9,7 +9,8 @@ from messages import PACKAGE, messages_in
 
 DOCUMENT = Path(__file__).parents[1] / 'docs' / 'troubleshooting.md'
 EXPLAINED = ('judge/agreement.py', 'judge/calibration.py', 'judge/conclude.py',
-             'judge/focal_by_turn.py', 'judge/next_turn.py', 'judge/verdict.py',
+             'judge/focal_by_turn.py', 'judge/mount.py', 'judge/next_turn.py',
+             'judge/verdict.py',
              'selection.py', 'input', 'detect',
              'reconstruct/scene_file.py', 'turn_store.py', 'workers', 'cli/run.py')
 # texts that are no messages: parts of others that are shown with them, SQL, code

@@ -29,7 +29,7 @@ from dashcalib_ros.judge.calibration import (
     TurnSummary,
     Verdict,
 )
-from dashcalib_ros.judge.mount import mount_of
+from dashcalib_ros.judge.mount import Speed, mount_of
 from dashcalib_ros.judge.verdict import (
     STEADY,
     Finding,
@@ -142,7 +142,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                              f'for it; `dashcalib export --to rays` has it',)
             if evidence.straights is not None and config.mount.enabled:
                 mount = mount_of(evidence.straights, evidence.lines, solution, verdict.level, px,
-                                 config.mount)
+                                 _constant(config.mount.speed_kmh))
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.crops:
@@ -170,6 +170,11 @@ def _witness(solution: Solution | None, evidence: Evidence, config: Config) -> B
     if solution is None or evidence.lines is None:
         return None
     return bend(evidence.lines, solution.camera, config.lines, solution.covariance)
+
+
+def _constant(speed_kmh: float) -> Speed | None:
+    """Return a speed, m/s, that is always the same; None where it is not known."""
+    return (lambda stamps_s: np.full(len(stamps_s), speed_kmh / 3.6)) if speed_kmh else None
 
 
 def _of_size(mask: Mask | None, size: tuple[int, int]) -> Mask | None:

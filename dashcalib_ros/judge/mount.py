@@ -7,14 +7,13 @@ lies below, where speed is known. What the sources say is averaged; sigma grows 
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.config import MountConfig
 from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.judge.calibration import Mount
@@ -50,6 +49,8 @@ HEIGHT_FLOOR = 0.01
 USUAL_HEIGHT_M, USUAL_SPEED = 1.4, 10.0
 ROUNDS = 20
 
+Speed = Callable[[Floats], Floats]
+
 
 @dataclass(frozen=True)
 class _Pairs:
@@ -65,11 +66,11 @@ class _Pairs:
 
 
 def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str, px: float,
-             config: MountConfig) -> Mount | None:
+             speed: Speed | None) -> Mount | None:
     """Return how the camera sits on the car; None where nothing tells.
 
     straights, lines: in the scenes' pixels. level: the lens's verdict; the mount's is never
-    better. px: of the input, in one pixel of the scenes.
+    better. px: of the input, in one pixel of the scenes. speed: m/s (n,) at stamps (n,), s.
     """
     camera = solution.camera
     pairs = _fitted(camera, _without_field(straights, solution))
@@ -84,19 +85,22 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
     own = np.degrees(solution.sigma[2:4] / solution.camera.params[:2])
     total = np.hypot(sigma, own)
     down = _direction(np.array([0.0, 90.0]), np.radians(roll[0] if roll else 0.0))
-    speed = config.speed_kmh / 3.6
-    height = _height(pairs, kept, straights, _level(down, ahead), speed or None)
-    metres = float(straights.apart_s[kept].sum() / 2) * (
-        speed or (USUAL_SPEED if height is None else height[0]))
+    # where the speed is not known, a second is the unit
+    way = straights.apart_s * (1.0 if speed is None else speed(straights.stamps_s))
+    height = _height(pairs, kept, way, _level(down, ahead))
+    metres = float(way[kept].sum() / 2)
+    if speed is None:
+        metres *= USUAL_SPEED if height is None else USUAL_HEIGHT_M / height[0]
+        height = None
     reasons = _reasons(level, total, own, metres)
     return Mount(
         verdict='weak' if reasons else 'accepted', reasons=reasons,
         yaw_left_deg=float(angles[0]), pitch_up_deg=float(angles[1]),
         roll_right_deg=None if roll is None else roll[0],
-        height_m=height[0] if height and speed else None,
+        height_m=None if height is None else height[0],
         sigma={'yaw_left_deg': float(total[0]), 'pitch_up_deg': float(total[1]),
                'roll_right_deg': None if roll is None else roll[1],
-               'height_m': height[1] if height and speed else None},
+               'height_m': None if height is None else height[1]},
         travel_px=(float((travel[0] + 0.5) * px - 0.5), float((travel[1] + 0.5) * px - 0.5)),
         travel_sigma_px=float(px * np.radians(np.hypot(*sigma)) * camera.fx / np.sqrt(2)),
         straight_m=metres)
@@ -314,32 +318,26 @@ def _level(down: Floats, ahead: Floats) -> Floats:
     return np.asarray(level / np.linalg.norm(level))
 
 
-def _height(pairs: _Pairs, kept: Mask, straights: Straights, down: Floats, speed: float | None
-            ) -> tuple[float, float] | None:
-    """Return the height above the road of the own lane and its sigma, m.
+def _height(pairs: _Pairs, kept: Mask, way: Floats, down: Floats) -> tuple[float, float] | None:
+    """Return the height above the road of the own lane and its sigma; None where it is not seen.
 
-    speed: m/s; where it is None, the first value is the speed at which the camera is as high as
-    usual. None where the road is not seen.
+    way: (n,) how far the car drove between a pair's images: the unit of its points.
     """
     points = pairs.points[kept]
     depth = points @ down
     with np.errstate(invalid='ignore'):
         aside = np.linalg.norm(np.cross(points, pairs.ahead[kept][:, None]), axis=-1)
         near = (depth > 0) & (np.sqrt(np.maximum(aside**2 - depth**2, 0)) < LANE * depth)
-    of_pair, place = np.nonzero(near)
-    seconds = straights.apart_s[kept][of_pair]
-    # the length of the way is the unit of a pair's points
-    logs = np.log(depth[of_pair, place] * seconds)
-    if len(logs) < LEAST_ROAD_POINTS:
+    of_pair, place = np.nonzero(near & (way[kept] > 0)[:, None])
+    if len(of_pair) < LEAST_ROAD_POINTS:
         return None
+    logs = np.log(depth[of_pair, place] * way[kept][of_pair])
     low, high = np.percentile(logs, (5, 95))
     grid = np.linspace(low, high, 200)
     middle = float(grid[np.exp(-((grid[:, None] - logs) / ROAD_SPREAD)**2 / 2).sum(1).argmax()])
+    weights = np.ones(len(logs))
     for _ in range(ROUNDS):
         weights = np.exp(-((logs - middle) / ROAD_SPREAD)**2 / 2)
         middle = float(weights @ logs / weights.sum())
-    if speed is None:
-        return USUAL_HEIGHT_M / float(np.exp(middle)), 0.0
-    height = speed * float(np.exp(middle))
-    return height, height * float(np.hypot(HEIGHT_FLOOR, ROAD_SPREAD / np.sqrt(
-        max(len(np.unique(of_pair[weights > 0.5])), 1))))
+    height, seen_in = float(np.exp(middle)), len(np.unique(of_pair[weights > 0.5]))
+    return height, height * float(np.hypot(HEIGHT_FLOOR, ROAD_SPREAD / np.sqrt(max(seen_in, 1))))

@@ -24,6 +24,7 @@ from dashcalib_ros.report.lens import (
     slider_of,
     uncertainty_of,
 )
+from dashcalib_ros.report.mounting import field_of, mounting_of
 from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
 from dashcalib_ros.report.turns import turn_rows, turn_sections
 from dashcalib_ros.report.wording import (
@@ -71,7 +72,8 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
         drive='' if c.magnitudes is None else magnitude_svg(c.magnitudes, c.turns,
                                                             c.start_s or None),
         turns=turn_sections(c, mask_id), rows=turn_rows(c),
-        evidence=evidence_of(c, mask_id), facts=run_facts(c),
+        evidence=[*evidence_of(c, mask_id), *field_of(c)], mounting=mounting_of(c),
+        facts=run_facts(c),
         mask='' if mask is None else mask_data_uri(mask), mask_id=MASK_ID,
         masked=0.0 if c.mask is None else 100 * (1 - float(np.mean(c.mask))),
         changed={key: value for key, value in settings.items() if value != defaults[key]},

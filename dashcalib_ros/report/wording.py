@@ -208,6 +208,8 @@ def run_facts(c: Calibration) -> list[tuple[str, str]]:
         facts.append(('reprojection error', f'{c.reprojection_error_px:.2f} px'))
     if c.straight_lines is not None:
         facts.append(('straight lines', lines_text(c.straight_lines)))
+    if c.mount is not None:
+        facts.append(('mounting', mount_text(c.mount)))
     if c.stored_turns:
         facts.append(('earlier drives', stored_text(c.stored_turns)))
     times = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in c.timing.items())

@@ -11,7 +11,6 @@ from made_calibration import make_calibration
 from scipy.spatial.transform import Rotation
 from solving import LENS, scenes_of, solved
 
-from dashcalib_ros.config import MountConfig
 from dashcalib_ros.detect.straights import PAIRS, POINTS, StraightCollector
 from dashcalib_ros.judge.calibration import OPTICAL, Mount
 from dashcalib_ros.judge.mount import mount_of
@@ -58,10 +57,14 @@ def pairs_of(mount, count=40, noise_px=0.2, still=0.0, seed=0):
     return collector.straights()
 
 
+def at(speed):
+    return lambda stamps_s: np.full(len(stamps_s), speed)
+
+
 @pytest.mark.parametrize('angles', [(0.0, 0.0, 0.0), (3.5, -2.0, 1.0), (-2.5, 3.0, -3.0)])
 def test_straights_tell_where_it_points(solution, angles):
     known = replace(solution, camera=LENS, scenes=())
-    found = mount_of(pairs_of(mounted(*angles)), None, known, 'accepted', 1.0, MountConfig())
+    found = mount_of(pairs_of(mounted(*angles)), None, known, 'accepted', 1.0, None)
     axis = np.degrees(np.arccos(np.clip(found.rotation[:, 2] @ mounted(*angles)[:, 2], -1, 1)))
     # without a turn or lines roll is unknown, and counts as none
     assert found.roll_right_deg is None and found.sigma['roll_right_deg'] is None
@@ -73,25 +76,25 @@ def test_straights_tell_where_it_points(solution, angles):
 def test_points_that_stay_do_not_spoil_it(solution):
     known = replace(solution, camera=LENS, scenes=())
     found = mount_of(pairs_of(mounted(2.0, 1.0, 0.0), still=0.2), None, known, 'accepted', 1.0,
-                     MountConfig())
+                     None)
     assert abs(found.yaw_left_deg - 2.0) < 0.15 and abs(found.pitch_up_deg - 1.0) < 0.15
 
 
 def test_height_needs_a_speed(solution):
     known, pairs = replace(solution, camera=LENS, scenes=()), pairs_of(mounted(0.5, 0.5, 0.0))
-    without = mount_of(pairs, None, known, 'accepted', 1.0, MountConfig())
+    without = mount_of(pairs, None, known, 'accepted', 1.0, None)
     assert without.height_m is None and without.sigma['height_m'] is None
-    found = mount_of(pairs, None, known, 'accepted', 1.0, MountConfig(speed_kmh=3.6 * SPEED))
+    found = mount_of(pairs, None, known, 'accepted', 1.0, at(SPEED))
     assert abs(found.height_m - HEIGHT_M) < 2 * found.sigma['height_m'] < 0.1
     assert found.straight_m == pytest.approx(SPEED * SPACING_S / 2 * len(pairs), rel=0.3)
     # an error of speed is one of height
-    fast = mount_of(pairs, None, known, 'accepted', 1.0, MountConfig(speed_kmh=4.0 * SPEED))
+    fast = mount_of(pairs, None, known, 'accepted', 1.0, at(SPEED * 4.0 / 3.6))
     assert fast.height_m / found.height_m == pytest.approx(4.0 / 3.6)
 
 
 def test_turns_alone_tell_all_angles(solution):
     none = StraightCollector().straights()
-    found = mount_of(none, None, solution, 'accepted', 1.0, MountConfig())
+    found = mount_of(none, None, solution, 'accepted', 1.0, None)
     for key in ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg'):
         assert abs(getattr(found, key)) < 2 * found.sigma[key] + 0.1, key
     assert found.straight_m == 0.0
@@ -99,19 +102,19 @@ def test_turns_alone_tell_all_angles(solution):
 
 def test_nothing_seen_is_no_mount(solution):
     assert mount_of(StraightCollector().straights(), None, replace(solution, scenes=()),
-                    'accepted', 1.0, MountConfig()) is None
+                    'accepted', 1.0, None) is None
 
 
 def test_it_is_never_better_than_the_lens(solution):
     pairs = pairs_of(mounted(1.0, 0.0, 0.0))
     known = replace(solution, camera=LENS, scenes=())
-    assert mount_of(pairs, None, known, 'accepted', 1.0, MountConfig()).verdict == 'accepted'
-    weak = mount_of(pairs, None, known, 'weak', 1.0, MountConfig())
+    assert mount_of(pairs, None, known, 'accepted', 1.0, None).verdict == 'accepted'
+    weak = mount_of(pairs, None, known, 'weak', 1.0, None)
     assert weak.verdict == 'weak' and 'the lens is weak' in weak.reasons[0]
     # 5 px of cy are half a degree of pitch, but not of the pixel of travel
     vague = np.array(solution.covariance)
     vague[3, 3] = 5.0**2
-    found = mount_of(pairs, None, replace(known, covariance=vague), 'accepted', 1.0, MountConfig())
+    found = mount_of(pairs, None, replace(known, covariance=vague), 'accepted', 1.0, None)
     assert found.verdict == 'weak' and 'drive more turns' in found.reasons[0]
     assert found.sigma['pitch_up_deg'] > np.degrees(5.0 / LENS.fy)
     assert found.travel_sigma_px == weak.travel_sigma_px
@@ -120,7 +123,7 @@ def test_it_is_never_better_than_the_lens(solution):
 def test_few_straights_say_to_drive_on(solution):
     known = replace(solution, camera=LENS, scenes=(), covariance=1e-4 * np.eye(6))
     found = mount_of(pairs_of(mounted(0, 0, 0), count=10, noise_px=4.0), None, known, 'accepted',
-                     1.0, MountConfig())
+                     1.0, None)
     assert found.verdict == 'weak' and 'drive straight on' in found.reasons[0]
 
 
