@@ -4,7 +4,6 @@ The stages are in stages.py; the Calibrator decides only what runs when.
 """
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass
@@ -47,31 +46,32 @@ class Calibrator:
     """Learns a camera from the turns of a drive.
 
     push() the frames as they come; calibrate() when enough turns have gathered, or at the end.
-    push() and calibrate() may be called from two threads: push() never waits for a calibration.
-    close() ends the child processes; a Calibrator is also a context manager.
+    close() ends the child processes; a Calibrator is also a context manager. All methods are for
+    one thread, but close() and child_pids(), which are for any.
     """
 
     def __init__(self, config: Config | None = None, mask: Mask | None = None,
                  verbose: bool = False, live: bool = False, use_stored: bool = True,
                  warn: Callable[[str], None] = lambda text: None, inline: bool = False,
-                 on_trouble: Callable[[str], None] = lambda text: None) -> None:
+                 on_trouble: Callable[[str], None] = lambda text: None,
+                 on_wait: Callable[[], None] | None = None) -> None:
         """mask: (h, w), False where the ego vehicle is.
 
         live: children run at low priority, and push() never waits for them; offline it does, so
         that few turns are in memory at a time. use_stored: False does not load the turns in
         turns.store, but adds to them. warn: called with one line for each problem with
-        turns.store, from any thread; the result's warnings have them, too. inline: everything runs
+        turns.store; the result's warnings have them, too. inline: everything runs
         in this process, with equal results; numpy must have one thread, else WorkerError says how;
         close() then does not end what runs. on_trouble: called with one line for each child that
-        died or hangs, and for each turn that is tried again after that, from any thread.
+        died or hangs, and for each turn that is tried again after that, from any thread. on_wait:
+        called again and again while calibrate(), check() or watch() waits for a worker; it may
+        push() frames, so that a live drive goes on.
         """
         self._config = config or Config()
         searched(self._config.model)  # raises ConfigError for one that there is not
-        # guards what push() and calibrate() share: the detection and the selection of turns
-        self._lock = threading.Lock()
         self._detection = Detection(self._config, mask)
-        self._scenes = SceneSelection(self._config, self._detection, self._lock, live, verbose,
-                                      use_stored, warn, inline, on_trouble)
+        self._scenes = SceneSelection(self._config, self._detection, live, verbose, use_stored,
+                                      warn, inline, on_trouble, on_wait)
         self._live = live
         self._solution: Solution | None = None
         self._read: _Read | None = None
@@ -81,12 +81,11 @@ class Calibrator:
     def push(self, frame: Frame) -> Status:
         """Take the next frame; raises InputError when its size differs from the first one's."""
         started = time.monotonic()
-        with self._lock:
-            new = self._detection.push(frame)
-            if self._detection.frames == 1:
-                self._scenes.load(frame.frame_id)
-            if new:
-                self._scenes.submit()
+        new = self._detection.push(frame)
+        if self._detection.frames == 1:
+            self._scenes.load(frame.frame_id)
+        if new:
+            self._scenes.submit()
         self._detect_s += time.monotonic() - started
         self._scenes.make_room()
         return self.status()
@@ -98,10 +97,9 @@ class Calibrator:
         progress: called with the stage's name and the share done.
         """
         tell = progress or (lambda stage, done: None)
-        with self._lock:
-            if final:
-                self._detection.finish()
-            self._scenes.submit()
+        if final:
+            self._detection.finish()
+        self._scenes.submit()
         started = time.monotonic()
         calibration = self._solve_and_judge(tell, final, started)
         # a weak result is calculated again with more turns
@@ -128,11 +126,10 @@ class Calibrator:
         now = time.monotonic()
         timing = {'detect': self._detect_s, 'calibrate': now - started,
                   'total': now - self._started}
-        with self._lock:
-            return evidence_of_detection(
-                self._detection, self._scenes.built(), timing, tuple(self._scenes.warnings),
-                self._scenes.stored_before(), self._scenes.left_out(),
-                None if self._live else self._scenes.pictures())
+        return evidence_of_detection(
+            self._detection, self._scenes.built(), timing, tuple(self._scenes.warnings),
+            self._scenes.stored_before(), self._scenes.left_out(),
+            None if self._live else self._scenes.pictures())
 
     def check(self, given: Camera, calibration: Calibration, progress: Progress | None = None
               ) -> Check:
@@ -144,8 +141,7 @@ class Calibrator:
         found: Check = self._scenes.run(
             stages.check, given, calibration.image_size, self._solution, calibration.verdict,
             self._config, progress=progress or (lambda stage, done: None))
-        with self._lock:
-            lines = self._detection.lines()
+        lines = self._detection.lines()
         return with_lines(found, given, lines, calibration.image_size, self._config)
 
     def odometry(self, given: Camera, calibration: Calibration, poses: Poses,
@@ -173,9 +169,8 @@ class Calibrator:
         progress: as for calibrate(). Raises InputError where the camera is for pictures of
         another size.
         """
-        with self._lock:
-            size, scale = self._detection.size, self._detection.scale
-            scenes = self._scenes.all_scenes()
+        size, scale = self._detection.size, self._detection.scale
+        scenes = self._scenes.all_scenes()
         if camera.image_size != size:
             raise InputError(f'the camera in use is for pictures of another size: '
                              f'{camera.image_size[0]}x{camera.image_size[1]}')
@@ -205,35 +200,32 @@ class Calibrator:
 
     def turns(self) -> tuple[Turn, ...]:
         """Return the bank's turns, the most prominent first."""
-        with self._lock:
-            return self._detection.turns()
+        return self._detection.turns()
 
     def status(self) -> Status:
-        """Return the present state."""
-        with self._lock:
-            chosen, stored = self._scenes.chosen(), len(self._scenes.stored())
-            found = self._detection
-            return Status(found.frames, len(found.turns()) + stored, len(chosen),
-                          sum(scene.yaw_deg for scene in chosen), found.magnitude,
-                          found.standing, tuple(scene.turn for scene in chosen), stored,
-                          tuple(scene.yaw_deg for scene in chosen),
-                          tuple(self._scenes.all_scenes()))
+        """Return the present state; scenes that are new are written to turns.store."""
+        self._scenes.store_new()
+        chosen, stored = self._scenes.chosen(), len(self._scenes.stored())
+        found = self._detection
+        return Status(found.frames, len(found.turns()) + stored, len(chosen),
+                      sum(scene.yaw_deg for scene in chosen), found.magnitude,
+                      found.standing, tuple(scene.turn for scene in chosen), stored,
+                      tuple(scene.yaw_deg for scene in chosen),
+                      tuple(self._scenes.all_scenes()))
 
     def view(self) -> View:
         """Return what is tracked and masked in the newest frame."""
-        with self._lock:
-            return View(self._detection.points(), self._detection.valid())
+        return View(self._detection.points(), self._detection.valid())
 
     def want(self, turns: int, more: int = 0) -> None:
         """Use so many turns from the next calibration on, turns.capacity at the most.
 
         more: turns of this drive are used beyond those.
         """
-        with self._lock:
-            self._scenes.more = more
-            if turns != self._config.turns.wanted:
-                self._config = self._config.replace({'turns.wanted': turns})
-                self._scenes.want(turns)
+        self._scenes.more = more
+        if turns != self._config.turns.wanted:
+            self._config = self._config.replace({'turns.wanted': turns})
+            self._scenes.want(turns)
 
     def reject(self, turns: Iterable[TurnId]) -> None:
         """Take turns out that are not of the present camera."""

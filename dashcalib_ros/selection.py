@@ -1,7 +1,6 @@
 """Which turns are reconstructed, and which scenes a calibration uses."""
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Collection, Mapping, Set
 from typing import Any
 
@@ -33,20 +32,15 @@ class SceneSelection:
 
     warnings: about turns.store, and about turns that ended the workers.
 
-    Threads: the Calibrator's lock guards the detection, the places and the stored turns. It is
-    held only briefly, as push() needs it for each frame: no thread that holds it waits for a
-    worker or for a file (except in load(), once). load(), want(), submit(), chosen(),
-    all_scenes(), built(), stored(), pictures(), left_out() and stored_before() must be called
-    with the lock held; all other methods without it, as they take it themselves. Locks are taken
-    in this order: the store's (of its files), this one, the pool's. The pool's threads call
-    _store() without any lock.
+    All methods are for the Calibrator's thread, but close(), which is for any.
     """
 
-    def __init__(self, config: Config, detection: Detection, lock: threading.Lock,
+    def __init__(self, config: Config, detection: Detection,
                  live: bool = False, verbose: bool = False, use_stored: bool = True,
                  warn: Callable[[str], None] = lambda text: None, inline: bool = False,
-                 on_trouble: Callable[[str], None] = lambda text: None) -> None:
-        """live, use_stored, warn, inline, on_trouble: as the Calibrator's."""
+                 on_trouble: Callable[[str], None] = lambda text: None,
+                 on_wait: Callable[[], None] | None = None) -> None:
+        """live, use_stored, warn, inline, on_trouble, on_wait: as the Calibrator's."""
         self.warnings: list[str] = []
         # how many turns are used: more than wanted once these have left a result weak
         self._places = config.turns.wanted
@@ -54,12 +48,13 @@ class SceneSelection:
         self.more = 0
         self._config = config
         self._detection = detection
-        self._lock = lock
         self._live = live
         self._use_stored = use_stored
         self._warn = warn
         self._on_trouble = on_trouble
         self._closed = False
+        # the turns whose scenes were written to turns.store
+        self._stored_turns: Set[TurnId] = frozenset()
         # why turns were taken out
         self._rejected: dict[TurnId, str] = {}
         # turns of earlier drives that this drive contradicts; on disk they stay
@@ -75,10 +70,8 @@ class SceneSelection:
             return ChildWorker(live, verbose, threads, on_trouble)
 
         self._pool = ScenePool(config, InlineWorker if inline else child,
-                               queue=turns.wanted if live else None, on_built=self._store,
-                               on_lost=self._lost, on_trouble=on_trouble, keep_pictures=not live)
-
-    # with the lock held
+                               queue=turns.wanted if live else None, on_lost=self._lost,
+                               on_trouble=on_trouble, keep_pictures=not live, on_wait=on_wait)
 
     def load(self, frame_id: str) -> None:
         """Load the turns of earlier drives, at the first frame: they must fit its size and id."""
@@ -165,8 +158,6 @@ class SceneSelection:
         unbuilt = self._pool.unbuilt()
         return any(key in unbuilt for key in self._best({*unbuilt, *self.all_scenes()}))
 
-    # without the lock
-
     def make_room(self) -> None:
         """Wait, unless live, until few turns wait in memory; raises what a worker raised."""
         if not self._live:
@@ -189,20 +180,18 @@ class SceneSelection:
                 tell('reconstructing turns', max(0.0, 1 - waiting / total))
                 if everything or not waiting:
                     return waiting == 0
-                with self._lock:
-                    return not self._undecided()
+                return not self._undecided()
 
             self._pool.wait(ready)
             if self._closed:
                 raise WorkerError('the calibrator was closed while it calibrated')
-            with self._lock:
-                # only when all are done: what is submitted must not depend on the workers' speed
-                own = [scene for scene in self._pool.scenes().values() if scene is not None]
-                self._kept.drop_repeated((), own)
-                self.submit(replace_failed=True)
-                ready_now = (not self._undecided()
-                             and not (everything and len(self._pool.unbuilt())))
-                chosen = self.chosen() if ready_now else []
+            # only when all are done: what is submitted must not depend on the workers' speed
+            own = [scene for scene in self._pool.scenes().values() if scene is not None]
+            self._kept.drop_repeated((), own)
+            self.submit(replace_failed=True)
+            ready_now = not self._undecided() and not (everything and len(self._pool.unbuilt()))
+            chosen = self.chosen() if ready_now else []
+            self.store_new()
             if ready_now:
                 kept, repeated = without_repeated(chosen, self._config.scene.min_images)
                 if repeated:
@@ -212,33 +201,29 @@ class SceneSelection:
                     self.reject({turn: f'shows the same pictures as {other}, which counts'
                                  for turn, other in repeated.items()})
                     continue
-                with self._lock:
-                    self._stored_before = self.stored()
+                self._stored_before = self.stored()
                 return kept
 
     def widen(self) -> bool:
         """Use more turns, up to turns.at_most; return False if there are no more to use."""
         turns = self._config.turns
         most = max(turns.at_most, turns.wanted)
-        with self._lock:
-            if self._places >= most or len(self._ranked()) <= self._places:
-                return False
-            self._places = most
-            return True
+        if self._places >= most or len(self._ranked()) <= self._places:
+            return False
+        self._places = most
+        return True
 
     def reject(self, reasons: Mapping[TurnId, str]) -> None:
         """Take out scenes that do not fit the others, each for a reason in words."""
-        with self._lock:
-            self._rejected.update(reasons)
-            for key in reasons:
-                if self._kept.turns.pop(key, None) is None:
-                    self._pool.reject(key)
+        self._rejected.update(reasons)
+        for key in reasons:
+            if self._kept.turns.pop(key, None) is None:
+                self._pool.reject(key)
         self._store()
 
     def leave_out(self, earlier: Set[TurnId]) -> None:
         """Use these turns of earlier drives no more in this drive; on disk they stay."""
-        with self._lock:
-            self._contradicted |= earlier
+        self._contradicted |= earlier
 
     def run(self, function: Callable[..., Any], *arguments: Any, progress: Progress) -> Any:
         """Run a stage in a worker, as soon as one is free, and return what it returns."""
@@ -248,23 +233,24 @@ class SceneSelection:
         """Return the process ids of the children that run now."""
         return self._pool.pids()
 
-    def _store(self) -> None:
-        """Write the present scenes to turns.store; the pool calls it for each new one."""
-        def snapshot() -> dict[TurnId, StoredTurn]:
-            with self._lock:
-                built = self._pool.scenes()
-                own = {turn.id: StoredTurn(scene, turn.stamp_s, turn.prominence)
-                       for turn in self._detection.turns()
-                       if (scene := built.get(turn.id)) is not None}
-                return {**self._kept.turns, **own}
+    def store_new(self) -> None:
+        """Write scenes that were built since the last call to turns.store."""
+        built = {turn for turn, scene in self._pool.scenes().items() if scene is not None}
+        if not built <= self._stored_turns:
+            self._store()
 
-        self._kept.mirror(snapshot)
+    def _store(self) -> None:
+        """Write the present scenes to turns.store."""
+        built = self._pool.scenes()
+        self._stored_turns = built.keys()
+        own = {turn.id: StoredTurn(scene, turn.stamp_s, turn.prominence)
+               for turn in self._detection.turns() if (scene := built.get(turn.id)) is not None}
+        self._kept.mirror({**self._kept.turns, **own})
 
     def forget_stored(self, but: Set[TurnId]) -> None:
         """Drop the turns of earlier drives but these, on disk too."""
-        with self._lock:
-            for key in self._kept.turns.keys() - but:
-                del self._kept.turns[key]
+        for key in self._kept.turns.keys() - but:
+            del self._kept.turns[key]
         self._store()
 
     def clear_store(self) -> None:

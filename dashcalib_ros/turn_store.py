@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import os
 import secrets
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -41,8 +40,6 @@ class TurnStore:
     Problems are reported by warn; nothing is raised.
 
     turns: of earlier drives.
-    One thread at a time may use `turns`, load() and drop_repeated(); mirror() and clear() are for
-    any thread that holds no lock that `snapshot` takes, as writing may take long.
     """
 
     def __init__(self, folder: str, capacity: int, half_width_s: float,
@@ -61,8 +58,6 @@ class TurnStore:
             self._off = True
             warn(f'turns cannot be stored in {folder} (there is no such home folder); set '
                  f'turns.store to a path without ~')
-        # guards the files, _own and _known
-        self._writing = threading.Lock()
         self._capacity = capacity
         self._half_width_s = half_width_s
         self._warn = warn
@@ -122,17 +117,10 @@ class TurnStore:
             del self.turns[key]
         return bool(repeated)
 
-    def mirror(self, snapshot: Callable[[], Mapping[TurnId, StoredTurn]]) -> None:
-        """Write these turns to the folder; remove others that were written or loaded before.
-
-        snapshot: returns the turns; called when no other thread writes, so that the last call
-        writes the newest ones.
-        """
-        if self._off:
-            return
-        with self._writing:
-            if not self._off:
-                self._write_all(snapshot())
+    def mirror(self, turns: Mapping[TurnId, StoredTurn]) -> None:
+        """Write these turns to the folder; remove others that were written or loaded before."""
+        if not self._off:
+            self._write_all(turns)
 
     def clear(self) -> None:
         """Remove the turns that were written or loaded; the folder is not used any more.
@@ -141,12 +129,11 @@ class TurnStore:
         """
         if self._off:
             return
-        with self._writing:
-            if self._origin is None:
-                self._own = {TurnId.stored(n): (name, 0.0) for n, name in enumerate(self._listed())
-                             if self._about(name) is not None}
-            self._write_all({})
-            self._off = True
+        if self._origin is None:
+            self._own = {TurnId.stored(n): (name, 0.0) for n, name in enumerate(self._listed())
+                         if self._about(name) is not None}
+        self._write_all({})
+        self._off = True
 
     def _write_all(self, turns: Mapping[TurnId, StoredTurn]) -> None:
         for key in self._own.keys() - turns.keys():

@@ -267,7 +267,7 @@ def test_two_short_drives_add_up(drive, frames, tmp_path):
     config = QUICK.replace({'turns.store': str(folder)})
     store = TurnStore(str(folder), 10, 3.0, pytest.fail)
     store.load(Origin((640, 360)))
-    store.mirror(lambda: {TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9)})
+    store.mirror({TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9)})
     assert len(list(folder.iterdir())) == 1
 
     first = calibrated(frames[:95], config)
@@ -316,7 +316,7 @@ def test_a_stored_turn_of_another_camera_is_told_and_stays(frames, tmp_path):
     store = TurnStore(str(tmp_path), 10, 3.0, pytest.fail)
     store.load(Origin((640, 360)))
     stranger = StoredTurn(synthetic_turn(lens).scene(lens), 5.0, 0.001)
-    store.mirror(lambda: {TurnId.at(0): stranger})
+    store.mirror({TurnId.at(0): stranger})
     result = calibrated(frames[:95], config)
     assert result.verdict.level != 'accepted' and result.turns[0].used, result.verdict
     # of two turns nobody can tell which one is odd
@@ -330,7 +330,7 @@ def test_stored_turns_of_another_size_are_left_out_and_told(tmp_path):
     config = QUICK.replace({'turns.store': str(tmp_path)})
     store = TurnStore(str(tmp_path), 10, 3.0, pytest.fail)
     store.load(Origin((640, 360)))
-    store.mirror(lambda: {TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9)})
+    store.mirror({TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9)})
     told: list[str] = []
     with Calibrator(config, warn=told.append) as calibrator:
         assert calibrator.push(pictures(1, 320, 180)[0]).turns == 0
@@ -356,7 +356,7 @@ def test_a_camera_in_use_is_compared_with_stored_turns(tmp_path):
     lens = Radial((640, 360), 390.0, 390.0, 319.5, 179.5, -0.2, 0.03)
     scenes = [synthetic_turn(lens, keyframes=10, tracks=100, world=n).scene(lens, n)
               for n in range(2)]
-    store.mirror(lambda: {scene.turn: StoredTurn(scene, 50.0 * n, 0.8 - n / 10)
+    store.mirror({scene.turn: StoredTurn(scene, 50.0 * n, 0.8 - n / 10)
                           for n, scene in enumerate(scenes)})
     sigma = dict.fromkeys(lens.names(), 0.1)
     with Calibrator(QUICK.replace({'turns.store': str(tmp_path)})) as calibrator:
@@ -377,7 +377,7 @@ def test_turns_of_this_drive_come_before_more_prominent_ones_of_earlier_drives(o
     scene = garbage()
     turns = tuple(types.SimpleNamespace(id=TurnId.at(n), prominence=0.01) for n in range(own))
     selection = SceneSelection(QUICK.replace({'turns.wanted': 3}),
-                               types.SimpleNamespace(turns=lambda: turns), threading.Lock())
+                               types.SimpleNamespace(turns=lambda: turns))
     selection.more = more
     selection._pool._scenes = {turn.id: replace(scene, turn=turn.id) for turn in turns}
     selection._kept.turns = {key: StoredTurn(replace(scene, turn=key), 0.0, 0.9)
@@ -392,7 +392,7 @@ def test_turns_that_are_rejected_leave_the_store(tmp_path):
     store.load(Origin((640, 360)))
     lens = Radial((640, 360), 390.0, 390.0, 325.0, 175.0, -0.2)
     other = synthetic_turn(lens, keyframes=12, tracks=120, world=1).scene(lens, 9)
-    store.mirror(lambda: {TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9),
+    store.mirror({TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9),
                           TurnId.at(9): StoredTurn(other, 50.0, 0.8)})
     with Calibrator(QUICK.replace({'turns.store': str(tmp_path)}), live=True) as calibrator:
         first, second = calibrator.push(pictures(1, 640, 360)[0]).reconstructed

@@ -58,7 +58,7 @@ def make(tmp_path):
 def hold(store: TurnStore, *turns: StoredTurn, first: int = 100) -> None:
     """Give an store these turns of its drive, beside those of earlier drives."""
     own = {TurnId.at(first + n): turn for n, turn in enumerate(turns)}
-    store.mirror(lambda: {**store.turns, **own})
+    store.mirror({**store.turns, **own})
 
 
 def names(store: TurnStore) -> set[str]:
@@ -366,7 +366,7 @@ def test_a_read_only_folder_is_read(make, tmp_path):
         store = make()
         assert len(store.turns) == 1
         hold(store, stored(1))
-        store.mirror(dict)
+        store.mirror({})
         assert len(store.said) == 1 and 'Permission denied' in store.said[0]
         assert len(names(store)) == 1
     finally:

@@ -13,7 +13,6 @@ import pickle
 import select
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, cast
@@ -37,8 +36,8 @@ class ChildWorker:
     """One child process, started at its first call, and anew at the next call after it died.
 
     See Worker. A child that uses no processor time during a call hangs: on_trouble is called, and
-    after LOOKS_TO_KILL looks the child is killed. pid, kill() and close() may be used from any
-    thread at any time.
+    after LOOKS_TO_KILL looks the child is killed. One thread at a time may call; pid, kill() and
+    close() may be used from any thread at any time.
     """
 
     def __init__(self, low_priority: bool = False, verbose: bool = False, threads: int = 1,
@@ -52,11 +51,10 @@ class ChildWorker:
         self._verbose = verbose
         self._on_trouble = on_trouble
         self._process: subprocess.Popen[bytes] | None = None
+        # of two threads, call()'s and close()'s, each writes its own before it reads the other's:
+        # no process that close() does not see goes on, and no pipe that is in use is closed
         self._closed = False
-        # held during a call: it guards the pipes
-        self._calling = threading.Lock()
-        # guards _process and _closed: close() must see every process that is started
-        self._starting = threading.Lock()
+        self._calling = False
 
     @property
     def pid(self) -> int | None:
@@ -69,7 +67,8 @@ class ChildWorker:
         """Run a module-level function in the child; see Worker.call."""
         # pickle first: an error must not leave a part of the message in the pipe
         request = pack((function, arguments, progress is not None))
-        with self._calling:
+        self._calling = True
+        try:
             process = self._running()
             try:
                 kind, value = self._answer(process, request, progress)
@@ -77,6 +76,8 @@ class ChildWorker:
                 # for example Ctrl-C: the next call must not receive the answer to this one
                 _end(process)
                 raise
+        finally:
+            self._calling = False
         if kind == 'error':
             raise value
         return value
@@ -90,13 +91,11 @@ class ChildWorker:
 
     def close(self) -> None:
         """End the child for good."""
-        with self._starting:
-            self._closed = True
-            self.kill()
+        self._closed = True
+        self.kill()
         # if a call is running, it finds its child dead and closes the pipes itself
-        if self._process is not None and self._calling.acquire(blocking=False):
+        if self._process is not None and not self._calling:
             _end(self._process)
-            self._calling.release()
 
     def _answer(self, process: subprocess.Popen[bytes], request: Parts,
                 progress: Progress | None) -> tuple[str, Any]:
@@ -116,15 +115,17 @@ class ChildWorker:
                 progress(*value)
 
     def _running(self) -> subprocess.Popen[bytes]:
-        with self._starting:
-            if self._closed:
-                raise WorkerDiedError('the calibrator is closed')
-            if self._process is not None and self._process.poll() is not None:
+        if self._process is not None and self._process.poll() is not None:
+            _end(self._process)
+            self._process = None
+        if self._process is None and not self._closed:
+            self._process = self._start()
+        if self._closed:
+            if self._process is not None:
                 _end(self._process)
-                self._process = None
-            if self._process is None:
-                self._process = self._start()
-            return self._process
+            raise WorkerDiedError('the calibrator is closed')
+        assert self._process is not None
+        return self._process
 
     def _start(self) -> subprocess.Popen[bytes]:
         environment = dict(os.environ)

@@ -1,9 +1,11 @@
 """Turns are reconstructed in parallel by a few workers while the drive goes on."""
 from __future__ import annotations
 
-import contextlib
 import threading
-from collections.abc import Callable, Iterator, Set
+import time
+from collections import deque
+from collections.abc import Callable, Set
+from dataclasses import dataclass, field
 from typing import Any
 
 from dashcalib_ros import stages
@@ -18,6 +20,21 @@ from dashcalib_ros.workers.worker import Progress, Worker, WorkerDiedError
 
 # if a worker dies on the same work this often, seconds apart, the work is the cause
 ATTEMPTS = 5
+# s between two looks at what is waited for, and between two calls of on_wait
+LOOK_S, CALL_S = 0.2, 0.02
+
+
+@dataclass(eq=False)
+class _Call:
+    """A function that a worker is to run, and what came of it. news: progress not told yet."""
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    tells: bool
+    news: deque[tuple[str, float]] = field(default_factory=deque)
+    done: bool = False
+    result: Any = None
+    error: Exception | None = None
 
 
 class ScenePool:
@@ -27,34 +44,35 @@ class ScenePool:
     If its worker dies or raises, it is tried again after a while. Only a turn on which workers die
     repeatedly, although they start without it, counts as one without a scene.
 
-    All methods may be called from any thread. A thread that calls wait() or run() must not hold a
-    lock that the callbacks, `until` or `progress` take; the other methods do not wait for workers.
-    The pool's threads call the callbacks without holding a lock; callbacks must not raise.
+    Each worker has a thread of the pool. All methods may be called from any thread; only wait()
+    and run() wait for workers. The pool's threads call on_lost and on_trouble, which must not
+    raise.
     """
 
     def __init__(self, config: Config, make_worker: Callable[[], Worker],
-                 queue: int | None = None, on_built: Callable[[], None] = lambda: None,
+                 queue: int | None = None,
                  on_lost: Callable[[str], None] = lambda text: None,
                  on_trouble: Callable[[str], None] = lambda text: None,
-                 keep_pictures: bool = False) -> None:
+                 keep_pictures: bool = False,
+                 on_wait: Callable[[], None] | None = None) -> None:
         """queue: how many turns may wait for a worker, with their images; None: any number.
 
         If there are more, as in a live drive, the least prominent counts as one without a scene.
-        on_built: called when a turn is done. on_lost: called with a line when a turn is given up.
-        on_trouble: called with a line when a worker failed and its work is tried again.
-        keep_pictures: pictures() has one of each turn that is done.
+        on_lost: called with a line when a turn is given up. on_trouble: called with a line when a
+        worker failed and its work is tried again.
+        keep_pictures: pictures() has one of each turn that is done. on_wait: called again and
+        again, in the thread that waits, while wait() or run() waits.
         """
         self._config = config
-        self._on_built, self._on_lost, self._on_trouble = on_built, on_lost, on_trouble
+        self._on_lost, self._on_trouble, self._on_wait = on_lost, on_trouble, on_wait
         self._workers = tuple(make_worker() for _ in range(config.threads))
         self._closed = threading.Event()
         self._threads: list[threading.Thread] = []
         # guards all that follows; held only briefly
         self._changed = threading.Condition()
         self._changes = 0
-        self._free = list(self._workers)
-        # how many run() calls wait for a worker: they have priority over turns
-        self._borrowers = 0
+        # of run(), which wait for a worker: they have priority over turns
+        self._calls: deque[_Call] = deque()
         self._jobs = Jobs(queue)
         # all turns without a result, also those that a worker has now
         self._unbuilt: set[TurnId] = set()
@@ -70,11 +88,7 @@ class ScenePool:
             known = turn.id in self._unbuilt or turn.id in self._scenes
             if self._closed.is_set() or known:
                 return
-            if not self._threads:
-                self._threads = [threading.Thread(target=self._work, daemon=True)
-                                 for _ in self._workers]
-                for thread in self._threads:
-                    thread.start()
+            self._start()
             self._unbuilt.add(turn.id)
             self._put(Job(turn, valid))
 
@@ -117,18 +131,13 @@ class ScenePool:
 
         Raises each error of a turn's reconstruction once; the turn is tried again in any case.
         """
-        while True:
+        def ended() -> bool:
             with self._changed:
-                seen = self._changes
                 if self._errors:
                     raise self._errors.pop(min(self._errors))
-                if self._closed.is_set():
-                    return
-            if until():
-                return
-            with self._changed:
-                if self._changes == seen:
-                    self._changed.wait(0.2)
+            return self._closed.is_set() or until()
+
+        self._wait(ended)
 
     def run(self, function: Callable[..., Any], *arguments: Any,
             progress: Progress | None = None) -> Any:
@@ -136,17 +145,29 @@ class ScenePool:
 
         progress: called in this thread. Raises what the function raises, and WorkerDiedError.
         """
-        failures = 0
-        while True:
-            try:
-                with self._borrowed() as worker:
-                    return worker.call(function, *arguments, progress=progress)
-            except WorkerDiedError as error:
-                failures += 1
-                if self._closed.is_set() or failures == ATTEMPTS:
-                    raise
-                self._on_trouble(str(error))
-            self._closed.wait(back_off_s(failures))
+        for failures in range(1, ATTEMPTS + 1):
+            call = _Call(function, arguments, progress is not None)
+            with self._changed:
+                if not self._closed.is_set():
+                    self._start()
+                self._calls.append(call)
+                self._notify()
+
+            def ended(call: _Call = call) -> bool:
+                while call.news and progress is not None:
+                    progress(*call.news.popleft())
+                return call.done
+
+            self._wait(ended)
+            if call.done and call.error is None:
+                return call.result
+            error = call.error or WorkerDiedError('the calibrator is closed')
+            if (not isinstance(error, WorkerDiedError) or self._closed.is_set()
+                    or failures == ATTEMPTS):
+                raise error
+            self._on_trouble(str(error))
+            self._pause(back_off_s(failures))
+        raise AssertionError('the last attempt returns or raises')
 
     def close(self) -> None:
         """End every worker; a run() in another thread raises, a wait() returns."""
@@ -158,48 +179,60 @@ class ScenePool:
         for thread in self._threads:
             thread.join(timeout=5)
 
-    @contextlib.contextmanager
-    def _borrowed(self) -> Iterator[Worker]:
-        with self._changed:
-            self._borrowers += 1
-            while not self._free and not self._closed.is_set():
-                self._changed.wait()
-            self._borrowers -= 1
-            if not self._free:
-                raise WorkerDiedError('the calibrator is closed')
-            worker = self._free.pop()
-        try:
-            yield worker
-        finally:
-            self._give_back(worker)
+    def _pause(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        self._wait(lambda: time.monotonic() >= end)
 
-    def _give_back(self, worker: Worker) -> None:
-        with self._changed:
-            self._free.append(worker)
-            self._notify()
+    def _wait(self, ended: Callable[[], bool]) -> None:
+        """Wait until the condition holds, or the pool is closed."""
+        while True:
+            with self._changed:
+                seen = self._changes
+            if ended() or self._closed.is_set():
+                return
+            if self._on_wait is not None:
+                self._on_wait()
+            with self._changed:
+                if self._changes == seen:
+                    self._changed.wait(LOOK_S if self._on_wait is None else CALL_S)
 
-    def _work(self) -> None:
+    def _work(self, worker: Worker) -> None:
         # a function of its own: its variables must not keep a turn's images while it waits
-        while self._work_once():
+        while self._work_once(worker):
             pass
 
-    def _work_once(self) -> bool:
-        """Wait for a job and a free worker, and run the job; return False when closed."""
+    def _work_once(self, worker: Worker) -> bool:
+        """Wait for a call or a job, and have the worker do it; return False when closed."""
         with self._changed:
-            while (job := self._next()) is None:
-                if self._closed.is_set():
-                    return False
+            while not self._closed.is_set() and not self._calls:
+                if (job := self._jobs.take()) is not None:
+                    break
                 self._changed.wait(self._jobs.pause_s())
-            worker = self._free.pop()
-        try:
+            else:
+                job = None
+            if self._closed.is_set():
+                return False
+            call = None if job else self._calls.popleft()
+        if job is not None:
             self._reconstruct(worker, job)
-        finally:
-            self._give_back(worker)
+        elif call is not None:
+            self._answer(worker, call)
+        with self._changed:
+            self._notify()
         return True
 
-    def _next(self) -> Job | None:
-        spare = len(self._free) > self._borrowers
-        return self._jobs.take() if spare and not self._closed.is_set() else None
+    def _answer(self, worker: Worker, call: _Call) -> None:
+        def tell(stage: str, share: float) -> None:
+            call.news.append((stage, share))
+            with self._changed:
+                self._notify()
+
+        try:
+            call.result = worker.call(call.function, *call.arguments,
+                                      progress=tell if call.tells else None)
+        except Exception as error:
+            call.error = error
+        call.done = True
 
     def _reconstruct(self, worker: Worker, job: Job) -> None:
         """Run a job: the draft of a turn, or its scene."""
@@ -218,7 +251,6 @@ class ScenePool:
             return
         picture = picture_of(job.turn, done) if self._keep_pictures else None
         self._settle(job.turn.id, done, picture)
-        self._on_built()
 
     def _failed(self, worker: Worker, job: Job, error: Exception) -> None:
         """Have a turn tried again, or give it up."""
@@ -253,6 +285,13 @@ class ScenePool:
         self._on_trouble(f'{error}; {job.name} is tried again')
 
     # with the lock held (a thread may take a Condition's lock again)
+
+    def _start(self) -> None:
+        if not self._threads:
+            self._threads = [threading.Thread(target=self._work, args=(worker,), daemon=True)
+                             for worker in self._workers]
+            for thread in self._threads:
+                thread.start()
 
     def _put(self, job: Job) -> None:
         dropped = self._jobs.put(job)

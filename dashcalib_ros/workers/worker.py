@@ -30,7 +30,7 @@ class Worker(Protocol):
 
         progress: passed to the function as its keyword argument `progress`; called in the calling
         thread. Raises what the function raises, and WorkerDiedError if the worker dies before it
-        answers. May be called from any thread; a second call waits for the first.
+        answers. One thread at a time may call.
         """
 
     def close(self) -> None:

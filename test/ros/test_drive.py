@@ -244,7 +244,7 @@ def test_reset_forgets_the_stored_turns_even_before_the_first_image(start_node, 
     store = TurnStore(str(folder), 10, 3.0, pytest.fail)
     store.load(Origin((640, 360)))
     scene = synthetic_turn(keyframes=8, tracks=60).scene(SYNTHETIC_LENS)
-    store.mirror(lambda: {0: StoredTurn(scene, 5.0, 0.05)})
+    store.mirror({0: StoredTurn(scene, 5.0, 0.05)})
     assert len(list(folder.iterdir())) == 1
     node, camera = start_node(turns__store=folder), make_bench()
     assert camera.call('reset', node).success

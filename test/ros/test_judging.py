@@ -367,7 +367,7 @@ def test_a_camera_that_changed_does_not_learn_from_the_turns_of_earlier_drives(
     store.load(Origin((320, 240), Scale(enlarge=2)))
     lens = Radial((640, 480), 400.0, 402.0, 320.0, 240.0)
     scene = synthetic_turn(lens, keyframes=8, tracks=60).scene(lens)
-    store.mirror(lambda: {TurnId.at(0): StoredTurn(scene, 5.0, 0.05)})
+    store.mirror({TurnId.at(0): StoredTurn(scene, 5.0, 0.05)})
     desk = make_desk(contradictions=1, **{'turns.store': tmp_path / 'turns'})
     assert desk.show() == 400.0
     desk.until(lambda: desk.bench.count('turns stored') == 1)

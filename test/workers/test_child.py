@@ -289,13 +289,6 @@ def test_a_parent_that_was_stopped_itself_blames_nobody(tmp_path):
         parent.stdout.close()
 
 
-def test_calls_from_two_threads_take_turns(child):
-    with (background(lambda: child.call(child_tasks.echo, 'a' * 200_000)) as first,
-          background(lambda: child.call(child_tasks.echo, 'b' * 200_000)) as second):
-        pass
-    assert first == ['a' * 200_000] and second == ['b' * 200_000]
-
-
 def test_close_leaves_no_pipe_open(child):
     child.call(child_tasks.pid)
     process = child._process

@@ -183,9 +183,7 @@ def test_scenes_of_turns_that_left_are_dropped(pool, monkeypatch, tmp_path):
 
 def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build_slowly)
-    settled = threading.Semaphore(0)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=2,
-                     on_built=settled.release)
+    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=2)
     try:
         pool.submit(turn(10, tmp_path / 'flag'), None)
         wait_for((tmp_path / 'flag.10').exists)
@@ -201,8 +199,6 @@ def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch,
         wait_until_built(pool)
         assert list(pool.scenes().items())[2:] == [
             (at(50), 'scene of 50'), (at(30), 'scene of 30')]
-        for _ in (50, 30):
-            assert settled.acquire(timeout=LIMIT_S)
         pool.submit(turn(60), None)
         pool.keep_only(set())
         assert not pool._jobs.turns() and len(pool.unbuilt()) == 0
@@ -226,9 +222,7 @@ def test_a_turn_is_built_in_two_halves(monkeypatch, tmp_path, live, done):
     log, hold = tmp_path / 'log', tmp_path / 'hold'
     use(monkeypatch, child_tasks.build_slowly)
     monkeypatch.setattr(stages, 'finish', child_tasks.finish)
-    settled = []
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=9 if live else None,
-                     on_built=lambda: settled.append(1))
+    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=9 if live else None)
     try:
         pool.submit(turn(5, hold), None)
         wait_for((tmp_path / 'hold.5').exists)
@@ -242,8 +236,6 @@ def test_a_turn_is_built_in_two_halves(monkeypatch, tmp_path, live, done):
         assert pool.scenes() == {
             at(10): [10, 12], at(20): [20, 22, 24, 26, 28], at(30): [30, 32, 34]}
         assert log.read_text().split('\n')[-7:-1] == done
-        # for each scene; not for drafts, nor for the turn that left
-        wait_for(lambda: len(settled) == 3)
     finally:
         pool.close()
 
@@ -325,7 +317,7 @@ def test_who_runs_something_comes_before_the_turns(monkeypatch, tmp_path):
         wait_for(lambda: (tmp_path / 'flag.10').exists())
         pool.submit(turn(20, tmp_path / 'flag'), None)
         with background(lambda: pool.run(os.path.exists, tmp_path / 'flag.20')) as ran:
-            wait_for(lambda: pool._borrowers)
+            wait_for(lambda: pool._calls)
             pool.keep_only({at(20)})
             pool._workers[0].kill()
         assert ran == [False]
@@ -388,6 +380,23 @@ def test_the_condition_may_take_a_lock_that_a_submitter_holds(pool, monkeypatch)
     assert waited == [None] and submitted == [None]
 
 
+def test_who_waits_may_do_other_things_meanwhile(monkeypatch, tmp_path):
+    use(monkeypatch, child_tasks.build)
+    done: list[str] = []
+
+    def meanwhile() -> None:
+        if not done:
+            done.append(threading.current_thread().name)
+            pool.submit(turn(10), None)
+
+    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, on_wait=meanwhile)
+    with contextlib.closing(pool):
+        assert pool.run(child_tasks.add, 1, 2) == 3
+        wait_until_built(pool)
+    assert done == [threading.current_thread().name]
+    assert pool.scenes() == {at(10): 'scene of 10'}
+
+
 def test_run_tries_a_child_that_dies_again(pool, tmp_path):
     assert pool.run(child_tasks.die_at_first, str(tmp_path / 'flag')) == 'second time'
     with pytest.raises(WorkerDiedError, match='exit code 7'):
@@ -407,7 +416,7 @@ def test_close_while_others_wait(pool, monkeypatch, tmp_path):
         wait_for(lambda: flag.exists() and flag.read_text())
         # all workers are busy
         queued = stack.enter_context(background(lambda: pool.run(child_tasks.add, 1, 2)))
-        wait_for(lambda: pool._borrowers)
+        wait_for(lambda: pool._calls)
         pids = pool.pids()
         assert len(pids) == 2
         pool.close()
