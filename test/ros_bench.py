@@ -30,8 +30,8 @@ COMMAND = [sys.executable, '-m', 'dashcalib_ros.ros']
 # the same with diagnostics ten times a second, which tests wait for again and again
 QUICK_COMMAND = [sys.executable, '-c', """
 import sys
-from dashcalib_ros.ros import diagnosis, main
-diagnosis.PERIOD_S = 0.1
+from dashcalib_ros.ros import node, main
+node.PERIOD_S = 0.1
 sys.exit(main())
 """]
 

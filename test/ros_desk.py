@@ -13,8 +13,8 @@ from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.ros import node as node_module
-from dashcalib_ros.ros.news import Result
-from dashcalib_ros.ros.node import CalibratorNode
+from dashcalib_ros.ros.background import Result
+from dashcalib_ros.ros.program import make_node
 
 # s; the tests wait for the diagnostics again and again
 node_module.PERIOD_S = 0.1
@@ -33,7 +33,7 @@ class Desk:
             arguments += ['-p', f'{name}:={value}']
         rclpy.init(args=['calibrator', *arguments])
         self.file, self.closed = home / 'camera.yaml', False
-        self.node = CalibratorNode()
+        self.node = make_node(lifecycle=False)
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self.node)
         self.bench = Bench(context)

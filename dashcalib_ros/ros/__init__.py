@@ -21,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     stopping = Stopping()
     open_closed_streams()
     try:
-        from dashcalib_ros.ros.arguments import check_files, help_text, parse, ros_arguments
+        from dashcalib_ros.ros.settings import check_files, help_text, parse, ros_arguments
         arguments = list(sys.argv[1:] if argv is None else argv)
         wants_help, lifecycle = parse(arguments)
         if wants_help:

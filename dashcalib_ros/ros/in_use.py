@@ -1,33 +1,99 @@
 """The calibration in use: loaded or adopted, replaced or given up, published and kept on disk."""
 from __future__ import annotations
 
+import time
+from typing import Any
+
+from rclpy.clock import Clock
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
+from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
 
-from dashcalib_ros.config import Config
+from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.ros.camera_in_use import CameraInUse
-from dashcalib_ros.ros.complaints import Complaints
-from dashcalib_ros.ros.kept import Kept, Whose
-from dashcalib_ros.ros.news import Result, Watched
-from dashcalib_ros.ros.publication import Publication
-from dashcalib_ros.ros.state import Action, Rules, judge, sigma_text
-from dashcalib_ros.ros.store import Store
-from dashcalib_ros.ros.stream import Source
-from dashcalib_ros.ros.wording import outcome_text
+from dashcalib_ros.ros.background import Result
+from dashcalib_ros.ros.diagnostics import Complaints
+from dashcalib_ros.ros.images import Source
+from dashcalib_ros.ros.parameters import make_publisher
+from dashcalib_ros.ros.state import Action, Rules, judge, outcome_text, sigma_text
+from dashcalib_ros.ros.store import Kept, Store, Whose
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# a reliable publisher reaches reliable and best-effort subscribers alike
+BESIDE_IMAGES = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# s between two looks whether the driver has answered
+LOOK_S = 0.1
 
 
-class CalibrationInUse(CameraInUse):
-    """At most one calibration; its topics and its file are always changed together."""
+def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:
+    """Return the camera as a message; rectified: as ros_camera()'s."""
+    c = ros_camera(camera, rectified)
+    width, height = c.image_size
+    return CameraInfo(header=header, width=width, height=height,
+                      distortion_model=c.distortion_model, d=c.d, k=c.k, r=c.r, p=c.p)
+
+
+class Publication:
+    """Publishes a camera between set() and retract(), and nothing before or after.
+
+    info: what is published now. sent: how many were published beside images.
+    """
+
+    def __init__(self, node: Node, rectified: str) -> None:
+        """rectified: what P shows, the setting of this name."""
+        self.info: CameraInfo | None = None
+        self.sent = 0
+        self._rectified = rectified
+        self._clock = node.get_clock()
+        self._beside = make_publisher(node, CameraInfo, 'camera_info', BESIDE_IMAGES)
+        self._latched = make_publisher(node, CameraInfo, '~/calibration', LATCHED)
+        # the full name of the topic beside the images
+        self.topic = str(self._beside.topic_name)
+
+    def set(self, camera: NamedCamera, frame_id: str) -> None:
+        """Publish this one from now on."""
+        self.info = camera_info(camera.camera, self._now(frame_id), self._rectified)
+        self._latched.publish(self.info)
+
+    def retract(self) -> None:
+        """Stop publishing; the latched topic gets an uncalibrated message."""
+        if self.info is not None:
+            # K[0] = 0 says that it is uncalibrated (sensor_msgs)
+            self._latched.publish(CameraInfo(header=self._now(self.info.header.frame_id)))
+        self.info = None
+
+    def accompany(self, header: Header, size: tuple[int, int]) -> None:
+        """Publish for one image, with its header, if the camera has such images."""
+        if self.info is not None and (self.info.width, self.info.height) == size:
+            self.info.header = header
+            self._beside.publish(self.info)
+            self.sent += 1
+
+    def _now(self, frame_id: str) -> Header:
+        return Header(stamp=self._clock.now().to_msg(), frame_id=frame_id)
+
+
+class CalibrationInUse:
+    """At most one calibration; its topics and its file are always changed together.
+
+    publication: its topics. contradictions: number of calibrations in a row that contradict it.
+    stale: it was given up, and is published only because of publish_stale. confirmed: False for
+    one of a file until turns of this drive agree with it. settled: whether the last calibration's
+    turns have told all that they can of it.
+    """
 
     def __init__(self, node: Node, whose: Whose, store: Store, rules: Rules,
                  complaints: Complaints, rectified: str) -> None:
-        super().__init__(node)
+        self.contradictions = 0
+        self.stale = False
+        self.confirmed = self.settled = True
         self._node = node
-        self._publication = Publication(node, rectified)
+        self.publication = Publication(node, rectified)
         self._kept: Kept | None = None
         self._log = node.get_logger()
         self._whose = whose
@@ -52,28 +118,6 @@ class CalibrationInUse(CameraInUse):
     def file(self) -> str:
         """Return the file's path."""
         return str(self._store.path)
-
-    @property
-    def published(self) -> int:
-        """Return how many camera_infos were published beside images."""
-        return self._publication.sent
-
-    @property
-    def info(self) -> CameraInfo | None:
-        """Return what is published now."""
-        return self._publication.info
-
-    def goal(self, config: Config) -> int:
-        """Return how many turns the next calibration needs.
-
-        The first one needs all turns wanted; to check a published one, a few are enough.
-        """
-        wanted = config.turns.wanted
-        return wanted if self.trusted is None else min(config.verdict.min_turns, wanted)
-
-    def accompany(self, header: Header, size: tuple[int, int]) -> None:
-        """Publish the camera_info of an image, if the camera has such images."""
-        self._publication.accompany(header, size)
 
     def load(self) -> None:
         """Use the file's calibration, if it is an accepted one of this node."""
@@ -110,9 +154,6 @@ class CalibrationInUse(CameraInUse):
         publish_stale: go on publishing a calibration that is given up.
         """
         calibration = result.calibration
-        self.verdict = calibration.verdict
-        for text in calibration.warnings:
-            self._complaints.once(text)
         self.settled = False
         turns = frozenset((result.bank, turn) for turn in calibration.misfits
                           if turn.of_this_drive)
@@ -150,7 +191,7 @@ class CalibrationInUse(CameraInUse):
     def drop(self) -> None:
         """Use no calibration, as at the start; the file stays where it is."""
         self._unpublish()
-        self.verdict, self.contradictions = None, 0
+        self.contradictions = 0
 
     def retire(self) -> tuple[bool, str]:
         """Move the file aside; return whether it is out of the way, and a line about it."""
@@ -183,12 +224,6 @@ class CalibrationInUse(CameraInUse):
         """Leave the file to other nodes."""
         self._store.close()
 
-    def on_watched(self, watched: Watched) -> None:
-        """Take what new turns show; those that agree confirm a calibration that was loaded."""
-        super().on_watched(watched)
-        if watched.camera is self.watched() and watched.monitor.agrees:
-            self.confirmed = True
-
     def warnings(self) -> list[str]:
         """Return warnings about the file and the topic, for the operator."""
         found = [self._store.taken] if self._store.taken else []
@@ -202,7 +237,7 @@ class CalibrationInUse(CameraInUse):
         if self._store.given_up:
             found.append(f'{self.file} was given up, but could not be moved aside: remove it, or '
                          f'the next start of the node publishes it again')
-        beside = self._publication.topic
+        beside = self.publication.topic
         if self._node.count_publishers(beside) > 1:
             found.append(f'another node publishes {beside}: remap it, or its subscribers get both')
         return found
@@ -227,8 +262,63 @@ class CalibrationInUse(CameraInUse):
 
     def _use(self, kept: Kept, confirmed: bool = True) -> None:
         self._kept, self.stale, self.confirmed = kept, False, confirmed
-        self._publication.set(kept.camera, kept.frame_id or '')
+        self.publication.set(kept.camera, kept.frame_id or '')
 
     def _unpublish(self) -> None:
         self._kept, self.stale = None, False
-        self._publication.retract()
+        self.publication.retract()
+
+
+class Commit:
+    """Calls the driver's service without waiting for it; logs the outcome.
+
+    There is one warning if the driver has no service, does not answer, or dies meanwhile.
+    """
+
+    def __init__(self, node: Node, timeout_s: float, clock: Clock) -> None:
+        self._node = node
+        self._timeout_s = timeout_s
+        self._name = node.resolve_service_name('set_camera_info')
+        self._client = node.create_client(SetCameraInfo, 'set_camera_info')
+        self._timer = node.create_timer(LOOK_S, self._look, clock=clock, autostart=False)
+        self._waiting: CameraInfo | None = None
+        self._answer: Any = None
+        self._deadline = 0.0
+
+    def call(self, info: CameraInfo) -> None:
+        """Send a calibration; an earlier call that is not answered yet is cancelled."""
+        self._forget()
+        self._waiting = info
+        self._deadline = time.monotonic() + self._timeout_s
+        self._timer.reset()
+
+    def _look(self) -> None:
+        if self._answer is None and self._client.service_is_ready():
+            request = SetCameraInfo.Request(camera_info=self._waiting)
+            self._answer = self._client.call_async(request)
+        if self._answer is not None and self._answer.done():
+            self._report(self._answer)
+            self._forget()
+        elif time.monotonic() > self._deadline:
+            trouble = (f'there is no service {self._name}' if self._answer is None else
+                       f'{self._name} did not answer within {self._timeout_s:g} s')
+            self._node.get_logger().warning(
+                f'{trouble}: the camera driver does not have the calibration; start a driver with '
+                f'that service, or set commit to false')
+            self._forget()
+
+    def _report(self, answer: Any) -> None:
+        if answer.exception() is not None:
+            text = f'{self._name} failed: {answer.exception()}'
+        elif answer.result().success:
+            self._node.get_logger().info(f'{self._name} took the calibration')
+            return
+        else:
+            text = f'{self._name} refused: {answer.result().status_message}'
+        self._node.get_logger().warning(text)
+
+    def _forget(self) -> None:
+        if self._answer is not None and not self._answer.done():
+            self._client.remove_pending_request(self._answer)
+        self._answer = self._waiting = None
+        self._timer.cancel()

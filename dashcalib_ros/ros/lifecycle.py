@@ -1,12 +1,13 @@
-"""The node as a managed one: images are subscribed only while it is active."""
+"""The nodes as managed ones: images are subscribed only while they are active."""
 from __future__ import annotations
 
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
-from dashcalib_ros.ros.node import CalibratorNode
+from dashcalib_ros.ros.check_node import CheckNode
+from dashcalib_ros.ros.node import CalibratorNode, CameraNode
 
 
-class LifecycleCalibratorNode(LifecycleNodeMixin, CalibratorNode):  # type: ignore[misc]
+class Managed(LifecycleNodeMixin, CameraNode):  # type: ignore[misc]
     """Starts unconfigured. What it learned outlives deactivate; cleanup drops it.
 
     The kept calibration stays latched on ~/calibration in every state. camera_info is published
@@ -14,28 +15,34 @@ class LifecycleCalibratorNode(LifecycleNodeMixin, CalibratorNode):  # type: igno
     """
 
     def __init__(self) -> None:
-        CalibratorNode.__init__(self, listen=False)
+        CameraNode.__init__(self, listen=False)
         LifecycleNodeMixin.__init__(self)
         self.answer_always()
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe the images."""
-        self._images.start()
+        self.listen(True)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; turns and calibration stay."""
-        self._images.stop()
+        self.listen(False)
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin anew: with the kept calibration and without turns."""
-        self._forget(keep_stored=True)
-        self._in_use.load()
-        self._set_goal()
+        self.begin_anew()
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening for good."""
-        self._images.stop()
+        self.listen(False)
         return super().on_shutdown(state)
+
+
+class ManagedCalibratorNode(Managed, CalibratorNode):
+    """A managed node that calibrates."""
+
+
+class ManagedCheckNode(Managed, CheckNode):
+    """A managed node that checks."""

@@ -1,119 +1,224 @@
 """The node: takes images, and publishes a camera_info for each once the camera is calibrated."""
 from __future__ import annotations
 
+import queue
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.input.decode import check_mask, read_mask
+from dashcalib_ros.judge import Verdict
+from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.camera_yaml import check_camera_name
-from dashcalib_ros.ros.camera_url import camera_info_path
-from dashcalib_ros.ros.commit import Commit
-from dashcalib_ros.ros.complaints import Complaints
-from dashcalib_ros.ros.diagnosis import PERIOD_S, Diagnosis
-from dashcalib_ros.ros.given import GivenCalibration
-from dashcalib_ros.ros.images import ImageInput
-from dashcalib_ros.ros.in_use import CalibrationInUse
-from dashcalib_ros.ros.intake import Intake
-from dashcalib_ros.ros.kept import Whose
-from dashcalib_ros.ros.learner import Learner
-from dashcalib_ros.ros.mailbox import Mailbox
-from dashcalib_ros.ros.news import Listener, NewTurn, Result
+from dashcalib_ros.ros.background import (
+    Activity,
+    Learner,
+    News,
+    NewTurn,
+    Result,
+    Started,
+    Trouble,
+    Watched,
+)
+from dashcalib_ros.ros.diagnostics import (
+    OK,
+    WARN,
+    Changes,
+    Complaints,
+    Health,
+    Listening,
+    diagnostic_status,
+    turns_text,
+)
+from dashcalib_ros.ros.images import CURES, ImageInput, Intake, Source
+from dashcalib_ros.ros.in_use import CalibrationInUse, Commit
 from dashcalib_ros.ros.parameters import (
     camera_name,
     changed,
     check_known,
     declare,
+    make_publisher,
     refusal,
     why_read_only,
 )
 from dashcalib_ros.ros.preview import Preview
-from dashcalib_ros.ros.qos import make_publisher
-from dashcalib_ros.ros.state import Rules
-from dashcalib_ros.ros.store import Store
-from dashcalib_ros.ros.stream import Source
-from dashcalib_ros.ros.wording import started_text, turn_text
+from dashcalib_ros.ros.state import Rules, state_of
+from dashcalib_ros.ros.store import Store, Whose, camera_info_path
 from dashcalib_ros.status import Status
+
+# s between two messages on /diagnostics
+PERIOD_S = 1.0
+# further kinds of problems than those of CURES, which come with a message of their own
+TROUBLES = ('undecodable', 'strays', 'failed', 'failed_calibrations', 'failed_watches', 'unsaved',
+            'store', 'workers', 'failed_callbacks', 'preview', 'other_calibrations')
 
 
 class SetupError(DashcalibError):
     """The node's parameters do not fit its images: it ends."""
 
 
-class CalibratorNode(Node):
-    """Connects the camera's topic, the learner's threads and the calibration in use.
+class Mailbox:
+    """Actions that other threads leave for the executor's thread.
 
-    Every callback runs in the executor's single thread and is short. The learner's threads put
-    their results into a mailbox, which is emptied in that same thread: no lock is needed.
+    A guard condition wakes the executor, whose thread then runs what was put in, in order.
+    failed: called in that thread with what an action raised.
     """
+
+    def __init__(self, node: Node, failed: Callable[[Exception], None]) -> None:
+        self._failed = failed
+        self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.wake = node.create_guard_condition(self._empty)
+
+    def put(self, action: Callable[[], None]) -> None:
+        """Let the executor's thread run an action; may be called from any thread."""
+        self._actions.put(action)
+        with suppress(RuntimeError):  # rclpy's, when the context is shut down already
+            self.wake.trigger()
+
+    def blocked(self) -> bool:
+        """Return whether rclpy calls no callback any more, after an exception of its own."""
+        return not self.wake.callback_group.can_execute(self.wake)
+
+    def _empty(self) -> None:
+        with suppress(queue.Empty):
+            while True:
+                action = self._actions.get_nowait()
+                try:
+                    action()
+                except Exception as error:
+                    # the other actions must not wait for the next trigger
+                    self._failed(error)
+
+
+class CameraNode(Node, ABC):
+    """What the node that calibrates and the one that checks have in common.
+
+    It gives the images to the background thread, and compares each turn with a camera in use.
+    Every callback runs in the executor's single thread and is short. The background thread puts
+    its news into a mailbox, which is emptied in that same thread: no lock is needed.
+    """
+
+    # what the node does with the camera, for its first line in the log
+    doing: str
 
     def __init__(self, listen: bool = True) -> None:
         """listen: subscribe the images at once."""
         super().__init__('calibrator')
         self._core, self._own = declare(self)
-        self._topic = self.resolve_topic_name('image_raw')
-        self._name = camera_name(self._own, self._topic)
+        topic = self.resolve_topic_name('image_raw')
+        self._name = camera_name(self._own, topic)
         check_camera_name(self._name)
         self._mask = read_mask(Path(self._own.mask_file)) if self._own.mask_file else None
-        self._complaints = Complaints(self.get_logger().warning)
+        self._log = self.get_logger()
+        self._complaints = Complaints(self._log.warning)
         self._mail = Mailbox(self, self.survive)
-        self._in_use = self._make_in_use()
+        self._changes = Changes(self._log)
+        self._verdict: Verdict | None = None
+        self._watched: NamedCamera | None = None
+        # not the ROS clock: diagnostics must also be published while a simulation is paused
+        self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._open(topic)
         self._magnitude = make_publisher(self, Float64, '~/turn_magnitude', QoSProfile(depth=10))
+        self._diagnostics = make_publisher(self, DiagnosticArray, '/diagnostics',
+                                           QoSProfile(depth=10))
         self._preview = Preview(self, self._own, self._core.rectified,
                                 lambda error: self._later(
                                     lambda: self._failed('preview', error)))
         self._intake = Intake(self._core.motion.rate, self._complaints, self._on_source)
-        # not the ROS clock: diagnostics must also be published while a simulation is paused
-        self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._images = ImageInput(self, self._own, self._on_image, steady)
-        self._diagnosis = Diagnosis(self, self._name, self._complaints, self._images,
-                                    self._intake, self._in_use, self._preview)
         self._images.start()
         # all parameters are declared now, those of qos_overrides too
         check_known(self._parameter_overrides, self._parameters)
         if not listen:
             self._images.stop()
-        self._commit: Commit | None = None
-        self._in_use.load()
+        self._load()
         # so many turns are kept: no more can be wanted later
         self._most_turns = max(self._core.turns.capacity, self._core.turns.wanted)
-        self._learner = Learner(self._core, self._own.queue_size, self._listener(), self._mask)
+        self._learner = Learner(self._core, self._own.queue_size,
+                                lambda news: self._later(lambda: self._on_news(news)),
+                                self._preview, self._mask)
         self._set_goal()
         self.create_timer(PERIOD_S, self._on_tick, clock=steady)
         for name, action in (('calibrate', self._calibrate), ('reset', self._reset),
-                             ('save', self._in_use.save)):
+                             ('save', self._save)):
             self.create_service(Trigger, f'~/{name}', _service(action))
         self.answer_always()
         self.add_on_set_parameters_callback(self._on_parameters)
-        doing = 'checking' if self._own.check_only else 'learning'
-        self.get_logger().info(f'{doing} the camera {self._name!r} from the turns seen on '
-                               f'{self._images.topic}')
+        self._log.info(f'{self.doing} the camera {self._name!r} from the turns seen on '
+                       f'{self._images.topic}')
 
-    def _make_in_use(self) -> CalibrationInUse | GivenCalibration:
-        if self._own.check_only:
-            return GivenCalibration(self, self._complaints, self._set_goal)
-        plain = self._topic == f'{self.get_namespace().rstrip("/")}/image_raw'
-        whose = Whose(self._name, self._topic, plain)
-        return CalibrationInUse(
-            self, whose, Store(camera_info_path(self._own.calibration_url, self._name), whose),
-            Rules(self._own.better, self._own.contradictions), self._complaints,
-            self._core.rectified)
+    # what the two nodes do in their own ways --------------------------------------------------
+
+    @abstractmethod
+    def _open(self, topic: str) -> None:
+        """Make what belongs to the camera in use. topic: of the images."""
+
+    @abstractmethod
+    def _load(self) -> None:
+        """Begin, at the start and after the turns were dropped."""
+
+    @abstractmethod
+    def _trusted(self) -> NamedCamera | None:
+        """Return the camera that each turn is compared with, None if there is none."""
+
+    @abstractmethod
+    def _goal(self) -> int | None:
+        """Return how many turns the next calibration needs; None: there is to be none."""
+
+    def _checked(self) -> NamedCamera | None:
+        """Return the camera that each calibration is to check, None if there is none."""
+        return None
+
+    def _accompany(self, header: Header, size: tuple[int, int]) -> None:
+        """Publish what belongs beside an image."""
+
+    @abstractmethod
+    def _fit(self, source: Source) -> None:
+        """Take what the images are: the camera in use may be of others."""
+
+    @abstractmethod
+    def _judge(self, result: Result) -> None:
+        """Take a new calibration."""
+
+    @abstractmethod
+    def _drop(self) -> None:
+        """Forget what turns said of the camera in use, and the camera if they made it."""
+
+    @abstractmethod
+    def _reset(self) -> tuple[bool, str]:
+        """Begin anew; return success and a message."""
+
+    @abstractmethod
+    def _save(self) -> tuple[bool, str]:
+        """Write the calibration; return success and a message."""
+
+    @abstractmethod
+    def _warnings(self) -> list[str]:
+        """Return warnings for the operator, about the camera in use."""
+
+    @abstractmethod
+    def _health(self, activity: Activity, turns: str) -> Health:
+        """Return what is said of the camera in use; turns: how many there are, in words."""
+
+    # the end, and what fails ------------------------------------------------------------------
 
     def close(self) -> None:
-        """End the learner with its child processes, the drawing, then the node."""
+        """End the background thread with its child processes, the drawing, then the node."""
         self._learner.close()
         self._preview.close()
-        self._in_use.close()
         self.destroy_node()
 
     def survive(self, error: Exception) -> None:
@@ -129,14 +234,22 @@ class CalibratorNode(Node):
         """Return whether rclpy calls no callback any more, after an exception of its own."""
         return self._mail.blocked()
 
+    def _later(self, action: Callable[[], None]) -> None:
+        """Let the executor's thread run an action; called from other threads."""
+        self._mail.put(action)
+
     # images ----------------------------------------------------------------------------------
+
+    def listen(self, active: bool) -> None:
+        """Subscribe the images, or end the subscription."""
+        (self._images.start if active else self._images.stop)()
 
     def _on_image(self, message: Any) -> None:
         taken = self._intake.take(message)
         if taken is None:
             return
         index, source = taken
-        self._in_use.accompany(message.header, source.size)
+        self._accompany(message.header, source.size)
         stamp_ns = self._intake.stamp_ns(message)
         if stamp_ns is not None:
             self._learner.offer(index, stamp_ns, message, source.size, source.frame_id)
@@ -151,69 +264,68 @@ class CalibratorNode(Node):
                 check_mask(self._mask, source.size)
             except InputError as error:
                 raise SetupError(str(error)) from error
-            self.get_logger().info(f'the images on {self._images.topic} are {source}')
+            self._log.info(f'the images on {self._images.topic} are {source}')
         else:
-            self.get_logger().error(
-                f'the camera changes from {before} to {source}: the turns and the calibration '
-                f'are dropped')
-            self._forget(keep_stored=True)
-            self._in_use.load()
-        self._in_use.check(source)
+            self._log.error(f'the camera changes from {before} to {source}: the turns and the '
+                            f'calibration are dropped')
+            self.begin_anew()
+        self._fit(source)
         self._set_goal()
 
-    # what was learned ------------------------------------------------------------------------
-
-    def _listener(self) -> Listener:
-        """Return what the learner's threads call: most of it is left for the executor's."""
-        return Listener(
-            result=lambda result: self._later(lambda: self._on_result(result)),
-            status=lambda status: self._later(lambda: self._on_status(status)),
-            trouble=lambda kind, text: self._later(lambda: self._complaints.say(kind, text)),
-            turn=lambda turn: self._later(lambda: self._on_turn(turn)),
-            started=lambda status: self._later(
-                lambda: self.get_logger().info(started_text(status))),
-            watching=self._preview.wanted, picture=self._preview.show,
-            watched=lambda watched: self._later(lambda: self._in_use.on_watched(watched)))
-
-    def _on_status(self, status: Status) -> None:
-        self._magnitude.publish(Float64(data=float(status.magnitude)))
-
-    def _on_turn(self, turn: NewTurn) -> None:
-        self.get_logger().info(turn_text(turn, self._core.turns.wanted,
-                                         self._in_use.trusted is not None))
-
-    def _on_result(self, result: Result) -> None:
-        if result.bank != self._learner.bank:
-            return  # a reset came in between
-        current = self._intake.source
-        action = self._in_use.judge(result, current.frame_id if current else '',
-                                    self._own.publish_stale)
-        if action in ('adopt', 'replace'):
-            self._learner.restart()
-            if self._own.commit and isinstance(self._in_use, CalibrationInUse):
-                self._commit = self._commit or Commit(self, self._own.commit_timeout,
-                                                      self._steady)
-                self._commit.call(self._in_use.info)
-        elif action == 'give_up':
-            # the turns that contradict it stay, and are used for the next one
-            self._learner.forget_stored(result.calibration.used_turns)
-        elif (action == 'keep' and result.complete
-              # turns that do not confirm it may be all that is known of another camera: they stay
-              and (self._in_use.settled or not self._learner.extend())):
-            # the next calibration must be independent: it uses new turns only
-            self._learner.restart()
+    def begin_anew(self) -> None:
+        """Forget the turns, not those in turns.store; begin as at the start."""
+        self._forget(keep_stored=True)
+        self._load()
         self._set_goal()
 
     def _forget(self, keep_stored: bool = False) -> None:
-        self._in_use.drop()
+        self._verdict = None
+        self._drop()
         self._learner.restart(keep_stored)
         self._intake.forget()
         self._set_goal()
 
+    # what was learned ------------------------------------------------------------------------
+
+    def _on_news(self, news: News) -> None:
+        match news:
+            case Status():
+                self._magnitude.publish(Float64(data=float(news.magnitude)))
+            case NewTurn():
+                self._log.info(news.text(self._core.turns.wanted, self._trusted() is not None))
+            case Started():
+                self._log.info(str(news))
+            case Trouble():
+                self._complaints.say(news.kind, news.text)
+            case Watched():
+                self._on_watched(news)
+            case Result():
+                self._on_result(news)
+
+    def _on_watched(self, watched: Watched) -> None:
+        if watched.camera is self._compared():
+            self._changes.take(watched.monitor)
+
+    def _on_result(self, result: Result) -> None:
+        if result.bank != self._learner.bank:
+            return  # a reset came in between
+        self._verdict = result.calibration.verdict
+        for text in result.calibration.warnings:
+            self._complaints.once(text)
+        self._judge(result)
+        self._set_goal()
+
+    def _compared(self) -> NamedCamera | None:
+        """Return the camera that each turn is compared with; the changes are of this one."""
+        if self._watched is not self._trusted():
+            self._watched = self._trusted()
+            self._changes.forget()
+        return self._watched
+
     def _set_goal(self) -> None:
         """Tell the learner from how many turns to calibrate, and what to compare turns with."""
-        self._learner.goal = self._in_use.goal(self._core)
-        self._learner.compare(self._in_use.watched(), self._in_use.checked)
+        self._learner.goal = self._goal()
+        self._learner.compare(self._compared(), self._checked())
 
     # services and parameters -----------------------------------------------------------------
 
@@ -237,15 +349,9 @@ class CalibratorNode(Node):
 
     def _calibrate(self) -> tuple[bool, str]:
         if self._learner.goal is None:
-            return False, '; '.join(self._in_use.warnings())
-        refusal = self._learner.request()
-        return not refusal, refusal or 'started: /diagnostics will have the result'
-
-    def _reset(self) -> tuple[bool, str]:
-        self.get_logger().warning('reset by request: the turns and the calibration are dropped')
-        self._forget()
-        moved, text = self._in_use.retire()
-        return moved, f'collecting; {text}'
+            return False, '; '.join(self._warnings())
+        refused = self._learner.request()
+        return not refused, refused or 'started: /diagnostics will have the result'
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         before = self._core.turns.wanted
@@ -253,7 +359,7 @@ class CalibratorNode(Node):
                                                 self._most_turns)
         wanted = self._core.turns.wanted
         if wanted != before:
-            self.get_logger().info(f'{wanted} turns are wanted now, not {before}')
+            self._log.info(f'{wanted} turns are wanted now, not {before}')
             self._learner.want(wanted)
             self._set_goal()
         return result
@@ -266,14 +372,131 @@ class CalibratorNode(Node):
                 result.reason = why_read_only(name)
         return result
 
-    # timers, other threads -------------------------------------------------------------------
+    # diagnostics -----------------------------------------------------------------------------
 
     def _on_tick(self) -> None:
-        self._diagnosis.tick(self._learner, self._core.turns.wanted)
+        images, intake, learner = self._images, self._intake, self._learner
+        intake.complain(learner.dropped)
+        if images.listening:
+            images.tell_silence(intake.silent_s)
+        activity, wanted = learner.activity(), self._core.turns.wanted
+        warnings = self._warnings()
+        if images.publishers > 1:
+            warnings.append(f'{images.publishers} publishers on {images.topic}: remap all but one '
+                            f'camera')
+        health = self._health(activity, turns_text(activity, wanted))
+        counts = {'received': intake.received, **health.counts,
+                  **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},
+                  'pictures published': self._preview.published}
+        status = diagnostic_status(
+            f'{self.get_fully_qualified_name().strip("/")}: camera calibration', self._name,
+            Listening(images.topic, images.reliability, images.listening, intake.silent_s),
+            activity, wanted, self._verdict, self._changes, warnings, health, counts)
+        camera = self._trusted() if health.published is None else health.published
+        self._preview.tell(status.message, camera.camera if camera else None)
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
 
-    def _later(self, action: Callable[[], None]) -> None:
-        """Let the executor's thread run an action; called from other threads."""
-        self._mail.put(action)
+
+class CalibratorNode(CameraNode):
+    """Calibrates the camera, and publishes what is accepted beside its images."""
+
+    doing = 'learning'
+
+    def _open(self, topic: str) -> None:
+        plain = topic == f'{self.get_namespace().rstrip("/")}/image_raw'
+        whose = Whose(self._name, topic, plain)
+        self._in_use = CalibrationInUse(
+            self, whose, Store(camera_info_path(self._own.camera_info_url, self._name), whose),
+            Rules(self._own.better, self._own.contradictions), self._complaints,
+            self._core.rectified)
+        self._commit: Commit | None = None
+
+    def close(self) -> None:
+        """End it, and leave the calibration's file to other nodes."""
+        self._in_use.close()
+        super().close()
+
+    def _load(self) -> None:
+        self._in_use.load()
+
+    def _trusted(self) -> NamedCamera | None:
+        return self._in_use.trusted
+
+    def _goal(self) -> int:
+        """Return how many turns the next calibration needs.
+
+        The first one needs all turns wanted; to check a published one, a few are enough.
+        """
+        wanted = self._core.turns.wanted
+        return (wanted if self._trusted() is None
+                else min(self._core.verdict.min_turns, wanted))
+
+    def _accompany(self, header: Header, size: tuple[int, int]) -> None:
+        self._in_use.publication.accompany(header, size)
+
+    def _fit(self, source: Source) -> None:
+        self._in_use.check(source)
+
+    def _on_watched(self, watched: Watched) -> None:
+        super()._on_watched(watched)
+        if watched.camera is self._compared() and watched.monitor.agrees:
+            self._in_use.confirmed = True
+
+    def _judge(self, result: Result) -> None:
+        current = self._intake.source
+        action = self._in_use.judge(result, current.frame_id if current else '',
+                                    self._own.publish_stale)
+        if action in ('adopt', 'replace'):
+            self._learner.restart()
+            if self._own.commit and self._in_use.publication.info is not None:
+                self._commit = self._commit or Commit(self, self._own.commit_timeout,
+                                                      self._steady)
+                self._commit.call(self._in_use.publication.info)
+        elif action == 'give_up':
+            # the turns that contradict it stay, and are used for the next one
+            self._learner.forget_stored(result.calibration.used_turns)
+        elif (action == 'keep' and result.complete
+              # turns that do not confirm it may be all that is known of another camera: they stay
+              and (self._in_use.settled or not self._learner.extend())):
+            # the next calibration must be independent: it uses new turns only
+            self._learner.restart()
+
+    def _drop(self) -> None:
+        self._in_use.drop()
+
+    def _reset(self) -> tuple[bool, str]:
+        self._log.warning('reset by request: the turns and the calibration are dropped')
+        self._forget()
+        moved, text = self._in_use.retire()
+        return moved, f'collecting; {text}'
+
+    def _save(self) -> tuple[bool, str]:
+        return self._in_use.save()
+
+    def _warnings(self) -> list[str]:
+        return self._in_use.warnings()
+
+    def _health(self, activity: Activity, turns: str) -> Health:
+        in_use, verdict = self._in_use, self._verdict
+        state = state_of(in_use.trusted is not None, activity.calibrating,
+                         verdict is not None and verdict.level != 'accepted')
+        if in_use.camera is not None:
+            known = 'calibrated' if in_use.confirmed else 'calibrated, unconfirmed'
+            level, message = OK, f'{known}; {turns} for the next check of it'
+        elif state == 'calibrating':
+            level, message = WARN, f'calibrating with {turns}: {activity.stage}'
+        elif state == 'refused_so_far' and verdict is not None:
+            why = verdict.reasons[0] if verdict.reasons else verdict.level
+            level, message = WARN, f'not calibrated, {turns}; so far {verdict.level}: {why}'
+        else:
+            level, message = WARN, f'not calibrated yet: {turns}'
+        error = f'the published calibration is contradicted; new turns: {turns}'
+        return Health(state, level, message, in_use.camera, in_use.confirmed,
+                      error if in_use.stale else '', in_use.file,
+                      counts={'camera_info published': in_use.publication.sent,
+                              'contradictions': in_use.contradictions})
 
 
 def _service(action: Callable[[], tuple[bool, str]]) -> Callable[..., Trigger.Response]:

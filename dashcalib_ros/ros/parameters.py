@@ -1,10 +1,11 @@
-"""The node's parameters: every setting of the core by its own name, and the node's own."""
+"""The node's parameters: settings of the core by their own names, the node's own, and QoS."""
 from __future__ import annotations
 
 import dataclasses
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -16,6 +17,10 @@ from rcl_interfaces.msg import (
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSPolicyKind, QoSProfile
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from dashcalib_ros.config import Config, describe
@@ -23,25 +28,30 @@ from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.report.camera_yaml import CAMERA_NAME
 from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig
 
-OF_ROS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
+# of the QoS that users may override: durability is not among them, as a latched topic that is not
+# latched would break its readers
+POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
 
 def declare(node: Node) -> tuple[Config, NodeConfig]:
-    """Declare every parameter on the node and return what was given.
+    """Declare the parameters on the node and return what was given.
 
+    Those for experts are declared where they are given, so that a list of all fits a screen.
     Raises ConfigError, or rclpy's ParameterException for a value out of its range.
     """
-    changes = {name: _declared(node, name, spec) for name, spec in describe()}
+    given = node._parameter_overrides
+    changes = {name: _declared(node, name, spec) for name, spec in describe()
+               if not spec.metadata['expert'] or name in given}
     own = {spec.name: _declared(node, spec.name, spec) for spec in dataclasses.fields(NodeConfig)}
     return Config().replace(changes), NodeConfig(**_floats(own))
 
 
-def check_known(names: Iterable[str], known: Iterable[str]) -> None:
+def check_known(names: Iterable[str], declared: Iterable[str]) -> None:
     """Check that each parameter that was given is one of this node.
 
     Raises ConfigError with the nearest name that there is.
     """
-    known = list(known)
+    known = [*declared, *(name for name, _ in describe())]
     for name in names:
         if name in known:
             continue
@@ -122,3 +132,45 @@ def _floats(values: Mapping[str, Any]) -> dict[str, Any]:
     defaults = NodeConfig()
     return {name: float(value) if type(value) is int and isinstance(getattr(defaults, name), float)
             else value for name, value in values.items()}
+
+
+def make_publisher(node: Node, kind: type, topic: str, profile: QoSProfile) -> Publisher:
+    """Make a publisher; raises ConfigError for an override that QoS has not."""
+    options = QoSOverridingOptions(POLICIES, callback=_checked)
+    with _told(topic, 'publisher'):
+        return node.create_publisher(kind, topic, profile, qos_overriding_options=options)
+
+
+def make_subscription(node: Node, kind: type, topic: str, callback: Callable[[Any], None],
+                      profile: QoSProfile, fixed: Iterable[QoSPolicyKind] = ()) -> Subscription:
+    """Make a subscription; fixed: policies that are not for the user.
+
+    Raises ConfigError for an override that QoS has not.
+    """
+    options = QoSOverridingOptions([each for each in POLICIES if each not in fixed],
+                                   callback=_checked)
+    with _told(topic, 'subscription'):
+        return node.create_subscription(kind, topic, callback, profile,
+                                        qos_overriding_options=options)
+
+
+def override_of(node: Node, topic: str, policy: QoSPolicyKind) -> Any:
+    """Return the user's value of a policy of a subscription, None if there is none."""
+    name = f'qos_overrides.{topic}.subscription.{policy.name.lower()}'
+    given = node._parameter_overrides.get(name)
+    return None if given is None else given.value
+
+
+def _checked(profile: QoSProfile) -> SetParametersResult:
+    return SetParametersResult(successful=profile.depth > 0, reason='depth must be 1 or more')
+
+
+@contextmanager
+def _told(topic: str, what: str) -> Iterator[None]:
+    """Turn what rclpy raises for an odd override into a ConfigError."""
+    try:
+        yield
+    except (RuntimeError, InvalidQosOverridesError) as error:
+        raise ConfigError(f'qos_overrides of the {what} of {topic}: {error}; history is keep_last '
+                          f'or keep_all, depth a number, reliability reliable or '
+                          f'best_effort') from error

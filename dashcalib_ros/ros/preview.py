@@ -1,8 +1,12 @@
-"""Pictures for people, drawn and published in a thread of their own while someone subscribes."""
+"""Pictures for people: tracks, mask and state, and the picture without distortion.
+
+They are drawn and published in a thread of their own while someone subscribes.
+"""
 from __future__ import annotations
 
 import array
 import os
+import queue
 import threading
 import time
 from collections.abc import Callable
@@ -17,24 +21,39 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage
 
+from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.ros.news import Picture
-from dashcalib_ros.ros.pictures import Rectifier, overlay
-from dashcalib_ros.ros.qos import make_publisher
+from dashcalib_ros.camera.rectified import rectified_matrix
+from dashcalib_ros.ros.background import Picture
+from dashcalib_ros.ros.parameters import make_publisher
 from dashcalib_ros.ros.settings import NodeConfig
+from dashcalib_ros.status import View
 
 # a viewer wants the newest only; a reliable publisher reaches both kinds of subscribers
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+# of the pictures as JPEG; 95 takes twice the space
+QUALITY = 80
 # of the drawing thread: the node's other work comes first
 NICE = 10
 # of the time between two pictures; images do not come exactly on time
 EARLY = 0.1
+# blue, green, red
+TRACK, INK = (90, 230, 90), (255, 255, 255)
+# the tint: what is taken away, and what is added
+LESS, MORE = (80.0, 80.0, 0.0, 0.0), (0.0, 0.0, 60.0, 0.0)
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+# binary digits after the point that cv2 draws with
+SHIFT = 4
+# outside of the picture, for pixels that the camera does not see
+NOWHERE = -1e6
+# rows that are projected at a time: rays of a whole large picture are some 100 MB
+BAND = 64
 
 
 class Preview:
     """Publishes ~/overlay/compressed and ~/rectified/compressed.
 
-    The detecting thread asks wanted() for each image and gives those that are to show(). Only the
+    The background thread asks wanted() for each image and gives those that are to show(). Only the
     newest is kept, so that neither it nor the image callback ever waits for a drawing.
     published: how many pictures, of both kinds.
     """
@@ -46,17 +65,13 @@ class Preview:
         self._overlay = make_publisher(node, CompressedImage, '~/overlay/compressed', NEWEST)
         self._rectified = make_publisher(node, CompressedImage, '~/rectified/compressed', NEWEST)
         self._period_s = (1 - EARLY) / config.preview_rate
-        self._quality = config.preview_quality
         self._failed = failed
         self._rectifier = Rectifier(rectified)
-        # used by the detecting thread only
+        # used by the background thread only
         self._due = 0.0
-        # guards _newest, _text, _camera and _closed
-        self._changed = threading.Condition()
-        self._newest: Picture | None = None
-        self._text = ''
-        self._camera: Camera | None = None
-        self._closed = False
+        # the newest picture only; None ends the thread
+        self._waiting: queue.Queue[Picture | None] = queue.Queue(1)
+        self._state: tuple[str, Camera | None] = ('', None)
         self._thread = threading.Thread(target=self._draw, name='preview', daemon=True)
         self._thread.start()
 
@@ -71,36 +86,30 @@ class Preview:
 
     def show(self, picture: Picture) -> None:
         """Take an image to draw; one that waits still is dropped."""
-        with self._changed:
-            self._newest = picture
-            self._changed.notify()
+        self._put(picture)
 
     def tell(self, text: str, camera: Camera | None) -> None:
         """Take the state that the overlay shows, and the camera in use."""
-        with self._changed:
-            self._text, self._camera = text, camera
+        self._state = text, camera
 
     def close(self) -> None:
         """End the thread."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
+        self._put(None)
         self._thread.join(timeout=10)
+
+    def _put(self, picture: Picture | None) -> None:
+        with suppress(queue.Empty):
+            self._waiting.get_nowait()
+        with suppress(queue.Full):  # of two threads that put, one comes first
+            self._waiting.put_nowait(picture)
 
     def _draw(self) -> None:
         with suppress(OSError, AttributeError):
             # on Linux, of this thread only
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
-        while True:
-            with self._changed:
-                while self._newest is None and not self._closed:
-                    self._changed.wait()
-                if self._closed or self._newest is None:
-                    return
-                picture, self._newest = self._newest, None
-                text, camera = self._text, self._camera
+        while (picture := self._waiting.get()) is not None:
             try:
-                self._publish(picture, text, camera)
+                self._publish(picture, *self._state)
             except Exception as error:
                 self._failed(error)
 
@@ -112,8 +121,87 @@ class Preview:
             self._send(self._rectified, picture, self._rectifier.rectified(picture.image, camera))
 
     def _send(self, publisher: Publisher, picture: Picture, drawn: npt.NDArray[np.uint8]) -> None:
-        _, data = cv2.imencode('.jpg', drawn, [cv2.IMWRITE_JPEG_QUALITY, self._quality])
+        _, data = cv2.imencode('.jpg', drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         message: Any = CompressedImage(header=picture.header, format='jpeg',
                                        data=array.array('B', data.tobytes()))
         publisher.publish(message)
         self.published += 1
+
+
+def overlay(image: GreyImage, view: View, text: str) -> npt.NDArray[np.uint8]:
+    """Return (h, w, 3), bgr: the image with tracks, the ego vehicle tinted, and a line of text."""
+    drawn: Any = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    if view.valid is not None:
+        _tint(drawn, view.valid)
+    thickness = max(1, round(image.shape[1] / 640))
+    before, now = (np.rint(xy * (1 << SHIFT)).astype(np.int32)
+                   for xy in (view.points.before, view.points.now))
+    cv2.polylines(drawn, list(np.stack([before, now], axis=1)), False, TRACK, thickness,
+                  cv2.LINE_AA, SHIFT)
+    for x, y in now.tolist():
+        cv2.circle(drawn, (x, y), thickness << (SHIFT + 1), TRACK, -1, cv2.LINE_AA, SHIFT)
+    if text:
+        _write(drawn, text)
+    return np.asarray(drawn)
+
+
+def _tint(drawn: Any, valid: Mask) -> None:
+    """Tint what is not valid, in place; valid may be of the image in another size."""
+    size = drawn.shape[1::-1]
+    hidden = cv2.resize((~valid).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    # both: white and black places become red, too; cv2's stubs do not know numbers for pictures
+    subtract: Any = cv2.subtract
+    add: Any = cv2.add
+    subtract(drawn, LESS, drawn, hidden)
+    add(drawn, MORE, drawn, hidden)
+
+
+def _write(drawn: Any, text: str) -> None:
+    """Write a line at the bottom on a dark bar, as large as fits."""
+    # cv2's fonts have ASCII only
+    text = text.replace('°', ' deg').replace('±', '+-').encode('ascii', 'replace').decode()
+    height, width = drawn.shape[:2]
+    margin = max(4, width // 100)
+    (needed, _), _ = cv2.getTextSize(text, FONT, 1.0, 1)
+    scale = min(width / 1100, (width - 2 * margin) / needed)
+    thickness = max(1, round(1.6 * scale))
+    (_, tall), below = cv2.getTextSize(text, FONT, scale, thickness)
+    bar = min(height, tall + below + margin)
+    drawn[height - bar:] //= 4
+    cv2.putText(drawn, text, (margin, height - below - margin // 2), FONT, scale, INK, thickness,
+                cv2.LINE_AA)
+
+
+class Rectifier:
+    """Takes the distortion out of images; what that needs is made once for each camera."""
+
+    def __init__(self, rectified: str) -> None:
+        """rectified: what the picture shows, the setting of this name."""
+        self._rectified = rectified
+        self._camera: Camera | None = None
+        self._maps: tuple[Any, Any] | None = None
+
+    def rectified(self, image: GreyImage, camera: Camera) -> GreyImage:
+        """Return (h, w), as a camera with P of camera_info sees it; black where it sees nothing.
+
+        image: of the camera's size.
+        """
+        if self._maps is None or camera != self._camera:
+            self._maps, self._camera = self._maps_of(camera), camera
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR), np.uint8)
+
+    def _maps_of(self, camera: Camera) -> tuple[Any, Any]:
+        """Return where each pixel of the rectified picture is in the image, as cv2 has it."""
+        matrix = rectified_matrix(camera, self._rectified)
+        width, height = camera.image_size
+        places = np.empty((height, width, 2), np.float32)
+        for top in range(0, height, BAND):
+            band = places[top:top + BAND]
+            y, x = np.mgrid[top:top + len(band), :width]
+            rays = np.stack([(x - matrix[0, 2]) / matrix[0, 0], (y - matrix[1, 2]) / matrix[1, 1],
+                             np.ones(x.shape)], axis=-1)
+            band[:] = np.nan_to_num(camera.project(rays), nan=NOWHERE)
+        # cv2's stubs do not know that both maps may be in one
+        convert: Any = cv2.convertMaps
+        whole, fractions = convert(places, None, cv2.CV_16SC2)
+        return whole, fractions

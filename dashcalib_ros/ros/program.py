@@ -1,25 +1,32 @@
 """From the command line to a spinning node and back to an exit code."""
 from __future__ import annotations
 
+import ctypes
 import re
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import rclpy
 import rclpy.utilities
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 
 from dashcalib_ros.errors import ConfigError, DashcalibError
-from dashcalib_ros.ros.memory import give_images_back
-from dashcalib_ros.ros.node import CalibratorNode, SetupError
+from dashcalib_ros.ros.check_node import CheckNode
+from dashcalib_ros.ros.node import CalibratorNode, CameraNode, SetupError
 from dashcalib_ros.ros.stopping import Stopping
 from dashcalib_ros.standard_streams import write_stderr
 
 FAILED = 2
 # s; the wait after a failed callback doubles from the first to the second while all fail
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.01, 1.0
+# bytes; images are larger, most else is smaller
+LARGE = 262_144
+M_MMAP_THRESHOLD = -3
 
 
 def run(argv: Sequence[str], lifecycle: bool, stopping: Stopping) -> int:
@@ -27,7 +34,7 @@ def run(argv: Sequence[str], lifecycle: bool, stopping: Stopping) -> int:
 
     argv: ROS's arguments. lifecycle: it waits for configure and activate.
     """
-    node: CalibratorNode | None = None
+    node: CameraNode | None = None
     give_images_back()
     try:
         start_ros(argv)
@@ -51,12 +58,17 @@ def run(argv: Sequence[str], lifecycle: bool, stopping: Stopping) -> int:
     return 0
 
 
-def make_node(lifecycle: bool) -> CalibratorNode:
+def make_node(lifecycle: bool) -> CameraNode:
     """Make the node; what only a managed one needs is imported for it only."""
+    # a parameter tells which node is to be made, and only a node knows its parameters
+    asked = Node('calibrator', enable_rosout=False, start_parameter_services=False)
+    any_type = ParameterDescriptor(dynamic_typing=True)
+    check_only = asked.declare_parameter('check_only', False, any_type).value is True
+    asked.destroy_node()
     if not lifecycle:
-        return CalibratorNode()
-    from dashcalib_ros.ros.lifecycle import LifecycleCalibratorNode
-    return LifecycleCalibratorNode()
+        return CheckNode() if check_only else CalibratorNode()
+    from dashcalib_ros.ros.lifecycle import ManagedCalibratorNode, ManagedCheckNode
+    return ManagedCheckNode() if check_only else ManagedCalibratorNode()
 
 
 def start_ros(argv: Sequence[str]) -> None:
@@ -79,7 +91,7 @@ class Executor(SingleThreadedExecutor):
     _sigint_gc: Any = None
 
 
-def spin(node: CalibratorNode, stopping: Stopping) -> None:
+def spin(node: CameraNode, stopping: Stopping) -> None:
     """Run the node's callbacks until the context is shut down, or a signal asked for the end.
 
     A signal that comes while rclpy installs its own handlers does not shut the context down; the
@@ -104,3 +116,15 @@ def spin(node: CalibratorNode, stopping: Stopping) -> None:
                 node.survive(error)
                 time.sleep(wait_s)
                 wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+
+
+def give_images_back() -> None:
+    """Have glibc return each image to the system as soon as it is freed.
+
+    glibc maps large blocks separately, but when the first one is freed it raises the threshold, up
+    to 32 MB. From then on images are in the heap among small blocks, and are not returned: 360 MB
+    after four turns of 1280x720 were reconstructed, instead of 155. Setting the threshold keeps it
+    fixed; detection takes 8 % longer. Nothing is done with other C libraries.
+    """
+    with suppress(AttributeError, OSError):
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE)

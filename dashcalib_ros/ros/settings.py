@@ -1,14 +1,58 @@
-"""What only the node needs to be told. No ROS is imported: the help is printed without it."""
+"""What only the node is told: its settings and its command line. No ROS is imported."""
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from dashcalib_ros.config import _check, expert, setting
-from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.config import _check, describe, expert, setting
+from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 
 # these take effect at once; all others are read-only while the node runs
 CHANGEABLE = ('commit', 'publish_stale', 'turns.wanted')
+HELP = """\
+usage: ros2 run dashcalib_ros calibrator [--lifecycle]
+           [--ros-args -r FROM:=TO -p NAME:=VALUE --params-file FILE ...]
+       calibrator ...     where it was installed by pip
+
+Learns a camera from the turns that the car takes. Nothing is published on
+camera_info until a calibration is accepted; from then on each image has its
+camera_info.
+
+options:
+  -h, --help     show this help and exit
+  --lifecycle    be a managed node: it waits for configure and activate
+
+topics, in the node's namespace:
+  image_raw               in   sensor_msgs/Image, or image_raw/compressed with
+                               image_transport:=compressed; remap image_raw
+  camera_info             out  sensor_msgs/CameraInfo, one for each image; with
+                               check_only it is the driver's, and comes in
+  ~/calibration           out  the same, latched; K[0] = 0 when it is taken back
+  ~/check                 out  std_msgs/String, JSON, latched: is the driver's
+                               calibration right? with check_only only
+  ~/turn_magnitude        out  std_msgs/Float64, for plotting
+  ~/overlay/compressed    out  tracks, mask and state, while someone subscribes
+  ~/rectified/compressed  out  without distortion, while someone subscribes
+  /diagnostics            out  what is missing, once a second
+
+services (std_srvs/Trigger): ~/calibrate, ~/reset, ~/save
+
+main parameters (* may be changed while the node runs):
+{parameters}
+All {count} parameters: config/calibrator.yaml in the package's share folder.
+
+example:
+  ros2 run dashcalib_ros calibrator --ros-args -r __ns:=/front \\
+      -r image_raw:=image -p image_transport:=compressed -p turns.wanted:=3
+"""
+COLUMNS = 80
+# settings of the core that are most often set
+CORE = ('model', 'rectified', 'turns.wanted', 'turns.store', 'motion.rate', 'verdict.max_sigma')
 
 
 @dataclass(frozen=True)
@@ -26,8 +70,6 @@ class NodeConfig:
     camera_info_url: str = setting(
         '', 'of the accepted calibration: a path, file:// or package://, with ${ROS_HOME} and '
             '${NAME}; empty: file://${ROS_HOME}/camera_info/${NAME}.yaml')
-    camera_info_file: str = setting(
-        '', 'older name of camera_info_url; set only one of them', expert=True)
     mask_file: str = setting(
         '', 'picture as large as the images, black where they are not used; empty: none')
     commit: bool = setting(
@@ -42,8 +84,6 @@ class NodeConfig:
     preview_rate: float = expert(
         5.0, 'Hz; overlay and rectified picture at the most: people follow a drive at 5', 0.1,
         30.0)
-    preview_quality: int = expert(
-        80, 'of these pictures as JPEG; 95 takes twice the space', 10, 100)
     commit_timeout: float = expert(5.0, 's; how long the driver may take to answer', 0.1, 600.0)
     better: float = expert(
         0.7, "ratio; a new calibration replaces the old one when fx's sigma falls to this",
@@ -54,14 +94,80 @@ class NodeConfig:
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self):
             _check(spec.name, spec, getattr(self, spec.name))
-        if self.camera_info_url and self.camera_info_file:
-            raise ConfigError('camera_info_file is the older name of camera_info_url: set only '
-                              'camera_info_url')
         if self.check_only and self.commit:
             raise ConfigError("commit changes the driver's calibration, which check_only only "
                               'checks: set one of them')
 
-    @property
-    def calibration_url(self) -> str:
-        """Return the URL or path of the calibration's file; empty for the default."""
-        return self.camera_info_url or self.camera_info_file
+
+def help_text() -> str:
+    """Return what --help prints."""
+    core = list(describe())
+    own = [(spec.name, spec) for spec in dataclasses.fields(NodeConfig)]
+    main = [each for each in own if not each[1].metadata['expert']]
+    main += [each for each in core if each[0] in CORE]
+    return HELP.format(parameters='\n'.join(_row(*each) for each in main),
+                       count=len(own) + len(core))
+
+
+def parse(argv: Sequence[str]) -> tuple[bool, bool]:
+    """Return whether help is wanted, and whether the node is to be a lifecycle node.
+
+    argv: without the program's name. Raises ConfigError for arguments that there are not.
+    """
+    wanted = {'--help': False, '--lifecycle': False}
+    for argument in _own(argv):
+        name = '--help' if argument == '-h' else argument
+        if name not in wanted:
+            raise ConfigError(f'unknown argument {argument!r}: topics and parameters go after '
+                              f'--ros-args, as in --ros-args -r image_raw:=/camera/image_raw; '
+                              f'--help tells more')
+        wanted[name] = True
+    return wanted['--help'], wanted['--lifecycle']
+
+
+def ros_arguments(argv: Sequence[str]) -> list[str]:
+    """Return the arguments without the node's own."""
+    return [each for each in argv if each != '--lifecycle']
+
+
+def check_files(argv: Sequence[str]) -> None:
+    """Check the files of parameters; raises InputError in one line, where rcl prints several."""
+    for option, name in itertools.pairwise(argv):
+        if option != '--params-file':
+            continue
+        data = parse_yaml(read_text(Path(name), YAML_BYTES), name)
+        if not _has_parameters(data):
+            raise InputError(f"{name} is no file of parameters: it begins with '/**:' (or the "
+                             f"node's name), then 'ros__parameters:', each indented below")
+
+
+def _has_parameters(data: object) -> bool:
+    """Return whether ros__parameters stands below a node's name, in namespaces or not."""
+    if not isinstance(data, dict):
+        return False
+    return any(isinstance(value, dict) and (isinstance(value.get('ros__parameters'), dict)
+                                            or _has_parameters(value))
+               for value in data.values())
+
+
+def _own(argv: Sequence[str]) -> list[str]:
+    """Return the arguments outside of --ros-args ... [--]."""
+    own, of_ros = [], False
+    for argument in argv:
+        if argument == '--ros-args':
+            of_ros = True
+        elif of_ros:
+            of_ros = argument != '--'
+        else:
+            own.append(argument)
+    return own
+
+
+def _row(name: str, spec: dataclasses.Field[object]) -> str:
+    about = spec.metadata
+    value = f'{spec.default}'.lower() if isinstance(spec.default, bool) else f'{spec.default!r}'
+    text = f'{about["reason"]}; default {value}'
+    if about['choices']:
+        text += f'; one of {", ".join(about["choices"])}'
+    name += ' *' if name in CHANGEABLE else ''
+    return textwrap.fill(text, COLUMNS, initial_indent=f'  {name:<21}', subsequent_indent=' ' * 23)

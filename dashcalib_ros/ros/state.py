@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.contradiction import contradicted
 from dashcalib_ros.judge.verdict import STEADY
@@ -18,6 +19,11 @@ from dashcalib_ros.report.wording import digits_of
 
 State = Literal['collecting', 'calibrating', 'calibrated', 'refused_so_far', 'checking']
 Action = Literal['wait', 'adopt', 'keep', 'replace', 'give_up']
+NEXT = {
+    'weak': 'it is calculated again with each better turn',
+    'refused': 'it is tried again with each better turn: those of 60° or more, at town speed and '
+               'in daylight, teach most',
+}
 
 
 @dataclass(frozen=True)
@@ -97,3 +103,11 @@ def sigma_text(camera: NamedCamera) -> str:
             value += f' ± {camera.sigma[name]:.{digits}f}'
         parts.append(value)
     return ', '.join(parts)
+
+
+def outcome_text(calibration: Calibration, why: str) -> str:
+    """Return a line about a calibration that is not adopted; why: the reasons."""
+    level = calibration.verdict.level
+    parts = [f'a calibration of {counted(calibration.turns_used, "turn")} is {level}'
+             + (f': {why}' if why else ''), NEXT.get(level, '')]
+    return '; '.join(part for part in parts if part)

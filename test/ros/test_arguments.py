@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from dashcalib_ros.errors import ConfigError, InputError
-from dashcalib_ros.ros.arguments import check_files, help_text, parse, ros_arguments
-from dashcalib_ros.ros.camera_url import camera_info_path
-from dashcalib_ros.ros.settings import NodeConfig
+from dashcalib_ros.ros.settings import check_files, help_text, parse, ros_arguments
+from dashcalib_ros.ros.store import camera_info_path
 
 LIMIT = 60.0
 # ROS is not there, and nothing of it may be needed
@@ -146,10 +145,3 @@ def test_a_package_is_looked_up(monkeypatch, tmp_path):
 def test_other_urls_are_refused_with_the_cure(url, words):
     with pytest.raises(InputError, match=words):
         camera_info_path(url, 'front')
-
-
-def test_the_older_name_of_the_file_is_taken_but_not_both():
-    assert NodeConfig(camera_info_file='/a.yaml').calibration_url == '/a.yaml'
-    assert NodeConfig(camera_info_url='/b.yaml').calibration_url == '/b.yaml'
-    with pytest.raises(ConfigError, match='set only camera_info_url'):
-        NodeConfig(camera_info_file='/a.yaml', camera_info_url='/b.yaml')

@@ -26,10 +26,10 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.report.camera_file import camera_of_message
-from dashcalib_ros.ros import learner, node
-from dashcalib_ros.ros.messages import camera_info
+from dashcalib_ros.ros import background, node
+from dashcalib_ros.ros.images import LASTING
+from dashcalib_ros.ros.in_use import camera_info
 from dashcalib_ros.ros.settings import NodeConfig
-from dashcalib_ros.ros.stream import LASTING
 from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.status import Status
 
@@ -48,7 +48,7 @@ class Core:
     dark: ClassVar[bool] = False
 
     def __init__(self, config=None, mask=None, verbose=False, live=False, use_stored=True,
-                 warn=None, inline=False, on_trouble=None):
+                 warn=None, inline=False, on_trouble=None, on_wait=None):
         self.ready, self.strangers = (), ()
         Core.newest = self
 
@@ -94,8 +94,8 @@ class Core:
 @pytest.fixture
 def desk(make_desk, monkeypatch):
     """Make a node with such a core; with a driver and a reader of ~/check beside it."""
-    monkeypatch.setattr(learner, 'Calibrator', Core)
-    monkeypatch.setattr(learner, 'LOOK_S', 0.05)
+    monkeypatch.setattr(background, 'Calibrator', Core)
+    monkeypatch.setattr(background, 'LOOK_S', 0.05)
     monkeypatch.setattr(node, 'PERIOD_S', 0.1)
 
     def make(**parameters):
@@ -196,12 +196,12 @@ def test_it_answers_as_soon_as_the_turns_can_tell(desk, monkeypatch):
     desk.until(lambda: heard[-1]['answer'] == 'right')
     bank = desk.node._learner.bank
     Core.newest.ready = turns(10, 20, 30, 40)
-    desk.until(lambda: desk.node._learner.bank > bank)
+    desk.until(lambda: desk.node._learner._now.number > bank)
     # few turns that cannot tell do not take back what more could
     heard.clear()
     monkeypatch.setattr(Core, 'dark', True)
     Core.newest.ready = turns(50, 60)
-    desk.until(lambda: desk.node._learner._bank.tried == set(turns(50, 60)))
+    desk.until(lambda: desk.node._learner._now.tried == set(turns(50, 60)))
     monkeypatch.setattr(Core, 'dark', False)
     Core.newest.ready = turns(50, 60, 70)
     desk.until(lambda: heard)
@@ -268,7 +268,7 @@ def test_a_camera_that_is_exchanged_is_told(desk, capfd):
     assert capfd.readouterr().err.count(text) == 1
     # after a reset, one turn is a suspicion again
     assert desk.call('reset').success
-    desk.until(lambda: heard[-1]['changes'] == [])
+    desk.until(lambda: heard[-1]['changes'] == [] and Core.newest is not core)
     Core.newest.strangers = turns(50)
     Core.newest.ready = turns(40, 50)
     desk.until(lambda: 'frame 50' in desk.bench.values['suspected change'])

@@ -103,6 +103,16 @@ def test_every_parameter_is_declared_with_its_reason_and_range(node_and_bench):
     assert 'fisheye' in about['model'].description
 
 
+def test_what_users_set_fits_a_screen(start_node, make_bench):
+    """Settings for experts are parameters where they are given."""
+    node, bench = start_node('-p', 'scene.loss_px:=0.6'), make_bench()
+    request = ListParameters.Request(depth=0)
+    names = ask(bench, node, ListParameters, 'list_parameters', request).result.names
+    assert 'scene.loss_px' in names and 'scene.error_px' not in names
+    assert {name for name, spec in describe() if not spec.metadata['expert']} < set(names)
+    assert len([name for name in names if not name.startswith('qos_overrides')]) <= 50
+
+
 def test_parameters_that_may_not_change_say_so(node_and_bench):
     node, bench = node_and_bench
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue

@@ -24,9 +24,8 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
 from dashcalib_ros.report import load_camera
-from dashcalib_ros.ros.kept import Whose
-from dashcalib_ros.ros.news import Result
-from dashcalib_ros.ros.store import Store
+from dashcalib_ros.ros.background import Result
+from dashcalib_ros.ros.store import Store, Whose
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 
 

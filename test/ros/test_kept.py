@@ -8,10 +8,9 @@ import yaml
 from made_calibration import EACH_MODEL, calibration_of
 
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.ros.kept import Kept, Whose, implausible
 from dashcalib_ros.ros.parameters import camera_name
 from dashcalib_ros.ros.settings import NodeConfig
-from dashcalib_ros.ros.store import Store
+from dashcalib_ros.ros.store import Kept, Store, Whose, implausible
 
 FRONT = Whose('front', '/front/image_raw')
 

@@ -1,4 +1,4 @@
-"""The learner's two threads: when it calibrates, what a failure costs, how it ends."""
+"""The background thread: when it calibrates, what a failure costs, how it ends."""
 from __future__ import annotations
 
 import dataclasses
@@ -20,9 +20,15 @@ from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.judge.calibration import StoredTurnSummary
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.ros import learner as room
-from dashcalib_ros.ros.learner import Learner
-from dashcalib_ros.ros.news import Listener
+from dashcalib_ros.ros import background as room
+from dashcalib_ros.ros.background import (
+    Learner,
+    NewTurn,
+    Result,
+    Started,
+    Trouble,
+    Watched,
+)
 from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.status import Status, View
 
@@ -41,8 +47,9 @@ class Core:
     failures: ClassVar[list[Exception]] = []
 
     def __init__(self, config=None, mask=None, verbose=False, live=False, use_stored=True,
-                 warn=None, inline=False, on_trouble=None):
+                 warn=None, inline=False, on_trouble=None, on_wait=None):
         assert live and not inline
+        self.on_wait = on_wait
         self.options = {'mask': mask, 'use_stored': use_stored, 'warn': warn,
                         'on_trouble': on_trouble}
         self.stored, self.pushed, self.done = (), [], []
@@ -67,6 +74,7 @@ class Core:
         self.calls += 1
         ready = self.ready
         while not self.hold.wait(0.01):
+            self.on_wait()
             if self.closed.is_set():
                 raise WorkerError('the calibrator was closed while it calibrated')
         if Core.failures:
@@ -118,11 +126,18 @@ def desk(monkeypatch):
     Core.made, Core.failures = [], []
     heard = types.SimpleNamespace(results=[], troubles=[], statuses=[], turns=[], begun=[],
                                   pictures=[], watching=False, watched=[])
-    heard.learner = Learner(CONFIG, 10, Listener(
-        heard.results.append, heard.statuses.append,
-        lambda kind, text: heard.troubles.append((kind, text)), heard.turns.append,
-        heard.begun.append, lambda: heard.watching, heard.pictures.append,
-        heard.watched.append))
+    viewer = types.SimpleNamespace(wanted=lambda: heard.watching, show=heard.pictures.append)
+
+    def hear(news):
+        match news:
+            case Trouble():
+                heard.troubles.append((news.kind, news.text))
+            case Started():
+                heard.begun.append(news.status)
+            case _:
+                {Result: heard.results, Status: heard.statuses, NewTurn: heard.turns,
+                 Watched: heard.watched}[type(news)].append(news)
+    heard.learner = Learner(CONFIG, 10, hear, viewer)
     yield heard
     heard.learner.close()
 
@@ -214,7 +229,7 @@ def test_a_bank_is_extended_turn_by_turn_as_far_as_turns_are_kept(desk):
     assert not desk.learner.extend()
     # the next bank begins as usual
     desk.learner.restart()
-    until(lambda: getattr(Core.made[1], 'wanted', None) == 9)
+    until(lambda: len(Core.made) == 2 and getattr(Core.made[1], 'wanted', None) == 9)
 
 
 def test_pictures_are_handed_on_only_while_someone_watches(desk):
@@ -328,23 +343,6 @@ def test_images_that_cannot_be_used_are_told(desk):
     until(lambda: desk.statuses)
 
 
-def test_a_listener_that_fails_ends_no_thread(desk, monkeypatch, caplog):
-    def fail(*news):
-        raise RuntimeError('a bug of the listener')
-    monkeypatch.setattr(desk.learner, '_tell', Listener(fail, fail, fail))
-    core = Core.made[0]
-    desk.learner.offer(0, 0, image(), (64, 48))
-    desk.learner.offer(1, 1, object(), (64, 48))
-    core.ready = at(10, 20)
-    until(lambda: core.calls == 1 and not desk.learner.activity().calibrating)
-    monkeypatch.setattr(desk.learner, '_tell', Listener(
-        desk.results.append, desk.statuses.append, fail))
-    desk.learner.offer(2, 2, image(), (64, 48))
-    core.ready = at(20, 30)
-    until(lambda: desk.results and desk.statuses)
-    assert 'a bug of the listener' in caplog.text
-
-
 def test_a_failing_core_ends_no_thread(desk, monkeypatch):
     core = Core.made[0]
     failures = ['status', 'reject']
@@ -393,6 +391,7 @@ def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
     # the turns of earlier drives are of the camera before
     assert Core.made[0].done == ['forget']
     desk.learner.restart()
+    until(lambda: len(Core.made) == 2)
     Core.made[1].ready = at(30)
     until(lambda: len(desk.watched) == 2)
     assert desk.watched[-1].monitor.lens.confirmed
@@ -447,9 +446,9 @@ def test_a_camera_that_changes_during_a_calibration_is_checked_by_the_next(desk)
     assert [result.given for result in desk.results] == [CAMERA, other]
 
 
-def test_closing_ends_both_threads_in_the_middle_of_a_calibration(desk):
+def test_closing_ends_the_thread_in_the_middle_of_a_calibration(desk):
     core = Core.made[0]
     held(desk, core)
     desk.learner.close()
-    assert not any(thread.is_alive() for thread in desk.learner._threads)
+    assert not desk.learner._thread.is_alive()
     assert desk.troubles == []

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 CODE = """
 import os, sys
 import numpy as np
-from dashcalib_ros.ros.memory import give_images_back
+from dashcalib_ros.ros.program import give_images_back
 if sys.argv[1] == 'back':
     give_images_back()
 

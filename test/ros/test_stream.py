@@ -1,15 +1,16 @@
-"""What the image callback does without ROS: strays, the queue, complaints."""
+"""What the image callback does: strays, the queue, complaints."""
 from __future__ import annotations
 
-import threading
 from types import SimpleNamespace
 
+import pytest
 from fakes import compressed_message
 
-from dashcalib_ros.ros.backlog import Backlog
-from dashcalib_ros.ros.complaints import Complaints
-from dashcalib_ros.ros.intake import Intake
-from dashcalib_ros.ros.stream import LASTING, Source, SourceWatch
+pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
+
+from dashcalib_ros.ros.background import Inbox
+from dashcalib_ros.ros.diagnostics import Complaints
+from dashcalib_ros.ros.images import LASTING, Intake, Source, SourceWatch
 
 SMALL, LARGE, REAR = (Source((320, 240), 'camera'), Source((640, 480), 'camera'),
                       Source((320, 240), 'rear'))
@@ -33,20 +34,26 @@ def test_a_change_that_lasts_is_one():
     assert watch.take(LARGE) == 'same'
 
 
-def test_the_backlog_drops_its_oldest_and_counts():
-    backlog = Backlog(3)
+def test_the_inbox_drops_its_oldest_images_and_no_command():
+    inbox, done = Inbox(3), []
     for n in range(5):
-        backlog.put(n)
-    assert [backlog.get() for _ in range(3)] == [2, 3, 4] and backlog.dropped == 2
+        inbox.put(lambda n=n: done.append(f'command {n}'))
+        inbox.put_image(lambda n=n: done.append(n))
+    for _ in range(8):
+        inbox.get(0.0)()
+    assert done == [*(f'command {n}' for n in range(5)), 2, 3, 4] and inbox.dropped == 2
+    assert inbox.get(0.0) is None
 
 
-def test_closing_the_backlog_wakes_who_waits():
-    backlog, got = Backlog(3), []
-    waiting = threading.Thread(target=lambda: got.append(backlog.get()))
-    waiting.start()
-    backlog.close()
-    waiting.join(timeout=10)
-    assert got == [None]
+def test_a_command_may_take_the_place_of_the_images_that_wait():
+    inbox, done = Inbox(3), []
+    for n in range(3):
+        inbox.put_image(lambda n=n: done.append(n))
+    inbox.put(lambda: done.append('new camera'), instead_of_images=True)
+    inbox.put_image(lambda: done.append('its image'))
+    while (action := inbox.get(0.0)) is not None:
+        action()
+    assert done == ['new camera', 'its image'] and inbox.dropped == 0
 
 
 def test_complaints_are_counted_always_and_said_now_and_then():

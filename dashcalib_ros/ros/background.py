@@ -1,0 +1,471 @@
+"""The background thread: it owns the calibrator, and does what comes into its inbox."""
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Set
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+from dashcalib_ros.arrays import GreyImage, Mask
+from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.config import Config
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.errors import DashcalibError, InputError, counted, one_line
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.decode import BitDepth, decode
+from dashcalib_ros.judge import Calibration, Check, Monitor
+from dashcalib_ros.judge.agreement import outdated, turns_of_another_camera
+from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.status import Status, View
+
+# s between two checks whether enough turns are built: scenes are finished without a push
+LOOK_S = 0.25
+LONGEST_BACK_OFF_S = 60.0
+NOTHING = Status(0, 0, 0, 0.0, 0.0, False)
+Action = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class Activity:
+    """What the background thread does now. stage: of the calibration that runs."""
+
+    status: Status = NOTHING
+    calibrating: bool = False
+    stage: str = ''
+
+
+@dataclass(frozen=True)
+class Result:
+    """A calibration; complete: it had all the turns wanted; bank: the number of their bank.
+
+    given, check: a camera that was to be checked, and what the calibration says of it.
+    """
+
+    calibration: Calibration
+    complete: bool
+    bank: int
+    given: NamedCamera | None = None
+    check: Check | None = None
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What the turns so far say of a camera in use."""
+
+    camera: NamedCamera
+    monitor: Monitor
+
+
+@dataclass(frozen=True)
+class NewTurn:
+    """A turn that was reconstructed. number: its place among the turns so far, from 1.
+
+    of_this_drive: False for a stored turn of an earlier drive. total_deg: yaw of all turns so far.
+    """
+
+    number: int
+    yaw_deg: float
+    total_deg: float
+    of_this_drive: bool
+
+    def text(self, wanted: int, checking: bool) -> str:
+        """Return 'turn 2 of 5: 89°, 179° in all'; checking: it checks a published calibration."""
+        number = f'turn {self.number}' + (f' of {wanted}' if self.number <= wanted else '')
+        source = '' if self.of_this_drive else ' (of an earlier drive)'
+        purpose = ' for the next check of the calibration' if checking else ''
+        return f'{number}{purpose}{source}: {self.yaw_deg:.0f}°, {self.total_deg:.0f}° in all'
+
+
+@dataclass(frozen=True)
+class Started:
+    """A calibration begins."""
+
+    status: Status
+
+    def __str__(self) -> str:
+        found, built = self.status.turns, self.status.built
+        if not built:
+            return f'calibrating, as soon as {counted(found, "turn")} found so far can be used…'
+        return f'calibrating with {counted(built, "turn")}, {self.status.yaw_deg:.0f}° of yaw…'
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """A problem: its kind, for counting, and one line for the log."""
+
+    kind: str
+    text: str
+
+
+News = Status | NewTurn | Started | Trouble | Result | Watched
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A decoded image with its message's header, and what was tracked and masked in it."""
+
+    header: Any
+    image: GreyImage
+    view: View
+
+
+class Viewer(Protocol):
+    """Who shows images to people; wanted() is called for each, show() where it returned True."""
+
+    def wanted(self) -> bool:
+        """Return whether the next image is to be shown."""
+
+    def show(self, picture: Picture) -> None:
+        """Take an image; must not wait."""
+
+
+class Inbox:
+    """What the background thread is to do next: commands first, then images, each in order.
+
+    put() and put_image() never wait: when too many images wait, the oldest is dropped.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        """capacity: how many images may wait."""
+        self.dropped = 0
+        self._commands: deque[Action] = deque()
+        self._images: deque[Action] = deque(maxlen=capacity)
+        # guards all of these
+        self._filled = threading.Condition()
+
+    def put(self, command: Action, instead_of_images: bool = False) -> None:
+        """Add a command; instead_of_images: those that wait now are forgotten."""
+        with self._filled:
+            if instead_of_images:
+                self._images.clear()
+            self._commands.append(command)
+            self._filled.notify()
+
+    def put_image(self, action: Action) -> None:
+        """Add what is to be done with an image."""
+        with self._filled:
+            self.dropped += len(self._images) == self._images.maxlen
+            self._images.append(action)
+            self._filled.notify()
+
+    def get(self, wait_s: float) -> Action | None:
+        """Take out what is next; wait for it so long at the most, then return None."""
+        with self._filled:
+            if not (self._commands or self._images):
+                self._filled.wait(wait_s)
+            waiting = self._commands or self._images
+            return waiting.popleft() if waiting else None
+
+
+@dataclass(eq=False)
+class _Bank:
+    """A Calibrator and what belongs to its turns only.
+
+    tried: the turns of the last calibration. told: those that the node knows of. requested: a
+    calibration is to begin with the present turns. failures: of calibrations in a row.
+    not_before: when the next one may begin, in s of time.monotonic().
+    """
+
+    number: int
+    calibrator: Calibrator
+    depth: BitDepth = field(default_factory=BitDepth)
+    tried: frozenset[TurnId] = frozenset()
+    told: frozenset[TurnId] = frozenset()
+    requested: bool = False
+    failures: int = 0
+    not_before: float = 0.0
+
+
+class Learner:
+    """Learns in the background. All methods are for the node's thread; none of them waits.
+
+    goal: calibrations start by themselves when so many turns are built, and again when others are
+    among the best; None: only by request. bank: the number of the present bank of turns; results
+    of an older one are out of date.
+    """
+
+    def __init__(self, config: Config, queue_size: int, tell: Callable[[News], None],
+                 viewer: Viewer, mask: Mask | None = None) -> None:
+        """tell: called with all news, in any thread; it must neither wait nor raise.
+
+        mask: (h, w), False where the images are not to be used.
+        """
+        self.goal: int | None = config.turns.wanted
+        self.bank = 0
+        self._config = config
+        # turns of this drive that are used beyond those wanted
+        self._more = 0
+        self._watched: NamedCamera | None = None
+        self._checked: NamedCamera | None = None
+        self._tell = tell
+        self._viewer = viewer
+        self._mask = mask
+        self._inbox = Inbox(queue_size)
+        self._activity = Activity()
+        self._closed = False
+        # from here on of the background thread only
+        self._now = _Bank(0, self._calibrator(use_stored=True))
+        self._watch = Watch(None)
+        self._tried_with: NamedCamera | None = None
+        self._thread = threading.Thread(target=self._run, name='learn', daemon=True)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """Return how many images were dropped because detection did not keep up."""
+        return self._inbox.dropped
+
+    def activity(self) -> Activity:
+        """Return what the background thread does now."""
+        return self._activity
+
+    def offer(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int],
+              frame_id: str = '') -> None:
+        """Take an image message; size and frame_id are what its header says."""
+        self._inbox.put_image(lambda: self._push(index, stamp_ns, message, size, frame_id))
+
+    def request(self) -> str:
+        """Calibrate now, with the present turns; return why not, '' if it is started."""
+        if self._activity.calibrating:
+            return 'a calibration is running already'
+        if not self._activity.status.turns:
+            return 'no turn was found so far: drive some'
+        self._inbox.put(self._request)
+        return ''
+
+    def want(self, turns: int) -> None:
+        """Use so many turns from the next calibration on."""
+        self._config = self._config.replace({'turns.wanted': turns})
+
+    def extend(self) -> bool:
+        """Use one turn of this drive more with this bank; False where no more are kept."""
+        turns = self._config.turns
+        if turns.wanted + self._more >= turns.capacity:
+            return False
+        self._more += 1
+        return True
+
+    def compare(self, watched: NamedCamera | None, checked: NamedCamera | None = None) -> None:
+        """Compare turns with cameras from now on; both may be called again with the same ones.
+
+        watched: each new turn is compared with it, to find changes. checked: each calibration is
+        compared with it; the present turns at once.
+        """
+        self._watched, self._checked = watched, checked
+
+    def restart(self, keep_stored: bool = False) -> None:
+        """Forget all turns and begin with an empty bank; a running calibration is cancelled.
+
+        turns.store is emptied, too. keep_stored: turns.store stays and its turns are used, as the
+        images are of another camera now.
+        """
+        self.bank, self._more = self.bank + 1, 0
+        number = self.bank
+        self._inbox.put(lambda: self._begin(number, keep_stored), instead_of_images=True)
+
+    def forget_stored(self, but: Set[TurnId]) -> None:
+        """Drop the turns of earlier drives but these: the camera has changed since."""
+        self._inbox.put(lambda: self._now.calibrator.forget_stored(but))
+
+    def close(self) -> None:
+        """End the thread and every child process."""
+        self._closed = True
+        self._inbox.put(lambda: None)
+        self._now.calibrator.close()
+        self._thread.join(timeout=10)
+
+    # in the background thread ------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._closed:
+            self._serve(LOOK_S)
+            bank = self._now
+            self._look(bank)
+            if self._due(bank) and not self._closed:
+                self._calibrate(bank)
+        # close() may have seen the bank before
+        self._now.calibrator.close()
+
+    def _serve(self, wait_s: float = 0.0) -> None:
+        """Do what is next in the inbox; the calibrator calls this while it waits for a child."""
+        action = self._inbox.get(wait_s)
+        if action is None or self._closed:
+            return
+        try:
+            action()
+        except Exception as error:
+            self._tell(Trouble('failed', f'the turns could not be changed: {_named(error)}'))
+
+    def _calibrator(self, use_stored: bool) -> Calibrator:
+        return Calibrator(self._config, mask=self._mask, live=True, use_stored=use_stored,
+                          warn=lambda text: self._tell(Trouble('store', text)),
+                          on_trouble=lambda text: self._tell(Trouble('workers', text)),
+                          on_wait=self._serve)
+
+    def _begin(self, number: int, keep_stored: bool) -> None:
+        old, self._now = self._now, _Bank(number, self._calibrator(use_stored=keep_stored))
+        self._activity = replace(self._activity, status=NOTHING)
+        old.calibrator.close()
+        if not keep_stored:
+            old.calibrator.clear_store()
+
+    def _request(self) -> None:
+        self._now.requested = True
+
+    def _push(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int],
+              frame_id: str) -> None:
+        """Search an image for turns, and hand it on to who watches."""
+        bank = self._now
+        try:
+            image = whole(message, size, bank.depth)
+            status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
+            if self._viewer.wanted():
+                self._viewer.show(Picture(message.header, image, bank.calibrator.view()))
+        except InputError as error:
+            self._tell(Trouble('undecodable', str(error)))
+        except Exception as error:
+            self._tell(Trouble('failed', f'an image could not be used: {_named(error)}'))
+        else:
+            self._note(bank, status)
+            self._tell(status)
+
+    def _look(self, bank: _Bank) -> None:
+        """See which turns are built, and compare those that are new with the camera in use."""
+        try:
+            bank.calibrator.want(self._config.turns.wanted, self._more)
+            status = bank.calibrator.status()
+        except Exception as error:
+            self._tell(Trouble('failed', f'the turns could not be counted: {_named(error)}'))
+            return
+        self._note(bank, status)
+        if self._watch.camera is not self._watched:
+            self._watch = Watch(self._watched)
+        try:
+            found = self._watch.read(bank.number, bank.calibrator, status)
+            lens = None if found is None else found.monitor.lens
+            if lens is not None and lens.confirmed and lens.since.of_this_drive:
+                # those of earlier drives are of the camera before the change
+                bank.calibrator.forget_stored()
+        except Exception as error:
+            if bank is self._now and not self._closed:
+                self._tell(Trouble('failed_watches', f'new turns could not be compared with the '
+                                                     f'calibration in use ({_named(error)}); the '
+                                                     f'next turn tries again'))
+            return
+        if found is not None:
+            self._tell(found)
+
+    def _note(self, bank: _Bank, status: Status) -> None:
+        self._activity = replace(self._activity, status=status)
+        for turn in new_turns(bank.told, status):
+            self._tell(turn)
+        bank.told |= set(status.ready)
+
+    def _due(self, bank: _Bank) -> bool:
+        if self._checked is not self._tried_with:
+            self._tried_with, bank.tried = self._checked, frozenset()
+        ready, goal = self._activity.status.ready, self.goal
+        news = goal is not None and len(ready) >= goal and not bank.tried.issuperset(ready)
+        return (bank is self._now and (bank.requested or news)
+                and time.monotonic() >= bank.not_before)
+
+    def _calibrate(self, bank: _Bank) -> None:
+        bank.requested, given = False, self._checked
+        self._activity = replace(self._activity, calibrating=True)
+        self._tell(Started(self._activity.status))
+        try:
+            calibration = bank.calibrator.calibrate(self._progress, final=False)
+            check = None if given is None else bank.calibrator.check(
+                given.camera, calibration, self._progress)
+            of_another = turns_of_another_camera(calibration.misfits, self._config.verdict)
+            bank.calibrator.reject(outdated(of_another | calibration.used_turns, of_another))
+        except Exception as error:
+            self._failed(bank, error)
+            return
+        finally:
+            self._activity = replace(self._activity, calibrating=False, stage='')
+        bank.tried, bank.failures = frozenset(calibration.misfits), 0
+        complete = calibration.turns_used >= self._config.turns.wanted
+        self._tell(Result(calibration, complete, bank.number, given, check))
+
+    def _progress(self, stage: str, share: float) -> None:
+        self._activity = replace(self._activity, stage=stage)
+
+    def _failed(self, bank: _Bank, error: Exception) -> None:
+        if bank is not self._now or self._closed:
+            return  # cancelled
+        bank.failures += 1
+        delay = min(2.0 ** bank.failures, LONGEST_BACK_OFF_S)
+        bank.not_before = time.monotonic() + delay
+        # the same turns are tried again
+        bank.requested = True
+        self._tell(Trouble('failed_calibrations', f'a calibration failed ({_named(error)}); the '
+                                                  f'turns are kept, next try in {delay:.0f} s'))
+
+
+class Watch:
+    """What turns say of a camera in use, over all banks of turns: each new one is read once.
+
+    A bank begins empty after each complete calibration; what the turns of the banks before it
+    said is kept, so that a change that was found is not forgotten.
+    """
+
+    def __init__(self, camera: NamedCamera | None) -> None:
+        """camera: None where there is none in use, and nothing is read."""
+        self.camera = camera
+        self._bank = -1
+        self._tried: frozenset[TurnId] = frozenset()
+        self._earlier: Monitor | None = None
+        self._now: Monitor | None = None
+
+    def read(self, bank: int, calibrator: Calibrator, status: Status) -> Watched | None:
+        """Read the turns that were reconstructed since the last call; None if there are none.
+
+        Raises what Calibrator.watch() raises; the same turns alone are not tried again then.
+        """
+        if self.camera is None:
+            return None
+        if bank != self._bank:
+            self._bank, self._tried, self._earlier = bank, frozenset(), self._now
+        turns = frozenset(status.reconstructed)
+        if turns <= self._tried:
+            return None
+        self._tried |= turns
+        found = calibrator.watch(self.camera.camera, self.camera.sigma)
+        if self._earlier is not None:
+            readings, found = found.readings, self._earlier
+            for reading in readings:
+                found = found.after(reading)
+        self._now = found
+        return Watched(self.camera, found)
+
+
+def whole(message: Any, size: tuple[int, int], depth: BitDepth | None = None) -> GreyImage:
+    """Decode a message whose header says this size; raises InputError if it is not so."""
+    image = decode(message, depth)
+    if image.shape[::-1] != size:
+        raise InputError(f'an image is {image.shape[1]}x{image.shape[0]} but its header says '
+                         f'{size[0]}x{size[1]}: the camera driver is broken')
+    return image
+
+
+def new_turns(told: Set[TurnId], now: Status) -> list[NewTurn]:
+    """Return the turns that are ready now and were not told.
+
+    The total is that of the turns so far; a turn that replaces another has the last number.
+    """
+    fresh = [place for place, turn in enumerate(now.ready) if turn not in told]
+    old = sum(now.yaws_deg) - sum(now.yaws_deg[place] for place in fresh)
+    found = []
+    for count, place in enumerate(fresh, len(now.ready) - len(fresh) + 1):
+        old += now.yaws_deg[place]
+        found.append(NewTurn(count, now.yaws_deg[place], old, now.ready[place].of_this_drive))
+    return found
+
+
+def _named(error: Exception) -> str:
+    """Return an error in one line, with its kind where it is not one of this project's."""
+    text = one_line(error, 500)
+    return text if isinstance(error, DashcalibError) else f'{type(error).__name__}: {text}'

@@ -1,0 +1,184 @@
+"""With check_only: the calibration that a driver publishes, checked with turns, never changed."""
+from __future__ import annotations
+
+import json
+from collections.abc import Hashable
+from dataclasses import replace
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import String
+
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.judge import Check, with_faults
+from dashcalib_ros.report import NamedCamera, answer_dict
+from dashcalib_ros.report.camera_file import camera_of_message
+from dashcalib_ros.ros.background import Activity, Result, Watched
+from dashcalib_ros.ros.diagnostics import OK, WARN, Health
+from dashcalib_ros.ros.images import Source, SourceWatch
+from dashcalib_ros.ros.in_use import LATCHED
+from dashcalib_ros.ros.node import CameraNode
+from dashcalib_ros.ros.parameters import make_publisher, make_subscription
+
+# hears reliable and best-effort drivers alike; one that is lost is followed by the next image's
+FROM_DRIVER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+NOT_YET = Check('cannot tell', ('the turns wanted are not there yet',))
+UNTOUCHED = 'check_only: the calibration is the driver\'s, and stays as it is'
+
+
+class CheckNode(CameraNode):
+    """Says on ~/check, latched, whether the calibration that a driver publishes is right."""
+
+    doing = 'checking'
+
+    def _open(self, topic: str) -> None:
+        self._given_topic = self.resolve_topic_name('camera_info')
+        self._infos: SourceWatch[Hashable] = SourceWatch()
+        self._given: NamedCamera | None = None
+        self._size: tuple[int, int] | None = None
+        self._found = NOT_YET
+        # why there is no camera, or it is not of the images
+        self._problem = f'no camera_info on {self._given_topic} yet'
+        self._answers = make_publisher(self, String, '~/check', LATCHED)
+        make_subscription(self, CameraInfo, 'camera_info', self._on_info, FROM_DRIVER)
+
+    def _load(self) -> None:
+        """Do nothing: the driver has the calibration."""
+
+    def _trusted(self) -> NamedCamera | None:
+        """Return the driver's camera, None if it is for other images."""
+        return self._given if self._fits else None
+
+    def _checked(self) -> NamedCamera | None:
+        """Return the driver's camera: of one for other images, the answer says what it is for."""
+        return self._given
+
+    def _goal(self) -> int | None:
+        """Return from how many turns on one is tried, None while there is no camera.
+
+        A single turn may be wrong; the next ones are waited for where two cannot tell.
+        """
+        return (None if self._given is None
+                else min(self._core.verdict.min_turns, self._core.turns.wanted))
+
+    def _fit(self, source: Source) -> None:
+        """Take the size of the images, which is compared with the driver's."""
+        self._size = source.size
+        self._tell_size()
+
+    def _on_watched(self, watched: Watched) -> None:
+        """Take what new turns show; publish it where it says more than before."""
+        before = self._changes.texts
+        super()._on_watched(watched)
+        if self._changes.texts != before:
+            self._publish()
+
+    def _judge(self, result: Result) -> None:
+        """Take an answer; where nothing more is to be expected, the next one is of new turns."""
+        if result.check is None or self._given is None or result.given is not self._given:
+            return
+        before, found = self._found.answer, result.check
+        if found.answer == 'cannot tell' and before != 'cannot tell' and not result.complete:
+            return  # that of more turns stays
+        self._found = found
+        self._publish()
+        if not result.complete and found.answer == before:
+            return
+        answer, topic = self._answer(), self._given_topic
+        reasons = '; '.join(answer.reasons)
+        # rclpy takes one severity for each line of code
+        if answer.answer == 'wrong':
+            self._log.warning(f'the calibration on {topic} is wrong: {reasons}')
+        elif answer.answer == 'right':
+            self._log.info(f'the calibration on {topic} is right: {reasons}')
+        else:
+            self._log.info(f'the turns cannot tell whether the calibration on {topic} is right: '
+                           f'{reasons}')
+        if result.complete and found.answer != 'cannot tell':
+            # the next answer must be independent: it uses new turns only
+            self._learner.restart()
+
+    def _drop(self) -> None:
+        """Forget the answer and the changes; the driver's camera stays."""
+        # as another object: what is still said of the former one is out of date
+        self._given = None if self._given is None else replace(self._given)
+        self._changes.forget()
+        self._found = NOT_YET
+        if self._infos.current is not None:
+            self._publish()
+
+    def _reset(self) -> tuple[bool, str]:
+        self._log.warning('reset by request: the turns are dropped')
+        self._forget()
+        return True, f'collecting; {UNTOUCHED}'
+
+    def _save(self) -> tuple[bool, str]:
+        return False, UNTOUCHED
+
+    def _warnings(self) -> list[str]:
+        """Return what keeps the calibration from being checked."""
+        return [self._problem] if self._problem else []
+
+    def _health(self, activity: Activity, turns: str) -> Health:
+        found = self._answer()
+        if found.answer == 'wrong':
+            level, message = WARN, f'the calibration is wrong: {found.reasons[0]}'
+        elif found.answer == 'right':
+            level, message = OK, f'the calibration is right; {turns} for the next check'
+        else:
+            level, message = OK, f'checking the calibration, {turns}: {found.reasons[0]}'
+        return Health('checking', level, message, check=found.answer, check_reasons=found.reasons)
+
+    def _answer(self) -> Check:
+        """Return what the turns say of it, and what no turn is needed for."""
+        return with_faults(self._found, self._given.faults if self._given else ())
+
+    @property
+    def _fits(self) -> bool:
+        return self._given is None or self._size in (None, self._given.image_size)
+
+    def _on_info(self, message: CameraInfo) -> None:
+        roi = message.roi
+        what = self._infos.take((
+            message.width, message.height, message.distortion_model, tuple(message.d),
+            tuple(message.k), tuple(message.r), tuple(message.p), message.binning_x,
+            message.binning_y, roi.x_offset, roi.y_offset, roi.width, roi.height))
+        if what == 'stray':
+            self._complaints.say('other_calibrations', f'a camera_info on {self._given_topic} '
+                                 f'differs from those before: is there a second publisher?')
+        elif what != 'same':
+            self._take(message, what == 'changed')
+
+    def _take(self, message: CameraInfo, changed: bool) -> None:
+        """Check this calibration from now on."""
+        topic = self._given_topic
+        if changed:
+            self._log.warning(f'the calibration on {topic} has changed: it is checked anew')
+        try:
+            self._given, self._problem = camera_of_message(message, topic), ''
+        except InputError as error:
+            self._given, self._problem = None, str(error)
+            self._log.warning(self._problem)
+        if self._given is not None and self._given.faults:
+            self._log.warning(f'the calibration on {topic} is wrong: '
+                              f'{"; ".join(self._given.faults)}')
+        self._tell_size()
+        self._verdict = None
+        self._drop()
+        self._set_goal()
+
+    def _tell_size(self) -> None:
+        if self._given is None:
+            return
+        self._problem = ''
+        if not self._fits and self._size is not None:
+            (width, height), (w, h) = self._given.image_size, self._size
+            self._problem = (f'the camera_info on {self._given_topic} is for {width}x{height}, '
+                             f'and the images are {w}x{h}')
+            self._log.warning(self._problem)
+
+    def _publish(self) -> None:
+        values = answer_dict(self._answer(), self._changes.texts)
+        if self._given is None:
+            values['reasons'] = self._warnings()
+        self._answers.publish(String(data=json.dumps(values, allow_nan=False)))
