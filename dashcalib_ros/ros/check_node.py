@@ -16,8 +16,7 @@ from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.background import Activity, Result, Watched
 from dashcalib_ros.ros.diagnostics import OK, WARN, Health
 from dashcalib_ros.ros.images import Source, SourceWatch
-from dashcalib_ros.ros.in_use import LATCHED
-from dashcalib_ros.ros.node import CameraNode
+from dashcalib_ros.ros.node import LATCHED, CameraNode
 from dashcalib_ros.ros.parameters import make_publisher, make_subscription
 
 # hears reliable and best-effort drivers alike; one that is lost is followed by the next image's

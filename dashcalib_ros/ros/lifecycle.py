@@ -3,8 +3,9 @@ from __future__ import annotations
 
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
+from dashcalib_ros.ros.calibrator_node import CalibratorNode
 from dashcalib_ros.ros.check_node import CheckNode
-from dashcalib_ros.ros.node import CalibratorNode, CameraNode
+from dashcalib_ros.ros.node import CameraNode
 
 
 class Managed(LifecycleNodeMixin, CameraNode):  # type: ignore[misc]

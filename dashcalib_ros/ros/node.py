@@ -1,4 +1,4 @@
-"""The node: takes images, and publishes a camera_info for each once the camera is calibrated."""
+"""What both nodes have: images in, a background thread that learns, services, diagnostics."""
 from __future__ import annotations
 
 import queue
@@ -14,7 +14,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 
@@ -34,8 +34,6 @@ from dashcalib_ros.ros.background import (
     Watched,
 )
 from dashcalib_ros.ros.diagnostics import (
-    OK,
-    WARN,
     Changes,
     Complaints,
     Health,
@@ -44,7 +42,6 @@ from dashcalib_ros.ros.diagnostics import (
     turns_text,
 )
 from dashcalib_ros.ros.images import CURES, ImageInput, Intake, Source
-from dashcalib_ros.ros.in_use import CalibrationInUse, Commit
 from dashcalib_ros.ros.parameters import (
     camera_name,
     changed,
@@ -55,10 +52,10 @@ from dashcalib_ros.ros.parameters import (
     why_read_only,
 )
 from dashcalib_ros.ros.preview import Preview
-from dashcalib_ros.ros.state import Rules, state_of
-from dashcalib_ros.ros.store import Store, Whose, camera_info_path
 from dashcalib_ros.status import Status
 
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # s between two messages on /diagnostics
 PERIOD_S = 1.0
 # further kinds of problems than those of CURES, which come with a message of their own
@@ -397,106 +394,6 @@ class CameraNode(Node, ABC):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
-
-
-class CalibratorNode(CameraNode):
-    """Calibrates the camera, and publishes what is accepted beside its images."""
-
-    doing = 'learning'
-
-    def _open(self, topic: str) -> None:
-        plain = topic == f'{self.get_namespace().rstrip("/")}/image_raw'
-        whose = Whose(self._name, topic, plain)
-        self._in_use = CalibrationInUse(
-            self, whose, Store(camera_info_path(self._own.camera_info_url, self._name), whose),
-            Rules(self._own.better, self._own.contradictions), self._complaints,
-            self._core.rectified)
-        self._commit: Commit | None = None
-
-    def close(self) -> None:
-        """End it, and leave the calibration's file to other nodes."""
-        self._in_use.close()
-        super().close()
-
-    def _load(self) -> None:
-        self._in_use.load()
-
-    def _trusted(self) -> NamedCamera | None:
-        return self._in_use.trusted
-
-    def _goal(self) -> int:
-        """Return how many turns the next calibration needs.
-
-        The first one needs all turns wanted; to check a published one, a few are enough.
-        """
-        wanted = self._core.turns.wanted
-        return (wanted if self._trusted() is None
-                else min(self._core.verdict.min_turns, wanted))
-
-    def _accompany(self, header: Header, size: tuple[int, int]) -> None:
-        self._in_use.publication.accompany(header, size)
-
-    def _fit(self, source: Source) -> None:
-        self._in_use.check(source)
-
-    def _on_watched(self, watched: Watched) -> None:
-        super()._on_watched(watched)
-        if watched.camera is self._compared() and watched.monitor.agrees:
-            self._in_use.confirmed = True
-
-    def _judge(self, result: Result) -> None:
-        current = self._intake.source
-        action = self._in_use.judge(result, current.frame_id if current else '',
-                                    self._own.publish_stale)
-        if action in ('adopt', 'replace'):
-            self._learner.restart()
-            if self._own.commit and self._in_use.publication.info is not None:
-                self._commit = self._commit or Commit(self, self._own.commit_timeout,
-                                                      self._steady)
-                self._commit.call(self._in_use.publication.info)
-        elif action == 'give_up':
-            # the turns that contradict it stay, and are used for the next one
-            self._learner.forget_stored(result.calibration.used_turns)
-        elif (action == 'keep' and result.complete
-              # turns that do not confirm it may be all that is known of another camera: they stay
-              and (self._in_use.settled or not self._learner.extend())):
-            # the next calibration must be independent: it uses new turns only
-            self._learner.restart()
-
-    def _drop(self) -> None:
-        self._in_use.drop()
-
-    def _reset(self) -> tuple[bool, str]:
-        self._log.warning('reset by request: the turns and the calibration are dropped')
-        self._forget()
-        moved, text = self._in_use.retire()
-        return moved, f'collecting; {text}'
-
-    def _save(self) -> tuple[bool, str]:
-        return self._in_use.save()
-
-    def _warnings(self) -> list[str]:
-        return self._in_use.warnings()
-
-    def _health(self, activity: Activity, turns: str) -> Health:
-        in_use, verdict = self._in_use, self._verdict
-        state = state_of(in_use.trusted is not None, activity.calibrating,
-                         verdict is not None and verdict.level != 'accepted')
-        if in_use.camera is not None:
-            known = 'calibrated' if in_use.confirmed else 'calibrated, unconfirmed'
-            level, message = OK, f'{known}; {turns} for the next check of it'
-        elif state == 'calibrating':
-            level, message = WARN, f'calibrating with {turns}: {activity.stage}'
-        elif state == 'refused_so_far' and verdict is not None:
-            why = verdict.reasons[0] if verdict.reasons else verdict.level
-            level, message = WARN, f'not calibrated, {turns}; so far {verdict.level}: {why}'
-        else:
-            level, message = WARN, f'not calibrated yet: {turns}'
-        error = f'the published calibration is contradicted; new turns: {turns}'
-        return Health(state, level, message, in_use.camera, in_use.confirmed,
-                      error if in_use.stale else '', in_use.file,
-                      counts={'camera_info published': in_use.publication.sent,
-                              'contradictions': in_use.contradictions})
 
 
 def _service(action: Callable[[], tuple[bool, str]]) -> Callable[..., Trigger.Response]:

@@ -67,8 +67,8 @@ from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.report.camera_file import camera_of_message
+from dashcalib_ros.ros.calibrator_node import camera_info
 from dashcalib_ros.ros.images import LASTING
-from dashcalib_ros.ros.in_use import camera_info
 from dashcalib_ros.ros.store import Store
 
 KEPT = CAMERA_FILE.format(width=320) + OURS

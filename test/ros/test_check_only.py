@@ -27,8 +27,8 @@ from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros import background, node
+from dashcalib_ros.ros.calibrator_node import camera_info
 from dashcalib_ros.ros.images import LASTING
-from dashcalib_ros.ros.in_use import camera_info
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.status import Status

@@ -98,11 +98,11 @@ def test_results_of_forgotten_turns_are_not_used(make_desk):
 def test_a_disk_that_takes_nothing_is_counted_and_the_calibration_published(make_desk, tmp_path):
     (tmp_path / 'plain').write_text('a file, no folder')
     desk = make_desk()
-    desk.node._in_use._store.path = tmp_path / 'plain' / 'camera.yaml'
+    desk.node._store.path = tmp_path / 'plain' / 'camera.yaml'
     desk.give()
     assert desk.show() == 400.0
     assert desk.bench.values['unsaved'] == '1'
-    saved, why = desk.node._in_use.save()
+    saved, why = desk.node._save()
     assert not saved and 'camera_info_url' in why
 
 
@@ -147,7 +147,7 @@ def test_a_reset_on_a_disk_that_is_read_only_does_not_say_it_was_done(make_desk,
     assert desk.file.exists() and desk.show() is None
     desk.until(lambda: 'could not be moved aside' in desk.bench.values['warnings'])
     # this process trusts it no more, whatever makes it look again
-    desk.node._in_use.load()
+    desk.node._load()
     assert desk.show() is None
     desk.file.unlink()
     desk.until(lambda: desk.bench.values['warnings'] == '')
@@ -162,7 +162,7 @@ def test_one_that_is_given_up_on_a_read_only_disk_is_told(make_desk, request, ca
     assert desk.show() is None and desk.file.exists()
     assert 'could not be moved aside' in capfd.readouterr().err
     desk.until(lambda: 'could not be moved aside' in desk.bench.values['warnings'])
-    desk.node._in_use.load()
+    desk.node._load()
     assert desk.show() is None
 
 

@@ -406,9 +406,9 @@ import signal
 import sys
 import time
 from std_msgs.msg import Float64
-from dashcalib_ros.ros import main, node
+from dashcalib_ros.ros import calibrator_node, main
 kind = sys.argv.pop(1)
-class Node(node.CalibratorNode):
+class Node(calibrator_node.CalibratorNode):
     def _on_image(self, message):
         super()._on_image(message)
         if kind == 'callback' and self._intake.received % 2:

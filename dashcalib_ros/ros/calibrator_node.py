@@ -1,0 +1,356 @@
+"""The node that calibrates: what is accepted is published beside the images and kept on disk."""
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo
+from sensor_msgs.srv import SetCameraInfo
+from std_msgs.msg import Header
+
+from dashcalib_ros.camera import Camera, ros_camera
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.ros.background import Activity, Result, Watched
+from dashcalib_ros.ros.diagnostics import OK, WARN, Health
+from dashcalib_ros.ros.images import Source
+from dashcalib_ros.ros.node import LATCHED, CameraNode
+from dashcalib_ros.ros.parameters import make_publisher
+from dashcalib_ros.ros.state import (
+    Action,
+    Judgement,
+    Rules,
+    judge,
+    outcome_text,
+    sigma_text,
+    state_of,
+)
+from dashcalib_ros.ros.store import Kept, Store, Whose, camera_info_path
+
+# a reliable publisher reaches reliable and best-effort subscribers alike
+BESIDE_IMAGES = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# s between two looks whether the driver has answered
+LOOK_S = 0.1
+
+
+class CalibratorNode(CameraNode):
+    """At most one calibration is in use; its topics and its file are always changed together."""
+
+    doing = 'learning'
+
+    def _open(self, topic: str) -> None:
+        plain = topic == f'{self.get_namespace().rstrip("/")}/image_raw'
+        self._whose = Whose(self._name, topic, plain)
+        self._store = Store(camera_info_path(self._own.camera_info_url, self._name), self._whose)
+        self._rules = Rules(self._own.better, self._own.contradictions)
+        self._commit: Commit | None = None
+        self._beside = make_publisher(self, CameraInfo, 'camera_info', BESIDE_IMAGES)
+        self._latched = make_publisher(self, CameraInfo, '~/calibration', LATCHED)
+        # what is published now, and how many were published beside images
+        self._info: CameraInfo | None = None
+        self._sent = 0
+        self._kept: Kept | None = None
+        # of calibrations in a row that contradict the one in use
+        self._contradictions = 0
+        # given up, and published only because of publish_stale
+        self._stale = False
+        # False for one of a file until turns of this drive agree with it
+        self._confirmed = True
+        # turns of this drive, with their bank, that were in a contradiction that was counted
+        self._counted: frozenset[tuple[int, TurnId]] = frozenset()
+
+    def close(self) -> None:
+        """End it, and leave the calibration's file to other nodes."""
+        self._store.close()
+        super().close()
+
+    def _trusted(self) -> NamedCamera | None:
+        """Return the camera that is published, None if it is stale."""
+        return None if self._kept is None or self._stale else self._kept.camera
+
+    def _goal(self) -> int:
+        """Return how many turns the next calibration needs.
+
+        The first one needs all turns wanted; to check a published one, a few are enough.
+        """
+        wanted = self._core.turns.wanted
+        return wanted if self._trusted() is None else min(self._core.verdict.min_turns, wanted)
+
+    def _accompany(self, header: Header, size: tuple[int, int]) -> None:
+        """Publish the camera_info of an image, if the camera has such images."""
+        if self._info is not None and (self._info.width, self._info.height) == size:
+            self._info.header = header
+            self._beside.publish(self._info)
+            self._sent += 1
+
+    def _load(self) -> None:
+        """Use the file's calibration, if it is an accepted one of this node."""
+        try:
+            kept = self._store.load()
+        except InputError as error:
+            self._log.warning(str(error))
+            return
+        if kept is None:
+            return
+        wanted = kept.rectified(self._core.rectified)
+        if wanted is not kept:
+            self._log.warning(f'the projection_matrix in {self._store.path} is not that of '
+                              f'rectified: {self._core.rectified}, which is published; ~/save '
+                              f'writes it there')
+        self._use(wanted, confirmed=False)
+        self._contradictions = kept.contradictions
+        self._log.info(f'loaded {self._store.path}: {sigma_text(kept.camera)}; unconfirmed until '
+                       f'turns agree with it')
+
+    def _fit(self, source: Source) -> None:
+        """Stop using it if it is for other images than these; the file stays where it is."""
+        kept = self._kept
+        if kept is None:
+            return
+        of = Source(kept.camera.image_size,
+                    source.frame_id if kept.frame_id is None else kept.frame_id)
+        if of != source:
+            self._log.warning(f'{self._store.path} is ignored: it is for {of}, the images are '
+                              f'{source}')
+            self._unpublish()
+
+    def _on_watched(self, watched: Watched) -> None:
+        super()._on_watched(watched)
+        if watched.camera is self._compared() and watched.monitor.agrees:
+            self._confirmed = True
+
+    def _judge(self, result: Result) -> None:
+        """Adopt a new calibration, or not: state.py has the reasons."""
+        used = result.calibration.used_turns
+        turns = frozenset((result.bank, turn) for turn in result.calibration.misfits
+                          if turn.of_this_drive)
+        settled = False
+        if self._trusted() is not None and turns and turns <= self._counted:
+            action: Action = 'keep'  # again, by request or with other stored turns: count once
+        else:
+            judged = judge(result.calibration, result.complete, self._trusted(),
+                           self._contradictions, self._rules)
+            action, settled = judged.action, judged.confirmed
+            self._do(judged, result.calibration, turns)
+        if action in ('adopt', 'replace'):
+            self._learner.restart()
+            if self._own.commit and self._info is not None:
+                self._commit = self._commit or Commit(self, self._own.commit_timeout,
+                                                      self._steady)
+                self._commit.call(self._info)
+        elif action == 'give_up':
+            # the turns that contradict it stay, and are used for the next one
+            self._learner.forget_stored(used)
+        elif (action == 'keep' and result.complete
+              # turns that do not confirm it may be all that is known of another camera: they stay
+              and (settled or not self._learner.extend())):
+            # the next calibration must be independent: it uses new turns only
+            self._learner.restart()
+
+    def _do(self, judged: Judgement, calibration: Calibration,
+            turns: frozenset[tuple[int, TurnId]]) -> None:
+        """Do what was decided about a calibration, and log it. turns: of this drive."""
+        if judged.action in ('adopt', 'replace'):
+            if judged.action == 'replace':
+                self._log.warning(f'the calibration is replaced: {judged.why}')
+            frame_id = self._intake.source.frame_id if self._intake.source else ''
+            self._adopt(Kept.of(calibration, self._whose, frame_id))
+            return
+        if judged.action == 'give_up':
+            self._log.error(f'the published calibration is given up: {judged.why}')
+            self._contradictions = 0
+            self._retire()
+            if self._own.publish_stale:
+                self._stale = True
+            else:
+                self._unpublish()
+            return
+        if judged.action == 'keep':
+            if judged.contradictions > self._contradictions:
+                self._counted |= turns
+            self._count(judged.contradictions)
+            self._confirmed = self._confirmed or judged.confirmed
+        text = outcome_text(calibration, judged.why)
+        # rclpy takes one severity for each line of code
+        if judged.contradictions:
+            self._log.warning(text)
+        else:
+            self._log.info(text)
+
+    def _drop(self) -> None:
+        """Use no calibration, as at the start; the file stays where it is."""
+        self._unpublish()
+        self._contradictions = 0
+
+    def _retire(self) -> tuple[bool, str]:
+        """Move the file aside; return whether it is out of the way, and a line about it."""
+        if self._store.taken:
+            return True, self._store.taken
+        try:
+            moved = self._store.retire()
+        except OutputError as error:
+            text = f'{error}; until then the next start of the node publishes it again'
+            self._log.error(text)
+            return False, text
+        return True, 'there was no file' if moved is None else f'{self._store.path} is now {moved}'
+
+    def _reset(self) -> tuple[bool, str]:
+        self._log.warning('reset by request: the turns and the calibration are dropped')
+        self._forget()
+        moved, text = self._retire()
+        return moved, f'collecting; {text}'
+
+    def _save(self) -> tuple[bool, str]:
+        """Write the file; return whether it was written, and a line about it."""
+        if self._kept is None:
+            return False, 'there is no accepted calibration yet'
+        if self._stale:
+            return False, 'the calibration is contradicted by new turns'
+        try:
+            moved = self._store.save(self._kept)
+        except OutputError as error:
+            self._complaints.say('unsaved', str(error))
+            return False, str(error)
+        if moved is not None:
+            self._log.warning(f'{self._store.path} was written by another program: it is now '
+                              f'{moved}')
+        return True, f'written: {self._store.path}'
+
+    def _warnings(self) -> list[str]:
+        """Return warnings about the file and the topic, for the operator."""
+        found = [self._store.taken] if self._store.taken else []
+        if self._contradictions:
+            found.append(f'{self._contradictions} of {self._rules.contradictions} calibrations in '
+                         f'a row contradict the published one: was the camera moved, its lens '
+                         f'changed, or a stabiliser switched on?')
+        if self._kept is not None and self._kept.edited and not self._confirmed:
+            found.append(f'{self._store.path} was edited since a node wrote it: unconfirmed until '
+                         f'turns agree with it')
+        if self._store.given_up:
+            found.append(f'{self._store.path} was given up, but could not be moved aside: remove '
+                         f'it, or the next start of the node publishes it again')
+        beside = self._beside.topic_name
+        if self.count_publishers(beside) > 1:
+            found.append(f'another node publishes {beside}: remap it, or its subscribers get both')
+        return found
+
+    def _health(self, activity: Activity, turns: str) -> Health:
+        verdict = self._verdict
+        state = state_of(self._trusted() is not None, activity.calibrating,
+                         verdict is not None and verdict.level != 'accepted')
+        if self._kept is not None:
+            known = 'calibrated' if self._confirmed else 'calibrated, unconfirmed'
+            level, message = OK, f'{known}; {turns} for the next check of it'
+        elif state == 'calibrating':
+            level, message = WARN, f'calibrating with {turns}: {activity.stage}'
+        elif state == 'refused_so_far' and verdict is not None:
+            why = verdict.reasons[0] if verdict.reasons else verdict.level
+            level, message = WARN, f'not calibrated, {turns}; so far {verdict.level}: {why}'
+        else:
+            level, message = WARN, f'not calibrated yet: {turns}'
+        error = f'the published calibration is contradicted; new turns: {turns}'
+        return Health(state, level, message, self._kept.camera if self._kept else None,
+                      self._confirmed, error if self._stale else '', str(self._store.path),
+                      counts={'camera_info published': self._sent,
+                              'contradictions': self._contradictions})
+
+    def _count(self, contradictions: int) -> None:
+        """Keep the count in the file too: it outlives the node."""
+        if contradictions == self._contradictions or self._kept is None:
+            return
+        self._contradictions = contradictions
+        self._kept = self._kept.contradicted(contradictions)
+        try:
+            self._store.update(self._kept)
+        except OutputError as error:
+            self._complaints.say('unsaved', str(error))
+
+    def _adopt(self, kept: Kept) -> None:
+        self._use(kept)
+        self._contradictions = 0
+        saved, text = self._save()
+        self._log.info(f'accepted: {sigma_text(kept.camera)}; '
+                       + (f'saved to {self._store.path}' if saved else f'not saved: {text}'))
+
+    def _use(self, kept: Kept, confirmed: bool = True) -> None:
+        self._kept, self._stale, self._confirmed = kept, False, confirmed
+        self._info = camera_info(kept.camera.camera, self._header(kept.frame_id or ''),
+                                 self._core.rectified)
+        self._latched.publish(self._info)
+
+    def _unpublish(self) -> None:
+        if self._info is not None:
+            # K[0] = 0 says that it is uncalibrated (sensor_msgs)
+            self._latched.publish(CameraInfo(header=self._header(self._info.header.frame_id)))
+        self._kept, self._stale, self._info = None, False, None
+
+    def _header(self, frame_id: str) -> Header:
+        return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame_id)
+
+
+class Commit:
+    """Calls the driver's service without waiting for it; logs the outcome.
+
+    There is one warning if the driver has no service, does not answer, or dies meanwhile.
+    """
+
+    def __init__(self, node: Node, timeout_s: float, clock: Clock) -> None:
+        self._node = node
+        self._timeout_s = timeout_s
+        self._name = node.resolve_service_name('set_camera_info')
+        self._client = node.create_client(SetCameraInfo, 'set_camera_info')
+        self._timer = node.create_timer(LOOK_S, self._look, clock=clock, autostart=False)
+        self._waiting: CameraInfo | None = None
+        self._answer: Any = None
+        self._deadline = 0.0
+
+    def call(self, info: CameraInfo) -> None:
+        """Send a calibration; an earlier call that is not answered yet is cancelled."""
+        self._forget()
+        self._waiting = info
+        self._deadline = time.monotonic() + self._timeout_s
+        self._timer.reset()
+
+    def _look(self) -> None:
+        if self._answer is None and self._client.service_is_ready():
+            request = SetCameraInfo.Request(camera_info=self._waiting)
+            self._answer = self._client.call_async(request)
+        if self._answer is not None and self._answer.done():
+            self._report(self._answer)
+            self._forget()
+        elif time.monotonic() > self._deadline:
+            trouble = (f'there is no service {self._name}' if self._answer is None else
+                       f'{self._name} did not answer within {self._timeout_s:g} s')
+            self._node.get_logger().warning(
+                f'{trouble}: the camera driver does not have the calibration; start a driver with '
+                f'that service, or set commit to false')
+            self._forget()
+
+    def _report(self, answer: Any) -> None:
+        if answer.exception() is not None:
+            text = f'{self._name} failed: {answer.exception()}'
+        elif answer.result().success:
+            self._node.get_logger().info(f'{self._name} took the calibration')
+            return
+        else:
+            text = f'{self._name} refused: {answer.result().status_message}'
+        self._node.get_logger().warning(text)
+
+    def _forget(self) -> None:
+        if self._answer is not None and not self._answer.done():
+            self._client.remove_pending_request(self._answer)
+        self._answer = self._waiting = None
+        self._timer.cancel()
+
+
+def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:
+    """Return the camera as a message; rectified: as ros_camera()'s."""
+    c = ros_camera(camera, rectified)
+    width, height = c.image_size
+    return CameraInfo(header=header, width=width, height=height,
+                      distortion_model=c.distortion_model, d=c.d, k=c.k, r=c.r, p=c.p)
