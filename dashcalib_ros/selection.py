@@ -193,7 +193,7 @@ class SceneSelection:
             chosen = self.chosen() if ready_now else []
             self.store_new()
             if ready_now:
-                kept, repeated = without_repeated(chosen, self._config.scene.min_images)
+                kept, repeated = self._without_repeated(chosen)
                 if repeated:
                     # the next best turns take their places
                     self.warnings += [_repeated_text(turn, other)
@@ -203,6 +203,14 @@ class SceneSelection:
                     continue
                 self._stored_before = self.stored()
                 return kept
+
+    def _without_repeated(self, scenes: list[Scene]) -> tuple[list[Scene], dict[TurnId, TurnId]]:
+        if len(scenes) < 2:
+            return scenes, {}
+        # in a worker: it takes seconds for many turns, and a live drive goes on meanwhile
+        found: tuple[list[Scene], dict[TurnId, TurnId]] = self.run(
+            without_repeated, scenes, self._config.scene.min_images)
+        return found
 
     def widen(self) -> bool:
         """Use more turns, up to turns.at_most; return False if there are no more to use."""
@@ -225,7 +233,8 @@ class SceneSelection:
         """Use these turns of earlier drives no more in this drive; on disk they stay."""
         self._contradicted |= earlier
 
-    def run(self, function: Callable[..., Any], *arguments: Any, progress: Progress) -> Any:
+    def run(self, function: Callable[..., Any], *arguments: Any,
+            progress: Progress | None = None) -> Any:
         """Run a stage in a worker, as soon as one is free, and return what it returns."""
         return self._pool.run(function, *arguments, progress=progress)
 

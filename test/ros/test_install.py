@@ -103,14 +103,17 @@ def test_every_parameter_is_declared_with_its_reason_and_range(node_and_bench):
     assert 'fisheye' in about['model'].description
 
 
-def test_what_users_set_fits_a_screen(start_node, make_bench):
+def test_what_users_set_fits_a_screen(ros_context):
     """Settings for experts are parameters where they are given."""
-    node, bench = start_node('-p', 'scene.loss_px:=0.6'), make_bench()
-    request = ListParameters.Request(depth=0)
-    names = ask(bench, node, ListParameters, 'list_parameters', request).result.names
-    assert 'scene.loss_px' in names and 'scene.error_px' not in names
-    assert {name for name, spec in describe() if not spec.metadata['expert']} < set(names)
-    assert len([name for name in names if not name.startswith('qos_overrides')]) <= 50
+    node = Node('read', context=ros_context, cli_args=['--ros-args', '-p', 'scene.loss_px:=0.6'])
+    try:
+        core, _ = declare(node)
+        names = set(node._parameters)
+    finally:
+        node.destroy_node()
+    assert core.scene.loss_px == 0.6 and 'scene.loss_px' in names
+    assert {name for name, spec in describe() if not spec.metadata['expert']} < names
+    assert len(names) <= 50 and 'scene.error_px' not in names
 
 
 def test_parameters_that_may_not_change_say_so(node_and_bench):
