@@ -49,16 +49,10 @@ class MotionConfig:
         640, 'px; wider images are divided by a whole number until they fit', 64, 8192)
     points: int = setting(
         300, 'points tracked at a time; 400 find the same turns and cost 20 % more', 50, 5000)
-    forward_backward_px: float = expert(
-        0.5, 'px; a point that does not track back to within this is dropped', 0.05, 5.0)
     standing_px: float = expert(
         0.3, 'px at the working width; the car stands when the median point moves less', 0.0, 5.0)
-    epipolar_px: float = expert(
-        0.5, 'px at the working width; inlier threshold of the fundamental matrix', 0.05, 5.0)
     spacing_s: float = expert(
         0.3, 's between the images of a triplet; few points survive a sharp turn', 0.05, 2.0)
-    replenish: float = expert(
-        0.65, 'of points; where fewer are left, new ones are looked for', 0.1, 1.0)
 
 
 @dataclass(frozen=True)
@@ -74,13 +68,6 @@ class MaskConfig:
     segmentation_classes: str = setting(
         '63,64', "the own car's classes; these are car mount and ego vehicle of Mapillary Vistas",
         pattern=r'\d{1,4}(, ?\d{1,4})*')
-    cell: int = expert(16, 'px at the working width; resolution of the mask', 4, 64)
-    period_s: float = expert(
-        3.0, 's between two updates of the mask that the tracking uses', 0.1, 600.0)
-    stays: float = expert(
-        0.4, "coherence of a cell's gradient: the world's is about 0, the vehicle's 0.7", 0.0, 1.0)
-    largest: float = expert(
-        0.4, 'of the picture; a mask of the vehicle that hides more is not used', 0.01, 1.0)
     segmentation_images: int = expert(
         15, 'images that vote; there is a mask from the first on', 1, 1000)
     segmentation_period_s: float = expert(
@@ -101,10 +88,6 @@ class TurnsConfig:
     store: str = setting(
         '', 'folder for reconstructed turns of one camera: short trips add up; empty: none')
     capacity: int = expert(10, 'turns kept at the most: twice those wanted', 1, 50)
-    min_prominence: float = expert(
-        0.0025, 'of the image width; lower peaks of the turning magnitude are no turns', 0.0, 1.0)
-    longest: int = expert(
-        4, 'half widths; overlapping turns that are longer together are not joined', 2, 20)
 
 
 @dataclass(frozen=True)
@@ -112,13 +95,8 @@ class TracksConfig:
     """A turn's images -> correspondences between its keyframes."""
 
     points: int = expert(800, 'points tracked at a time', 100, 10000)
-    window: int = expert(21, 'px; side of the Lucas-Kanade window', 7, 61)
-    forward_backward_px: float = expert(
-        0.5, 'px; a point that does not track back to within this is dropped', 0.05, 5.0)
     keyframe_motion: float = expert(
         0.03, 'of the image width; the median point moves so far between keyframes', 0.0, 1.0)
-    keyframe_overlap: float = expert(
-        0.6, "a keyframe comes at the latest when fewer of the last one's points live", 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -131,7 +109,6 @@ class SceneConfig:
     keyframes: int = expert(
         30, 'of a turn at the most; more cost time and change nothing', 5, 1000)
     profile_keyframes: int = expert(16, 'of a turn at the most, for the focal profile', 5, 1000)
-    min_tracks: int = expert(80, 'a turn with fewer tracks is not tried', 20, 1000)
     min_images: int = expert(6, 'a turn with fewer keyframes is not tried', 4, 100)
     error_px: float = expert(2.0, 'px; an observation farther off is not used', 0.2, 20.0)
     chain_error: float = expert(
@@ -145,18 +122,6 @@ class SceneConfig:
     min_explained: float = expert(
         0.3, "of a turn's observations; a turn of which the camera explains fewer is dropped",
         0.0, 0.9)
-    good_cost: float = expert(
-        1.2, 'px^2 per observation; a turn that costs more is chained with other tracks, too',
-        0.0, 1e4)
-    well_explained: float = expert(
-        0.9, "of a turn's observations; with fewer it is chained anew with the common camera",
-        0.0, 1.0)
-    well_fitting: float = expert(
-        1.25, "times a turn's cost with its own camera; above it, its own poses are tried, too",
-        1.0, 1e4)
-    patch_half_window: int = expert(7, 'px; of the affine registration', 3, 25)
-    max_shift_px: float = expert(
-        3.0, 'px; a registration that moves a point farther is wrong', 0.2, 20.0)
 
 
 @dataclass(frozen=True)
@@ -201,15 +166,8 @@ class MountConfig:
 class LinesConfig:
     """Upright lines of the world: poles and the edges of houses, a second witness."""
 
-    period_s: float = expert(
-        0.5, 's between the images that are searched; more often costs time and adds little',
-        0.0, 600.0)
     images: int = expert(
         300, 'searched at the most; when there are more, every second one is dropped', 10, 10000)
-    min_length_px: int = expert(
-        40, 'px; a shorter line shows too little of its bend', 32, 10000)
-    contrast: float = expert(
-        4.0, 'grey levels per px across a line; noise of 6 levels comes to 0.7', 0.1, 255.0)
     group_s: float = expert(
         5.0, 's; images of so long a time may show the same line, and count as one witness',
         0.1, 600.0)
@@ -226,38 +184,18 @@ class VerdictConfig:
         10.0, 'degrees over all turns; less is refused', 0.0, 1000.0)
     min_contrast: float = expert(
         0.05, 'relative rise of the error 20 % off the focal length; less is weak', 0.0, 10.0)
-    refused_contrast: float = expert(
-        0.01, 'relative rise of the error; less is refused', 0.0, 10.0)
-    refused_sigma: float = expert(0.1, 'sigma of fx, of fx; more is refused', 0.0, 1.0)
     max_roll_deg: float = expert(
         45.0, 'degrees; pictures turned more are weak; 180 for a camera mounted so', 0.0, 180.0)
     max_aspect: float = expert(
         0.015, 'fy / fx farther from 1 is weak; a rolling shutter of 20 ms made it 0.04', 0.0, 1.0)
-    max_readout_ms: float = expert(
-        50.0, 'ms; a rolling shutter that takes longer is weak: one picture at 20 fps', 0.0, 1e4)
     max_disagreement: float = expert(
         0.03, 'of fx; weighted scatter between the turns, more is weak', 0.0, 1.0)
     max_leverage: float = expert(
         0.9, 'of the information about fx; the others cannot confirm a turn that gives more',
         0.0, 1.0)
-    max_untold_model_error: float = expert(
-        0.005, 'of fx or the width; a warning comes if p1, p2 and k3 would change more', 0.0, 1.0)
-    told_field_px: float = expert(
-        0.5, 'px RMS; a warning tells of a field that no lens model has, if it is larger',
-        0.0, 1e6)
     max_line_sigmas: float = expert(
         4.0, 'of both; where straight lines ask for another k1 by more, the result is weak',
         1.0, 1e6)
-    max_line_move: float = expert(
-        0.001, 'of the width; only if that k1 moves the picture by more: less does no harm',
-        0.0, 1.0)
-    max_model_sigmas: float = expert(
-        2.0, 'over the picture; a model asked for, but farther from what turns choose, is weak',
-        0.0, 1e6)
-    min_kind_ratio: float = expert(
-        1.5, "of the turns' costs, pinhole to fisheye; true fisheyes have 2.7 and more", 1.0, 1e6)
-    max_kind_sigmas: float = expert(
-        10.0, 'over the picture; kinds of lenses that differ by less may be mistaken', 0.0, 1e6)
     max_misfit: float = expert(
         2.0, "times a turn's cost with a camera of its own; more is weak: another lens", 1.0, 1e4)
     max_crop_sigmas: float = expert(
@@ -276,22 +214,9 @@ class FleetConfig:
         1200, 'MB declared for a task; measured: 250 MB, and up to 8 turns of 1440 px', 1, 2**20)
     least_units: int = expert(
         8, 'cameras of one make, beside the one it is for; fewer give it no prior', 3, 10**6)
-    focal_spread: float = expert(
-        0.0125, 'of fx between units of a model; 14 models in public profiles: 1 to 1.5 %',
-        1e-4, 1.0)
-    distortion_spread: float = expert(
-        0.01, 'of k1 and the like between units of a model: much less than of fx', 1e-5, 1.0)
-    spread_units: float = expert(
-        20.0, 'units that the two spreads count as, beside those of the fleet', 0.0, 1e6)
-    one_turn_excess: float = expert(
-        3.0, 'by which one turn varies more than its noise, as monitor.scatter; counts so, too',
-        1.0, 64.0)
     other_mode: float = expert(
         3.0, 'sigmas off the fx of its make; a unit farther off is in another sensor mode',
         1.0, 1e3)
-    least_odds: float = expert(
-        3.0, 'that a unit is in the mode of its make, by its own turns; with less: no prior',
-        0.0, 1e6)
 
 
 @dataclass(frozen=True)
@@ -305,25 +230,12 @@ class MonitorConfig:
         0.0, 1e6)
     turn_limit: float = expert(
         4.0, 'of one turn, the same: two sigma', 0.0, 1e6)
-    scatter: float = expert(
-        3.0, 'by which the turns of one camera vary more than their noise; KITTI 03: up to 5',
-        1.0, 100.0)
     max_misfit: float = expert(
         1.3, "times a turn's cost with its own camera; in 88 turns of one camera: 1.21 at most",
         1.0, 1e4)
-    least_change: float = expert(
-        0.008, 'of fx, or of the width: smaller changes are not told', 0.0, 1.0)
     heading_limit: float = expert(
         4.0, 'sigmas between the directions of travel before and after the camera was moved',
         0.0, 100.0)
-    least_turned_deg: float = expert(
-        0.6, 'degrees; a camera that was moved by less is not told', 0.0, 90.0)
-    heading_sigma_deg: float = expert(
-        0.15, 'degrees; the direction of travel varies so much between turns, sideways', 0.0, 10.0)
-    pitch_sigma_deg: float = expert(
-        0.2, 'degrees; the same up and down: roads, brakes and load', 0.0, 10.0)
-    max_heading_sigma_deg: float = expert(
-        1.0, 'degrees; a turn that shows the direction of travel worse is not used', 0.0, 90.0)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from dashcalib_ros.input import Frame
 ROUNDING = 1_000_000
 # half widths; frames are kept no longer than this for a peak that may still come (on a plateau)
 RECENT = 3
+# half widths; overlapping turns that are longer together are not joined
+LONGEST = 4
 
 
 @dataclass
@@ -155,7 +157,7 @@ class TurnBank:
             if not _overlap(new.turn, other.turn):
                 continue
             span = max(new.last_ns, other.last_ns) - min(new.first_ns, other.first_ns)
-            if not other.fixed and span <= self.config.longest * self._half_ns + ROUNDING:
+            if not other.fixed and span <= LONGEST * self._half_ns + ROUNDING:
                 self._kept.remove(other)
                 new = _merge(new, other)
                 continue

@@ -9,6 +9,8 @@ from dashcalib_ros.detect.edges import KNOTS, Lines, upright_edges
 
 # edges kept of a picture, the longest: they tell most, and a fence may have hundreds
 MOST = 50
+# s between the images that are searched; more often costs time and adds little
+PERIOD_S = 0.5
 
 
 class LineCollector:
@@ -16,14 +18,14 @@ class LineCollector:
 
     def __init__(self, config: LinesConfig) -> None:
         self._config = config
-        self._period_ns = config.period_s * 1e9
+        self._period_ns = PERIOD_S * 1e9
         self._found: list[tuple[int, Floats32]] = []
 
     def push(self, image: GreyImage, stamp_ns: int) -> None:
         """Take a picture of the moving car; it is searched if the last one is long enough ago."""
         if self._found and 0 <= stamp_ns - self._found[-1][0] < self._period_ns:
             return
-        points = upright_edges(image, self._config)
+        points = upright_edges(image)
         if len(points) > MOST:
             height = points[:, -1, 1] - points[:, 0, 1]
             points = points[np.sort(np.argsort(-height, kind='stable')[:MOST])]

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask, Pixels
-from dashcalib_ros.config import LinesConfig
 
 # points of an edge: means over as many equal parts of it
 KNOTS = 16
@@ -30,6 +29,10 @@ BRANCHES = 1.1
 ENDS = 4
 # px left out at the picture's border
 BORDER = 3
+# px; a shorter line shows too little of its bend
+MIN_LENGTH_PX = 40
+# grey levels per px across a line; noise of 6 levels comes to 0.7
+CONTRAST = 4.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class Lines:
         return self.chosen(inside.reshape(-1, KNOTS).all(axis=1))
 
 
-def upright_edges(image: GreyImage, config: LinesConfig) -> Floats32:
+def upright_edges(image: GreyImage) -> Floats32:
     """Return the points (n, KNOTS, 2) px of a picture's upright edges, from above."""
     blurred = cv2.GaussianBlur(image, (0, 0), sigmaX=BLUR_ACROSS, sigmaY=BLUR_ALONG)
     slope = cv2.Sobel(blurred, cv2.CV_16S, 1, 0)
@@ -67,11 +70,11 @@ def upright_edges(image: GreyImage, config: LinesConfig) -> Floats32:
     middle = steep[:, 1:-1]
     peak = np.zeros(image.shape, bool)
     peak[:, 1:-1] = ((middle >= steep[:, :-2]) & (middle > steep[:, 2:])
-                     & (middle > SOBEL * config.contrast))
+                     & (middle > SOBEL * CONTRAST))
     peak[:, :BORDER] = peak[:, -BORDER:] = peak[:BORDER] = peak[-BORDER:] = False
     # from dark to bright and from bright to dark: such edges may touch each other
     signs = (peak & (slope > 0), peak & (slope < 0))
-    return np.concatenate([_knots(_traced(each, config.min_length_px), steep) for each in signs])
+    return np.concatenate([_knots(_traced(each, MIN_LENGTH_PX), steep) for each in signs])
 
 
 @dataclass(frozen=True)

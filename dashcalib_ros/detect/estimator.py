@@ -13,7 +13,7 @@ from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.config import MaskConfig, MotionConfig
 from dashcalib_ros.detect.continuity import goes_on
 from dashcalib_ros.detect.epipoles import epipoles_of, turning
-from dashcalib_ros.detect.mask import EgoMask
+from dashcalib_ros.detect.mask import CELL, EgoMask
 from dashcalib_ros.detect.motion import Motion, TrackedPoints
 from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
@@ -29,6 +29,12 @@ LEAST_SIDE = 20
 JITTER = 6.0
 # times the step from image to image; jitter does not add up over a triplet, motion does
 JITTER_GROWTH = 1.5
+# px at the working width; inlier threshold of the fundamental matrix
+EPIPOLAR_PX = 0.5
+# of points; where fewer are left, new ones are looked for
+REPLENISH = 0.65
+# s between two updates of the mask that the tracking uses
+MASK_PERIOD_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -72,8 +78,7 @@ class MotionEstimator:
         self._period_ns = 1e9 / config.rate
         # a small window, as this runs on every image; one pixel of the coarsest level is 8 px of
         # the picture, enough for the motion in a sharp turn
-        self._tracking = Tracking(config.forward_backward_px, window=9, levels=3, steps=12,
-                                  step_px=0.02, border=5)
+        self._tracking = Tracking(window=9, levels=3, steps=12, step_px=0.02, border=5)
         self._shape: tuple[int, int] | None = None
         self._straights = StraightCollector()
         self._reset()
@@ -183,8 +188,8 @@ class MotionEstimator:
         self._factor = -(-shape[1] // self.config.width)
         self._ego = None
         # smaller pictures are too small for the mask's cells
-        if self.mask_config.enabled and min(self._size) >= 4 * self.mask_config.cell:
-            self._ego = EgoMask(self.mask_config, self._size)
+        if self.mask_config.enabled and min(self._size) >= 4 * CELL:
+            self._ego = EgoMask(self._size)
         self._segmented = SegmentationMask(self._model, self.mask_config) if self._model else None
         self._ego_ns = self._masked_ns = -math.inf
         self._exclude(self._user)
@@ -203,7 +208,7 @@ class MotionEstimator:
             return
         self._ego_ns = now.stamp_ns
         self._ego.push(image, *_common(middle, now), epipoles)
-        if abs(now.stamp_ns - self._masked_ns) > 1e9 * self.mask_config.period_s:
+        if abs(now.stamp_ns - self._masked_ns) > 1e9 * MASK_PERIOD_S:
             self._masked_ns = now.stamp_ns
             self._exclude(self.valid())
 
@@ -244,7 +249,7 @@ class MotionEstimator:
 
     def _replenish(self, image: GreyImage) -> None:
         """Add points where there are few; they are found at half resolution, which is enough."""
-        enough = len(self._ids) >= self.config.replenish * self.config.points
+        enough = len(self._ids) >= REPLENISH * self.config.points
         if enough or min(image.shape) < LEAST_SIDE:
             return
         half = np.asarray(
@@ -292,7 +297,7 @@ class MotionEstimator:
         before, after = _common(a, b)
         if _median_shift(before, after) < self.config.standing_px:
             return np.zeros((2, 2))
-        return epipoles_of(before, after, self._size, self.config.epipolar_px)
+        return epipoles_of(before, after, self._size, EPIPOLAR_PX)
 
 
 def _common(a: _Seen, b: _Seen) -> tuple[Floats32, Floats32]:

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
-from dashcalib_ros.config import MaskConfig
 
 # px at the mask's resolution; with less flow the world does not count as moving
 MOVED = 2.5
@@ -24,7 +23,7 @@ TURNED = 4.0
 SAMPLES = 12
 # samples of a cell at which all sums are halved: new samples count more than old ones
 REMEMBERED = 2000
-# least coherence of a pixel's gradient; mask.stays is that of a cell's
+# least coherence of a pixel's gradient
 PIXEL_STAYS = 0.7
 # effective number of samples a pixel needs: a few may be alike by chance
 PIXEL_SAMPLES = 6.0
@@ -34,16 +33,21 @@ PIXELS = 0.06
 FLAT = 1.5
 # share of a flat region's outline that must be vehicle, for the region to be vehicle, too
 ENCLOSED = 0.6
+# px at the working width; resolution of the mask
+CELL = 16
+# coherence of a cell's gradient: the world's is about 0, the vehicle's 0.7
+CELL_STAYS = 0.4
+# of the picture; a mask of the vehicle that hides more is not used
+LARGEST = 0.4
 
 
 class EgoMask:
     """Accumulates what stays in the picture; works at half the working resolution."""
 
-    def __init__(self, config: MaskConfig, size: tuple[int, int]) -> None:
+    def __init__(self, size: tuple[int, int]) -> None:
         """size: (width, height) at the working resolution."""
         self._size = size[0] // 2, size[1] // 2
-        self._config = config
-        self._cell = max(2, config.cell // 2)
+        self._cell = max(2, CELL // 2)
         width, height = self._size
         self.grid = -(-height // self._cell), -(-width // self._cell)
         self._sum = np.zeros((2, height, width), np.float32)
@@ -94,11 +98,11 @@ class EgoMask:
             return None
         stays, strength, pixels = self._evidence()
         flat = known & (strength < FLAT)
-        ego = known & ~flat & (stays > self._config.stays) | known & (pixels > PIXELS)
+        ego = known & ~flat & (stays > CELL_STAYS) | known & (pixels > PIXELS)
         ego = _without_specks(ego)
         filled = _closed(ego | self._enclosed(flat & ~ego, ego))
         for cells in (filled, ego):
-            if cells.mean() <= self._config.largest:
+            if cells.mean() <= LARGEST:
                 return cells
         return None
 

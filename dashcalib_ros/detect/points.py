@@ -9,18 +9,19 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats32, GreyImage, Mask
 
+# px; a point that does not track back to within this is dropped
+FORWARD_BACKWARD_PX = 0.5
+
 
 @dataclass(frozen=True)
 class Tracking:
     """Options of the tracking; the defaults are those of a reconstruction.
 
-    forward_backward_px: a point that does not track back to within this is dropped.
     window: px, side of the Lucas-Kanade window. levels: of the pyramid, above the full picture.
     steps, step_px: the iteration ends after this many steps, or with a step this short.
     border: px; points nearer to it are dropped: where the window leaves the picture, they drift.
     """
 
-    forward_backward_px: float
     window: int = 21
     levels: int = 4
     steps: int = 10
@@ -82,6 +83,6 @@ def follow_points(before: GreyImage, after: GreyImage, points: Floats32, trackin
     x, y, border = moved[:, 0], moved[:, 1], tracking.border
     trusted = (
         (ahead.ravel() > 0) & (behind.ravel() > 0)
-        & (np.linalg.norm(back - points, axis=1) < tracking.forward_backward_px)
+        & (np.linalg.norm(back - points, axis=1) < FORWARD_BACKWARD_PX)
         & (x > border) & (x < width - 1 - border) & (y > border) & (y < height - 1 - border))
     return moved, trusted

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats32, GreyImage, Mask
 from dashcalib_ros.config import MaskConfig
+from dashcalib_ros.detect.mask import LARGEST
 from dashcalib_ros.errors import ConfigError, InputError, one_line
 from dashcalib_ros.limits import MODEL_BYTES, check_file
 
@@ -112,7 +113,7 @@ class SegmentationMask:
     def hidden(self, shape: tuple[int, int]) -> Mask | None:
         """Return (height, width) of the full image: where the vehicle is; None if unknown."""
         found = self._found()
-        if found is None or found.mean() > self._config.largest or not found.any():
+        if found is None or found.mean() > LARGEST or not found.any():
             return None
         assert self._votes is not None
         # interpolate between the output's pixels, which are coarse
@@ -130,7 +131,7 @@ class SegmentationMask:
             return None
         if not found.any():
             return f'the segmentation model sees no part of the own car; if there is one, {cure}'
-        if found.mean() > self._config.largest:
+        if found.mean() > LARGEST:
             return (f'the segmentation model takes {100 * found.mean():.0f} % of the picture for '
                     f'the own car, which is too much and not used; {cure}')
         return None

@@ -3,7 +3,7 @@
 The units of a make have nearly the same focal length and distortion (the centre is each unit's
 own). Each unit is measured with its own covariance S; between units the lenses differ by a
 covariance B, which is estimated by maximum likelihood (EM), so that S is not mistaken for B. The
-spreads of FleetConfig count as some more units. A unit with one turn has no scatter between turns
+spreads below count as some more units. A unit with one turn has no scatter between turns
 in its S: by how much such S are too small is estimated, too. A unit that is several sigmas off is
 in another mode of its sensor: it is thrown out, and has no prior. Nor has a unit that knows so
 little that it may well be in another mode. A unit's prior is made without itself.
@@ -33,6 +33,16 @@ FOLDS = 40
 CANDIDATES = 500
 # of the variance of units with one turn: real turns are off by 2 to 8 times the sigma of noise
 MOST_EXCESS = 64.0
+# of fx between units of a model; 14 models in public profiles: 1 to 1.5 %
+FOCAL_SPREAD = 0.0125
+# of k1 and the like between units of a model: much less than of fx
+DISTORTION_SPREAD = 0.01
+# units that the two spreads count as, beside those of the fleet
+SPREAD_UNITS = 20.0
+# by which one turn varies more than its noise, counts so, too
+ONE_TURN_EXCESS = 3.0
+# that a unit is in the mode of its make, by its own turns; with less: no prior
+LEAST_ODDS = 3.0
 
 
 @dataclass(frozen=True)
@@ -116,7 +126,7 @@ def _verdict(unit: Unit, prior: LensPrior | None, others: int, config: FleetConf
         percent = 100 * (focal_length(unit.lens[0]) / focal_length(prior.mean[0]) - 1)
         return Verdict(None, f'its fx is {percent:+.1f} % off that of its make, or its distortion '
                              f'is another: another mode of the sensor, or another device', True)
-    if odds_of_mode(unit, prior) < config.least_odds:
+    if odds_of_mode(unit, prior) < LEAST_ODDS:
         return Verdict(None, 'its own turns know too little to tell whether its sensor is in the '
                              'mode of its make')
     return Verdict(prior)
@@ -164,7 +174,7 @@ def _densest(focal: Floats, variance: Floats, config: FleetConfig) -> Mask:
 
     focal: (n,) curvatures; variance: (n,) of each. A unit that knows little counts little.
     """
-    spread = np.square(2 * focal * config.focal_spread)
+    spread = np.square(2 * focal * FOCAL_SPREAD)
     total = variance + spread
     weight = spread / total
     # the candidates are the best known units
@@ -180,9 +190,9 @@ def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:
     own = np.array([unit.covariance for unit in units])
     vague = np.array([unit.one_turn for unit in units])
     count, size = lenses.shape
-    focal_spread = 2 * float(np.median(lenses[:, 0])) * config.focal_spread
-    assumed = np.diag([focal_spread**2] + [config.distortion_spread**2] * (size - 1))
-    between, excess = assumed, config.one_turn_excess if vague.any() else 1.0
+    focal_spread = 2 * float(np.median(lenses[:, 0])) * FOCAL_SPREAD
+    assumed = np.diag([focal_spread**2] + [DISTORTION_SPREAD**2] * (size - 1))
+    between, excess = assumed, ONE_TURN_EXCESS if vague.any() else 1.0
     for _ in range(STEPS):
         noise = own * np.where(vague, excess, 1.0)[:, None, None]
         weights = np.linalg.inv(between + noise)
@@ -192,16 +202,16 @@ def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:
         offset = np.einsum('nij,nj->ni', gain, lenses - mean)
         # what a unit's own data, and the mean, leave unknown of its offset
         rest = between - gain @ between + gain @ of_mean @ gain.transpose(0, 2, 1)
-        total = offset.T @ offset + rest.sum(axis=0) + config.spread_units * assumed
-        new = total / (count + config.spread_units)
+        total = offset.T @ offset + rest.sum(axis=0) + SPREAD_UNITS * assumed
+        new = total / (count + SPREAD_UNITS)
         change = np.max(np.abs(new - between)) / np.max(np.diag(new))
         between = (new + new.T) / 2
         if vague.any():
             # of fx: its sigma is what matters
             error = (lenses - mean - offset)[:, 0]
             ratios = (error**2 + rest[:, 0, 0]) / own[:, 0, 0]
-            known = ratios[vague].sum() + config.spread_units * config.one_turn_excess
-            now = min(max(float(known / (vague.sum() + config.spread_units)), 1.0), MOST_EXCESS)
+            known = ratios[vague].sum() + SPREAD_UNITS * ONE_TURN_EXCESS
+            now = min(max(float(known / (vague.sum() + SPREAD_UNITS)), 1.0), MOST_EXCESS)
             change, excess = max(change, abs(now - excess)), now
         if change < SETTLED:
             break

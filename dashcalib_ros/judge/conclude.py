@@ -52,6 +52,10 @@ NOT_NEEDED = 'more prominent turns were enough'
 # result.json has their versions: a result's last digits depend on them
 PACKAGES = (
     'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap', 'pyceres')
+# of fx or the width; a warning comes if p1, p2 and k3 would change more
+MAX_UNTOLD_MODEL_ERROR = 0.005
+# px RMS; a warning tells of a field that no lens model has, if it is larger
+TOLD_FIELD_PX = 0.5
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
             straight_lines = witness and witness.resized(px)
             warnings += _model_error_warnings(solution, px, config)
             field = _field(solution, px, evidence.image_size)
-            if field is not None and field.used and field.rms_px >= config.verdict.told_field_px:
+            if field is not None and field.used and field.rms_px >= TOLD_FIELD_PX:
                 warnings += (f'the picture is bent by {field.rms_px:.1f} px (up to '
                              f'{field.worst_px:.1f} px), as by a windscreen or a rectification: '
                              f'camera_info cannot say that, and sigma over the picture allows '
@@ -205,7 +209,7 @@ def _model_error_warnings(solution: Solution, px: float, config: Config) -> tupl
     step = solution.known.step_to_wider_model
     shifts, others = step[:4], step[count:]
     scale = np.repeat([solution.camera.fx, solution.camera.image_size[0]], 2)
-    if not np.max(np.abs(shifts) / scale) > config.verdict.max_untold_model_error:
+    if not np.max(np.abs(shifts) / scale) > MAX_UNTOLD_MODEL_ERROR:
         return ()
     changes = ', '.join(f'{name} by {px * shift:+.1f}'
                         for name, shift in zip(names, shifts, strict=False))

@@ -37,6 +37,18 @@ UNEXPLAINED_ZOOM = 0.05
 # of the evidence; parts of the camera that leave less are the explanation: a turn's cost is not
 # exactly quadratic, so that the others gain some evidence from a change they have no part in
 UNEXPLAINED = 0.2
+# by which the turns of one camera vary more than their noise; KITTI 03: up to 5
+SCATTER = 3.0
+# of fx, or of the width: smaller changes are not told
+LEAST_CHANGE = 0.008
+# degrees; a camera that was moved by less is not told
+LEAST_TURNED_DEG = 0.6
+# degrees; the direction of travel varies so much between turns, sideways
+HEADING_SIGMA_DEG = 0.15
+# degrees; the same up and down: roads, brakes and load
+PITCH_SIGMA_DEG = 0.2
+# degrees; a turn that shows the direction of travel worse is not used
+MAX_HEADING_SIGMA_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -116,7 +128,7 @@ class Monitor:
             return False
         zoom = RELEVANT * self._zoom_and_shift()[:, 0]
         against = min(-sum(each.gain(size) for each in own) for size in (zoom, -zoom))
-        return against / self.config.scatter > CONTRADICTION**2
+        return against / SCATTER > CONTRADICTION**2
 
     def after(self, reading: Reading) -> Monitor:
         """Return the state after one more turn."""
@@ -148,7 +160,7 @@ class Monitor:
                      for each, bad in zip(newest, unlike, strict=True)]
             if not (shows[0] and shows[-1]):
                 continue
-            if evidence > self.config.limit and np.abs(size).max() > self.config.least_change:
+            if evidence > self.config.limit and np.abs(size).max() > LEAST_CHANGE:
                 zoom, *shift = map(float, size)
                 change = Change('lens', newest[0].turn, sum(shows), zoom, (shift[0], shift[1]),
                                 self._looks_like(before, newest))
@@ -172,7 +184,7 @@ class Monitor:
             return True
         offsets = np.asarray(np.linalg.pinv(reading.cost.hessian) @ reading.cost.score, np.float64)
         return (reading.misfit > self.config.max_misfit
-                and reading.gain(offsets) / self.config.scatter > self.config.limit)
+                and reading.gain(offsets) / SCATTER > self.config.limit)
 
     def _explains(self, readings: Sequence[Reading]) -> bool:
         """Return whether the camera in use may be right in turns."""
@@ -185,7 +197,7 @@ class Monitor:
         Turns that know little of the lens are explained by any camera: at least one must speak
         against the change as clearly as the turns behind it must speak for it.
         """
-        against = [self._against(each, change) / self.config.scatter for each in before]
+        against = [self._against(each, change) / SCATTER for each in before]
         return max(against, default=0.0) > self.config.limit and self._explains(before)
 
     def _against(self, reading: Reading, change: Change) -> float:
@@ -225,7 +237,7 @@ class Monitor:
         """Return the sum of turns' costs, for their true scatter; 0 for no turns."""
         nothing = Quadratic.prior(np.zeros_like(self.covariance))
         return Quadratic.together([nothing, *(each.cost for each in readings)]).at_noise(
-            self.config.scatter)
+            SCATTER)
 
     def _zoom_and_shift(self) -> Floats:
         """Return (n, 3): a zoom of 1, and shifts of the centre by the picture's width."""
@@ -275,7 +287,7 @@ class Monitor:
         # a camera that does not fit bends the path
         known = [each for each in self.readings if each.heading is not None
                  and max(each.heading.yaw_sigma_deg, each.heading.pitch_sigma_deg)
-                 < self.config.max_heading_sigma_deg and self._explains([each])]
+                 < MAX_HEADING_SIGMA_DEG and self._explains([each])]
         found: Change | None = None
         clearest = self.config.heading_limit
         # two turns before it, so that one bad turn is not taken for how the camera was mounted
@@ -284,7 +296,7 @@ class Monitor:
             (old, old_variance), (new, variance) = (
                 self._headings(known[:-count]), self._headings(newest))
             apart = new - old
-            sigmas = float(np.max(np.where(np.abs(apart) > self.config.least_turned_deg,
+            sigmas = float(np.max(np.where(np.abs(apart) > LEAST_TURNED_DEG,
                                            np.abs(apart) / np.sqrt(old_variance + variance), 0)))
             if sigmas > clearest:
                 clearest = sigmas
@@ -296,7 +308,7 @@ class Monitor:
         """Return the mean yaw and pitch of the direction of travel (2,), and its variance."""
         angles = np.array([[each.heading.yaw_deg, each.heading.pitch_deg] for each in readings
                            if each.heading is not None])
-        varies = np.array([self.config.heading_sigma_deg, self.config.pitch_sigma_deg])
+        varies = np.array([HEADING_SIGMA_DEG, PITCH_SIGMA_DEG])
         return angles.mean(axis=0), np.square(varies) / len(angles)
 
 

@@ -31,6 +31,20 @@ from dashcalib_ros.solve.solution import Solution
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
 ON_BOUND = 0.01
 STEADY = 'switch the stabiliser off'
+# relative rise of the error; less is refused
+REFUSED_CONTRAST = 0.01
+# sigma of fx, of fx; more is refused
+REFUSED_SIGMA = 0.1
+# ms; a rolling shutter that takes longer is weak: one picture at 20 fps
+MAX_READOUT_MS = 50.0
+# of the width; only if that k1 moves the picture by more: less does no harm
+MAX_LINE_MOVE = 0.001
+# over the picture; a model asked for, but farther from what turns choose, is weak
+MAX_MODEL_SIGMAS = 2.0
+# of the turns' costs, pinhole to fisheye; true fisheyes have 2.7 and more
+MIN_KIND_RATIO = 1.5
+# over the picture; kinds of lenses that differ by less may be mistaken
+MAX_KIND_SIGMAS = 10.0
 
 
 @dataclass(frozen=True)
@@ -107,7 +121,7 @@ def flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
     contrast = profile_contrast(solution)
     return _graded(
         # written with not: a contrast of NaN is refused, too
-        not contrast >= config.refused_contrast, contrast < config.min_contrast,
+        not contrast >= REFUSED_CONTRAST, contrast < config.min_contrast,
         f'a focal length 20 % off would explain the pictures almost as well (the error rises by '
         f'{100 * max(contrast, 0.0):.1f} %; at least {100 * config.min_contrast:.0f} % needed)',
         'drive sharper turns, in daylight')
@@ -144,7 +158,7 @@ def sigma_too_large(solution: Solution, config: VerdictConfig) -> Finding | None
     relative = float(solution.sigma[0] / solution.camera.fx)
     known = f'to {100 * relative:.1f} % only' if np.isfinite(relative) else 'not at all'
     return _graded(
-        not np.isfinite(relative) or relative > config.refused_sigma, relative > config.max_sigma,
+        not np.isfinite(relative) or relative > REFUSED_SIGMA, relative > config.max_sigma,
         f'the focal length is known {known}; {100 * config.max_sigma:.1f} % or better needed',
         'drive more turns, or sharper ones')
 
@@ -260,7 +274,7 @@ def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None
 
 def _strange_shutter(solution: Solution, config: VerdictConfig) -> Finding | None:
     readout_ms = 1e3 * abs(solution.readout_s)
-    if readout_ms <= config.max_readout_ms:
+    if readout_ms <= MAX_READOUT_MS:
         return None
     return Finding('weak', f'the rows of a picture seem to be exposed over {readout_ms:.0f} ms, '
                            f'longer than rolling shutters take',
@@ -300,7 +314,7 @@ def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
     if own is None or chosen is None or isinstance(solution.camera, MODELS[chosen.model]):
         return None
     apart = own.apart_px
-    if apart is not None and apart <= config.max_model_sigmas * solution.picture.rms:
+    if apart is not None and apart <= MAX_MODEL_SIGMAS * solution.picture.rms:
         return None
     far = f'{solution.px * apart:.1f} px' if apart is not None else 'far'
     return Finding('weak', f'the turns ask for a lens of the model {chosen.model}, not '
@@ -314,9 +328,9 @@ def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
         model = MODELS[each.model]
         if model.family == camera.family or len(model.names()) >= len(camera.names()):
             continue
-        alike_px = config.max_kind_sigmas * solution.picture.rms
+        alike_px = MAX_KIND_SIGMAS * solution.picture.rms
         far = each.apart_px is None or each.apart_px > alike_px
-        if far and each.cost_ratio < config.min_kind_ratio:
+        if far and each.cost_ratio < MIN_KIND_RATIO:
             return Finding('weak', f'the turns do not tell whether the lens is {camera.model} or '
                                    f'{each.model}, and near the corners these differ',
                            'drive where there is something to see up to the corners')
@@ -337,7 +351,7 @@ def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> F
 def lines_contradict(lines: Bend, width: int, config: VerdictConfig) -> bool:
     """Return whether straight lines contradict a camera of pictures of this width, px."""
     return (lines.sigmas > config.max_line_sigmas
-            and lines.picture_px / width > config.max_line_move)
+            and lines.picture_px / width > MAX_LINE_MOVE)
 
 
 def _graded(refused: bool, weak: bool, what: str, cure: str) -> Finding | None:

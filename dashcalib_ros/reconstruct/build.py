@@ -36,6 +36,14 @@ COMPLETIONS = 2
 ROUGH = 1e-3
 # columns and rows in which tracks are to be seen in each keyframe
 GRID = (6, 3)
+# a turn with fewer tracks is not tried
+MIN_TRACKS = 80
+# px^2 per observation; a turn that costs more is chained with other tracks, too
+GOOD_COST = 1.2
+# px; of the affine registration
+PATCH_HALF_WINDOW = 7
+# px; a registration that moves a point farther is wrong
+MAX_SHIFT_PX = 3.0
 
 
 def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft | None:
@@ -44,7 +52,7 @@ def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft 
     valid: (h, w), False where the ego vehicle is.
     """
     tracks, settings = track_turn(turn, config.tracks, valid), config.scene
-    if tracks.xy.shape[1] < settings.min_tracks or len(tracks.frames) < settings.min_images:
+    if tracks.xy.shape[1] < MIN_TRACKS or len(tracks.frames) < settings.min_images:
         return None
     found: list[Scene] = []
     for model in searched(config.model):
@@ -72,7 +80,7 @@ def _around(camera: Camera) -> tuple[float, float]:
 
 def _may_be_another(profile: Profile, config: SceneConfig) -> bool:
     """Return whether a pinhole's profile leaves it open that the lens is a fisheye."""
-    return profile.best < WIDE or float(profile.costs.min()) > config.good_cost
+    return profile.best < WIDE or float(profile.costs.min()) > GOOD_COST
 
 
 def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
@@ -93,7 +101,7 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
     by_index = {frame.index: frame.image for frame in turn.frames}
     images = [by_index[int(index)] for index in scene.tracks.frames]
     registered = register_tracks(scene.tracks, scene.structure, scene.camera, images,
-                                 settings.patch_half_window, settings.max_shift_px)
+                                 PATCH_HALF_WINDOW, MAX_SHIFT_PX)
     scene = retriangulated(replace(scene, tracks=registered), scene.camera,
                            settings.error_px, settings.min_angle_deg)
     scene = _refined(scene, settings, reach)
@@ -131,7 +139,7 @@ def _trials(tracks: Tracks, turn: Turn, config: Config, model: type[Camera]
     settings = config.scene
     few = thinned(tracks, settings.profile_keyframes)
     trials = _profile_trials(_longest(few, settings.profile_tracks), turn, config, model)
-    if not trials or min(map(_cost_of, trials.values())) > settings.good_cost:
+    if not trials or min(map(_cost_of, trials.values())) > GOOD_COST:
         others = _profile_trials(_spread(few, settings.profile_tracks), turn, config, model)
         for ratio, scene in others.items():
             trials[ratio] = min(trials.get(ratio, scene), scene, key=_cost_of)

@@ -18,6 +18,8 @@ from dashcalib_ros.detect.turn import Turn
 MIN_LENGTH = 3
 # px between two keyframes; a track that moves less stands still in the picture
 STANDING_PX = 0.3
+# a keyframe comes at the latest when fewer of the last one's points live
+KEYFRAME_OVERLAP = 0.6
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def _follow(images: list[GreyImage], config: TracksConfig, valid: Mask | None
     points = np.zeros((0, 2), np.float32)
     born = 0
     rows = []
-    tracking = Tracking(config.forward_backward_px, config.window)
+    tracking = Tracking()
     for k, image in enumerate(images):
         if k:
             points, trusted = follow_points(images[k - 1], image, points, tracking)
@@ -114,7 +116,7 @@ def _keyframes(ids: Ints, frames: Ints, xy: Floats, width: int,
         now_ids, now_xy = observed(k)
         _, a, b = np.intersect1d(last_ids, now_ids, assume_unique=True, return_indices=True)
         moved = np.linalg.norm(now_xy[b] - last_xy[a], axis=1)
-        survived = len(a) >= config.keyframe_overlap * len(last_ids)
+        survived = len(a) >= KEYFRAME_OVERLAP * len(last_ids)
         if survived and (len(a) == 0 or np.median(moved) < config.keyframe_motion * width):
             continue
         chosen.append(k)

@@ -21,6 +21,10 @@ FIRST_TRACKS = 200
 # of an adjustment with a fixed camera; it moves poses and points only, and is cheap
 ITERATIONS = 20
 ROUNDS = 3
+# of a turn's observations; with fewer it is chained anew with the common camera
+WELL_EXPLAINED = 0.9
+# times a turn's cost with its own camera; above it, its own poses are tried, too
+WELL_FITTING = 1.25
 
 
 def retriangulate(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
@@ -82,7 +86,7 @@ def explained_by(scenes: Sequence[Scene], measured: Mapping[TurnId, Scene], came
     """
     kept = []
     for scene in scenes:
-        if scene.explained < config.scene.well_explained:
+        if scene.explained < WELL_EXPLAINED:
             scene = max(scene, _rechained(measured[scene.turn], camera, config),
                         key=lambda candidate: candidate.explained)
         if scene.explained >= config.scene.min_explained:
@@ -111,7 +115,7 @@ def with_better_poses(scenes: Sequence[Scene], per_turn: Sequence[Scene], camera
         return truncated_cost(scene, camera, config.error_px)
 
     return [min(scene, _readjusted(replace(scene, structure=own[scene.turn]), camera, config),
-                key=cost) if found[scene.turn] > config.well_fitting else scene
+                key=cost) if found[scene.turn] > WELL_FITTING else scene
             for scene in scenes]
 
 

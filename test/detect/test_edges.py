@@ -29,7 +29,7 @@ def picture(edge, size=(320, 240), top=40, bottom=200, noise=2.0, seed=0, levels
     lambda y: 150.0 + 8 * ((y - 120) / 80)**2], ids=['upright', 'leaning', 'back', 'curved'])
 @pytest.mark.parametrize('levels', [(60, 160), (160, 60)], ids=['brighter', 'darker'])
 def test_an_edge_is_found_to_a_fraction_of_a_pixel(edge, levels):
-    points = upright_edges(picture(edge, levels=levels), CONFIG)
+    points = upright_edges(picture(edge, levels=levels))
     assert points.shape == (1, KNOTS, 2) and points.dtype == np.float32
     x, y = points[0].T
     off = x - edge(y)
@@ -47,7 +47,7 @@ def test_an_edge_is_found_to_a_fraction_of_a_pixel(edge, levels):
     np.zeros((1, 1), np.uint8), np.zeros((3, 400), np.uint8), np.full((400, 2), 9, np.uint8)],
     ids=['black', 'noise', 'short', 'leaning too much', 'wavy', 'a pixel', 'flat', 'thin'])
 def test_what_is_no_upright_smooth_edge_gives_nothing(image):
-    assert upright_edges(image, CONFIG).shape == (0, KNOTS, 2)
+    assert upright_edges(image).shape == (0, KNOTS, 2)
 
 
 def test_both_edges_of_a_pole_are_found():
@@ -55,12 +55,12 @@ def test_both_edges_of_a_pole_are_found():
     image[:, 180:] = picture(lambda y: 150.0 + 0.1 * y, levels=(160, 60))[:, 180:]
     pole = np.maximum(picture(lambda y: 140.0 + 0 * y), 0) // 2
     pole += picture(lambda y: 144.0 + 0 * y, levels=(160, 60)) // 2
-    points = upright_edges(pole, CONFIG)
+    points = upright_edges(pole)
     assert sorted(points[:, :, 0].mean(axis=1)) == pytest.approx([140, 144], abs=0.3)
 
 
 def test_lines_on_the_own_car_are_left_out():
-    lines = Lines(upright_edges(picture(lambda y: 150.0 + 0 * y), CONFIG), np.zeros(1))
+    lines = Lines(upright_edges(picture(lambda y: 150.0 + 0 * y)), np.zeros(1))
     valid = np.ones((240, 320), bool)
     assert len(lines.within(None)) == len(lines.within(valid)) == 1
     valid[150:170] = False
@@ -103,4 +103,4 @@ def test_a_fence_has_its_longest_posts_only():
     image = np.tile(np.where(x % 8 < 4, 60, 180).astype(np.uint8), (120, 1))
     collector = LineCollector(CONFIG)
     collector.push(image, 0)
-    assert len(upright_edges(image, CONFIG)) > 300 and len(collector.lines()) == 50
+    assert len(upright_edges(image)) > 300 and len(collector.lines()) == 50

@@ -89,7 +89,7 @@ def test_a_vehicle_that_hides_most_is_not_believed():
     """A mask of nearly everything would leave nothing to calibrate with."""
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (200, 320)).astype(np.uint8)
-    mask = EgoMask(MaskConfig(), (320, 200))
+    mask = EgoMask((320, 200))
     before = rng.uniform((0, 0), (320, 200), (100, 2)).astype(np.float32)
     epipoles = np.array([[0.0, 0.0], [0.1, 0.0]])
     for _ in range(40):
@@ -100,7 +100,7 @@ def test_a_vehicle_that_hides_most_is_not_believed():
 def test_static_patch_in_a_moving_world():
     rng = np.random.default_rng(1)
     world = rng.integers(0, 255, (200, 3000)).astype(np.uint8)
-    mask = EgoMask(MaskConfig(), (320, 200))
+    mask = EgoMask((320, 200))
     before = rng.uniform((0, 0), (320, 200), (100, 2)).astype(np.float32)
     epipoles = np.array([[0.0, 0.0], [0.1, 0.0]])
     assert mask.cells() is None and mask.hidden((200, 320), 1) is None
