@@ -261,9 +261,9 @@ class Learner:
         turns.store is emptied, too. keep_stored: turns.store stays and its turns are used, as the
         images are of another camera now.
         """
-        self.bank, self._more = self.bank + 1, 0
-        number = self.bank
-        self._inbox.put(lambda: self._begin(number, keep_stored), instead_of_images=True)
+        new = _Bank(self.bank + 1, self._calibrator(use_stored=keep_stored))
+        self.bank, self._more = new.number, 0
+        self._inbox.put(lambda: self._begin(new, keep_stored), instead_of_images=True)
 
     def forget_stored(self, but: Set[TurnId]) -> None:
         """Drop the turns of earlier drives but these: the camera has changed since."""
@@ -304,8 +304,8 @@ class Learner:
                           on_trouble=lambda text: self._tell(Trouble('workers', text)),
                           on_wait=self._serve)
 
-    def _begin(self, number: int, keep_stored: bool) -> None:
-        old, self._now = self._now, _Bank(number, self._calibrator(use_stored=keep_stored))
+    def _begin(self, new: _Bank, keep_stored: bool) -> None:
+        old, self._now = self._now, new
         self._activity = replace(self._activity, status=NOTHING)
         old.calibrator.close()
         if not keep_stored:
@@ -368,7 +368,7 @@ class Learner:
             self._tried_with, bank.tried = self._checked, frozenset()
         ready, goal = self._activity.status.ready, self.goal
         news = goal is not None and len(ready) >= goal and not bank.tried.issuperset(ready)
-        return (bank is self._now and (bank.requested or news)
+        return (bank.number == self.bank and (bank.requested or news)
                 and time.monotonic() >= bank.not_before)
 
     def _calibrate(self, bank: _Bank) -> None:

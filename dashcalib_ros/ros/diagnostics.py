@@ -141,27 +141,18 @@ class Health:
     counts: Mapping[str, int] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Listening:
-    """How the images come. active: False for a managed node that is not.
+def silence(topic: str, listening: bool, silent_s: float | None) -> tuple[bytes, str] | None:
+    """Return level and message where no images come; silent_s: since the last one."""
+    if not listening:
+        return WARN, 'inactive: the node subscribes no images until it is activated'
+    if silent_s is None or silent_s > SILENT_S:
+        return STALE, f'no image on {topic} {since_text(silent_s)}'
+    return None
 
-    silent_s: s since the last one, None before the first.
-    """
 
-    topic: str
-    reliability: str
-    active: bool
-    silent_s: float | None
-
-    @property
-    def trouble(self) -> tuple[bytes, str] | None:
-        """Return level and message where no images come."""
-        if not self.active:
-            return WARN, 'inactive: the node subscribes no images until it is activated'
-        if self.silent_s is None or self.silent_s > SILENT_S:
-            since = 'yet' if self.silent_s is None else f'for {self.silent_s:.0f} s'
-            return STALE, f'no image on {self.topic} {since}'
-        return None
+def since_text(silent_s: float | None) -> str:
+    """Return since when there are no images, None: none came."""
+    return 'yet' if silent_s is None else f'for {silent_s:.0f} s'
 
 
 def turns_text(activity: Activity, wanted: int) -> str:
@@ -170,13 +161,12 @@ def turns_text(activity: Activity, wanted: int) -> str:
     return f'{min(status.built, wanted)} of {wanted} turns, {status.yaw_deg:.0f}° of yaw'
 
 
-def diagnostic_status(name: str, camera_name: str, listening: Listening, activity: Activity,
-                      wanted: int, verdict: Verdict | None, changes: Changes,
-                      warnings: list[str], health: Health, counts: Mapping[str, int]
-                      ) -> DiagnosticStatus:
-    """Return the status of one camera. counts: of images and problems, since the start."""
-    if listening.trouble:
-        level, message = listening.trouble
+def diagnostic_status(silence: tuple[bytes, str] | None, activity: Activity, wanted: int,
+                      verdict: Verdict | None, changes: Changes, warnings: list[str],
+                      health: Health, further: Mapping[str, object]) -> DiagnosticStatus:
+    """Return the status of one camera, without its name. further: values beside these."""
+    if silence is not None:
+        level, message = silence
     elif health.error:
         level, message = ERROR, health.error
     elif warnings or changes.misfit:
@@ -205,15 +195,13 @@ def diagnostic_status(name: str, camera_name: str, listening: Listening, activit
         'camera model': published.camera.model if published else '',
         'sigma fx (px)': f'{sigma["fx"]:.3f}' if sigma else '',
         'file': health.file,
-        'topic': listening.topic,
-        'reliability': listening.reliability,
         'warnings': '; '.join(warnings),
         'check': health.check,
         'check reasons': '; '.join(health.check_reasons),
         'change': '; '.join(changes.texts),
         'suspected change': '; '.join(map(str, changes.suspected)),
-        **counts,
+        **further,
     }
     return DiagnosticStatus(
-        level=level, name=name, hardware_id=camera_name, message=message,
+        level=level, message=message,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])

@@ -26,7 +26,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.decode import message_size
 from dashcalib_ros.input.stamps import StampGate
 from dashcalib_ros.ros.background import whole
-from dashcalib_ros.ros.diagnostics import Complaints
+from dashcalib_ros.ros.diagnostics import Complaints, since_text
 from dashcalib_ros.ros.parameters import make_subscription, override_of
 from dashcalib_ros.ros.settings import NodeConfig
 
@@ -252,8 +252,7 @@ class ImageInput:
             self._said = None
         elif self._said is None or now - self._said >= AGAIN_S:
             self._said = now
-            since = 'yet' if silent_s is None else f'for {silent_s:.0f} s'
-            self._node.get_logger().info(f'no images on {self.topic} {since}; '
+            self._node.get_logger().info(f'no images on {self.topic} {since_text(silent_s)}; '
                                          f'{self._reason()}')
 
     def _reason(self) -> str:

@@ -37,8 +37,8 @@ from dashcalib_ros.ros.diagnostics import (
     Changes,
     Complaints,
     Health,
-    Listening,
     diagnostic_status,
+    silence,
     turns_text,
 )
 from dashcalib_ros.ros.images import CURES, ImageInput, Intake, Source
@@ -382,13 +382,15 @@ class CameraNode(Node, ABC):
             warnings.append(f'{images.publishers} publishers on {images.topic}: remap all but one '
                             f'camera')
         health = self._health(activity, turns_text(activity, wanted))
-        counts = {'received': intake.received, **health.counts,
-                  **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},
-                  'pictures published': self._preview.published}
         status = diagnostic_status(
-            f'{self.get_fully_qualified_name().strip("/")}: camera calibration', self._name,
-            Listening(images.topic, images.reliability, images.listening, intake.silent_s),
-            activity, wanted, self._verdict, self._changes, warnings, health, counts)
+            silence(images.topic, images.listening, intake.silent_s), activity, wanted,
+            self._verdict, self._changes, warnings, health,
+            {'topic': images.topic, 'reliability': images.reliability,
+             'received': intake.received, **health.counts,
+             **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},
+             'pictures published': self._preview.published})
+        status.name = f'{self.get_fully_qualified_name().strip("/")}: camera calibration'
+        status.hardware_id = self._name
         camera = self._trusted() if health.published is None else health.published
         self._preview.tell(status.message, camera.camera if camera else None)
         message = DiagnosticArray(status=[status])

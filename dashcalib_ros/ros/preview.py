@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -58,15 +59,15 @@ class Preview:
     published: how many pictures, of both kinds.
     """
 
-    def __init__(self, node: Node, config: NodeConfig, rectified: str,
+    def __init__(self, node: Node, config: NodeConfig, view: str,
                  failed: Callable[[Exception], None]) -> None:
-        """rectified: the setting of this name. failed: called with what a drawing raised."""
+        """view: the setting `rectified`. failed: called with what a drawing raised."""
         self.published = 0
         self._overlay = make_publisher(node, CompressedImage, '~/overlay/compressed', NEWEST)
         self._rectified = make_publisher(node, CompressedImage, '~/rectified/compressed', NEWEST)
         self._period_s = (1 - EARLY) / config.preview_rate
         self._failed = failed
-        self._rectifier = Rectifier(rectified)
+        self._view = view
         # used by the background thread only
         self._due = 0.0
         # the newest picture only; None ends the thread
@@ -118,7 +119,7 @@ class Preview:
             self._send(self._overlay, picture, overlay(picture.image, picture.view, text))
         fits = camera is not None and camera.image_size == picture.image.shape[::-1]
         if camera is not None and fits and self._rectified.get_subscription_count():
-            self._send(self._rectified, picture, self._rectifier.rectified(picture.image, camera))
+            self._send(self._rectified, picture, rectified(picture.image, camera, self._view))
 
     def _send(self, publisher: Publisher, picture: Picture, drawn: npt.NDArray[np.uint8]) -> None:
         _, data = cv2.imencode('.jpg', drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
@@ -172,36 +173,27 @@ def _write(drawn: Any, text: str) -> None:
                 cv2.LINE_AA)
 
 
-class Rectifier:
-    """Takes the distortion out of images; what that needs is made once for each camera."""
+def rectified(image: GreyImage, camera: Camera, view: str) -> GreyImage:
+    """Return (h, w), as a camera with P of camera_info sees it; black where it sees nothing.
 
-    def __init__(self, rectified: str) -> None:
-        """rectified: what the picture shows, the setting of this name."""
-        self._rectified = rectified
-        self._camera: Camera | None = None
-        self._maps: tuple[Any, Any] | None = None
+    image: of the camera's size. view: what the picture shows, the setting `rectified`.
+    """
+    return np.asarray(cv2.remap(image, *_maps(camera, view), cv2.INTER_LINEAR), np.uint8)
 
-    def rectified(self, image: GreyImage, camera: Camera) -> GreyImage:
-        """Return (h, w), as a camera with P of camera_info sees it; black where it sees nothing.
 
-        image: of the camera's size.
-        """
-        if self._maps is None or camera != self._camera:
-            self._maps, self._camera = self._maps_of(camera), camera
-        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR), np.uint8)
-
-    def _maps_of(self, camera: Camera) -> tuple[Any, Any]:
-        """Return where each pixel of the rectified picture is in the image, as cv2 has it."""
-        matrix = rectified_matrix(camera, self._rectified)
-        width, height = camera.image_size
-        places = np.empty((height, width, 2), np.float32)
-        for top in range(0, height, BAND):
-            band = places[top:top + BAND]
-            y, x = np.mgrid[top:top + len(band), :width]
-            rays = np.stack([(x - matrix[0, 2]) / matrix[0, 0], (y - matrix[1, 2]) / matrix[1, 1],
-                             np.ones(x.shape)], axis=-1)
-            band[:] = np.nan_to_num(camera.project(rays), nan=NOWHERE)
-        # cv2's stubs do not know that both maps may be in one
-        convert: Any = cv2.convertMaps
-        whole, fractions = convert(places, None, cv2.CV_16SC2)
-        return whole, fractions
+@lru_cache(maxsize=1)
+def _maps(camera: Camera, view: str) -> tuple[Any, Any]:
+    """Return where each pixel of the rectified picture is in the image, as cv2 has it."""
+    matrix = rectified_matrix(camera, view)
+    width, height = camera.image_size
+    places = np.empty((height, width, 2), np.float32)
+    for top in range(0, height, BAND):
+        band = places[top:top + BAND]
+        y, x = np.mgrid[top:top + len(band), :width]
+        rays = np.stack([(x - matrix[0, 2]) / matrix[0, 0], (y - matrix[1, 2]) / matrix[1, 1],
+                         np.ones(x.shape)], axis=-1)
+        band[:] = np.nan_to_num(camera.project(rays), nan=NOWHERE)
+    # cv2's stubs do not know that both maps may be in one
+    convert: Any = cv2.convertMaps
+    whole, fractions = convert(places, None, cv2.CV_16SC2)
+    return whole, fractions

@@ -12,7 +12,7 @@ from dashcalib_ros.camera.rectified import rectified_matrix
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.motion import TrackedPoints
 from dashcalib_ros.input import Frame
-from dashcalib_ros.ros.preview import TRACK, Rectifier, overlay
+from dashcalib_ros.ros.preview import TRACK, overlay, rectified
 from dashcalib_ros.status import View
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
@@ -64,26 +64,25 @@ def test_the_state_is_written_on_a_bar_and_fits(size):
     assert ink.any() and not ink[-2:].any()
 
 
-@pytest.mark.parametrize('rectified', ['same', 'crop', 'all'])
-def test_the_rectified_picture_is_what_opencv_makes_of_it(rectified):
+@pytest.mark.parametrize('view', ['same', 'crop', 'all'])
+def test_the_rectified_picture_is_what_opencv_makes_of_it(view):
     image = texture()
-    matrix = rectified_matrix(LENS, rectified)
+    matrix = rectified_matrix(LENS, view)
     theirs = cv2.undistort(image, LENS.matrix, np.array(LENS.ros_distortion()),
                            newCameraMatrix=matrix)
-    ours = Rectifier(rectified).rectified(image, LENS)
+    ours = rectified(image, LENS, view)
     assert np.abs(ours.astype(int) - theirs)[8:-8, 8:-8].max() <= 4
 
 
 def test_a_fisheye_is_rectified_and_what_it_cannot_see_is_black():
     image = np.full((240, 320), 255, np.uint8)
-    rectifier = Rectifier('all')
-    ours = rectifier.rectified(image, WIDE)
+    ours = rectified(image, WIDE, 'all')
     theirs = cv2.fisheye.undistortImage(
         image, WIDE.matrix, np.array(WIDE.ros_distortion()), Knew=rectified_matrix(WIDE, 'all'))
     assert np.mean(np.abs(ours.astype(int) - theirs) > 4) < 0.02
     assert ours[120, 160] == 255 and (ours == 0).any()
     # another camera, another view
-    assert (rectifier.rectified(image, LENS) != ours).any()
+    assert (rectified(image, LENS, 'all') != ours).any()
 
 
 def test_points_are_told_in_pixels_of_the_input():
@@ -154,12 +153,12 @@ def test_they_are_published_only_while_someone_subscribes(make_desk, drawings):
     assert picture.shape == (240, 320, 3) and overlays[-1].format == 'jpeg'
     assert overlays[-1].header.frame_id == 'camera' and overlays[-1].header.stamp.sec > 0
     # there is no calibration: no rectified picture
-    rectified, _ = subscribe(desk, 'rectified')
+    flat, _ = subscribe(desk, 'rectified')
     publish(desk, 3)
-    assert rectified == []
+    assert flat == []
     desk.give()
-    desk.until(lambda: publish(desk, 1) or rectified)
-    picture = cv2.imdecode(np.frombuffer(rectified[-1].data, np.uint8), cv2.IMREAD_UNCHANGED)
+    desk.until(lambda: publish(desk, 1) or flat)
+    picture = cv2.imdecode(np.frombuffer(flat[-1].data, np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (240, 320)
     desk.bench.node.destroy_subscription(subscription)
     desk.until(lambda: desk.node._preview._overlay.get_subscription_count() == 0)
