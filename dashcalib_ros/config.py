@@ -88,6 +88,8 @@ class TurnsConfig:
     store: str = setting(
         '', 'folder for reconstructed turns of one camera: short trips add up; empty: none')
     capacity: int = expert(10, 'turns kept at the most: twice those wanted', 1, 50)
+    min_prominence: float = expert(
+        0.0025, 'of the image width; lower peaks of the turning magnitude are no turns', 0.0, 1.0)
 
 
 @dataclass(frozen=True)

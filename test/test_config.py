@@ -51,10 +51,14 @@ def test_about_twenty_settings_are_for_users_and_come_first():
 def test_what_was_measured_is_told_of_settings_that_exist_with_their_defaults():
     text = (Path(__file__).parents[1] / 'docs' / 'notebook' / 'lessons.md').read_text()
     rows = re.findall(r'^\| `([a-z_.0-9]+)` \| ([^|]+) \|', text, re.MULTILINE)
-    assert len(rows) > 20
+    constants = re.findall(r'^\| `([A-Z_]+)` in (\S+) \|', text, re.MULTILINE)
+    assert len(rows) + len(constants) > 20
     for name, default in rows:
         shown = str(SPECS[name].default) or 'none'
         assert default == shown, name
+    for name, path in constants:
+        module = Path(__file__).parents[1] / 'dashcalib_ros' / path
+        assert re.search(rf'^{name} = ', module.read_text(), re.MULTILINE), name
 
 
 @pytest.mark.parametrize('name', [n for n, s in SPECS.items() if isinstance(s.default, float)])

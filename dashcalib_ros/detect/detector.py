@@ -18,8 +18,6 @@ from dashcalib_ros.input import Frame
 # least prominences; an edge of the drive may be a turn where the magnitude is higher, as nothing
 # tells how straight the car drove beyond. KITTI's raw drive begins in a turn, with 24
 CUT_OFF = 3.0
-# of the image width; lower peaks of the turning magnitude are no turns
-MIN_PROMINENCE = 0.0025
 
 
 @dataclass(frozen=True)
@@ -88,8 +86,8 @@ class TurnDetector:
         """Begin a stretch without gaps."""
         self._median = StreamingMedian(self.config.half_width)
         # a turn that the stretch cuts off counts as far as it goes
-        self._peaks = PeakFinder(MIN_PROMINENCE,
-                                 CUT_OFF * MIN_PROMINENCE)
+        self._peaks = PeakFinder(self.config.min_prominence,
+                                 CUT_OFF * self.config.min_prominence)
         # _centers: frames whose magnitude waits for the median; _samples: those that may be peaks
         self._centers: deque[tuple[int, int]] = deque()
         self._samples: deque[_Sample] = deque()

@@ -41,9 +41,6 @@ class CheckNode(CameraNode):
         self._answers = make_publisher(self, String, '~/check', LATCHED)
         make_subscription(self, CameraInfo, 'camera_info', self._on_info, FROM_DRIVER)
 
-    def _load(self) -> None:
-        """Do nothing: the driver has the calibration."""
-
     def _trusted(self) -> NamedCamera | None:
         """Return the driver's camera, None if it is for other images."""
         return self._given if self._fits else None

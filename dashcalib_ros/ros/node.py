@@ -164,10 +164,6 @@ class CameraNode(Node, ABC):
         """Make what belongs to the camera in use. topic: of the images."""
 
     @abstractmethod
-    def _load(self) -> None:
-        """Begin, at the start and after the turns were dropped."""
-
-    @abstractmethod
     def _trusted(self) -> NamedCamera | None:
         """Return the camera that each turn is compared with, None if there is none."""
 
@@ -178,6 +174,9 @@ class CameraNode(Node, ABC):
     def _checked(self) -> NamedCamera | None:
         """Return the camera that each calibration is to check, None if there is none."""
         return None
+
+    def _load(self) -> None:
+        """Begin, at the start and after the turns were dropped."""
 
     def _accompany(self, header: Header, size: tuple[int, int]) -> None:
         """Publish what belongs beside an image."""

@@ -145,7 +145,8 @@ class ScenePool:
 
         progress: called in this thread. Raises what the function raises, and WorkerDiedError.
         """
-        for failures in range(1, ATTEMPTS + 1):
+        failures = 0
+        while True:
             call = _Call(function, arguments, progress is not None)
             with self._changed:
                 if not self._closed.is_set():
@@ -162,12 +163,12 @@ class ScenePool:
             if call.done and call.error is None:
                 return call.result
             error = call.error or WorkerDiedError('the calibrator is closed')
+            failures += 1
             if (not isinstance(error, WorkerDiedError) or self._closed.is_set()
                     or failures == ATTEMPTS):
                 raise error
             self._on_trouble(str(error))
             self._pause(back_off_s(failures))
-        raise AssertionError('the last attempt returns or raises')
 
     def close(self) -> None:
         """End every worker; a run() in another thread raises, a wait() returns."""
