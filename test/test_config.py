@@ -58,7 +58,7 @@ def test_what_was_measured_is_told_of_settings_that_exist_with_their_defaults():
         assert default == shown, name
     for name, path in constants:
         module = Path(__file__).parents[1] / 'dashcalib_ros' / path
-        assert re.search(rf'^{name} = ', module.read_text(), re.MULTILINE), name
+        assert re.search(rf'^([A-Z_]+, )*{name}\b.* = ', module.read_text(), re.MULTILINE), name
 
 
 @pytest.mark.parametrize('name', [n for n, s in SPECS.items() if isinstance(s.default, float)])
