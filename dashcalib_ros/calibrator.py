@@ -54,7 +54,7 @@ class Calibrator:
                  verbose: bool = False, live: bool = False, use_stored: bool = True,
                  warn: Callable[[str], None] = lambda text: None, inline: bool = False,
                  on_trouble: Callable[[str], None] = lambda text: None,
-                 on_wait: Callable[[], None] | None = None) -> None:
+                 on_wait: Callable[[], bool] | None = None) -> None:
         """mask: (h, w), False where the ego vehicle is.
 
         live: children run at low priority, and push() never waits for them; offline it does, so
@@ -65,7 +65,7 @@ class Calibrator:
         close() then does not end what runs. on_trouble: called with one line for each child that
         died or hangs, and for each turn that is tried again after that, from any thread. on_wait:
         called again and again while calibrate(), check() or watch() waits for a worker; it may
-        push() frames, so that a live drive goes on.
+        push() a frame, so that a live drive goes on, and returns whether it did something.
         """
         self._config = config or Config()
         searched(self._config.model)  # raises ConfigError for one that there is not

@@ -39,7 +39,7 @@ class SceneSelection:
                  live: bool = False, verbose: bool = False, use_stored: bool = True,
                  warn: Callable[[str], None] = lambda text: None, inline: bool = False,
                  on_trouble: Callable[[str], None] = lambda text: None,
-                 on_wait: Callable[[], None] | None = None) -> None:
+                 on_wait: Callable[[], bool] | None = None) -> None:
         """live, use_stored, warn, inline, on_trouble, on_wait: as the Calibrator's."""
         self.warnings: list[str] = []
         # how many turns are used: more than wanted once these have left a result weak

@@ -288,15 +288,19 @@ class Learner:
         # close() may have seen the bank before
         self._now.calibrator.close()
 
-    def _serve(self, wait_s: float = 0.0) -> None:
-        """Do what is next in the inbox; the calibrator calls this while it waits for a child."""
+    def _serve(self, wait_s: float = 0.0) -> bool:
+        """Do what is next in the inbox; return whether there was something.
+
+        The calibrator calls this while it waits for a child.
+        """
         action = self._inbox.get(wait_s)
         if action is None or self._closed:
-            return
+            return False
         try:
             action()
         except Exception as error:
             self._tell(Trouble('failed', f'the turns could not be changed: {_named(error)}'))
+        return True
 
     def _calibrator(self, use_stored: bool) -> Calibrator:
         return Calibrator(self._config, mask=self._mask, live=True, use_stored=use_stored,

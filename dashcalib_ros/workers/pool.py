@@ -54,14 +54,15 @@ class ScenePool:
                  on_lost: Callable[[str], None] = lambda text: None,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  keep_pictures: bool = False,
-                 on_wait: Callable[[], None] | None = None) -> None:
+                 on_wait: Callable[[], bool] | None = None) -> None:
         """queue: how many turns may wait for a worker, with their images; None: any number.
 
         If there are more, as in a live drive, the least prominent counts as one without a scene.
         on_lost: called with a line when a turn is given up. on_trouble: called with a line when a
         worker failed and its work is tried again.
         keep_pictures: pictures() has one of each turn that is done. on_wait: called again and
-        again, in the thread that waits, while wait() or run() waits.
+        again, in the thread that waits, while wait() or run() waits; returns whether it did
+        something, and is called again at once then.
         """
         self._config = config
         self._on_lost, self._on_trouble, self._on_wait = on_lost, on_trouble, on_wait
@@ -191,8 +192,8 @@ class ScenePool:
                 seen = self._changes
             if ended() or self._closed.is_set():
                 return
-            if self._on_wait is not None:
-                self._on_wait()
+            if self._on_wait is not None and self._on_wait():
+                continue
             with self._changed:
                 if self._changes == seen:
                     self._changed.wait(LOOK_S if self._on_wait is None else CALL_S)

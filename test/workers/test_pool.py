@@ -384,10 +384,12 @@ def test_who_waits_may_do_other_things_meanwhile(monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build)
     done: list[str] = []
 
-    def meanwhile() -> None:
-        if not done:
-            done.append(threading.current_thread().name)
-            pool.submit(turn(10), None)
+    def meanwhile() -> bool:
+        if done:
+            return False
+        done.append(threading.current_thread().name)
+        pool.submit(turn(10), None)
+        return True
 
     pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, on_wait=meanwhile)
     with contextlib.closing(pool):
