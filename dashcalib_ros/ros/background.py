@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any, Protocol
 
 from dashcalib_ros.arrays import GreyImage, Mask
@@ -165,7 +166,8 @@ class _Bank:
 
     tried: the turns of the last calibration. told: those that the node knows of. requested: a
     calibration is to begin with the present turns. failures: of calibrations in a row.
-    not_before: when the next one may begin, in s of time.monotonic().
+    not_before: when the next one may begin, in s of time.monotonic(). read: the turns that were
+    compared with the camera in use. earlier: what those of the banks before said of it.
     """
 
     number: int
@@ -176,6 +178,8 @@ class _Bank:
     requested: bool = False
     failures: int = 0
     not_before: float = 0.0
+    read: frozenset[TurnId] = frozenset()
+    earlier: Monitor | None = None
 
 
 class Learner:
@@ -207,7 +211,8 @@ class Learner:
         self._closed = False
         # from here on of the background thread only
         self._now = _Bank(0, self._calibrator(use_stored=True))
-        self._watch = Watch(None)
+        self._watching: NamedCamera | None = None
+        self._monitor: Monitor | None = None
         self._tried_with: NamedCamera | None = None
         self._thread = threading.Thread(target=self._run, name='learn', daemon=True)
         self._thread.start()
@@ -336,7 +341,7 @@ class Learner:
             self._tell(status)
 
     def _look(self, bank: _Bank) -> None:
-        """See which turns are built, and compare those that are new with the camera in use."""
+        """See which turns are built now."""
         try:
             bank.calibrator.want(self._config.turns.wanted, self._more)
             status = bank.calibrator.status()
@@ -344,12 +349,27 @@ class Learner:
             self._tell(Trouble('failed', f'the turns could not be counted: {_named(error)}'))
             return
         self._note(bank, status)
-        if self._watch.camera is not self._watched:
-            self._watch = Watch(self._watched)
+        if self._watching is not self._watched:
+            self._watching, self._monitor, bank.read = self._watched, None, frozenset()
+        turns = frozenset(status.reconstructed)
+        if self._watching is not None and not turns <= bank.read:
+            self._read(bank, self._watching, turns)
+
+    def _read(self, bank: _Bank, camera: NamedCamera, turns: frozenset[TurnId]) -> None:
+        """Compare turns that are new with the camera in use.
+
+        A bank begins empty after each complete calibration; what the turns of the banks before it
+        said is kept, so that a change that was found is not forgotten.
+        """
+        if not bank.read:
+            bank.earlier = self._monitor
+        # the same turns alone are not tried again
+        bank.read |= turns
         try:
-            found = self._watch.read(bank.number, bank.calibrator, status)
-            lens = None if found is None else found.monitor.lens
-            if lens is not None and lens.confirmed and lens.since.of_this_drive:
+            found = bank.calibrator.watch(camera.camera, camera.sigma)
+            if bank.earlier is not None:
+                found = reduce(Monitor.after, found.readings, bank.earlier)
+            if found.lens and found.lens.confirmed and found.lens.since.of_this_drive:
                 # those of earlier drives are of the camera before the change
                 bank.calibrator.forget_stored()
         except Exception as error:
@@ -358,8 +378,8 @@ class Learner:
                                                      f'calibration in use ({_named(error)}); the '
                                                      f'next turn tries again'))
             return
-        if found is not None:
-            self._tell(found)
+        self._monitor = found
+        self._tell(Watched(camera, found))
 
     def _note(self, bank: _Bank, status: Status) -> None:
         self._activity = replace(self._activity, status=status)
@@ -407,43 +427,6 @@ class Learner:
         bank.requested = True
         self._tell(Trouble('failed_calibrations', f'a calibration failed ({_named(error)}); the '
                                                   f'turns are kept, next try in {delay:.0f} s'))
-
-
-class Watch:
-    """What turns say of a camera in use, over all banks of turns: each new one is read once.
-
-    A bank begins empty after each complete calibration; what the turns of the banks before it
-    said is kept, so that a change that was found is not forgotten.
-    """
-
-    def __init__(self, camera: NamedCamera | None) -> None:
-        """camera: None where there is none in use, and nothing is read."""
-        self.camera = camera
-        self._bank = -1
-        self._tried: frozenset[TurnId] = frozenset()
-        self._earlier: Monitor | None = None
-        self._now: Monitor | None = None
-
-    def read(self, bank: int, calibrator: Calibrator, status: Status) -> Watched | None:
-        """Read the turns that were reconstructed since the last call; None if there are none.
-
-        Raises what Calibrator.watch() raises; the same turns alone are not tried again then.
-        """
-        if self.camera is None:
-            return None
-        if bank != self._bank:
-            self._bank, self._tried, self._earlier = bank, frozenset(), self._now
-        turns = frozenset(status.reconstructed)
-        if turns <= self._tried:
-            return None
-        self._tried |= turns
-        found = calibrator.watch(self.camera.camera, self.camera.sigma)
-        if self._earlier is not None:
-            readings, found = found.readings, self._earlier
-            for reading in readings:
-                found = found.after(reading)
-        self._now = found
-        return Watched(self.camera, found)
 
 
 def whole(message: Any, size: tuple[int, int], depth: BitDepth | None = None) -> GreyImage:
