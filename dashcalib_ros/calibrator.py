@@ -120,7 +120,12 @@ class Calibrator:
                 {scene.turn for scene in scenes} - evidence_of(solution, self._config.verdict)
                 - contradicted, CONTRADICTS))
         self._solution = solution
-        return stages.judge(solution, self._evidence(started), self._config)
+        evidence = self._evidence(started)
+        if not self._live or solution is None:
+            return stages.judge(solution, evidence, self._config)
+        # it takes a second or two, and a live drive goes on meanwhile
+        found: Calibration = self._scenes.run(stages.judge, solution, evidence, self._config)
+        return found
 
     def _evidence(self, started: float) -> Evidence:
         now = time.monotonic()
