@@ -114,6 +114,14 @@ class CameraNode(Node, ABC):
     def __init__(self, listen: bool = True) -> None:
         """listen: subscribe the images at once."""
         super().__init__('calibrator')
+        try:
+            self._make(listen)
+        except Exception:
+            # a node that is left half made may crash rclpy at the end of the process
+            self.destroy_node()
+            raise
+
+    def _make(self, listen: bool) -> None:
         self._core, self._own = declare(self)
         topic = self.resolve_topic_name('image_raw')
         self._name = camera_name(self._own, topic)

@@ -74,7 +74,6 @@ class Preview:
         self._waiting: queue.Queue[Picture | None] = queue.Queue(1)
         self._state: tuple[str, Camera | None] = ('', None)
         self._thread = threading.Thread(target=self._draw, name='preview', daemon=True)
-        self._thread.start()
 
     def wanted(self) -> bool:
         """Return whether the next image is to be shown: someone subscribes, and it is due."""
@@ -87,6 +86,8 @@ class Preview:
 
     def show(self, picture: Picture) -> None:
         """Take an image to draw; one that waits still is dropped."""
+        if not self._thread.is_alive():
+            self._thread.start()
         self._put(picture)
 
     def tell(self, text: str, camera: Camera | None) -> None:
@@ -96,7 +97,8 @@ class Preview:
     def close(self) -> None:
         """End the thread."""
         self._put(None)
-        self._thread.join(timeout=10)
+        if self._thread.is_alive():
+            self._thread.join(timeout=10)
 
     def _put(self, picture: Picture | None) -> None:
         with suppress(queue.Empty):

@@ -112,7 +112,9 @@ def spin(node: CameraNode, stopping: Stopping) -> None:
             except (SetupError, ExternalShutdownException):
                 raise
             except Exception as error:
-                if not executor.context.ok() or node.blocked():
+                if not executor.context.ok():
+                    return  # shut down by a signal in the middle of a call, which raises anything
+                if node.blocked():
                     raise
                 node.survive(error)
                 time.sleep(wait_s)
