@@ -256,10 +256,10 @@ class Config:
     rectified: str = setting(
         'same', 'view of rectified pictures, P: as K, without black border, or all up to 75 deg',
         choices=('same', 'crop', 'all'))
-    max_width: int = setting(
+    max_width: int = expert(
         1440, 'px; wider images are halved until they fit: time and memory fall by four',
         320, 16384)
-    min_width: int = setting(
+    min_width: int = expert(
         640, 'px; narrower images are enlarged 2, 3 or 4 times: limits in px fit them, too',
         1, 4096)
     motion: MotionConfig = field(default_factory=MotionConfig)
