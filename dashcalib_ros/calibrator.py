@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 
 from dashcalib_ros import stages
@@ -17,6 +17,7 @@ from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.judge import (
     Check,
     Monitor,
@@ -75,6 +76,7 @@ class Calibrator:
         self._live = live
         self._solution: Solution | None = None
         self._read: _Read | None = None
+        self._motion: SensorStream | None = None
         self._detect_s = 0.0
         self._started = time.monotonic()
 
@@ -89,6 +91,13 @@ class Calibrator:
         self._detect_s += time.monotonic() - started
         self._scenes.make_room()
         return self.status()
+
+    def sense(self, motion: SensorStream) -> None:
+        """Take what the car's sensors say of the drive so far, in the place of what came before.
+
+        The next calibrate() asks it; its stamps count from the first image.
+        """
+        self._motion = motion
 
     def calibrate(self, progress: Progress | None = None, final: bool = True) -> Calibration:
         """Adjust the best turns' scenes together and judge the result.
@@ -120,7 +129,7 @@ class Calibrator:
                 {scene.turn for scene in scenes} - evidence_of(solution, self._config.verdict)
                 - contradicted, CONTRADICTS))
         self._solution = solution
-        evidence = self._evidence(started)
+        evidence = replace(self._evidence(started), motion=self._motion)
         if not self._live or solution is None:
             return stages.judge(solution, evidence, self._config)
         # it takes a second or two, and a live drive goes on meanwhile

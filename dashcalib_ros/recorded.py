@@ -2,10 +2,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,7 +20,9 @@ from dashcalib_ros.detect import Turn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, read_mask
-from dashcalib_ros.input.inputs import Paths, open_frames
+from dashcalib_ros.input.inputs import Paths, fits_bag, open_frames
+from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.input.motion_files import bag_motion, read_motion
 from dashcalib_ros.judge import Check
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import Progress
@@ -30,7 +33,8 @@ MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
 def calibrate(path: Paths, fps: float | None = None,
               config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
               duration_s: float | None = None, mask: MaskOrPath = None,
-              progress: Progress | None = None) -> Calibration:
+              progress: Progress | None = None,
+              motion: str | os.PathLike[str] | SensorStream | None = None) -> Calibration:
     """Calibrate a recorded drive.
 
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
@@ -42,13 +46,18 @@ def calibrate(path: Paths, fps: float | None = None,
     mask: what is not to be used (bonnet, burnt-in text): a picture's path, black there, or an
     array (height, width), 0 or False there; in addition to what is found by itself.
     progress: called with the stage's name and the share done, 0 to 1.
+    motion: the car's own sensors: a CSV, a GPX or a KITTI oxts folder, or a stream. None: of a
+    bag, its own topics.
 
     Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and where it is
     refused its camera is None. Raises InputError for what cannot be read, ConfigError for a bad
     setting, WorkerError where a child process cannot run.
     """
     source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
+    sensors = motion if isinstance(motion, SensorStream) else drive_motion(path, motion)
     with _fed(source, config, mask, tell) as calibrator:
+        if sensors is not None:
+            calibrator.sense(sensors)
         return with_source(calibrator.calibrate(tell), source)
 
 
@@ -77,6 +86,29 @@ def check(given: Camera, path: Paths, fps: float | None = None,
     source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
     with _fed(source, config, mask, tell) as calibrator:
         return calibrator.check(given, calibrator.calibrate(tell), tell)
+
+
+def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
+                 chosen: Mapping[str, str | None] = MappingProxyType({})) -> SensorStream | None:
+    """Return what the file motion has, else what the bags of a drive have; None where none is.
+
+    chosen: the bag's topic by imu, gps and odom. Raises InputError for a file of another kind, and
+    for a topic that there is not.
+    """
+    wanted = {name: topic for name, topic in chosen.items() if topic is not None}
+    if motion is not None:
+        if wanted:
+            raise InputError('--imu, --gps and --odom choose topics of a bag: leave them or '
+                             '--motion away')
+        return read_motion(Path(motion))
+    given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
+    try:
+        bags = [each for each in map(Path, given) if each.exists() and fits_bag(each)]
+        return bag_motion(bags, wanted) if bags else None
+    except (InputError, OSError, ValueError):
+        if wanted:
+            raise
+        return None  # what is wrong with the bag, its pictures will tell
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from messages import PACKAGE, messages_in
 DOCUMENT = Path(__file__).parents[1] / 'docs' / 'troubleshooting.md'
 EXPLAINED = ('judge/agreement.py', 'judge/calibration.py', 'judge/conclude.py',
              'judge/focal_by_turn.py', 'judge/mount.py', 'judge/next_turn.py',
-             'judge/verdict.py',
+             'judge/verdict.py', 'judge/witnesses.py',
              'selection.py', 'input', 'detect',
              'reconstruct/scene_file.py', 'turn_store.py', 'workers', 'cli/run.py')
 # texts that are no messages: parts of others that are shown with them, SQL, code
@@ -18,10 +18,18 @@ PARTS = {
     'judge/calibration.py': {'from one turn alone, which nothing confirms'},
     'judge/conclude.py': {'…, with … times the error of a camera of its own'},
     'judge/next_turn.py': {'…: fx to about … %'},
+    'judge/witnesses.py': {'write rad/s, not degrees a second'},
     'judge/verdict.py': {
+        'check its scale, its clock and that it is of this drive, and leave it away if it is '
+        'wrong; else drive more turns',
         'the turn… at frame …', '… turn… of earlier drives',
         ', so that nothing confirms the numbers and their sigma'},
     'input/inputs.py': {' (and … more like it)', 'the time of recording'},
+    'input/motion.py': {
+        'there are more than … of them', '… of … are damaged, doubled or out of order',
+        'no car turns at … rad/s; write rad/s, not degrees a second',
+        'they are not of one drive'},
+    'input/motion_files.py': {'stamp_s and any of …'},
     'input/joined.py': {' (and … more like it)'},
     'input/bag_write.py': {
         'compressed must be jpeg, png or None, not …',

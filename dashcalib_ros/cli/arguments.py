@@ -127,6 +127,7 @@ def _add_run(commands: Any) -> None:
         'Writes result.json, report.html and, when accepted, calibration.yaml to DIR.',
         "dashcalib run 'clips/*.mp4' --out calibration", EXIT_HELP)
     _add_drive_arguments(parser)
+    _add_motion(parser)
     _add_shared(parser, '--model', '--seed')
     parser.add_argument('--threads', type=int, metavar='N',
                         help='processes that reconstruct turns side by side; the result is the '
@@ -206,10 +207,12 @@ def _add_check(commands: Any) -> None:
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path,
                         help=CALIBRATION_HELP)
     _add_drive_arguments(parser, '*', 'left away: the bag that CALIBRATION is; else: ')
+    _add_motion(parser)
     _add_shared(parser, '--model', '--seed')
     parser.add_argument('--poses', type=Path, metavar='FILE',
-                        help="true poses, in KITTI's or TUM's format: compare the rotation and "
-                             'the scale that each camera finds with them')
+                        help="true poses, in KITTI's or TUM's format, or a GPS track (GPX, a bag "
+                             'with NavSatFix): compare the rotation and the scale that each '
+                             'camera finds with them')
     parser.add_argument('--out', type=path_or('--out is a folder'), metavar='DIR',
                         help='with --poses: write a plot of the paths, and the paths for evo')
     parser.add_argument('--json', action='store_true', help='print JSON')
@@ -272,6 +275,20 @@ def _add_drive_arguments(parser: argparse.ArgumentParser, count: str = '+', more
                         help='a segmentation network that finds the own car, used in addition to '
                              'the automatic mask')
     _add_shared(parser, '--config', '--set')
+
+
+def _add_motion(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the car's own sensors, which say how much it turned."""
+    parser.add_argument('--motion', type=Path, metavar='FILE',
+                        help="the car's own sensors: a CSV (head line: stamp_s from the first "
+                             'image on, and any of gyro_x, gyro_y, gyro_z [rad/s], speed [m/s], '
+                             'latitude, longitude, altitude), a GPX, or a KITTI oxts folder')
+    for name, what in (('imu', 'Imu'), ('gps', 'NavSatFix'), ('odom', 'Odometry or Twist')):
+        parser.add_argument(f'--{name}', metavar='TOPIC',
+                            help=f"the bag's {what} topic, where it has several")
+    parser.add_argument('--gyro-scale-sigma', type=number('0 or more', lambda v: v >= 0),
+                        metavar='S', help="how far the gyro's angles may be off, of them: 0.03 "
+                                          'unless given, a calibrated one has 0.001')
 
 
 def _add_shared(parser: argparse.ArgumentParser, *names: str) -> None:

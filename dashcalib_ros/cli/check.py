@@ -10,11 +10,28 @@ from rich.text import Text
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
-from dashcalib_ros.cli.drive import feed, open_calibrator, open_drive, read_config
+from dashcalib_ros.cli.drive import (
+    feed,
+    open_calibrator,
+    open_drive,
+    read_config,
+    read_sensors,
+)
 from dashcalib_ros.cli.terminal import Stages, show, warn
-from dashcalib_ros.errors import counted
+from dashcalib_ros.errors import InputError, counted
 from dashcalib_ros.input.inputs import fits_bag
-from dashcalib_ros.judge import Calibration, Check, Odometry, path_files, read_poses, with_faults
+from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.input.motion_files import bag_motion, read_motion
+from dashcalib_ros.judge import (
+    Calibration,
+    Check,
+    Odometry,
+    Poses,
+    path_files,
+    read_poses,
+    track_poses,
+    with_faults,
+)
 from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.camera_file import load_with_faults
 from dashcalib_ros.report.tables import TextTable, labelled
@@ -41,19 +58,24 @@ def check(args: argparse.Namespace) -> int:
     else:
         named = load_with_faults(args.calibration)
     given = named.camera
-    poses = None if args.poses is None else read_poses(args.poses)
+    poses, track = _poses(args)
     if args.out is not None:
-        if poses is None:
+        if args.poses is None:
             raise UsageError('--out is for the paths that --poses compares; add --poses FILE')
         check_writable(args.out)
     source, mask = open_drive(args)
-    motion = None
+    sensors, motion = read_sensors(args), None
     with open_calibrator(config, mask, args.verbose) as calibrator, Stages(args.quiet) as stages:
+        if sensors is not None:
+            calibrator.sense(sensors)
         feed(calibrator, source, mask, stages)
         calibration = calibrator.calibrate(stages.show)
         found = with_faults(calibrator.check(given, calibration, stages.show), named.faults)
         # one for pictures of another size is wrong, and explains no motion
         changes = _changes(calibrator, given, calibration)
+        if track is not None and track.position is not None:
+            since = track.since(calibration.start_s).position or track.position
+            poses = track_poses(since, calibration.start_s)
         if poses is not None and given.image_size == calibration.image_size:
             motion = calibrator.odometry(given, calibration, poses, stages.show)
     warn((*source.warnings, *calibration.warnings))
@@ -67,6 +89,22 @@ def check(args: argparse.Namespace) -> int:
         if not args.json:
             write_stdout(f'written: {args.out / "paths.svg"}, and beside it the paths for evo')
     return EXIT_CODES[found.answer]
+
+
+def _poses(args: argparse.Namespace) -> tuple[Poses | None, SensorStream | None]:
+    """Return the poses that --poses has, or the GPS track: it waits for the pictures' stamps."""
+    path = args.poses
+    if path is None:
+        return None, None
+    is_bag = path.exists() and fits_bag(path)
+    if not is_bag and path.suffix.lower() not in ('.gpx', '.csv'):
+        return read_poses(path), None
+    track = bag_motion([path], {'gps': args.gps}) if is_bag else read_motion(path)
+    if track is None or track.position is None:
+        why = '; '.join(() if track is None else track.warnings)
+        raise InputError(f'{path} has no GPS track{why and f" ({why})"}: give one with positions '
+                         f'(NavSatFix, GPX), or poses in the format of KITTI or TUM')
+    return None, track
 
 
 def _changes(calibrator: Calibrator, given: Camera, calibration: Calibration) -> list[str]:

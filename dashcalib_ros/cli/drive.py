@@ -19,14 +19,17 @@ from dashcalib_ros.errors import ConfigError, InputError, counted, shortened
 from dashcalib_ros.input import FrameSource
 from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
-from dashcalib_ros.recorded import Taker, pushed, with_source
+from dashcalib_ros.recorded import Taker, drive_motion, pushed, with_source
 
 # --turns sets both, so that exactly this number of turns is used
 FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads': ('threads',),
          'segmentation': ('mask.segmentation',), 'model': ('model',),
-         'speed': ('mount.speed_kmh',), 'mount': ('mount.enabled',)}
+         'segmentation': ('mask.segmentation',), 'model': ('model',),
+         'speed': ('mount.speed_kmh',), 'mount': ('mount.enabled',),
+         'gyro_scale_sigma': ('motion.gyro_scale_sigma',)}
 EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+')  # 1e-3, a word to YAML 1.1
 
 
@@ -85,6 +88,15 @@ def open_drive(args: argparse.Namespace) -> tuple[FrameSource, Mask | None]:
     return open_frames(args.input, args.topic, args.fps, args.start, args.duration), mask
 
 
+def read_sensors(args: argparse.Namespace) -> SensorStream | None:
+    """Return what --motion has, else what the bags of the drive have; None where there is none.
+
+    Raises InputError for a file of another kind, and for a topic that there is not.
+    """
+    return drive_motion(args.input, args.motion,
+                        {name: getattr(args, name) for name in ('imu', 'gps', 'odom')})
+
+
 @contextmanager
 def open_calibrator(config: Config, mask: Mask | None, verbose: bool) -> Iterator[Calibrator]:
     """Make a calibrator that is closed at the end, even if Ctrl-C is pressed again meanwhile."""
@@ -107,9 +119,11 @@ def feed(taker: Taker, source: FrameSource, mask: Mask | None, stages: Stages) -
 
 
 def calibrate(source: FrameSource, config: Config, mask: Mask | None, verbose: bool,
-              stages: Stages) -> Calibration:
+              stages: Stages, motion: SensorStream | None = None) -> Calibration:
     """Calibrate a whole drive; the input's name and warnings are in the result."""
     with open_calibrator(config, mask, verbose) as calibrator:
+        if motion is not None:
+            calibrator.sense(motion)
         feed(calibrator, source, mask, stages)
         calibration: Calibration = calibrator.calibrate(stages.show)
     return with_source(calibration, source)

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.text import Text
 
 from dashcalib_ros.cli.arguments import exit_code
-from dashcalib_ros.cli.drive import calibrate, open_drive, read_config
+from dashcalib_ros.cli.drive import calibrate, open_drive, read_config, read_sensors
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import FrameSource
@@ -24,11 +24,12 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate, write the results, show them; return the verdict's exit code."""
     config = read_config(args)
     source, mask = open_drive(args)
+    motion = read_sensors(args)
     if args.write_bag is not None:
         _check_bag(args, source)
     with output_folder(args.out):
         with Stages(args.quiet) as stages:
-            calibration = calibrate(source, config, mask, args.verbose, stages)
+            calibration = calibrate(source, config, mask, args.verbose, stages, motion)
         written = write_results(calibration, args.out, created=now())
     warn((*calibration.warnings, *set_aside_lines(written)))
     if args.json:

@@ -105,6 +105,38 @@ class Stabiliser:
 
 
 @dataclass(frozen=True)
+class Witness:
+    """What a sensor says of the focal length, from the angles of the turns.
+
+    time_offset_s: what must be taken off the sensor's stamps; positive: its messages are late.
+    None where it is not known. scale: the sensor's angles over the camera's. fx_percent: by how
+    much fx would have to change to agree with the sensor, of fx; fx_sigma_percent: with what the
+    sensor's own scale may be off. agrees: no contradiction beyond 3 sigmas of both.
+    camera_from_sensor: (3, 3) row by row, from the sensor's axes to the camera's; bias_rad_s: (3,)
+    of the sensor's rates; both None where a sensor has none.
+    """
+
+    time_offset_s: float | None
+    time_sigma_s: float | None
+    scale: float
+    scale_sigma: float
+    fx_percent: float
+    fx_sigma_percent: float
+    agrees: bool
+    camera_from_sensor: tuple[tuple[float, ...], ...] | None = None
+    alignment_sigma_deg: float | None = None
+    bias_rad_s: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Witnesses:
+    """The sensors that were asked; each None where it has nothing to say."""
+
+    gyro: Witness | None = None
+    gps: Witness | None = None
+
+
+@dataclass(frozen=True)
 class LensField:
     """The smooth displacements over the picture that no lens model has, as of a windscreen.
 
@@ -200,6 +232,7 @@ class Calibration:
     sigma_px: how far the whole camera may be off over the picture. held_out: what each turn says
     of the calibration without it, in the full-size images' pixels; () for fewer than three turns.
     straight_lines: what upright lines of the world say of the distortion; None: too few of them.
+    witnesses: what the car's own sensors say of the focal length.
     start_s: stamp of the first image. material: what the report draws, None in a live drive.
     """
 
@@ -226,6 +259,7 @@ class Calibration:
     mount: Mount | None = None
     held_out: tuple[LeftOut, ...] = ()
     straight_lines: Bend | None = None
+    witnesses: Witnesses = default(default_factory=Witnesses)
     start_s: float = 0.0
     material: Material | None = default(default=None, compare=False)
 

@@ -17,6 +17,7 @@ from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
+from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import focal_disagreement
 from dashcalib_ros.judge.calibration import (
@@ -37,6 +38,7 @@ from dashcalib_ros.judge.verdict import (
     profile_contrast,
     verdict_of,
 )
+from dashcalib_ros.judge.witnesses import ask_sensors
 from dashcalib_ros.reconstruct.picture import TurnPicture, picture_of
 from dashcalib_ros.reconstruct.scene import Scene, rms_px
 from dashcalib_ros.reconstruct.scene_file import StoredTurn
@@ -66,7 +68,8 @@ class Evidence:
     turn. stored: the turns of earlier drives that were available. left_out: why turns were taken
     out, in words. pictures: of turns whose images are gone; None: the report is not wanted.
     start_s: stamp of the first image. lines: upright ones, in the resized images; None where they
-    were not looked for. straights: pairs of images of straight driving, likewise.
+    were not looked for. straights: pairs of images of straight driving, likewise. motion: what the
+    car's sensors say.
     """
 
     image_size: tuple[int, int]
@@ -84,6 +87,7 @@ class Evidence:
     start_s: float = 0.0
     lines: Lines | None = None
     straights: Straights | None = None
+    motion: SensorStream | None = None
 
 
 def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] = (),
@@ -112,13 +116,14 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     if solution is not None:
         solution = replace(solution, px=evidence.scale.px)
     witness = _witness(solution, evidence, config)
-    verdict = (judge(solution, config.verdict, witness, True) if solution
+    witnesses, unused = ask_sensors(solution, evidence.motion, evidence.start_s, config)
+    verdict = (judge(solution, config.verdict, witness, True, witnesses) if solution
                else _verdict_without_solution(evidence))
     camera = sigma = error = shutter = sigma_px = stabiliser = straight_lines = None
     field = mount = None
     details: dict[str, object] = {}
     without: tuple[LeftOut, ...] = ()
-    warnings = evidence.warnings
+    warnings = evidence.warnings + unused
     if solution is not None and verdict.level != 'accepted' and config.model != AUTO:
         warnings += (f'the lens model {config.model} was asked for and may be why the result is '
                      f'{verdict.level}: --model {AUTO} takes the one that the turns prove',)
@@ -164,7 +169,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         mask=_of_size(evidence.mask, evidence.image_size), held_out=without,
         details=details, rolling_shutter=shutter, stabiliser=stabiliser, sigma_px=sigma_px,
         field=field, mount=mount, warnings=warnings, start_s=evidence.start_s,
-        straight_lines=straight_lines,
+        straight_lines=straight_lines, witnesses=witnesses,
         material=_material(solution, evidence),
         stored_turns=tuple(_stored_summary(turn, evidence, solution) for turn in evidence.stored))
 

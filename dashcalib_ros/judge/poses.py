@@ -1,4 +1,4 @@
-"""True poses of a drive, from GPS/IMU, lidar or SLAM, in the format of KITTI or of TUM."""
+"""True poses of a drive, from GPS/IMU, lidar or SLAM: KITTI's format, TUM's, or a GPS track."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.limits import read_text
 
 # of a file of poses: an hour at 100 Hz
@@ -16,6 +17,8 @@ POSES_BYTES = 2**26
 KITTI, KITTI_TIMED, TUM = 12, 13, 8
 # s between two poses; over more they are not interpolated
 LONGEST_GAP_S = 0.5
+# s to either side, over which a track has a heading; m in that time, with less it stands
+COURSE_S, STANDING_M = 1.0, 2.0
 # of a rotation matrix; KITTI rounds them to 7 digits
 NOT_A_ROTATION = 1e-2
 
@@ -74,6 +77,35 @@ def read_poses(path: Path) -> Poses:
     if not np.isfinite(table).all():
         raise InputError(f'{path} has numbers that are not finite; leave these poses out')
     return _tum(table, path) if counts == {TUM} else _kitti(table[:, -KITTI:], path)
+
+
+def track_poses(position: Samples, start_s: float) -> Poses:
+    """Return the poses of a GPS track: its headings and places; it knows neither pitch nor roll.
+
+    position: m, east, north and up; stamps in s since the drive's first image, which was at
+    start_s. The heading is that of the way, a second to either side. Raises InputError where the
+    track is shorter.
+    """
+    from scipy.spatial.transform import Rotation
+    stamps, places = position.stamps_s, position.values
+    inside = stamps[(stamps >= stamps[0] + COURSE_S) & (stamps <= stamps[-1] - COURSE_S)]
+    if len(inside) < 2:
+        raise InputError('the GPS track is too short for headings: record it during the drive')
+
+    def at(when: Floats) -> Floats:
+        return np.stack([np.interp(when, stamps, column) for column in places.T], axis=1)
+
+    way = at(inside + COURSE_S) - at(inside - COURSE_S)
+    heading = np.arctan2(way[:, 1], way[:, 0])
+    # one that stands has no heading: it keeps the one before
+    moves = np.linalg.norm(way[:, :2], axis=1) > STANDING_M
+    if not moves.any():
+        raise InputError('the GPS track does not move: record it during the drive')
+    last = np.maximum.accumulate(np.where(moves, np.arange(len(moves)), int(np.argmax(moves))))
+    # to the world (east, north, up), from axes as a camera's: right, down, ahead
+    axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    turned = Rotation.from_rotvec(heading[last][:, None] * [0.0, 0.0, 1.0]).as_matrix() @ axes
+    return Poses(np.asarray(turned), at(inside), inside + start_s)
 
 
 def _kitti(table: Floats, path: Path) -> Poses:

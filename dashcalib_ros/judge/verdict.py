@@ -22,7 +22,7 @@ from dashcalib_ros.judge.agreement import (
     leverages,
     turns_of_another_camera,
 )
-from dashcalib_ros.judge.calibration import Verdict
+from dashcalib_ros.judge.calibration import Verdict, Witnesses
 from dashcalib_ros.judge.next_turn import next_turn
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.solve.fixed_camera import FixedCameraTest, largest_crop
@@ -62,13 +62,15 @@ class Finding:
 
 
 def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
-          outlook: bool = False) -> Verdict:
+          outlook: bool = False, witnesses: Witnesses | None = None) -> Verdict:
     """Return the verdict on a solution, its reasons sorted: causes, then those that refuse it.
 
     lines: what straight lines say of it, if there are enough of them. outlook: to tell what one
-    more turn would bring, where only knowledge is missing.
+    more turn would bring, where only knowledge is missing. witnesses: what sensors say of it.
     """
-    of_lines = () if lines is None else (partial(_lines_disagree, lines),)
+    of_lines: tuple[Rule, ...] = () if lines is None else (partial(_lines_disagree, lines),)
+    if witnesses is not None:
+        of_lines += (partial(_sensors_disagree, witnesses),)
     findings = [found for rule in (*RULES, *of_lines)
                 if (found := rule(solution, config)) is not None]
     findings.sort(key=lambda found: (not found.cause, found.level != 'refused'))
@@ -346,6 +348,21 @@ def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> F
                            f'{lines.sigmas:.0f} times what both may be off)',
                    'look for a curved windscreen or cover before the lens, try another --model, '
                    'or drive more turns')
+
+
+def _sensors_disagree(witnesses: Witnesses, solution: Solution, config: VerdictConfig
+                      ) -> Finding | None:
+    """A gyro and GPS know the angles of the turns, and so the focal length, without pictures."""
+    for name, said in (('the gyro', witnesses.gyro), ('GPS', witnesses.gps)):
+        if said is not None and not said.agrees:
+            own = 100 * float(solution.sigma[0]) / solution.camera.fx
+            return Finding('weak', f'the pictures and {name} contradict each other: by {name} the '
+                                   f'focal length is {said.fx_percent:+.1f} ± '
+                                   f'{said.fx_sigma_percent:.1f} % off, which the pictures '
+                                   f'know to {own:.1f} %',
+                           'check its scale, its clock and that it is of this drive, and leave '
+                           'it away if it is wrong; else drive more turns')
+    return None
 
 
 def lines_contradict(lines: Bend, width: int, config: VerdictConfig) -> bool:

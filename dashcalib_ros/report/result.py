@@ -23,6 +23,8 @@ from dashcalib_ros.judge.calibration import (
     Shutter,
     Stabiliser,
     StoredTurnSummary,
+    Witness,
+    Witnesses,
 )
 from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, read_text
 from dashcalib_ros.report.camera_file import parse_camera
@@ -58,6 +60,7 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'mount': c.mount,
         'held_out': [_held_out_dict(turn) for turn in c.held_out],
         'straight_lines': c.straight_lines,
+        'witnesses': c.witnesses,
         'input': c.input_name,
         'warnings': c.warnings,
         'masked_fraction': None if c.mask is None else 1.0 - float(np.mean(c.mask)),
@@ -138,7 +141,17 @@ def _calibration(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
             Field(size, np.array(field['coefficients'], np.float64)), bool(field['used']),
             field['rms_px'], field['worst_px'], field['sigma_px']),
         mount=_mount(data.get('mount')),
-        held_out=tuple(held_out), straight_lines=made(Bend, 'straight_lines'))
+        held_out=tuple(held_out), straight_lines=made(Bend, 'straight_lines'),
+        witnesses=_witnesses(data.get('witnesses') or {}))
+
+
+def _witnesses(data: Mapping[str, Any]) -> Witnesses:
+    """Return the witnesses that result_dict() gave these values; lists are tuples again."""
+    def frozen(value: Any) -> Any:
+        return tuple(map(frozen, value)) if isinstance(value, list) else value
+    return Witnesses(**{
+        name: Witness(**{key: frozen(value) for key, value in said.items()})
+        for name, said in data.items() if said is not None})
 
 
 def _mount(values: Mapping[str, Any] | None) -> Mount | None:

@@ -25,6 +25,7 @@ from dashcalib_ros.report.wording import (
     shutter_text,
     stabiliser_text,
     stored_text,
+    witness_texts,
 )
 
 # columns between two of a table
@@ -52,6 +53,7 @@ def summary(calibration: Calibration) -> RenderableType:
     if c.turns:
         parts.append(TextTable(TURNS, [_turn_row(turn, c.start_s) for turn in c.turns]))
     parts.append(Text(_facts(c)))
+    parts += [Text(text) for text in witness_texts(c.witnesses)]
     return Group(*parts)
 
 

@@ -13,7 +13,14 @@ from dashcalib_ros.detect import Bend
 from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary
 from dashcalib_ros.judge.agreement import focal_disagreement, leverages
-from dashcalib_ros.judge.calibration import Mount, Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.judge.calibration import (
+    Mount,
+    Shutter,
+    Stabiliser,
+    StoredTurnSummary,
+    Witness,
+    Witnesses,
+)
 from dashcalib_ros.judge.verdict import (
     Rule,
     flat_profile,
@@ -109,6 +116,22 @@ def mount_text(mount: Mount) -> str:
                  else f'{mount.height_m:.2f} ± {height:.2f} m above the road')
     return (f'{mount.verdict}: looks {", ".join(parts)}; it travels towards pixel '
             f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± {mount.travel_sigma_px:.1f}')
+
+
+def witness_text(name: str, said: Witness) -> str:
+    """Return a line about what a sensor says of the focal length."""
+    text = (f'the {name} {"agrees" if said.agrees else "contradicts"}: fx off by '
+            f'{said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} %')
+    if said.time_offset_s is not None and said.time_sigma_s is not None:
+        text += (f', its stamps late by {1e3 * said.time_offset_s:.0f} ± '
+                 f'{max(1e3 * said.time_sigma_s, 0.1):.1f} ms')
+    return text
+
+
+def witness_texts(witnesses: Witnesses) -> list[str]:
+    """Return a line for each sensor that says something."""
+    return [witness_text(name, said) for name, said in
+            (('gyro', witnesses.gyro), ('GPS', witnesses.gps)) if said is not None]
 
 
 def picture_text(sigma: PictureSigma) -> str:
@@ -210,6 +233,7 @@ def run_facts(c: Calibration) -> list[tuple[str, str]]:
         facts.append(('straight lines', lines_text(c.straight_lines)))
     if c.mount is not None:
         facts.append(('mounting', mount_text(c.mount)))
+    facts += [('motion sensor', text) for text in witness_texts(c.witnesses)]
     if c.stored_turns:
         facts.append(('earlier drives', stored_text(c.stored_turns)))
     times = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in c.timing.items())

@@ -103,6 +103,30 @@ def test_json_has_what_programs_need(files, capfd):
     assert found['turns'][0]['center'] == 88
 
 
+def test_a_gps_track_may_be_the_poses(files, tmp_path, capfd):
+    rows = '\n'.join(f'{n / 10},49.0,{8 + n * 1e-5}' for n in range(60))
+    (tmp_path / 'track.csv').write_text(f'stamp_s,latitude,longitude\n{rows}\n')
+    assert main([*files, '--json', '--poses', 'track.csv']) == 0
+    assert 'rotation_deg' in json.loads(capfd.readouterr().out)
+    (tmp_path / 'gyro.csv').write_text('stamp_s,speed\n' + '0.1,2\n0.2,3\n')
+    assert main([*files, '--poses', 'gyro.csv']) == 2
+    assert 'has no GPS track' in capfd.readouterr().err
+    write_bag(tmp_path / 'bag', images(drive(3)))
+    assert main([*files, '--poses', 'bag']) == 2
+    assert 'has no GPS track' in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(('more', 'line'), [
+    (['--motion', 'none.csv'], 'none.csv'), (['--motion', 'camera.json'], 'no CSV of motion'),
+    (['--motion', 'gyro.csv', '--imu', '/imu'], '--imu'),
+    (['--gyro-scale-sigma', '-1'], 'must be 0 or more')])
+def test_wrong_motion_arguments_are_one_line(files, tmp_path, capfd, more, line):
+    (tmp_path / 'gyro.csv').write_text('stamp_s,speed\n0.1,2\n')
+    assert main([*files, *more]) == 2
+    [error] = capfd.readouterr().err.splitlines()
+    assert line in error
+
+
 def test_a_change_during_the_drive_is_told(files, monkeypatch, capfd):
     monkeypatch.setattr(FakeCalibrator, 'fits', 3)
     assert main(files) == 0

@@ -9,9 +9,10 @@ from solving import CONFIG
 from synthetic import LENS, rotation, synthetic_turn
 
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.motion import Samples
 from dashcalib_ros.judge.odometry import odometry
 from dashcalib_ros.judge.paths import mounting, path_files
-from dashcalib_ros.judge.poses import Poses, read_poses
+from dashcalib_ros.judge.poses import Poses, read_poses, track_poses
 
 STAMPS = np.array([10.0, 10.5, 11.0])
 
@@ -63,6 +64,28 @@ def test_what_is_no_file_of_poses_is_named(tmp_path, text, match):
     with pytest.raises(InputError, match=match) as caught:
         read_poses(path)
     assert str(path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
+
+
+def test_a_gps_track_has_headings_and_places():
+    when = np.arange(0.0, 12.0, 0.2)
+    heading = np.clip((when - 5.0) / 2, 0.0, 1.0) * np.pi / 2
+    way = np.stack([np.cos(heading), np.sin(heading), 0 * when], axis=1)
+    places = np.cumsum(2.0 * way, axis=0)
+    poses = track_poses(Samples(when, places), 1_700_000_000.0)
+    stamps = np.array([1_700_000_002_000_000_000, 1_700_000_009_000_000_000])
+    turned, _, known = poses.at(np.arange(2), stamps)
+    # the axes are a camera's: z points ahead, and the way from east to north is a left turn
+    assert known.all()
+    np.testing.assert_allclose(turned[0][:, 2], [1.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(turned[1][:, 2], [0.0, 1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(turned[1][:, 1], [0.0, 0.0, -1.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(('places', 'match'), [
+    (np.zeros((60, 3)), 'does not move'), (np.zeros((3, 3)), 'too short')])
+def test_a_track_without_headings_is_named(places, match):
+    with pytest.raises(InputError, match=match):
+        track_poses(Samples(0.2 * np.arange(len(places)), places), 0.0)
 
 
 MOUNT = rotation(0, 0.3) @ rotation(2, -0.2)

@@ -1,19 +1,22 @@
 """result.json: the contract, strict JSON, and reading it back."""
 from __future__ import annotations
 
+import io
 import json
 import math
 
 import numpy as np
 import pytest
 from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
+from rich.console import Console
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.judge.calibration import StoredTurnSummary
+from dashcalib_ros.judge.calibration import StoredTurnSummary, Witness, Witnesses
 from dashcalib_ros.report import load_calibration, result_dict, result_json
 from dashcalib_ros.report.page import report_html
+from dashcalib_ros.report.tables import summary
 
 
 def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
@@ -28,6 +31,25 @@ def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
     page = report_html(calibration)
     assert '1 of 1 stored turn used' in page and '0.37 px' in page
     assert result_dict(make_calibration())['stored_turns'] == []
+
+
+def test_witnesses_are_written_and_read_and_told_in_one_line(tmp_path):
+    said = Witness(0.04, 0.0006, 1.0012, 0.0011, -0.13, 0.14, True,
+                   ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), 0.4, (0.01, 0.0, -0.02))
+    calibration = make_calibration(witnesses=Witnesses(gyro=said))
+    result = strict(result_json(calibration))
+    assert result['witnesses']['gps'] is None
+    gyro = result['witnesses']['gyro']
+    assert list(gyro)[:7] == ['time_offset_s', 'time_sigma_s', 'scale', 'scale_sigma',
+                              'fx_percent', 'fx_sigma_percent', 'agrees']
+    (tmp_path / 'result.json').write_text(result_json(calibration))
+    assert load_calibration(tmp_path).witnesses == calibration.witnesses
+    line = 'the gyro agrees: fx off by -0.13 ± 0.14 %, its stamps late by 40 ± 0.6 ms'
+    assert line in report_html(calibration)
+    console = Console(width=200, file=io.StringIO())
+    console.print(summary(calibration))
+    assert line in console.file.getvalue()
+    assert result_dict(make_calibration())['witnesses'] == {'gyro': None, 'gps': None}
 
 
 def strict(text):

@@ -1,0 +1,181 @@
+"""What the car knows of its own motion: streams of a gyro, a speed, positions and headings.
+
+A stream's stamps are seconds since the drive's first image, on the sensor's own clock: how far
+that is off is found later, from the turns (judge/witnesses.py). A stream that cannot be used is
+None, and a warning says why: it never costs the calibration.
+"""
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+
+# s; stamps beyond it are times of day, since 1970
+EPOCH_S = 1e8
+# metres of a degree of latitude
+DEGREE_M = 111_320.0
+# of the Earth's radius, by which positions of another drive would be off: not this car's
+FARTHEST_M = 1e6
+# values of a stream at the most: ten hours at 200 Hz
+SAMPLES = 7_200_000
+# samples of a stream at the least; fewer say nothing of a turn
+LEAST_SAMPLES = 10
+# share of samples that may be damaged before the stream is not used
+DAMAGED = 0.2
+# rad/s; no car turns faster: degrees were written for radians
+FASTEST_TURN = 6.0
+# the same for the whole drive, by the 99th percentile, where single peaks do not count
+QUANTILE = 99.0
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Values with their times. stamps_s: (n,) ascending; values: (n, d)."""
+
+    stamps_s: Floats
+    values: Floats
+
+    def shifted(self, later_s: float) -> Samples:
+        """Return the samples with later stamps."""
+        return Samples(self.stamps_s + later_s, self.values)
+
+
+@dataclass(frozen=True)
+class SensorStream:
+    """What sensors say of a drive; each None where there is none of its kind.
+
+    rate: (n, 3) rad/s about the sensor's own three axes, in any mounting. speed: (n, 1) m/s.
+    position: (n, 3) m, east, north and up from the first. heading: (n, 1) rad, left positive.
+    Stamps: s since the drive's first image; absolute: since 1970, as bags and GPX have them.
+    warnings: what was left out, one line each.
+    """
+
+    rate: Samples | None = None
+    speed: Samples | None = None
+    position: Samples | None = None
+    heading: Samples | None = None
+    warnings: tuple[str, ...] = ()
+    absolute: bool = False
+
+    @property
+    def empty(self) -> bool:
+        """Return whether there is nothing to use."""
+        return self.rate is None and self.speed is None and self.position is None
+
+    def shifted(self, later_s: float) -> SensorStream:
+        """Return the same with later stamps."""
+        moved = {name: None if samples is None else samples.shifted(later_s)
+                 for name, samples in self.kinds.items()}
+        return SensorStream(**moved, warnings=self.warnings, absolute=self.absolute)
+
+    @property
+    def kinds(self) -> Mapping[str, Samples | None]:
+        """Return the streams by their names."""
+        return {'rate': self.rate, 'speed': self.speed, 'position': self.position,
+                'heading': self.heading}
+
+    def since(self, start_s: float) -> SensorStream:
+        """Return the same, with stamps from a drive's first image on. start_s: its stamp.
+
+        Pictures without a time of day (a video's) begin where an absolute stream begins.
+        """
+        if not self.absolute or self.empty:
+            return replace(self, absolute=False)
+        if start_s > EPOCH_S:
+            return replace(self.shifted(-start_s), absolute=False)
+        first = min(float(samples.stamps_s[0]) for samples in self.kinds.values()
+                    if samples is not None)
+        return replace(self.shifted(start_s - first), absolute=False, warnings=(
+            *self.warnings, 'the pictures have no time of day: the first sample of the motion '
+                            'sensors is taken to be of the first image'))
+
+
+def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
+                  absolute: bool = False) -> SensorStream:
+    """Return a stream from raw values, with what is damaged left out.
+
+    values: by kind, as SensorStream's, the stamps (n,) in s and the values (n, d); positions are
+    in metres. what: where they come from, for warnings.
+    """
+    found: dict[str, Samples] = {}
+    warnings: list[str] = []
+    for kind, (stamps_s, rows) in values.items():
+        samples, trouble = _cleaned(np.asarray(stamps_s, np.float64),
+                                    np.asarray(rows, np.float64), kind)
+        if trouble:
+            warnings.append(f'the {NAMES[kind]} of {what} are not used: {trouble}')
+        if samples is not None:
+            found[kind] = samples
+    return SensorStream(**found, warnings=tuple(warnings), absolute=absolute)
+
+
+NAMES = {'rate': 'angular rates', 'speed': 'speeds', 'position': 'positions',
+         'heading': 'headings'}
+
+
+def _cleaned(stamps_s: Floats, values: Floats, kind: str) -> tuple[Samples | None, str]:
+    """Return the usable samples, and what is wrong with them, '' where nothing is."""
+    if len(stamps_s) > SAMPLES:
+        return None, f'there are more than {SAMPLES} of them'
+    good = np.isfinite(stamps_s) & np.isfinite(values).all(axis=1)
+    # a clock that was set back: what follows until it has caught up is not used
+    ahead = np.where(good, stamps_s, -np.inf)
+    latest = np.maximum.accumulate(np.r_[-np.inf, ahead[:-1]]) if len(ahead) else ahead
+    good &= ahead > latest
+    count = int(good.sum())
+    if count < max(LEAST_SAMPLES if kind == 'rate' else 2, (1 - DAMAGED) * len(good)):
+        return None, f'{len(good) - count} of {len(good)} are damaged, doubled or out of order'
+    samples = Samples(stamps_s[good], values[good])
+    if kind == 'rate' and np.percentile(np.abs(samples.values), QUANTILE) > FASTEST_TURN:
+        return None, (f'no car turns at {np.percentile(np.abs(samples.values), QUANTILE):.0f} '
+                      f'rad/s; write rad/s, not degrees a second')
+    if kind == 'position' and not np.ptp(samples.values, axis=0).max() < FARTHEST_M:
+        return None, 'they are not of one drive'
+    return samples, ''
+
+
+def local_metres(latitude: Floats, longitude: Floats, altitude: Floats) -> Floats:
+    """Return positions (n, 3) in metres east, north and up from the first finite fix.
+
+    latitude, longitude: (n,) degrees; altitude: (n,) m, where NaN counts as 0. A drive is small:
+    the Earth is flat there.
+    """
+    known = np.flatnonzero(np.isfinite(latitude) & np.isfinite(longitude))
+    if not len(known):
+        return np.full((len(latitude), 3), np.nan)
+    first = known[0]
+    east = np.mod(longitude - longitude[first] + 180.0, 360.0) - 180.0
+    up = np.where(np.isfinite(latitude), np.nan_to_num(altitude, nan=0.0), np.nan)
+    return np.stack([
+        east * DEGREE_M * np.cos(np.radians(latitude[first])),
+        (latitude - latitude[first]) * DEGREE_M, up - up[first]], axis=1)
+
+
+class SensorBuffer:
+    """The newest samples of live sensors, for a node: add() them as they come, stream() to ask.
+
+    Doubled and late samples are dropped when they are asked for. Memory is bounded: of each kind
+    the newest are kept.
+    """
+
+    def __init__(self, length: int = 200_000) -> None:
+        """length: samples of each kind that are kept."""
+        self._kept: dict[str, deque[tuple[float, tuple[float, ...]]]] = {}
+        self._length = length
+
+    def add(self, kind: str, stamp_s: float, values: Sequence[float]) -> None:
+        """Take a sample. kind: rate, speed, position or heading; stamp_s: since 1970."""
+        kept = self._kept.setdefault(kind, deque(maxlen=self._length))
+        kept.append((stamp_s, tuple(values)))
+
+    def stream(self) -> SensorStream:
+        """Return what there is."""
+        # a thread may add meanwhile
+        found = {kind: list(kept) for kind, kept in tuple(self._kept.items())}
+        return sensor_stream(
+            {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
+             for kind, rows in found.items() if rows}, 'the topic', absolute=True)

@@ -1,0 +1,509 @@
+"""What a gyro and GPS say of a solution: they know the angles of the turns without any picture.
+
+A turn's angle by the pictures depends on the focal length; by a gyro it does not. The model: from
+keyframe to keyframe the camera turned by phi, in its own axes; the sensor by theta, in its axes,
+read at the keyframes' stamps plus the time offset. With A the rotation from the sensor to the
+camera, b the sensor's bias and s its scale,
+
+    phi = A (theta - b dt) / s
+
+All turns share A, b, s and the offset, which are found by generalised least squares: a gyro's
+noise adds up along a turn, that of the poses is of each keyframe alone, and how large each is the
+residuals say. How phi follows the camera's parameters is known from the solution's own normal
+equations: so a scale becomes a focal length.
+
+GPS has headings on the straights before and after a turn: the angle between them, with neither
+bias nor scale.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.config import Config
+from dashcalib_ros.input.motion import Samples, SensorStream
+from dashcalib_ros.judge.calibration import Witness, Witnesses
+from dashcalib_ros.reconstruct.scene import Scene, main_axis
+from dashcalib_ros.solve.normal import normal_equations, used_keyframes
+from dashcalib_ros.solve.prior import loss_px_of
+from dashcalib_ros.solve.solution import Solution
+
+# s to either side: clocks of sensors in one car are not farther apart
+LARGEST_OFFSET_S = 0.5
+# s between the offsets that are tried first; a turn takes seconds
+COARSE_S = 0.02
+# s between samples of a gyro; over more the angle between them is not known
+LONGEST_GAP_S = 0.35
+# s over which a rate is taken, to know how an angle follows the offset
+RATE_S = 0.03
+# keyframes of a turn at the least
+LEAST_KEYFRAMES = 5
+# degrees in all turns; with less there is no angle to compare
+LEAST_TURNED_DEG = 10.0
+# of the squared angles; a sensor that explains less is of another drive, or its clock is
+LEAST_EXPLAINED = 0.9
+# times ours; a scale farther off is one of units
+SCALES = (0.7, 1.4)
+DEGREES = (40.0, 80.0)
+# of a turn's angle: what pictures of real drives may be off in one turn, beyond their noise
+TURN_SIGMA = 0.0045
+# s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
+LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
+# ratios of the poses' variance to the gyro's in a second, of which the likeliest is taken
+RATIOS = np.logspace(-4, 3, 22)
+# steps of the fit, and those at which the noises are weighed anew
+STEPS, WEIGHED = 8, (1, 4)
+# sigmas; where a witness is farther off, it contradicts
+CONTRADICTED = 3.0
+
+
+# degrees by which the car may turn on what counts as a straight
+STRAIGHT_DEG = 1.5
+# degrees of a turn at the least, between two headings of GPS
+LEAST_GPS_DEG = 30.0
+# m from the rear axle, which goes where the car points, to the aerial
+LEVER_M = 2.0
+# m and fixes of a straight at the least
+STRAIGHT_M, STRAIGHT_FIXES = 8.0, 3
+# m that fixes are off at the least: those of one receiver share errors, which no residual shows
+LEAST_NOISE_M = 0.05
+# of the median; straights of which fixes are farther off have jumps
+JUMP = 4.0
+# degrees; a heading that is known worse says nothing
+HEADING_SIGMA_DEG = 5.0
+
+
+def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s: float,
+                config: Config) -> tuple[Witnesses, tuple[str, ...]]:
+    """Return what a drive's sensors say of its solution, and a line for each that is not used.
+
+    start_s: stamp of the drive's first image.
+    """
+    if stream is None:
+        return Witnesses(), ()
+    stream = stream.since(start_s)
+    if solution is None or stream.empty:
+        return Witnesses(), stream.warnings
+    scenes = [scene for scene in solution.scenes if scene.turn.of_this_drive]
+    gyro = gps = None
+    lines = list(stream.warnings)
+    try:
+        loss_px = loss_px_of(solution.scenes, solution.camera, config.intrinsics)
+        turns = [steps for scene in scenes
+                 if len(used_keyframes(scene)) >= LEAST_KEYFRAMES
+                 and (steps := steps_of(scene, solution, loss_px, start_s)) is not None]
+        if stream.rate is not None:
+            gyro, line = _gyro(fit_to(turns, stream.rate), solution, config)
+            lines.append(line)
+        if stream.position is not None:
+            gps, line = _gps(turns, stream.position, solution)
+            lines.append(line)
+    except (np.linalg.LinAlgError, ValueError, FloatingPointError) as error:
+        lines.append(f'the motion sensors could not be compared with the turns ({error})')
+    return Witnesses(gyro, gps), tuple(line for line in lines if line)
+
+
+def _gyro(fit: Fit | None, solution: Solution, config: Config) -> tuple[Witness | None, str]:
+    """Return what the gyro says, or why it says nothing."""
+    if fit is None:
+        return None, ('the gyro is not used: it has no samples during the turns, within 0.5 s of '
+                      'their stamps')
+    if abs(fit.offset_s) >= LARGEST_OFFSET_S or not fit.explained >= LEAST_EXPLAINED:
+        return None, (f'the gyro is not used: it does not turn as the pictures do (it explains '
+                      f'{100 * max(fit.explained, 0.0):.0f} % of that): check that it is of this '
+                      f'drive, and that its stamps are within 0.5 s of those of the pictures')
+    if not SCALES[0] < fit.scale < SCALES[1]:
+        cure = ('write rad/s, not degrees a second' if DEGREES[0] < fit.scale < DEGREES[1] else
+                'check its unit')
+        return None, (f'the gyro is not used: its angles are {fit.scale:.3g} times those of the '
+                      f'pictures: {cure}')
+    if fit.skew_s > LARGEST_SKEW_S:
+        return None, (f'the gyro is not used: its stamps and those of the pictures do not keep '
+                      f'pace (turns are {1e3 * fit.skew_s:.0f} ms apart): check --fps, and that '
+                      f'no images are missing')
+    own = config.motion.gyro_scale_sigma
+    kappa_sigma = float(np.sqrt(fit.covariance[6, 6]))
+    return _witness(fit.inverse_scale, kappa_sigma, own, fit.by_camera, solution, fit), ''
+
+
+def _witness(inverse_scale: float, sigma: float, own_sigma: float, by_camera: Floats,
+             solution: Solution, fit: Fit | None = None) -> Witness:
+    """Return a witness. own_sigma: what the sensor's own scale may be off.
+
+    Of all cameras that make up for the scale the likeliest is told, given what turns know.
+    """
+    along = solution.covariance @ by_camera
+    variance = float(by_camera @ along)
+    percent = 100 * float(along[0]) / variance / solution.camera.fx
+    known = float(np.hypot(sigma, own_sigma))
+    scale = 1 / inverse_scale
+    details: dict[str, Any] = {} if fit is None else {
+        'camera_from_sensor': tuple(tuple(row) for row in fit.alignment.tolist()),
+        'alignment_sigma_deg': float(np.degrees(np.sqrt(np.trace(fit.covariance[:3, :3])))),
+        'bias_rad_s': tuple(fit.bias.tolist())}
+    return Witness(
+        None if fit is None else fit.offset_s,
+        None if fit is None else float(np.sqrt(fit.covariance[7, 7])),
+        scale, sigma * scale**2, percent * (1 - inverse_scale), abs(percent) * known,
+        bool(abs(1 - inverse_scale) <= CONTRADICTED * np.hypot(known, np.sqrt(variance))),
+        **details)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How a camera turned from keyframe to keyframe.
+
+    stamps_s: (k,); turned: (k - 1, 3) rad, in the camera's axes; follow: (k - 1, 3, n) its
+    derivatives by the camera's parameters.
+    """
+
+    stamps_s: Floats
+    turned: Floats
+    follow: Floats
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a gyro and a camera fit together. parameters: as in the module's description.
+
+    covariance: (8, 8) of the small rotation (3), bias (3), 1 / scale and offset. by_camera: (n,)
+    by how much 1 / scale follows the camera's parameters. explained: of the squared angles.
+    skew_s: between the turns' own offsets, where that is no chance; else 0.
+    """
+
+    alignment: Floats
+    bias: Floats
+    inverse_scale: float
+    offset_s: float
+    covariance: Floats
+    by_camera: Floats
+    explained: float
+    skew_s: float
+
+    @property
+    def scale(self) -> float:
+        """Return the sensor's angles over the camera's."""
+        return 1 / self.inverse_scale
+
+    @property
+    def scale_sigma(self) -> float:
+        """Return the sigma of the scale."""
+        return float(np.sqrt(self.covariance[6, 6])) * self.scale**2
+
+
+def steps_of(scene: Scene, solution: Solution, loss_px: float, start_s: float) -> Steps:
+    """Return how a scene's camera turned. start_s: stamp of the drive's first image."""
+    structure, camera = scene.structure, solution.camera
+    eliminated = normal_equations(scene, camera, loss_px).eliminated
+    rows, size = used_keyframes(scene), eliminated.pose_mixed.shape[1]
+    follow = []
+    for place, sigma in enumerate(np.sqrt(np.diag(solution.covariance))):
+        step = np.zeros(size)
+        step[place] = sigma
+        ahead, behind = (eliminated.moved(structure, sign * step).rotations[rows]
+                         for sign in (1, -1))
+        follow.append((_turned(ahead) - _turned(behind)) / (2 * sigma))
+    start_ns = round(start_s * 1e9)
+    stamps_s = (scene.tracks.stamps_ns[rows] - start_ns) / 1e9
+    return Steps(stamps_s, _turned(structure.rotations[rows]), np.stack(follow, axis=-1))
+
+
+def _turned(rotations: Floats) -> Floats:
+    """Return (k - 1, 3) rad, from one rotation (k, 3, 3), world to camera, to the next."""
+    from scipy.spatial.transform import Rotation
+    return np.asarray(Rotation.from_matrix(
+        rotations[:-1] @ rotations[1:].transpose(0, 2, 1)).as_rotvec())
+
+
+@dataclass(frozen=True)
+class Angles:
+    """A gyro's rates, added up. stamps_s: (n,); sums: (n, 3) rad since the first sample."""
+
+    stamps_s: Floats
+    sums: Floats
+
+    @staticmethod
+    def of(rate: Samples) -> Angles:
+        """Return the angles of rates (n, 3)."""
+        steps = np.diff(rate.stamps_s)[:, None] * (rate.values[1:] + rate.values[:-1]) / 2
+        return Angles(rate.stamps_s, np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]))
+
+    def at(self, stamps_s: Floats) -> Floats:
+        """Return (k, 3) the angles at stamps (k,)."""
+        return np.stack([np.interp(stamps_s, self.stamps_s, column)
+                         for column in self.sums.T], axis=1)
+
+    def turned(self, stamps_s: Floats) -> Floats:
+        """Return (k - 1, 3) what was turned between stamps (k,)."""
+        return np.diff(self.at(stamps_s), axis=0)
+
+    def covered(self, turn: Steps, offset: float = 0.0) -> Steps | None:
+        """Return the part of a turn for which there are samples; None where it is too short.
+
+        offset: by which the sensor's clock is late, s.
+        """
+        gaps = np.flatnonzero(np.diff(self.stamps_s) > LONGEST_GAP_S)
+        piece = np.searchsorted(self.stamps_s[gaps + 1], turn.stamps_s + offset, side='right')
+        begins = np.r_[self.stamps_s[0], self.stamps_s[gaps + 1]][piece]
+        ends = np.r_[self.stamps_s[gaps], self.stamps_s[-1]][piece]
+        inside = ((turn.stamps_s + offset > begins + 2 * RATE_S)
+                  & (turn.stamps_s + offset < ends - 2 * RATE_S))
+        best = max((np.flatnonzero(inside & (piece == each)) for each in np.unique(piece)),
+                   key=len)
+        if len(best) < LEAST_KEYFRAMES:
+            return None
+        first, last = int(best[0]), int(best[-1])
+        return Steps(turn.stamps_s[first:last + 1], turn.turned[first:last],
+                     turn.follow[first:last])
+
+
+def fit_to(turns: Sequence[Steps], rate: Samples) -> Fit | None:
+    """Return how a gyro fits to the turns, those parts of them for which it has samples."""
+    angles, found = Angles.of(rate), None
+    for _ in range(2):
+        offset = 0.0 if found is None else found.offset_s
+        covered = [part for turn in turns if (part := angles.covered(turn, offset)) is not None]
+        found = fit_gyro(covered, angles)
+        if found is None or not abs(found.offset_s) < LARGEST_OFFSET_S:
+            break
+    return found
+
+
+def fit_gyro(turns: Sequence[Steps], angles: Angles) -> Fit | None:
+    """Return how a gyro fits to the turns; None where too little was turned."""
+    total = np.degrees(sum(np.linalg.norm(turn.turned.sum(axis=0)) for turn in turns))
+    if not turns or total < LEAST_TURNED_DEG:
+        return None
+    start = min((_aligned(turns, angles, offset) for offset in
+                 np.arange(-LARGEST_OFFSET_S, LARGEST_OFFSET_S + COARSE_S / 2, COARSE_S)),
+                key=lambda each: each[0])
+    _, alignment, inverse_scale, offset = start
+    bias, ratio = np.zeros(3), 1.0
+    for number in range(STEPS):
+        rows = [_linear(turn, angles, alignment, bias, inverse_scale, offset) for turn in turns]
+        if number in WEIGHED:
+            ratio = _likeliest_ratio(turns, rows)
+        jacobian, residual, _ = _whitened(turns, rows, ratio)
+        step = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+        alignment = _rotation(step[:3]) @ alignment
+        bias, inverse_scale = bias + step[3:6], inverse_scale + step[6]
+        offset = float(np.clip(offset + step[7], -2 * LARGEST_OFFSET_S, 2 * LARGEST_OFFSET_S))
+    rows = [_linear(turn, angles, alignment, bias, inverse_scale, offset) for turn in turns]
+    jacobian, residual, follow = _whitened(turns, rows, ratio)
+    hessian = jacobian.T @ jacobian
+    noise = float(residual @ residual) / max(len(residual) - hessian.shape[0], 1)
+    covariance = noise * np.linalg.inv(hessian)
+    parts, rests = _by_turn(turns, jacobian), _by_turn(turns, residual)
+    # what each turn alone would change of the scale and of the offset, all else as it is
+    own = [noise / np.sum(part[:, 6:]**2, axis=0) for part in parts]
+    off = [part[:, 6:].T @ rest / np.sum(part[:, 6:]**2, axis=0)
+           for part, rest in zip(parts, rests, strict=True)]
+    alone, variances = np.array(off), np.array(own)
+    covariance[6, 6] += _between_turns(alone[:, 0], variances[:, 0], inverse_scale)
+    clear = np.abs(alone[:, 1]) > SKEW_SIGMAS * np.sqrt(variances[:, 1])
+    turned = np.concatenate([turn.turned for turn in turns])
+    left = np.concatenate([row[1] for row in rows])
+    return Fit(alignment, bias, float(inverse_scale), offset, covariance,
+               np.linalg.solve(hessian, jacobian.T @ follow)[6],
+               1 - float(np.sum(left**2) / np.sum(turned**2)),
+               float(np.max(np.abs(alone[:, 1]), where=clear, initial=0.0)))
+
+
+def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:
+    """Return the variance of a common value that turns which differ add to it.
+
+    offsets, variances: (t,) of each turn's own value. Turns differ as their noise says, or by
+    TURN_SIGMA more: both are as likely before, and are weighed by how well they explain the turns.
+    """
+    more = (TURN_SIGMA * size)**2
+    if len(offsets) == 1:
+        return more
+    logs, found = [], []
+    for extra in (0.0, more):
+        weights = 1 / (variances + extra)
+        mean = float(np.average(offsets, weights=weights))
+        squares = float(weights @ (offsets - mean)**2)
+        logs.append(0.5 * float(np.log(weights).sum() - np.log(weights.sum())) - 0.5 * squares)
+        # they may differ by still more
+        found.append(max(squares / (len(offsets) - 1), 1.0) / float(weights.sum()) + mean**2)
+    share = 1 / (1 + np.exp(np.clip(logs[0] - logs[1], -100, 100)))
+    return float(max((1 - share) * found[0] + share * found[1] - 1 / np.sum(1 / variances), 0.0))
+
+
+def _aligned(turns: Sequence[Steps], angles: Angles, offset: float
+             ) -> tuple[float, Floats, float, float]:
+    """Return what is left, the rotation, 1 / scale for an offset: a start, without bias."""
+    sensor = np.concatenate([angles.turned(turn.stamps_s + offset) for turn in turns])
+    camera = np.concatenate([turn.turned for turn in turns])
+    u, sizes, v = np.linalg.svd(camera.T @ sensor)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    rotation = u @ sign @ v
+    gain = float(sizes @ np.diag(sign)) / max(float(np.sum(sensor**2)), 1e-12)
+    left = float(np.sum((camera - gain * sensor @ rotation.T)**2))
+    return left, rotation, gain, float(offset)
+
+
+def _linear(turn: Steps, angles: Angles, alignment: Floats, bias: Floats, inverse_scale: float,
+            offset: float) -> tuple[Floats, Floats]:
+    """Return (k - 1, 3, 8) derivatives of the prediction, and (k - 1, 3) what it leaves."""
+    when, apart = turn.stamps_s + offset, np.diff(turn.stamps_s)[:, None]
+    plain = (angles.turned(when) - bias * apart) @ alignment.T
+    predicted = inverse_scale * plain
+    by_offset = inverse_scale * (angles.turned(when + RATE_S) - angles.turned(when - RATE_S)
+                                 ) @ alignment.T / (2 * RATE_S)
+    jacobian = np.zeros((len(plain), 3, 8))
+    # a small rotation w of the alignment moves the prediction p by w x p
+    for axis, unit in enumerate(np.eye(3)):
+        jacobian[:, :, axis] = np.cross(unit, predicted)
+    jacobian[:, :, 3:6] = -inverse_scale * apart[:, :, None] * alignment
+    jacobian[:, :, 6] = plain
+    jacobian[:, :, 7] = by_offset
+    return jacobian, turn.turned - predicted
+
+
+def _whitening(turn: Steps, ratio: float) -> tuple[Floats, float]:
+    """Return what makes the noise of a turn's steps white, (k - 1, k - 1), and its log size.
+
+    ratio: of the variance of a keyframe's pose to that of the gyro in a second.
+    """
+    apart = np.diff(turn.stamps_s)
+    covariance = np.diag(apart + 2 * ratio)
+    for place in range(len(apart) - 1):
+        covariance[place, place + 1] = covariance[place + 1, place] = -ratio
+    root = np.linalg.cholesky(covariance)
+    return np.linalg.inv(root), float(np.log(np.diag(root)).sum())
+
+
+Rows = Sequence[tuple[Floats, Floats]]
+
+
+def _whitened(turns: Sequence[Steps], rows: Rows, ratio: float) -> tuple[Floats, Floats, Floats]:
+    """Return derivatives (m, 8), residuals (m,), and what the camera does to them (m, n)."""
+    parts = []
+    for turn, (jacobian, residual) in zip(turns, rows, strict=True):
+        white = _whitening(turn, ratio)[0]
+        parts.append((np.einsum('ij,jac->iac', white, jacobian).reshape(-1, 8),
+                      (white @ residual).reshape(-1),
+                      np.einsum('ij,jac->iac', white, turn.follow).reshape(
+                          -1, turn.follow.shape[2])))
+    jacobian, residual, follow = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return jacobian, residual, follow
+
+
+def _by_turn(turns: Sequence[Steps], rows: Floats) -> list[Floats]:
+    return np.split(rows, np.cumsum([3 * len(turn.turned) for turn in turns])[:-1])
+
+
+def _likeliest_ratio(turns: Sequence[Steps], rows: Rows) -> float:
+    """Return the ratio of the two noises that explains the residuals best."""
+    def badness(ratio: float) -> float:
+        jacobian, residual, _ = _whitened(turns, rows, ratio)
+        step = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+        squares = float(np.sum((residual - jacobian @ step)**2))
+        logs = sum(_whitening(turn, ratio)[1] for turn in turns)
+        return len(residual) / 2 * float(np.log(max(squares, 1e-300))) + 3 * logs
+    return float(min(RATIOS, key=badness))
+
+
+def _rotation(turned: npt.NDArray[Any]) -> Floats:
+    from scipy.spatial.transform import Rotation
+    return np.asarray(Rotation.from_rotvec(turned).as_matrix())
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A straight before or after a turn.
+
+    gps: its heading, rad, left positive; yaw: the camera's there; follow: (n,) what that does with
+    the camera's parameters. off_m: RMS of the fixes; spread_m2: their sum of
+    squares along the way; freedom: fixes beyond those that a line needs. slip: rad by which an
+    aerial that is not over the rear axle goes beside the car's heading.
+    """
+
+    gps: float
+    yaw: float
+    follow: Floats
+    off_m: float
+    spread_m2: float
+    freedom: int
+    slip: float
+
+
+def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
+         ) -> tuple[Witness | None, str]:
+    """Return what GPS headings say, from straight to straight, or why they say nothing."""
+    pairs = [pair for turn in turns if (pair := _straights(turn, position)) is not None]
+    if not pairs:
+        return None, ''
+    straights = [each for pair in pairs for each in pair]
+    usual = float(np.median([each.off_m for each in straights]))
+    sound = [pair for pair in pairs
+             if all(each.off_m <= max(JUMP * usual, LEAST_NOISE_M) for each in pair)]
+    if not sound:
+        return None, ''
+    squares = sum(each.off_m**2 * (each.freedom + 2) for pair in sound for each in pair)
+    noise_m = max(float(np.sqrt(squares / sum(each.freedom for pair in sound for each in pair))),
+                  LEAST_NOISE_M)
+    measured, ours, sigmas, follow = [], [], [], []
+    for before, after in sound:
+        sigma = float(np.sqrt(noise_m**2 * (1 / before.spread_m2 + 1 / after.spread_m2)
+                              + before.slip**2 + after.slip**2))
+        ours_rad = after.yaw - before.yaw
+        if np.degrees(sigma) > HEADING_SIGMA_DEG or abs(ours_rad) < np.radians(LEAST_GPS_DEG):
+            continue
+        # of all angles that headings allow, the nearest: turns are less than 180 degrees off
+        turned = after.gps - before.gps
+        ours.append(ours_rad)
+        measured.append(ours_rad + float(np.angle(np.exp(1j * (turned - ours_rad)))))
+        sigmas.append(sigma)
+        follow.append(after.follow - before.follow)
+    if not ours:
+        return None, ''
+    camera, gps = np.array(ours), np.array(measured)
+    weights = (gps / np.array(sigmas))**2
+    each = camera / gps
+    kappa = float(np.average(each, weights=weights))
+    if not 1 / SCALES[1] < kappa < 1 / SCALES[0]:
+        return None, ('GPS is not used: it does not turn as the pictures do: check that it is of '
+                      'this drive, and its stamps')
+    variance = 1 / float(weights.sum()) + _between_turns(each - kappa, 1 / weights, kappa)
+    by_camera = np.average(np.array(follow) / gps[:, None], axis=0, weights=weights)
+    return _witness(kappa, float(np.sqrt(variance)), 0.0, by_camera, solution), ''
+
+
+def _straights(turn: Steps, position: Samples) -> tuple[Heading, Heading] | None:
+    """Return the straights before and after a turn; None where one has too few fixes."""
+    # a car turns about the vertical: y points down, and a turn to the left is negative about it
+    axis = main_axis(np.cumsum(turn.turned, axis=0))
+    yaw = -np.r_[0.0, np.cumsum(turn.turned @ axis)]
+    follow = -np.concatenate([np.zeros((1, turn.follow.shape[2])),
+                              np.cumsum(np.einsum('kan,a->kn', turn.follow, axis), axis=0)])
+    limit, found = np.radians(STRAIGHT_DEG), []
+    last = len(yaw) - 1
+    begin = int(np.argmax(np.abs(yaw - yaw[0]) > limit)) - 1
+    end = last - int(np.argmax(np.abs(yaw[::-1] - yaw[-1]) > limit)) + 1
+    for first, past in ((0, begin), (end, last)):
+        inside = ((position.stamps_s >= turn.stamps_s[first])
+                  & (position.stamps_s <= turn.stamps_s[past]))
+        where, when = position.values[inside, :2], position.stamps_s[inside]
+        if past <= first or len(where) < STRAIGHT_FIXES:
+            return None
+        away = where - where.mean(axis=0)
+        direction = np.linalg.svd(away, full_matrices=False)[2][0]
+        direction = direction * np.sign(direction @ (where[-1] - where[0]))
+        along = away @ direction
+        if np.ptp(along) < STRAIGHT_M:
+            return None
+        left = np.array([-direction[1], direction[0]])
+        found.append(Heading(
+            float(np.arctan2(direction[1], direction[0])),
+            float(np.interp(when, turn.stamps_s, yaw).mean()),
+            np.array([np.interp(when, turn.stamps_s, column).mean() for column in follow.T]),
+            float(np.sqrt(np.mean((away @ left)**2))), float(along @ along), len(where) - 2,
+            float(np.ptp(yaw[first:past + 1])) * LEVER_M / float(np.ptp(along))))
+    return found[0], found[1]

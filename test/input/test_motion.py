@@ -1,0 +1,216 @@
+"""Motion streams from files, bags and live samples."""
+from __future__ import annotations
+
+import builtins
+
+import numpy as np
+import pytest
+from made_drives import ROS2, START, drive, head, images, write_bag
+
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.motion import SensorBuffer, local_metres
+from dashcalib_ros.input.motion_files import bag_motion, read_motion
+
+NONE: dict[str, str | None] = {}
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def gyro_csv(path, change=lambda rows: rows):
+    rows = [f'{0.01 * n:.2f},0.1,0.2,0.3' for n in range(50)]
+    return write(path / 'imu.csv', '\n'.join(['stamp_s,gyro_x,gyro_y,gyro_z', *change(rows)]))
+
+
+def test_a_csv_has_any_of_its_columns_in_any_order(tmp_path):
+    path = write(tmp_path / 'all.csv', 'speed,stamp_s,latitude,longitude,gyro_z,gyro_y,gyro_x\n'
+                 + '\n'.join(f'{n},{n / 10},49.0,{8 + n * 1e-5},3,2,{n / 10}' for n in range(20)))
+    found = read_motion(path)
+    assert found.warnings == () and not found.absolute
+    np.testing.assert_allclose(found.rate.values[5], [0.5, 2.0, 3.0])
+    np.testing.assert_allclose(found.speed.values[:, 0], np.arange(20))
+    east = 1e-5 * 111_320 * np.cos(np.radians(49))
+    np.testing.assert_allclose(found.position.values[:, 0], east * np.arange(20), atol=1e-6)
+
+
+def test_sensors_of_different_rates_leave_cells_empty(tmp_path):
+    path = write(tmp_path / 'two.csv', 'stamp_s,gyro_x,gyro_y,gyro_z,latitude,longitude\n'
+                 + '\n'.join(f'{n / 10},0,0,1,,' if n % 10 else f'{n / 10},,,,49.0,{8 + n / 1e6}'
+                             for n in range(50)))
+    found = read_motion(path)
+    assert found.warnings == ()
+    assert len(found.rate.values) == 45 and len(found.position.values) == 5
+
+
+@pytest.mark.parametrize(('text', 'line'), [
+    ('', 'its first line must name its columns'),
+    ('time,gyro_x\n1,2\n', 'its first line must name its columns'),
+    ('stamp_s,temperature\n1,2\n', 'no column of a sensor'),
+    ('stamp_s,gyro_x,gyro_y\n1,2,3\n', 'has only gyro_x, gyro_y')])
+def test_what_is_no_csv_of_sensors_is_named(tmp_path, text, line):
+    with pytest.raises(InputError, match=line):
+        read_motion(write(tmp_path / 'bad.csv', text))
+
+
+def test_a_few_damaged_lines_are_left_out(tmp_path):
+    def damage(rows):
+        return [*rows[:10], 'x,y', rows[5], 'nan,1,2,3', '0.105,inf,0,0', *rows[10:]]
+    found = read_motion(gyro_csv(tmp_path, damage))
+    assert len(found.rate.stamps_s) == 50 and (np.diff(found.rate.stamps_s) > 0).all()
+
+
+@pytest.mark.parametrize(('change', 'line'), [
+    (lambda rows: rows[::-1], 'out of order'),
+    (lambda rows: ['a,b,c,d'] * 40 + rows, 'damaged'),
+    (lambda rows: rows[:5], 'damaged'),
+    (lambda rows: [row.replace('0.3', '17.2') for row in rows], 'write rad/s')])
+def test_a_stream_that_is_damaged_is_not_used_and_told_in_one_line(tmp_path, change, line):
+    found = read_motion(gyro_csv(tmp_path, change))
+    assert found.rate is None and found.empty
+    [warning] = found.warnings
+    assert line in warning and len(warning.splitlines()) == 1
+
+
+def gpx(points):
+    return ('<?xml version="1.0"?><gpx version="1.1" creator="x"><trk><trkseg>'
+            + ''.join(f'<trkpt lat="49.0" lon="{8 + n * 1e-4}">{time}</trkpt>'
+                      for n, time in enumerate(points)) + '</trkseg></trk></gpx>')
+
+
+def test_a_gpx_has_times_of_day(tmp_path):
+    pytest.importorskip('gpxpy')
+    times = [f'<time>2023-11-14T22:13:{20 + n}Z</time>' for n in range(5)]
+    found = read_motion(write(tmp_path / 'track.gpx', gpx(times)))
+    assert found.absolute
+    since = found.since(START / 1e9)
+    np.testing.assert_allclose(since.position.stamps_s, np.arange(5.0))
+    assert since.warnings == ()
+    # pictures without a time of day: it can only be guessed, and that is told
+    guessed = found.since(0.0)
+    assert guessed.position.stamps_s[0] == 0.0 and 'time of day' in guessed.warnings[0]
+    assert guessed.since(0.0) == guessed
+
+
+@pytest.mark.parametrize('text', ['<gpx', gpx(['']), '<!DOCTYPE x [<!ENTITY a "b">]><gpx/>'])
+def test_what_is_no_gpx_with_times_is_named(tmp_path, text):
+    pytest.importorskip('gpxpy')
+    with pytest.raises(InputError, match=r'track\.gpx'):
+        read_motion(write(tmp_path / 'track.gpx', text))
+
+
+def test_without_gpxpy_the_line_says_what_to_install(tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest, **more):
+        if name.startswith('gpxpy'):
+            raise ImportError(name)
+        return real(name, *rest, **more)
+    monkeypatch.setattr(builtins, '__import__', without)
+    with pytest.raises(InputError, match=r'dashcalib_ros\[motion\]'):
+        read_motion(write(tmp_path / 'track.gpx', gpx([])))
+
+
+def test_a_kitti_oxts_folder_counts_from_its_first_image(tmp_path):
+    data = tmp_path / 'oxts' / 'data'
+    data.mkdir(parents=True)
+    for n in range(12):
+        values = np.zeros(30)
+        values[:2], values[8], values[17:20] = (49.0, 8.0 + n * 1e-5), 7.0, (0.1, 0.2, n / 10)
+        write(data / f'{n:010}.txt', ' '.join(map(str, values)) if n != 4 else 'broken')
+    write(tmp_path / 'oxts' / 'timestamps.txt', '\n'.join(
+        f'2011-09-26 13:02:{25 + n // 10}.{n % 10}00000000' for n in range(12)))
+    (tmp_path / 'image_00').mkdir()
+    write(tmp_path / 'image_00' / 'timestamps.txt', '2011-09-26 13:02:25.050000000\n')
+    for place in (tmp_path, tmp_path / 'oxts'):
+        found = read_motion(place)
+        assert found.rate.stamps_s[0] == pytest.approx(-0.05, abs=1e-6)
+        assert len(found.rate.values) == 11 and found.rate.values[-1].tolist() == [0.1, 0.2, 1.1]
+        assert found.speed.values[0, 0] == 7.0
+    with pytest.raises(InputError, match='no folder of motion data'):
+        read_motion(data)
+
+
+def imu(n, topic='/imu', stamp_ns=None):
+    types = ROS2.types
+    vector = types['geometry_msgs/msg/Vector3']
+    none = np.zeros(9)
+    message = types['sensor_msgs/msg/Imu'](
+        header=head(START + n * 10**7 if stamp_ns is None else stamp_ns, ROS2),
+        orientation=types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=none, angular_velocity=vector(x=0.1, y=0.2, z=float(n) / 100),
+        angular_velocity_covariance=none, linear_acceleration=vector(x=0.0, y=0.0, z=9.8),
+        linear_acceleration_covariance=none)
+    return topic, START + n * 10**7, message
+
+
+def fix(n, status=0):
+    types = ROS2.types
+    return '/fix', START + n * 10**8, types['sensor_msgs/msg/NavSatFix'](
+        header=head(START + n * 10**8, ROS2),
+        status=types['sensor_msgs/msg/NavSatStatus'](status=status, service=1), latitude=49.0,
+        longitude=8.0 + n * 1e-5, altitude=float('nan'), position_covariance=np.zeros(9),
+        position_covariance_type=0)
+
+
+def twist(n):
+    types = ROS2.types
+    vector = types['geometry_msgs/msg/Vector3']
+    return '/speed', START + n * 10**8, types['geometry_msgs/msg/TwistStamped'](
+        header=head(START + n * 10**8, ROS2), twist=types['geometry_msgs/msg/Twist'](
+            linear=vector(x=7.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.5)))
+
+
+def test_a_bags_topics_are_found_by_their_type(tmp_path):
+    path = write_bag(tmp_path / 'bag', [
+        *images(drive(3)), *(imu(n) for n in range(40)), *(fix(n) for n in range(9)),
+        fix(9, status=-1), *(twist(n) for n in range(12))])
+    found = bag_motion([path], NONE)
+    assert found.absolute and found.warnings == ()
+    since = found.since(START / 1e9)
+    # a gyro is better than what odometry makes of it
+    assert since.rate.values.shape == (40, 3) and since.rate.values[0, 0] == 0.1
+    assert since.rate.stamps_s[-1] == pytest.approx(0.39, abs=1e-5)
+    assert len(since.position.values) == 9 and since.speed.values[0, 0] == 7.0
+    alone = write_bag(tmp_path / 'odometry', [twist(n) for n in range(12)])
+    assert bag_motion([alone], NONE).rate.values[0].tolist() == [0.0, 0.0, 0.5]
+
+
+def test_without_sensors_a_bag_has_none(tmp_path):
+    assert bag_motion([write_bag(tmp_path / 'bag', images(drive(3)))], NONE) is None
+
+
+def test_of_several_topics_none_is_used_until_one_is_chosen(tmp_path):
+    path = write_bag(tmp_path / 'bag', [
+        *(imu(n) for n in range(20)), *(imu(n, '/other') for n in range(20))])
+    found = bag_motion([path], NONE)
+    [line] = found.warnings
+    assert found.empty and '/imu, /other' in line and '--imu' in line
+    assert bag_motion([path], {'imu': 'other'}).rate is not None
+    with pytest.raises(InputError, match=r"no imu topic '/none'.*/imu, /other"):
+        bag_motion([path], {'imu': '/none'})
+
+
+def test_messages_without_a_stamp_have_the_time_they_came(tmp_path):
+    path = write_bag(tmp_path / 'bag', [imu(n, stamp_ns=0) for n in range(20)])
+    assert bag_motion([path], NONE).since(START / 1e9).rate.stamps_s[1] == pytest.approx(
+        0.01, abs=1e-5)
+
+
+def test_live_samples_are_bounded_and_in_order():
+    buffer = SensorBuffer(length=100)
+    assert buffer.stream().empty
+    for n in range(1000):
+        buffer.add('rate', START / 1e9 + n / 100, (0.0, 0.0, n / 1000))
+        if n % 20 == 0:
+            buffer.add('rate', START / 1e9 + n / 100, (0.0, 0.0, 9.0))  # doubled
+    found = buffer.stream()
+    assert 90 <= len(found.rate.values) <= 100 and found.rate.values.max() < 1.0
+    assert found.absolute and (np.diff(found.rate.stamps_s) > 0).all()
+
+
+def test_positions_are_metres_from_the_first_fix_also_at_the_date_line():
+    found = local_metres(np.array([np.nan, 0.0, 0.0, 1e-5]), np.array([0.0, 179.99999, -179.99999,
+                                                                      179.99999]), np.zeros(4))
+    np.testing.assert_allclose(found[1:, :2], [[0, 0], [2.2264, 0], [0, 1.1132]], atol=1e-3)

@@ -1,0 +1,170 @@
+"""A gyro and GPS as witnesses of a solution whose truth is known."""
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from solving import CONFIG, YAWS, solved
+from synthetic import LENS, synthetic_turn
+
+from dashcalib_ros.config import VerdictConfig
+from dashcalib_ros.input.motion import Samples, SensorStream
+from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.judge.witnesses import ask_sensors, fit_to, steps_of
+from dashcalib_ros.solve.fitting import scene_with
+
+TURNS = 4
+START_S, APART_S, LATE_S = 1_700_000_000.0, 20.0, 0.04
+MOUNT = Rotation.from_euler('xyz', (20.0, -130.0, 75.0), degrees=True)
+CALIBRATED = CONFIG.replace({'motion.gyro_scale_sigma': 0.001})
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Return a solution, and the true angles: times (n,), rates (n, 3) about the camera's axes."""
+    scenes, times, rates = [], [], []
+    for world, yaw in enumerate(YAWS[:TURNS]):
+        turn = synthetic_turn(yaw_deg=yaw, tracks=250, keyframes=18, world=world)
+        when = APART_S * (world + 1) + turn.tracks.stamps_ns / 1e9
+        fine = np.arange(when[0], when[-1], 0.01)
+        steps = Rotation.from_matrix(turn.structure.rotations[:-1]
+                                     @ turn.structure.rotations[1:].transpose(0, 2, 1))
+        place = np.clip(np.searchsorted(when, fine, side='right') - 1, 0, len(when) - 2)
+        rates.append(steps.as_rotvec()[place] / np.diff(when)[place, None])
+        times.append(fine)
+        scene = turn.scene(LENS.with_focal(1.03 * LENS.fx), world)
+        stamps = np.round((START_S + when) * 1e9).astype(np.int64)
+        scenes.append(dataclasses.replace(
+            scene, tracks=dataclasses.replace(scene.tracks, stamps_ns=stamps)))
+    everywhere = np.arange(0.0, APART_S * (TURNS + 1), 0.01)
+    known = np.concatenate(times)
+    still = everywhere[np.abs(everywhere[:, None] - known[::5]).min(axis=1) > 0.06]
+    order = np.argsort(when := np.r_[known, still], kind='stable')
+    values = np.concatenate([*rates, np.zeros((len(still), 3))])[order]
+    return solved(scenes), when[order], values
+
+
+def gyro(drive, scale=1.0, density_deg=0.02, bias_deg=0.2, late_s=LATE_S, unit=1.0, seed=0):
+    _, when, rates = drive
+    noise = np.random.default_rng(seed).standard_normal(rates.shape)
+    seen = unit * scale * MOUNT.apply(rates) + np.radians(
+        bias_deg * np.array([1.0, -1.0, 0.5]) + density_deg * 10 * noise)
+    return SensorStream(rate=Samples(when + late_s, seen))
+
+
+def asked(drive, stream, config=CALIBRATED, solution=None):
+    found, lines = ask_sensors(solution or drive[0], stream, START_S, config)
+    return found.gyro, lines
+
+
+def wrong_camera(solution, focal):
+    camera = solution.camera.with_focal(focal * solution.camera.fx)
+    scenes = tuple(scene_with(camera, scene, CONFIG) for scene in solution.scenes)
+    return dataclasses.replace(solution, camera=camera, scenes=scenes)
+
+
+def test_offset_mounting_bias_and_scale_are_found(drive):
+    said, lines = asked(drive, gyro(drive))
+    assert lines == ()
+    assert abs(said.time_offset_s - LATE_S) < 0.003
+    assert abs(said.time_offset_s - LATE_S) < 4 * said.time_sigma_s
+    assert abs(said.scale - 1) < 4 * said.scale_sigma < 0.02
+    np.testing.assert_allclose(np.degrees(said.bias_rad_s), [0.2, -0.2, 0.1], atol=0.05)
+    off = Rotation.from_matrix(said.camera_from_sensor) * MOUNT
+    assert np.degrees(off.magnitude()) < 4 * said.alignment_sigma_deg < 3.0
+    assert said.agrees and abs(said.fx_percent) < 3 * said.fx_sigma_percent < 2.0
+
+
+def test_a_focal_length_that_is_off_is_contradicted_in_its_direction(drive):
+    for focal in (0.97, 1.03):
+        said, _ = asked(drive, gyro(drive), solution=wrong_camera(drive[0], focal))
+        assert not said.agrees
+        assert said.fx_percent == pytest.approx(100 * (1 / focal - 1), abs=1.0)
+        assert abs(said.fx_percent) > 4 * said.fx_sigma_percent
+
+
+def test_a_gyro_of_unknown_scale_never_contradicts_falsely(drive):
+    for scale in (0.97, 1.03):
+        said, _ = asked(drive, gyro(drive, scale), CONFIG)
+        assert said.agrees and said.fx_sigma_percent > 2.5
+        assert said.scale == pytest.approx(scale, abs=4 * said.scale_sigma)
+        # and where a false calibration is claimed, it does
+        assert not asked(drive, gyro(drive, scale))[0].agrees
+
+
+def test_a_contradiction_makes_the_result_weak_with_both_named(drive):
+    solution, config = drive[0], VerdictConfig()
+    before = judge(solution, config)
+    found, _ = ask_sensors(solution, gyro(drive, 1.05), START_S, CALIBRATED)
+    verdict = judge(solution, config, witnesses=found)
+    assert verdict.level == 'weak'
+    [more] = set(verdict.reasons) - set(before.reasons)
+    assert 'pictures' in more and 'the gyro' in more
+    assert judge(solution, config, witnesses=ask_sensors(
+        solution, gyro(drive), START_S, CALIBRATED)[0]) == before
+
+
+def test_sigmas_hold(drive):
+    pulls, solution = [], drive[0]
+    turns = [steps_of(scene, solution, 0.3, START_S) for scene in solution.scenes]
+    for seed in range(30):
+        said = fit_to(turns, gyro(drive, density_deg=0.1, seed=seed).rate)
+        pulls.append([(said.offset_s - LATE_S) / np.sqrt(said.covariance[7, 7]),
+                      (said.scale - 1) / said.scale_sigma])
+    assert (np.abs(pulls) < 2).mean(axis=0).min() >= 0.9
+
+
+@pytest.mark.parametrize(('stream', 'line'), [
+    (lambda drive: gyro(drive, unit=180 / np.pi), 'not degrees a second'),
+    (lambda drive: gyro(drive, unit=9.0), 'check its unit'),
+    (lambda drive: gyro(drive).shifted(3.0), 'does not turn as the pictures do'),
+    (lambda drive: gyro(drive).shifted(1e4), 'no samples during the turns'),
+    (lambda drive: SensorStream(rate=Samples(
+        gyro(drive).rate.stamps_s * 1.002, gyro(drive).rate.values)), 'do not keep pace')])
+def test_streams_that_do_not_fit_are_told_and_not_used(drive, stream, line):
+    said, [found] = asked(drive, stream(drive))
+    assert said is None and line in found and len(found.splitlines()) == 1
+
+
+def test_gaps_leave_out_what_they_hide(drive):
+    rate = gyro(drive).rate
+    kept = (rate.stamps_s < 41.0) | (rate.stamps_s > 59.0)
+    said, lines = asked(drive, SensorStream(rate=Samples(rate.stamps_s[kept], rate.values[kept])))
+    whole, _ = asked(drive, gyro(drive))
+    assert lines == () and said.agrees and said.scale_sigma > whole.scale_sigma
+
+
+def fixes(drive, noise_m, rate_hz=10.0, seed=0):
+    """Return a track: each turn is driven at its own place, as jumps between them."""
+    when, places = [], []
+    for world, scene in enumerate(drive[0].scenes):
+        turn = synthetic_turn(yaw_deg=YAWS[world], tracks=250, keyframes=18, world=world)
+        own = scene.tracks.stamps_ns / 1e9 - START_S
+        centres = -np.einsum('kji,kj->ki', turn.structure.rotations, turn.structure.translations)
+        fine = np.arange(own[0], own[-1], 1 / rate_hz)
+        east, north = (np.interp(fine, own, centres[:, axis]) for axis in (0, 2))
+        when.append(fine)
+        places.append(np.stack([east + 300.0 * world, north, 0 * fine], axis=1))
+    values = np.concatenate(places)
+    values += noise_m * np.random.default_rng(seed).standard_normal(values.shape)
+    return SensorStream(position=Samples(np.concatenate(when), values))
+
+
+def gps(drive, stream, solution=None):
+    found, lines = ask_sensors(solution or drive[0], stream, START_S, CONFIG)
+    return found.gps, lines
+
+
+
+
+def test_gps_headings_say_nothing_where_the_straights_are_short(drive):
+    # six metres before and after each turn
+    assert gps(drive, fixes(drive, 0.02)) == (None, ())
+
+
+def test_noisy_gps_does_no_harm(drive):
+    for seed in range(5):
+        said, lines = gps(drive, fixes(drive, 3.0, 1.0, seed))
+        assert lines == () and (said is None or said.agrees)
