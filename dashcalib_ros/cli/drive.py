@@ -27,7 +27,6 @@ from dashcalib_ros.recorded import Taker, drive_motion, pushed, with_source
 # --turns sets both, so that exactly this number of turns is used
 FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads': ('threads',),
          'segmentation': ('mask.segmentation',), 'model': ('model',),
-         'segmentation': ('mask.segmentation',), 'model': ('model',),
          'speed': ('mount.speed_kmh',), 'mount': ('mount.enabled',),
          'gyro_scale_sigma': ('motion.gyro_scale_sigma',)}
 EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+')  # 1e-3, a word to YAML 1.1
