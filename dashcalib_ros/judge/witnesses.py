@@ -422,7 +422,8 @@ class Heading:
     gps: its heading, rad, left positive; yaw: the camera's there; follow: (n,) what that does with
     the camera's parameters. off_m: RMS of the fixes; spread_m2: their sum of
     squares along the way; freedom: fixes beyond those that a line needs. slip: rad by which an
-    aerial that is not over the rear axle goes beside the car's heading.
+    aerial that is not over the rear axle goes beside the car's heading, and by which the fixes
+    turn there: where they are late, or filtered, a straight ends in the turn.
     """
 
     gps: float
@@ -505,5 +506,6 @@ def _straights(turn: Steps, position: Samples) -> tuple[Heading, Heading] | None
             float(np.interp(when, turn.stamps_s, yaw).mean()),
             np.array([np.interp(when, turn.stamps_s, column).mean() for column in follow.T]),
             float(np.sqrt(np.mean((away @ left)**2))), float(along @ along), len(where) - 2,
-            float(np.ptp(yaw[first:past + 1])) * LEVER_M / float(np.ptp(along))))
+            float(np.hypot(np.ptp(yaw[first:past + 1]) * LEVER_M / np.ptp(along),
+                           2 * np.polyfit(along, away @ left, 2)[0] * np.ptp(along)))))
     return found[0], found[1]

@@ -69,7 +69,7 @@ def test_help_imports_nothing_heavy():
 @pytest.mark.parametrize(('line', 'expected'), [
     ('dashcalib ', ['run', 'turns', 'demo', 'compare', 'export', 'check',
                     'batch']),
-    ('dashcalib run --mo', ['--model']), ('dashcalib export x --to n', ['nerfstudio']),
+    ('dashcalib run --mod', ['--model']), ('dashcalib export x --to n', ['nerfstudio']),
     ('dashcalib demo --model f', ['fisheye'])])
 def test_the_shell_completes(tmp_path, line, expected):
     pytest.importorskip('argcomplete')
