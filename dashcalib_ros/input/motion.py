@@ -30,6 +30,8 @@ DAMAGED = 0.2
 FASTEST_TURN = 6.0
 # the same for the whole drive, by the 99th percentile, where single peaks do not count
 QUANTILE = 99.0
+# s over which positions tell a speed
+SPEED_OVER_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,23 @@ def local_metres(latitude: Floats, longitude: Floats, altitude: Floats) -> Float
     return np.stack([
         east * DEGREE_M * np.cos(np.radians(latitude[first])),
         (latitude - latitude[first]) * DEGREE_M, up - up[first]], axis=1)
+
+
+def speeds_of(stream: SensorStream) -> Samples | None:
+    """Return the car's speed (n, 1), m/s: as it was measured, else by its positions; or None."""
+    if stream.speed is not None:
+        return Samples(stream.speed.stamps_s, np.abs(stream.speed.values))
+    if stream.position is None or len(stream.position.stamps_s) < 3:
+        return None
+    stamps_s, places = stream.position.stamps_s, stream.position.values
+    # over a second or more: from fix to fix noise is speed, too
+    later = np.minimum(np.searchsorted(stamps_s, stamps_s + SPEED_OVER_S), len(stamps_s) - 1)
+    passed = stamps_s[later] - stamps_s
+    known = passed >= SPEED_OVER_S
+    if not known.any():
+        return None
+    way = np.linalg.norm(places[later, :2] - places[:, :2], axis=1)
+    return Samples((stamps_s + passed / 2)[known], (way[known] / passed[known])[:, None])
 
 
 class SensorBuffer:

@@ -17,7 +17,7 @@ from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
-from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.input.motion import SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import focal_disagreement
 from dashcalib_ros.judge.calibration import (
@@ -151,7 +151,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                              f'for it; `dashcalib export --to rays` has it',)
             if evidence.straights is not None and config.mount.enabled:
                 mount = mount_of(evidence.straights, evidence.lines, solution, verdict.level, px,
-                                 _constant(config.mount.speed_kmh))
+                                 _speed(evidence, config))
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.crops:
@@ -181,9 +181,18 @@ def _witness(solution: Solution | None, evidence: Evidence, config: Config) -> B
     return bend(evidence.lines, solution.camera, config.lines, solution.covariance)
 
 
-def _constant(speed_kmh: float) -> Speed | None:
-    """Return a speed, m/s, that is always the same; None where it is not known."""
-    return (lambda stamps_s: np.full(len(stamps_s), speed_kmh / 3.6)) if speed_kmh else None
+def _speed(evidence: Evidence, config: Config) -> Speed | None:
+    """Return the car's speed, m/s, at stamps of pictures; None where it is not known."""
+    constant = config.mount.speed_kmh / 3.6
+    if constant:
+        return lambda stamps_s: np.full(len(stamps_s), constant)
+    if evidence.motion is None:
+        return None
+    known = speeds_of(evidence.motion.since(evidence.start_s))
+    if known is None:
+        return None
+    return lambda stamps_s: np.interp(stamps_s - evidence.start_s, known.stamps_s,
+                                      known.values[:, 0], left=0.0, right=0.0)
 
 
 def _of_size(mask: Mask | None, size: tuple[int, int]) -> Mask | None:

@@ -112,7 +112,7 @@ def mount_text(mount: Mount) -> str:
              angle('pitch_up_deg', mount.pitch_up_deg, ('upwards', 'downwards')),
              angle('roll_right_deg', mount.roll_right_deg, ('rolled right', 'rolled left'))]
     height = mount.sigma['height_m']
-    parts.append('height unknown without --speed' if mount.height_m is None or height is None
+    parts.append('height unknown without a speed' if mount.height_m is None or height is None
                  else f'{mount.height_m:.2f} ± {height:.2f} m above the road')
     return (f'{mount.verdict}: looks {", ".join(parts)}; it travels towards pixel '
             f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± {mount.travel_sigma_px:.1f}')

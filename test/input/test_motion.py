@@ -8,7 +8,13 @@ import pytest
 from made_drives import ROS2, START, drive, head, images, write_bag
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.motion import SensorBuffer, local_metres
+from dashcalib_ros.input.motion import (
+    SensorBuffer,
+    SensorStream,
+    local_metres,
+    sensor_stream,
+    speeds_of,
+)
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
 
 NONE: dict[str, str | None] = {}
@@ -214,3 +220,15 @@ def test_positions_are_metres_from_the_first_fix_also_at_the_date_line():
     found = local_metres(np.array([np.nan, 0.0, 0.0, 1e-5]), np.array([0.0, 179.99999, -179.99999,
                                                                       179.99999]), np.zeros(4))
     np.testing.assert_allclose(found[1:, :2], [[0, 0], [2.2264, 0], [0, 1.1132]], atol=1e-3)
+
+
+def test_speed_is_measured_or_comes_from_positions():
+    stamps = np.arange(0.0, 20.0, 0.5)
+    places = np.column_stack([9.0 * stamps, 12.0 * stamps, np.zeros(len(stamps))])
+    by_places = speeds_of(sensor_stream({'position': (stamps, places)}, 'a test'))
+    assert np.allclose(by_places.values, 15.0) and by_places.stamps_s[0] == 0.5
+    backwards = sensor_stream({'speed': (stamps, np.full((len(stamps), 1), -3.0)),
+                               'position': (stamps, places)}, 'a test')
+    assert np.allclose(speeds_of(backwards).values, 3.0)
+    assert speeds_of(sensor_stream({'position': (stamps[:2], places[:2])}, 'a test')) is None
+    assert speeds_of(SensorStream()) is None

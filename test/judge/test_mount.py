@@ -85,7 +85,7 @@ def test_height_needs_a_speed(solution):
     without = mount_of(pairs, None, known, 'accepted', 1.0, None)
     assert without.height_m is None and without.sigma['height_m'] is None
     found = mount_of(pairs, None, known, 'accepted', 1.0, at(SPEED))
-    assert abs(found.height_m - HEIGHT_M) < 2 * found.sigma['height_m'] < 0.1
+    assert abs(found.height_m - HEIGHT_M) < 2 * found.sigma['height_m'] < 0.15
     assert found.straight_m == pytest.approx(SPEED * SPACING_S / 2 * len(pairs), rel=0.3)
     # an error of speed is one of height
     fast = mount_of(pairs, None, known, 'accepted', 1.0, at(SPEED * 4.0 / 3.6))
