@@ -29,6 +29,7 @@ from dashcalib_ros.judge import (
 )
 from dashcalib_ros.judge.agreement import earlier_of_another_camera, evidence_of
 from dashcalib_ros.judge.conclude import CONTRADICTS, Evidence, evidence_of_detection
+from dashcalib_ros.judge.witnesses import Asked
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve.solution import Solution
@@ -121,15 +122,23 @@ class Calibrator:
         tell('reconstructing turns', 0.0)
         scenes = self._scenes.wanted(tell, final)
         solution: Solution | None = None
+        asked = Asked()
         if scenes:
-            solution = self._scenes.run(stages.solve, scenes, self._config, progress=tell)
+            if self._motion is None:
+                solution = self._scenes.run(stages.solve, scenes, self._config, progress=tell)
+            else:
+                asked = self._scenes.run(stages.solve_with_sensors, scenes, self._config,
+                                         self._motion, self._detection.start_s, progress=tell)
+                solution = asked.solution
             contradicted = earlier_of_another_camera(scenes, solution)
             self._scenes.leave_out(contradicted)
             self._scenes.reject(dict.fromkeys(
                 {scene.turn for scene in scenes} - evidence_of(solution, self._config.verdict)
                 - contradicted, CONTRADICTS))
         self._solution = solution
-        evidence = replace(self._evidence(started), motion=self._motion)
+        # the solution itself is judged
+        evidence = replace(self._evidence(started), motion=self._motion,
+                           asked=replace(asked, solution=None))
         if not self._live or solution is None:
             return stages.judge(solution, evidence, self._config)
         # it takes a second or two, and a live drive goes on meanwhile

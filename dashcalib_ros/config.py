@@ -49,6 +49,9 @@ class MotionConfig:
         640, 'px; wider images are divided by a whole number until they fit', 64, 8192)
     points: int = setting(
         300, 'points tracked at a time; 400 find the same turns and cost 20 % more', 50, 5000)
+    use: str = setting(
+        'information', 'of a gyro: in the solution where its scale is known, or a witness only',
+        choices=('information', 'witness'), expert=True)
     gyro_scale_sigma: float = expert(
         0.03, 'of its angles; cheap gyros are 1 to 3 % off, a calibrated one 0.001', 0.0, 1.0)
     standing_px: float = expert(

@@ -54,7 +54,8 @@ def calibrate(path: Paths, fps: float | None = None,
     setting, WorkerError where a child process cannot run.
     """
     source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
-    sensors = motion if isinstance(motion, SensorStream) else drive_motion(path, motion)
+    sensors = motion if isinstance(motion, SensorStream) else drive_motion(
+        path, motion, start_s=start_s)
     with _fed(source, config, mask, tell) as calibrator:
         if sensors is not None:
             calibrator.sense(sensors)
@@ -89,9 +90,11 @@ def check(given: Camera, path: Paths, fps: float | None = None,
 
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
-                 chosen: Mapping[str, str | None] = MappingProxyType({})) -> SensorStream | None:
+                 chosen: Mapping[str, str | None] = MappingProxyType({}),
+                 start_s: float = 0.0) -> SensorStream | None:
     """Return what the file motion has, else what the bags of a drive have; None where none is.
 
+    start_s: of the part of the drive that is used: a CSV counts from the drive's first image.
     chosen: the bag's topic by imu, gps and odom. Raises InputError for a file of another kind, and
     for a topic that there is not.
     """
@@ -100,7 +103,8 @@ def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
         if wanted:
             raise InputError('--imu, --gps and --odom choose topics of a bag: leave them or '
                              '--motion away')
-        return read_motion(Path(motion))
+        found = read_motion(Path(motion))
+        return found if found.absolute else found.shifted(-start_s)
     given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
     try:
         bags = [each for each in map(Path, given) if each.exists() and fits_bag(each)]

@@ -19,9 +19,11 @@ from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Calibration, Check, Odometry, Poses, Reading, Verdict
 from dashcalib_ros.judge.conclude import Evidence, conclude
+from dashcalib_ros.judge.witnesses import Asked
 from dashcalib_ros.reconstruct.scene import Draft, Scene
 from dashcalib_ros.solve.solution import Solution
 
@@ -92,6 +94,15 @@ def solve(scenes: Sequence[Scene], config: Config,
     from dashcalib_ros.solve import earlier, joint
     return earlier.solve_with_earlier(
         scenes, lambda some: joint.solve(some, config, progress))
+
+
+def solve_with_sensors(scenes: Sequence[Scene], config: Config, stream: SensorStream,
+                       start_s: float, progress: Progress = lambda stage, done: None) -> Asked:
+    """Solve as solve(), and ask the car's sensors. start_s: stamp of the drive's first image."""
+    from dashcalib_ros.judge.witnesses import ask_sensors
+    solution = solve(scenes, config, progress)
+    progress('asking the motion sensors', 0.0)
+    return ask_sensors(solution, stream, start_s, config)
 
 
 def judge(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:

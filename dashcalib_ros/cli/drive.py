@@ -93,7 +93,8 @@ def read_sensors(args: argparse.Namespace) -> SensorStream | None:
     Raises InputError for a file of another kind, and for a topic that there is not.
     """
     return drive_motion(args.input, args.motion,
-                        {name: getattr(args, name) for name in ('imu', 'gps', 'odom')})
+                        {name: getattr(args, name) for name in ('imu', 'gps', 'odom')},
+                        args.start)
 
 
 @contextmanager

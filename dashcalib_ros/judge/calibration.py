@@ -285,7 +285,8 @@ class Calibration:
     @property
     def caveat(self) -> str:
         """Return what must stand wherever the numbers stand; '' where nothing must."""
-        lone = self.camera is not None and self.turns_used == 1
+        lone = (self.camera is not None and self.turns_used == 1
+                and not (self.verdict.level == 'accepted' and 'pictures_alone' in self.details))
         return 'from one turn alone, which nothing confirms' if lone else ''
 
     @property

@@ -38,7 +38,7 @@ from dashcalib_ros.judge.verdict import (
     profile_contrast,
     verdict_of,
 )
-from dashcalib_ros.judge.witnesses import ask_sensors
+from dashcalib_ros.judge.witnesses import Asked
 from dashcalib_ros.reconstruct.picture import TurnPicture, picture_of
 from dashcalib_ros.reconstruct.scene import Scene, rms_px
 from dashcalib_ros.reconstruct.scene_file import StoredTurn
@@ -68,8 +68,8 @@ class Evidence:
     turn. stored: the turns of earlier drives that were available. left_out: why turns were taken
     out, in words. pictures: of turns whose images are gone; None: the report is not wanted.
     start_s: stamp of the first image. lines: upright ones, in the resized images; None where they
-    were not looked for. straights: pairs of images of straight driving, likewise. motion: what the
-    car's sensors say.
+    were not looked for. straights: pairs of images of straight driving, likewise. motion: of the
+    car's sensors; asked: what they say.
     """
 
     image_size: tuple[int, int]
@@ -88,6 +88,7 @@ class Evidence:
     lines: Lines | None = None
     straights: Straights | None = None
     motion: SensorStream | None = None
+    asked: Asked = default(default_factory=Asked)
 
 
 def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] = (),
@@ -116,19 +117,21 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     if solution is not None:
         solution = replace(solution, px=evidence.scale.px)
     witness = _witness(solution, evidence, config)
-    witnesses, unused = ask_sensors(solution, evidence.motion, evidence.start_s, config)
-    verdict = (judge(solution, config.verdict, witness, True, witnesses) if solution
+    asked = evidence.asked
+    verdict = (judge(solution, config.verdict, witness, True, asked.witnesses) if solution
                else _verdict_without_solution(evidence))
     camera = sigma = error = shutter = sigma_px = stabiliser = straight_lines = None
     field = mount = None
     details: dict[str, object] = {}
     without: tuple[LeftOut, ...] = ()
-    warnings = evidence.warnings + unused
+    warnings = evidence.warnings + asked.unused
     if solution is not None and verdict.level != 'accepted' and config.model != AUTO:
         warnings += (f'the lens model {config.model} was asked for and may be why the result is '
                      f'{verdict.level}: --model {AUTO} takes the one that the turns prove',)
     if solution is not None:
         details = _details(solution)
+        if solution.alone is not None:
+            details['pictures_alone'] = _alone(solution.alone, evidence.scale.px)
         if verdict.level != 'refused':
             px = evidence.scale.px
             camera = solution.camera.resized(px, evidence.image_size)
@@ -169,7 +172,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         mask=_of_size(evidence.mask, evidence.image_size), held_out=without,
         details=details, rolling_shutter=shutter, stabiliser=stabiliser, sigma_px=sigma_px,
         field=field, mount=mount, warnings=warnings, start_s=evidence.start_s,
-        straight_lines=straight_lines, witnesses=witnesses,
+        straight_lines=straight_lines, witnesses=asked.witnesses,
         material=_material(solution, evidence),
         stored_turns=tuple(_stored_summary(turn, evidence, solution) for turn in evidence.stored))
 
@@ -330,6 +333,11 @@ def _details(solution: Solution) -> dict[str, object]:
         'models': [asdict(candidate) for candidate in solution.tried],
         'correlation': (solution.covariance / np.outer(solution.sigma, solution.sigma)).tolist(),
     }
+
+
+def _alone(solution: Solution, px: float) -> dict[str, float]:
+    """Return what pictures alone say of fx, where a gyro is in the solution, px of the input."""
+    return {'fx': px * solution.camera.fx, 'sigma_fx': px * float(solution.sigma[0])}
 
 
 def _versions() -> dict[str, str]:

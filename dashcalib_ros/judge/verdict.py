@@ -31,6 +31,8 @@ from dashcalib_ros.solve.solution import Solution
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
 ON_BOUND = 0.01
 STEADY = 'switch the stabiliser off'
+# of the sigma of fx by pictures alone; a gyro that knows as much as these leaves 0.71
+CONFIRMED = 0.71
 # relative rise of the error; less is refused
 REFUSED_CONTRAST = 0.01
 # sigma of fx, of fx; more is refused
@@ -103,11 +105,17 @@ def lacks_knowledge_only(solution: Solution, config: VerdictConfig,
 
 def _too_few_turns(solution: Solution, config: VerdictConfig) -> Finding | None:
     count = len(solution.scenes)
-    if count >= config.min_turns:
+    if count >= config.min_turns or _gyro_confirms(solution):
         return None
     lone = ', so that nothing confirms the numbers and their sigma' if count == 1 else ''
     return Finding('weak', f'only {count} of at least {config.min_turns} turns could be used'
                            f'{lone}', 'drive more turns, as at crossings')
+
+
+def _gyro_confirms(solution: Solution) -> bool:
+    """Return whether a gyro that agrees knows fx as well as the turns do, or better."""
+    alone = solution.alone
+    return alone is not None and bool(solution.sigma[0] <= CONFIRMED * alone.sigma[0])
 
 
 def _too_little_yaw(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -146,6 +154,8 @@ def _index_of_result(solution: Solution) -> int:
 
 
 def _far_from_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
+    # the profile is of the pictures alone
+    solution = solution.alone or solution
     best = solution.around.best * solution.camera.image_size[0]
     if np.isclose(best, solution.camera.fx):
         return None
@@ -169,7 +179,7 @@ def one_turn_dominates(solution: Solution, config: VerdictConfig) -> Finding | N
     """If one turn gives nearly all information about fx, the others cannot confirm it."""
     shares = leverages(solution)
     turn = max(shares, key=lambda turn: shares[turn])
-    if len(shares) < 2 or shares[turn] <= config.max_leverage:
+    if len(shares) < 2 or shares[turn] <= config.max_leverage or _gyro_confirms(solution):
         return None
     return Finding('weak', f'no other turn confirms {_turns([turn])}, which gives '
                            f'{100 * min(shares[turn], 1.0):.0f} % of what is known about the '

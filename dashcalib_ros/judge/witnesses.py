@@ -18,7 +18,7 @@ bias nor scale.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge.calibration import Witness, Witnesses
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
+from dashcalib_ros.solve.earlier import with_doubt
 from dashcalib_ros.solve.normal import normal_equations, used_keyframes
 from dashcalib_ros.solve.prior import loss_px_of
 from dashcalib_ros.solve.solution import Solution
@@ -52,6 +53,8 @@ SCALES = (0.7, 1.4)
 DEGREES = (40.0, 80.0)
 # of a turn's angle: what pictures of real drives may be off in one turn, beyond their noise
 TURN_SIGMA = 0.0045
+# of time: what a rate that was given with --fps may be off, as the frames of two real drives are
+PACE = 0.005
 # s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
 LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
 # ratios of the poses' variance to the gyro's in a second, of which the likeliest is taken
@@ -76,21 +79,36 @@ LEAST_NOISE_M = 0.05
 JUMP = 4.0
 # degrees; a heading that is known worse says nothing
 HEADING_SIGMA_DEG = 5.0
+# times the sigma that the pictures leave of the angles; a gyro that knows them worse is a witness
+# only: one that is 3 % off, and does not say so, must not move an accepted camera
+WORTH = 1.0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a drive's sensors say of its solution by pictures alone.
+
+    solution: with what the gyro knows. unused: a line for each sensor that is not used.
+    """
+
+    solution: Solution | None = None
+    witnesses: Witnesses = field(default_factory=Witnesses)
+    unused: tuple[str, ...] = ()
 
 
 def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s: float,
-                config: Config) -> tuple[Witnesses, tuple[str, ...]]:
-    """Return what a drive's sensors say of its solution, and a line for each that is not used.
+                config: Config) -> Asked:
+    """Ask a drive's sensors about its solution. start_s: stamp of the drive's first image.
 
-    start_s: stamp of the drive's first image.
+    Where the gyro's scale is known well enough its angles are information, too; that loads COLMAP.
     """
     if stream is None:
-        return Witnesses(), ()
+        return Asked(solution)
     stream = stream.since(start_s)
     if solution is None or stream.empty:
-        return Witnesses(), stream.warnings
+        return Asked(solution, unused=stream.warnings)
     scenes = [scene for scene in solution.scenes if scene.turn.of_this_drive]
-    gyro = gps = None
+    gyro = gps = informed = None
     lines = list(stream.warnings)
     try:
         loss_px = loss_px_of(solution.scenes, solution.camera, config.intrinsics)
@@ -98,14 +116,41 @@ def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s:
                  if len(used_keyframes(scene)) >= LEAST_KEYFRAMES
                  and (steps := steps_of(scene, solution, loss_px, start_s)) is not None]
         if stream.rate is not None:
-            gyro, line = _gyro(fit_to(turns, stream.rate), solution, config)
+            fit = _with_clocks(fit_to(turns, stream.rate), turns, stream.rate)
+            gyro, line = _gyro(fit, solution, config)
             lines.append(line)
+            if fit is not None and gyro is not None and gyro.agrees:
+                informed = _informed(solution, fit, config)
         if stream.position is not None:
             gps, line = _gps(turns, stream.position, solution)
             lines.append(line)
     except (np.linalg.LinAlgError, ValueError, FloatingPointError) as error:
         lines.append(f'the motion sensors could not be compared with the turns ({error})')
-    return Witnesses(gyro, gps), tuple(line for line in lines if line)
+    kept = solution if informed is None or (gps is not None and not gps.agrees) else informed
+    return Asked(kept, Witnesses(gyro, gps), tuple(line for line in lines if line))
+
+
+def _informed(solution: Solution, fit: Fit, config: Config) -> Solution | None:
+    """Return the solution with the gyro's angles as information; None where they have little.
+
+    They are one more measurement of the camera's parameters (a Kalman update); then the turns'
+    poses and points are adjusted anew with the camera that it leads to.
+    """
+    from dashcalib_ros.solve.fitting import scene_with
+    along = solution.covariance @ fit.by_camera
+    own = float(fit.by_camera @ along)
+    known = float(fit.covariance[6, 6]) + config.motion.gyro_scale_sigma**2
+    if config.motion.use != 'information' or known > (WORTH * np.sqrt(own))**2:
+        return None
+    gain = along / (own + known)
+    camera = solution.camera.with_params(
+        solution.camera.params + gain * (1 - fit.inverse_scale))
+    scenes = [scene_with(camera, scene, config) for scene in solution.scenes]
+    if any(scene is None for scene in scenes):
+        return None
+    moved = replace(solution, camera=camera, alone=solution,
+                    scenes=tuple(scene for scene in scenes if scene is not None))
+    return with_doubt(moved, -np.outer(gain, along))
 
 
 def _gyro(fit: Fit | None, solution: Solution, config: Config) -> tuple[Witness | None, str]:
@@ -272,6 +317,22 @@ def fit_to(turns: Sequence[Steps], rate: Samples) -> Fit | None:
         if found is None or not abs(found.offset_s) < LARGEST_OFFSET_S:
             break
     return found
+
+
+def _with_clocks(fit: Fit | None, turns: Sequence[Steps], rate: Samples) -> Fit | None:
+    """Return the fit with what clocks that do not keep pace add to the sigma of the scale.
+
+    Whole turns are hardly changed by that; those that an edge cuts are.
+    """
+    stretched = [] if fit is None else [replace(
+        turn, stamps_s=turn.stamps_s + PACE * (turn.stamps_s - turn.stamps_s.mean()))
+        for turn in turns]
+    other = fit_to(stretched, rate) if stretched else None
+    if fit is None or other is None:
+        return fit
+    covariance = fit.covariance.copy()
+    covariance[6, 6] += (other.inverse_scale - fit.inverse_scale)**2
+    return replace(fit, covariance=covariance)
 
 
 def fit_gyro(turns: Sequence[Steps], angles: Angles) -> Fit | None:

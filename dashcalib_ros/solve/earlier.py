@@ -17,7 +17,6 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import as_model, sensitivity
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.knowledge import sigma_over
 from dashcalib_ros.solve.solution import Solution
 
 # of fx, and as much over the picture in every other parameter: by how much the cameras of two
@@ -94,12 +93,14 @@ def _rms(moves: Floats) -> float:
 
 
 def with_doubt(solution: Solution, doubt: Floats) -> Solution:
-    """Return the solution with more covariance (n, n), over the picture too."""
+    """Return the solution with more covariance (n, n), or less, over the picture too."""
     moves, _ = sensitivity(solution.camera.widened())
-    moved = sigma_over(moves[:, :, :len(doubt)], doubt)
+    moves = moves[:, :, :len(doubt)]
+    more = np.einsum('mai,ij,maj->m', moves, doubt, moves)
     drawn = solution.sigma_map
-    return replace(solution, covariance=solution.covariance + doubt, doubt=doubt,
-                   sigma_map=replace(drawn, sigma=np.hypot(drawn.sigma, moved)))
+    before = 0.0 if solution.doubt is None else solution.doubt
+    return replace(solution, covariance=solution.covariance + doubt, doubt=before + doubt,
+                   sigma_map=replace(drawn, sigma=np.sqrt(np.maximum(drawn.sigma**2 + more, 0))))
 
 
 def _scenes_of(solution: Solution, this_drive: bool) -> list[Scene]:

@@ -51,7 +51,8 @@ class Solution:
     whether it is one, the strongest first. crops: of a stabilised video, taken out of the tracks.
     field: what no lens model has; None: nothing speaks for one. doubt: (n, n) the part of
     covariance that says how little this drive's turns confirm those of earlier drives; None where
-    there are none. px: of the input's pictures, in one pixel of the scenes.
+    there are none; less where a gyro knows more. alone: the solution of the pictures alone, where
+    a gyro's angles are in this one. px: of the input's pictures, in one pixel of the scenes.
     """
 
     camera: Camera
@@ -71,6 +72,7 @@ class Solution:
     crops: Crops = default(default_factory=dict)
     field: FoundField | None = None
     doubt: Floats | None = None
+    alone: Solution | None = None
     px: float = 1.0
 
     @property

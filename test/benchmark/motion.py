@@ -72,8 +72,9 @@ def row(name: str, solution: Solution, start_s: float, stream: SensorStream, tru
         verdict: str) -> None:
     """Print what the gyro says, calibrated and not, and of a camera that is 2 % off."""
     config = Config().replace({'motion.gyro_scale_sigma': CALIBRATED})
-    witnesses, lines = ask_sensors(solution, stream, start_s, config)
-    for line in lines:
+    asked = ask_sensors(solution, stream, start_s, config)
+    witnesses = asked.witnesses
+    for line in asked.unused:
         print(f'{name}: {line}')
     own = 100 * (solution.camera.fx / truth - 1)
     for sensor, said in (('gyro', witnesses.gyro), ('gps', witnesses.gps)):
@@ -88,9 +89,9 @@ def row(name: str, solution: Solution, start_s: float, stream: SensorStream, tru
               f'{own + said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} | {said.agrees} |')
     camera = solution.camera.with_focal(1.02 * solution.camera.fx)
     scenes = [scene_with(camera, scene, Config()) for scene in solution.scenes]
-    off, _ = ask_sensors(dataclasses.replace(
+    off = ask_sensors(dataclasses.replace(
         solution, camera=camera, scenes=tuple(each for each in scenes if each is not None)),
-        dataclasses.replace(stream, position=None), start_s, config)
+        dataclasses.replace(stream, position=None), start_s, config).witnesses
     if off.gyro is not None:
         print(f'  2 % too long: asked for {off.gyro.fx_percent:+.2f} ± '
               f'{off.gyro.fx_sigma_percent:.2f} %, '

@@ -55,8 +55,8 @@ def gyro(drive, scale=1.0, density_deg=0.02, bias_deg=0.2, late_s=LATE_S, unit=1
 
 
 def asked(drive, stream, config=CALIBRATED, solution=None):
-    found, lines = ask_sensors(solution or drive[0], stream, START_S, config)
-    return found.gyro, lines
+    found = ask_sensors(solution or drive[0], stream, START_S, config)
+    return found.witnesses.gyro, found.unused
 
 
 def wrong_camera(solution, focal):
@@ -97,13 +97,13 @@ def test_a_gyro_of_unknown_scale_never_contradicts_falsely(drive):
 def test_a_contradiction_makes_the_result_weak_with_both_named(drive):
     solution, config = drive[0], VerdictConfig()
     before = judge(solution, config)
-    found, _ = ask_sensors(solution, gyro(drive, 1.05), START_S, CALIBRATED)
+    found = ask_sensors(solution, gyro(drive, 1.05), START_S, CALIBRATED).witnesses
     verdict = judge(solution, config, witnesses=found)
     assert verdict.level == 'weak'
     [more] = set(verdict.reasons) - set(before.reasons)
     assert 'pictures' in more and 'the gyro' in more
     assert judge(solution, config, witnesses=ask_sensors(
-        solution, gyro(drive), START_S, CALIBRATED)[0]) == before
+        solution, gyro(drive), START_S, CALIBRATED).witnesses) == before
 
 
 def test_sigmas_hold(drive):
@@ -153,9 +153,8 @@ def fixes(drive, noise_m, rate_hz=10.0, seed=0):
 
 
 def gps(drive, stream, solution=None):
-    found, lines = ask_sensors(solution or drive[0], stream, START_S, CONFIG)
-    return found.gps, lines
-
+    found = ask_sensors(solution or drive[0], stream, START_S, CONFIG)
+    return found.witnesses.gps, found.unused
 
 
 
@@ -168,3 +167,43 @@ def test_noisy_gps_does_no_harm(drive):
     for seed in range(5):
         said, lines = gps(drive, fixes(drive, 3.0, 1.0, seed))
         assert lines == () and (said is None or said.agrees)
+
+
+def alone(drive, turn):
+    """Return the solution of one turn of the drive, as pictures alone give it."""
+    return solved([drive[0].scenes[turn]])
+
+
+def test_a_calibrated_gyro_is_information_for_one_turn(drive):
+    pulls = []
+    for turn in range(len(drive[0].scenes)):
+        solution = alone(drive, turn)
+        found = ask_sensors(solution, gyro(drive, density_deg=0.005), START_S, CALIBRATED)
+        informed = found.solution
+        assert informed.alone is solution
+        assert informed.sigma[0] < 0.71 * solution.sigma[0]
+        assert informed.picture.rms < solution.picture.rms
+        assert np.linalg.eigvalsh(informed.covariance).min() > 0
+        # its poses are of its camera: the error stays what it was
+        assert informed.reprojection_error_px < 1.2 * solution.reprojection_error_px
+        pulls.append((informed.camera.fx - LENS.fx) / informed.sigma[0])
+        before, after = (judge(each, VerdictConfig()).reasons for each in (solution, informed))
+        assert any('only 1 of' in reason for reason in before)
+        assert not any("only 1 of" in reason or "two ways" in reason for reason in after)
+    assert np.abs(pulls).max() < 3
+
+
+def test_what_is_no_information_changes_nothing(drive):
+    solution = alone(drive, 0)
+    # its scale is unknown; it is wrong and says so not; it is to be a witness only
+    as_witness = CALIBRATED.replace({'motion.use': 'witness'})
+    for scale, config in ((1.0, CONFIG), (0.97, CONFIG), (1.2, CALIBRATED), (1.0, as_witness)):
+        found = ask_sensors(solution, gyro(drive, scale), START_S, config)
+        assert found.solution is solution and found.witnesses.gyro is not None
+
+
+def test_a_gyro_hardly_moves_what_many_turns_know(drive):
+    solution = drive[0]
+    found = ask_sensors(solution, gyro(drive), START_S, CALIBRATED).solution
+    assert abs(found.camera.fx - solution.camera.fx) < solution.sigma[0]
+    assert found.sigma[0] <= solution.sigma[0]
