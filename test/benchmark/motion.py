@@ -25,6 +25,7 @@ from dashcalib_ros.demo.drive import MARGIN_S
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import Samples, SensorStream, local_metres
+from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.judge.witnesses import ask_sensors
 from dashcalib_ros.solve.fitting import scene_with
 from dashcalib_ros.solve.solution import Solution
@@ -87,6 +88,11 @@ def row(name: str, solution: Solution, start_s: float, stream: SensorStream, tru
               f'{said.scale_sigma:.4f} | {own:+.2f} ± '
               f'{100 * solution.sigma[0] / solution.camera.fx:.2f} | '
               f'{own + said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} | {said.agrees} |')
+    informed = asked.solution
+    if informed is not None and informed.alone is not None:
+        print(f'  as information: {100 * (informed.camera.fx / truth - 1):+.2f} ± '
+              f'{100 * informed.sigma[0] / informed.camera.fx:.2f} %, '
+              f'{judge(informed, config.verdict, witnesses=witnesses).level}', flush=True)
     camera = solution.camera.with_focal(1.02 * solution.camera.fx)
     scenes = [scene_with(camera, scene, Config()) for scene in solution.scenes]
     off = ask_sensors(dataclasses.replace(
