@@ -126,5 +126,6 @@ def _provenance(calibration: Calibration, created: str | None) -> dict[str, Any]
         'input': calibration.input_name,
         'seed': calibration.config.seed,
         'versions': calibration.versions,
+        **({} if calibration.mount is None else {'mount': calibration.mount}),
     })
     return block if created is None else {**block, 'created': created}

@@ -140,7 +140,7 @@ def _calibration(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
         field=None if field is None else LensField(
             Field(size, np.array(field['coefficients'], np.float64)), bool(field['used']),
             field['rms_px'], field['worst_px'], field['sigma_px']),
-        mount=_mount(data.get('mount')),
+        mount=mount_of(data.get('mount')),
         held_out=tuple(held_out), straight_lines=made(Bend, 'straight_lines'),
         witnesses=_witnesses(data.get('witnesses') or {}))
 
@@ -154,7 +154,8 @@ def _witnesses(data: Mapping[str, Any]) -> Witnesses:
         for name, said in data.items() if said is not None})
 
 
-def _mount(values: Mapping[str, Any] | None) -> Mount | None:
+def mount_of(values: Mapping[str, Any] | None) -> Mount | None:
+    """Return the mount that result_dict() gave these values; None for None."""
     if values is None:
         return None
     u, v = values['travel_px']

@@ -10,8 +10,9 @@ from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, wr
 INSTALL = ("calibrator: error: the Python package {name} is missing: source your ROS 2 "
            "installation (. /opt/ros/jazzy/setup.sh), or pip install "
            "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces")
-ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'lifecycle_msgs',
-                'rcl_interfaces', 'sensor_msgs', 'std_msgs', 'std_srvs')
+ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
+                'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
+                'std_srvs')
 
 
 def main(argv: Sequence[str] | None = None) -> int:

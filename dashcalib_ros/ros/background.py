@@ -4,7 +4,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, Protocol
@@ -16,6 +16,7 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, counted, one_line
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
+from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge import Calibration, Check, Monitor
 from dashcalib_ros.judge.agreement import outdated, turns_of_another_camera
 from dashcalib_ros.report import NamedCamera
@@ -168,6 +169,7 @@ class _Bank:
     calibration is to begin with the present turns. failures: of calibrations in a row.
     not_before: when the next one may begin, in s of time.monotonic(). read: the turns that were
     compared with the camera in use. earlier: what those of the banks before said of it.
+    start_s: stamp of the first image.
     """
 
     number: int
@@ -180,6 +182,7 @@ class _Bank:
     not_before: float = 0.0
     read: frozenset[TurnId] = frozenset()
     earlier: Monitor | None = None
+    start_s: float | None = None
 
 
 class Learner:
@@ -207,6 +210,7 @@ class Learner:
         self._viewer = viewer
         self._mask = mask
         self._inbox = Inbox(queue_size)
+        self._sensors = SensorBuffer()
         self._activity = Activity()
         self._closed = False
         # from here on of the background thread only
@@ -230,6 +234,10 @@ class Learner:
               frame_id: str = '') -> None:
         """Take an image message; size and frame_id are what its header says."""
         self._inbox.put_image(lambda: self._push(index, stamp_ns, message, size, frame_id))
+
+    def sense(self, kind: str, stamp_s: float, values: Sequence[float]) -> None:
+        """Take a sample of the car's own sensors; kind: one of SensorStream's."""
+        self._sensors.add(kind, stamp_s, values)
 
     def request(self) -> str:
         """Calibrate now, with the present turns; return why not, '' if it is started."""
@@ -330,6 +338,7 @@ class Learner:
         try:
             image = whole(message, size, bank.depth)
             status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
+            bank.start_s = stamp_ns / 1e9 if bank.start_s is None else bank.start_s
             if self._viewer.wanted():
                 self._viewer.show(Picture(message.header, image, bank.calibrator.view()))
         except InputError as error:
@@ -400,6 +409,10 @@ class Learner:
         self._activity = replace(self._activity, calibrating=True)
         self._tell(Started(self._activity.status))
         try:
+            stream = self._sensors.stream()
+            if bank.start_s is not None and not stream.empty:
+                # both have the same clock, whichever it is
+                bank.calibrator.sense(replace(stream.shifted(-bank.start_s), absolute=False))
             calibration = bank.calibrator.calibrate(self._progress, final=False)
             check = None if given is None else bank.calibrator.check(
                 given.camera, calibration, self._progress)

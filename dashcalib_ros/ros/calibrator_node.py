@@ -19,6 +19,7 @@ from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.background import Activity, Result, Watched
 from dashcalib_ros.ros.diagnostics import OK, WARN, Health
 from dashcalib_ros.ros.images import Source
+from dashcalib_ros.ros.mounting import Mounting, text_of
 from dashcalib_ros.ros.node import LATCHED, CameraNode
 from dashcalib_ros.ros.parameters import make_publisher
 from dashcalib_ros.ros.state import (
@@ -51,6 +52,7 @@ class CalibratorNode(CameraNode):
         self._commit: Commit | None = None
         self._beside = make_publisher(self, CameraInfo, 'camera_info', BESIDE_IMAGES)
         self._latched = make_publisher(self, CameraInfo, '~/calibration', LATCHED)
+        self._mounting = Mounting(self, self._own)
         # what is published now, and how many were published beside images
         self._info: CameraInfo | None = None
         self._sent = 0
@@ -175,6 +177,9 @@ class CalibratorNode(CameraNode):
                 self._counted |= turns
             self._count(judged.contradictions)
             self._confirmed = self._confirmed or judged.confirmed
+            if judged.confirmed and calibration.mount is not None and self._kept is not None:
+                # the newest, as a camera may have been pushed
+                self._mounting.show(calibration.mount, self._kept.frame_id or '')
         text = outcome_text(calibration, judged.why)
         # rclpy takes one severity for each line of code
         if judged.contradictions:
@@ -257,7 +262,9 @@ class CalibratorNode(CameraNode):
         return Health(state, level, message, self._kept.camera if self._kept else None,
                       self._confirmed, error if self._stale else '', str(self._store.path),
                       counts={'camera_info published': self._sent,
-                              'contradictions': self._contradictions})
+                              'contradictions': self._contradictions,
+                              'mounting': ('unknown' if self._mounting.mount is None else
+                                           text_of(self._mounting.mount))})
 
     def _count(self, contradictions: int) -> None:
         """Keep the count in the file too: it outlives the node."""
@@ -282,12 +289,18 @@ class CalibratorNode(CameraNode):
         self._info = camera_info(kept.camera.camera, self._header(kept.frame_id or ''),
                                  self._core.rectified)
         self._latched.publish(self._info)
+        self._mounting.show(kept.mount, kept.frame_id or '')
+
+    def _on_tick(self) -> None:
+        super()._on_tick()
+        self._mounting.tick()
 
     def _unpublish(self) -> None:
         if self._info is not None:
             # K[0] = 0 says that it is uncalibrated (sensor_msgs)
             self._latched.publish(CameraInfo(header=self._header(self._info.header.frame_id)))
         self._kept, self._stale, self._info = None, False, None
+        self._mounting.show(None, '')
 
     def _header(self, frame_id: str) -> Header:
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame_id)

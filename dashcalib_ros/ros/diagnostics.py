@@ -126,7 +126,7 @@ class Health:
 
     published: the camera that is published now. confirmed: False for one of a file until turns
     agree with it. error: more than a warning. check, check_reasons: of a driver's calibration.
-    counts: of the node's own kind.
+    counts: of the node's own kind, and words.
     """
 
     state: str
@@ -138,7 +138,7 @@ class Health:
     file: str = ''
     check: str = ''
     check_reasons: tuple[str, ...] = ()
-    counts: Mapping[str, int] = field(default_factory=dict)
+    counts: Mapping[str, int | str] = field(default_factory=dict)
 
 
 def silence(topic: str, listening: bool, silent_s: float | None) -> tuple[bytes, str] | None:

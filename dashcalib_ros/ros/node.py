@@ -52,6 +52,7 @@ from dashcalib_ros.ros.parameters import (
     why_read_only,
 )
 from dashcalib_ros.ros.preview import Preview
+from dashcalib_ros.ros.sensors import Sensors
 from dashcalib_ros.status import Status
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
@@ -155,6 +156,7 @@ class CameraNode(Node, ABC):
         self._learner = Learner(self._core, self._own.queue_size,
                                 lambda news: self._later(lambda: self._on_news(news)),
                                 self._preview, self._mask)
+        self._sensors = Sensors(self, self._own, self._learner.sense)
         self._set_goal()
         self.create_timer(PERIOD_S, self._on_tick, clock=steady)
         for name, action in (('calibrate', self._calibrate), ('reset', self._reset),

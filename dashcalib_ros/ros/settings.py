@@ -35,6 +35,8 @@ topics, in the node's namespace:
   ~/calibration           out  the same, latched; K[0] = 0 when it is taken back
   ~/check                 out  std_msgs/String, JSON, latched: is the driver's
                                calibration right? with check_only only
+  ~/mount                 out  geometry_msgs/PoseWithCovarianceStamped, latched:
+                               how the camera sits on the car
   ~/turn_magnitude        out  std_msgs/Float64, for plotting
   ~/overlay/compressed    out  tracks, mask and state, while someone subscribes
   ~/rectified/compressed  out  without distortion, while someone subscribes
@@ -79,6 +81,16 @@ class NodeConfig:
     check_only: bool = setting(
         False, 'only check the calibration that the driver publishes on camera_info; nothing is '
                'published there, saved or committed')
+    base_frame: str = setting('base_link', 'of the car: in it ~/mount says where the camera is')
+    publish_tf: bool = setting(
+        False, 'one static transform from base_frame to camera_frame, once the mounting is known')
+    camera_frame: str = setting('', "for publish_tf; empty: the images' frame_id")
+    mount_x: float = setting(0.0, 'm ahead of base_frame, as measured by hand', -50.0, 50.0)
+    mount_y: float = setting(0.0, 'm to the left of it', -50.0, 50.0)
+    mount_z: float = setting(0.0, 'm above it; 0: as found, where speed is known', -50.0, 50.0)
+    imu_topic: str = setting('', 'sensor_msgs/Imu of the car, a witness of fx; empty: none')
+    odom_topic: str = setting('', 'nav_msgs/Odometry, for the height by its speed; empty: none')
+    fix_topic: str = setting('', 'sensor_msgs/NavSatFix, a witness of fx; empty: none')
     queue_size: int = expert(
         10, 'images that may wait for detection, a second of them; the oldest is dropped', 1, 1000)
     preview_rate: float = expert(

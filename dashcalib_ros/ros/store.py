@@ -19,6 +19,7 @@ import yaml
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.report import (
     NamedCamera,
@@ -29,6 +30,7 @@ from dashcalib_ros.report import (
 )
 from dashcalib_ros.report.camera_file import parse_camera
 from dashcalib_ros.report.camera_yaml import matrix_block, yaml_text
+from dashcalib_ros.report.result import mount_of
 from dashcalib_ros.whole_files import remove_leftovers
 
 # camera_info_manager's
@@ -66,6 +68,7 @@ class Kept:
 
     frame_id: None where the file does not say it. contradictions: how many calibrations in a row
     contradict it. edited: the text is not what a node wrote; then the camera's sigma is unknown.
+    mount: how the camera sits on the car, where that is known.
     """
 
     camera: NamedCamera
@@ -73,6 +76,7 @@ class Kept:
     text: str
     contradictions: int = 0
     edited: bool = False
+    mount: Mount | None = None
 
     @classmethod
     def of(cls, calibration: Calibration, whose: Whose, frame_id: str) -> Kept:
@@ -82,7 +86,8 @@ class Kept:
         own = document['dashcalib']
         own |= {'topic': whose.topic, 'frame_id': frame_id}
         own[CHECKSUM] = _checksum(document)
-        return cls(calibrated_camera(calibration, whose.name), frame_id, yaml_text(document))
+        return cls(calibrated_camera(calibration, whose.name), frame_id, yaml_text(document),
+                   mount=calibration.mount)
 
     @classmethod
     def read(cls, text: str, path: Path, whose: Whose) -> Kept:
@@ -109,7 +114,8 @@ class Kept:
         older = topic is None and CHECKSUM not in own
         edited = not older and own.get(CHECKSUM) != _checksum(document)
         return cls(camera, None if frame_id is None else str(frame_id), text,
-                   count if type(count) is int and count > 0 else 0, edited)
+                   count if type(count) is int and count > 0 else 0, edited,
+                   None if edited else _mount_in(own))
 
     def rectified(self, rectified: str) -> Kept:
         """Return it with the P of a setting, itself where the file has that already.
@@ -129,6 +135,14 @@ class Kept:
         document = parse_yaml(self.text, self.camera.name)
         document['dashcalib'][COUNT] = times
         return replace(self, text=yaml_text(document), contradictions=times)
+
+
+def _mount_in(own: dict[str, Any]) -> Mount | None:
+    """Return the mounting in a file's block; None where there is none, or a damaged one."""
+    try:
+        return mount_of(own.get('mount'))
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 class Store:

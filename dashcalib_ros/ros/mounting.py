@@ -1,0 +1,146 @@
+"""How the camera sits on the car, as a pose and as a static transform (REP-103, REP-105)."""
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from dashcalib_ros.judge.calibration import Mount
+from dashcalib_ros.ros.parameters import make_publisher
+from dashcalib_ros.ros.settings import NodeConfig
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# of all that publish static transforms
+STATIC = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE,
+                    durability=DurabilityPolicy.TRANSIENT_LOCAL)
+TOPIC = '/tf_static'
+# s; so long others may take to say that they have the frame
+LISTEN_S = 2.0
+# degrees, and sigmas; a mounting that differs by less is the same
+MOVED_DEG, MOVED_SIGMAS = 0.5, 3.0
+# variance of an angle of which nothing is known, rad^2
+UNKNOWN = math.pi**2 / 3
+
+
+class Mounting:
+    """Publishes the mounting on ~/mount, and, where it is asked for, once on /tf_static."""
+
+    def __init__(self, node: Node, own: NodeConfig) -> None:
+        self._node, self._own = node, own
+        # what was published last
+        self.mount: Mount | None = None
+        self._pose = make_publisher(node, PoseWithCovarianceStamped, '~/mount', LATCHED)
+        self._sent: Mount | None = None
+        self._waiting: tuple[Mount, str] | None = None
+        self._since = time.monotonic()
+        # the parent of each frame, as others say
+        self._parents: dict[str, str] = {}
+        self._transforms: Any = None
+        self._told: set[str] = set()
+        if own.publish_tf:
+            self._prepare()
+
+    def show(self, mount: Mount | None, frame_id: str) -> None:
+        """Publish a mounting; None: there is none. frame_id: of the images."""
+        self.mount = mount
+        if mount is None:
+            return
+        self._pose.publish(self._message(mount))
+        if self._transforms is not None and mount.verdict == 'accepted':
+            self._waiting = mount, self._own.camera_frame or frame_id
+
+    def tick(self) -> None:
+        """Send the transform that waits, once others had the time to tell theirs."""
+        if self._waiting is None or time.monotonic() - self._since < LISTEN_S:
+            return
+        (mount, frame), self._waiting = self._waiting, None
+        if not frame:
+            self._warn('there is no static transform: the images have no frame_id; set '
+                       'camera_frame')
+        elif self._parents.get(frame, self._own.base_frame) != self._own.base_frame:
+            self._warn(f'there is no static transform: {frame} has the parent '
+                       f'{self._parents[frame]} already, and a frame has one; set publish_tf to '
+                       f'false, or camera_frame to another name')
+        elif self._sent is None or differs(mount, self._sent):
+            self._sent = mount
+            self._transforms.publish(self._kind(transforms=[self._transform(mount, frame)]))
+            self._node.get_logger().info(f'static transform {self._own.base_frame} -> {frame}: '
+                                         f'{text_of(mount)}')
+
+    def _prepare(self) -> None:
+        try:
+            # not on the package index: from the distribution, where it is
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            self._warn('publish_tf needs tf2_msgs, which is not installed: apt install '
+                       'ros-jazzy-tf2-msgs; ~/mount has the pose')
+            return
+        self._kind = TFMessage
+        self._transforms = self._node.create_publisher(TFMessage, TOPIC, STATIC)
+        self._node.create_subscription(TFMessage, TOPIC, self._listen, STATIC)
+
+    def _listen(self, message: Any) -> None:
+        self._parents.update({each.child_frame_id.lstrip('/'): each.header.frame_id.lstrip('/')
+                              for each in message.transforms})
+
+    def _warn(self, text: str) -> None:
+        if text not in self._told:
+            self._told.add(text)
+            self._node.get_logger().warning(text)
+
+    def _message(self, mount: Mount) -> PoseWithCovarianceStamped:
+        message = PoseWithCovarianceStamped()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.frame_id = self._own.base_frame
+        place = message.pose.pose.position
+        place.x, place.y, place.z = self._place(mount)
+        turn = message.pose.pose.orientation
+        turn.x, turn.y, turn.z, turn.w = mount.quaternion
+        found = mount.sigma['height_m'] if not self._own.mount_z else None
+        variances = [0.0, 0.0, (found or 0.0)**2]
+        for name in ('roll_right_deg', 'pitch_up_deg', 'yaw_left_deg'):
+            sigma = mount.sigma[name]
+            variances.append(UNKNOWN if sigma is None else math.radians(sigma)**2)
+        message.pose.covariance = np.diag(variances).ravel()
+        return message
+
+    def _transform(self, mount: Mount, frame: str) -> TransformStamped:
+        transform = TransformStamped(child_frame_id=frame)
+        transform.header.stamp = self._node.get_clock().now().to_msg()
+        transform.header.frame_id = self._own.base_frame
+        place = transform.transform.translation
+        place.x, place.y, place.z = self._place(mount)
+        turn = transform.transform.rotation
+        turn.x, turn.y, turn.z, turn.w = mount.quaternion
+        return transform
+
+    def _place(self, mount: Mount) -> tuple[float, float, float]:
+        own = self._own
+        return own.mount_x, own.mount_y, own.mount_z or mount.height_m or 0.0
+
+
+def differs(mount: Mount, other: Mount) -> bool:
+    """Return whether two mountings differ by more than their sigmas, and by half a degree."""
+    for name in ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg'):
+        one, two = getattr(mount, name), getattr(other, name)
+        if one is None or two is None:
+            if one is not two:
+                return True
+            continue
+        sigma = math.hypot(mount.sigma[name] or 0.0, other.sigma[name] or 0.0)
+        if abs(one - two) > max(MOVED_DEG, MOVED_SIGMAS * sigma):
+            return True
+    return False
+
+
+def text_of(mount: Mount) -> str:
+    """Return the angles in one line, for /diagnostics and the log."""
+    roll = '' if mount.roll_right_deg is None else f', roll {mount.roll_right_deg:+.2f}'
+    return (f'{mount.verdict}: yaw to the left {mount.yaw_left_deg:+.2f}, pitch upwards '
+            f'{mount.pitch_up_deg:+.2f}{roll} degrees')
