@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
 from importlib import metadata
@@ -24,6 +25,7 @@ from dashcalib_ros.judge.calibration import (
     Calibration,
     LensField,
     Material,
+    Mount,
     Shutter,
     Stabiliser,
     StoredTurnSummary,
@@ -152,9 +154,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                              f'{field.worst_px:.1f} px), as by a windscreen or a rectification: '
                              f'camera_info cannot say that, and sigma over the picture allows '
                              f'for it; `dashcalib export --to rays` has it',)
-            if evidence.straights is not None and config.mount.enabled:
-                mount = mount_of(evidence.straights, evidence.lines, solution, verdict.level, px,
-                                 _speed(evidence, config))
+            mount = _mount(solution, evidence, verdict.level, config)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.crops:
@@ -182,6 +182,16 @@ def _witness(solution: Solution | None, evidence: Evidence, config: Config) -> B
     if solution is None or evidence.lines is None:
         return None
     return bend(evidence.lines, solution.camera, config.lines, solution.covariance)
+
+
+def _mount(solution: Solution, evidence: Evidence, level: str, config: Config) -> Mount | None:
+    """Return how the camera sits on the car; a failure there must not cost the lens."""
+    if evidence.straights is None or not config.mount.enabled:
+        return None
+    with suppress(np.linalg.LinAlgError, ValueError):
+        return mount_of(evidence.straights, evidence.lines, solution, level, evidence.scale.px,
+                        _speed(evidence, config))
+    return None
 
 
 def _speed(evidence: Evidence, config: Config) -> Speed | None:

@@ -11,7 +11,10 @@ from made_calibration import make_calibration
 from scipy.spatial.transform import Rotation
 from solving import LENS, scenes_of, solved
 
+from dashcalib_ros.config import Config
 from dashcalib_ros.detect.straights import PAIRS, POINTS, StraightCollector
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge import conclude
 from dashcalib_ros.judge.calibration import OPTICAL, Mount
 from dashcalib_ros.judge.mount import mount_of
 from dashcalib_ros.report import load_calibration, write_results
@@ -154,3 +157,15 @@ def test_the_pairs_of_a_long_drive_are_few_and_spread():
     assert PAIRS / 4 < len(found) <= PAIRS and found.before.shape == (len(found), POINTS, 2)
     steps = np.diff(found.stamps_s)
     assert steps.max() <= 2.1 * steps.min() and found.stamps_s[-1] > 1900
+
+
+def test_a_failure_does_not_cost_the_lens(solution, monkeypatch):
+    def fails(*arguments):
+        raise np.linalg.LinAlgError('Singular matrix')
+
+    monkeypatch.setattr(conclude, 'mount_of', fails)
+    evidence = conclude.Evidence(
+        LENS.image_size, 100, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {}, pictures=None,
+        straights=pairs_of(mounted(0, 0, 0), count=2))
+    found = conclude.conclude(solution, evidence, Config())
+    assert found.mount is None and found.camera is not None
