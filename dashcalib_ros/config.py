@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -22,7 +23,7 @@ T = TypeVar('T')
 
 
 def setting(default: T, reason: str, minimum: float | None = None, maximum: float | None = None,
-            choices: tuple[str, ...] = (), pattern: str = '', expert: bool = False) -> T:
+            choices: tuple[str, ...] = (), pattern: str = '', *, expert: bool = False) -> T:
     """Declare a setting: its default, why it has that value in one line, and what else it may be.
 
     expert: few users set it; such settings are listed after the others. What was measured
@@ -34,9 +35,8 @@ def setting(default: T, reason: str, minimum: float | None = None, maximum: floa
     return value
 
 
-def expert(default: T, reason: str, minimum: float, maximum: float) -> T:
-    """Declare a setting for experts."""
-    return setting(default, reason, minimum, maximum, expert=True)
+# declares a setting for experts
+expert = functools.partial(setting, expert=True)
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ class MotionConfig:
 
     rate: float = setting(
         10.0, 'Hz; faster cameras are thinned to it: the paper works at 10 fps', 1.0, 60.0)
-    width: int = setting(
+    width: int = expert(
         640, 'px; wider images are divided by a whole number until they fit', 64, 8192)
-    points: int = setting(
+    points: int = expert(
         300, 'points tracked at a time; 400 find the same turns and cost 20 % more', 50, 5000)
-    use: str = setting(
+    use: str = expert(
         'information', 'of a gyro: in the solution where its scale is known, or a witness only',
-        choices=('information', 'witness'), expert=True)
+        choices=('information', 'witness'))
     gyro_scale_sigma: float = expert(
         0.03, 'of its angles; cheap gyros are 1 to 3 % off, a calibrated one 0.001', 0.0, 1.0)
     standing_px: float = expert(
@@ -70,7 +70,7 @@ class MaskConfig:
     enabled: bool = setting(True, 'bonnet, pillars and burnt-in text spoil the matches (paper)')
     segmentation: str = setting(
         '', 'path of an ONNX model that finds the own car; empty: only the automatic mask')
-    segmentation_classes: str = setting(
+    segmentation_classes: str = expert(
         '63,64', "the own car's classes; these are car mount and ego vehicle of Mapillary Vistas",
         pattern=r'\d{1,4}(, ?\d{1,4})*')
     segmentation_images: int = expert(
@@ -87,7 +87,7 @@ class TurnsConfig:
         5, 'turns; the paper: focal lengths settle at 2, the centre at 4, distortion at 5', 1, 20)
     at_most: int = setting(
         8, 'turns used where those wanted leave the result weak', 1, 50)
-    half_width: float = setting(
+    half_width: float = expert(
         3.0, "s kept on either side of a turn's centre: the paper's k = 30 frames at 10 fps",
         0.5, 10.0)
     store: str = setting(
@@ -163,7 +163,7 @@ class IntrinsicsConfig:
 class MountConfig:
     """How the camera sits on the car."""
 
-    enabled: bool = setting(True, 'yaw, pitch and roll cost less than a second')
+    enabled: bool = expert(True, 'yaw, pitch and roll cost less than a second')
     speed_kmh: float = setting(
         0.0, 'km/h; constant on straight stretches: tells the height; 0 where it is unknown',
         0.0, 300.0)
@@ -253,7 +253,7 @@ class Config:
     Raises ConfigError for a value of the wrong type, NaN or out of range.
     """
 
-    seed: int = setting(0, 'same input and seed: same result', 0, 2**31 - 1)
+    seed: int = expert(0, 'same input and seed: same result', 0, 2**31 - 1)
     threads: int = setting(
         2, 'processes that reconstruct turns side by side; the result is the same with any', 1, 64)
     model: str = setting(

@@ -64,7 +64,7 @@ class NodeConfig:
     image_transport: str = setting(
         'raw', 'compressed subscribes image_raw/compressed instead',
         choices=('raw', 'compressed'))
-    reliability: str = setting(
+    reliability: str = expert(
         'auto', 'auto does as the publishers do: best effort if any of them does',
         choices=('auto', 'best_effort', 'reliable'))
     camera_name: str = setting(
@@ -76,7 +76,7 @@ class NodeConfig:
         '', 'picture as large as the images, black where they are not used; empty: none')
     commit: bool = setting(
         False, 'give an accepted calibration to the camera driver: service set_camera_info')
-    publish_stale: bool = setting(
+    publish_stale: bool = expert(
         False, 'go on publishing a calibration that new turns contradict')
     check_only: bool = setting(
         False, 'only check the calibration that the driver publishes on camera_info; nothing is '
@@ -84,7 +84,7 @@ class NodeConfig:
     base_frame: str = setting('base_link', 'of the car: in it ~/mount says where the camera is')
     publish_tf: bool = setting(
         False, 'one static transform from base_frame to camera_frame, once the mounting is known')
-    camera_frame: str = setting('', "for publish_tf; empty: the images' frame_id")
+    camera_frame: str = expert('', "for publish_tf; empty: the images' frame_id")
     mount_x: float = setting(0.0, 'm ahead of base_frame, as measured by hand', -50.0, 50.0)
     mount_y: float = setting(0.0, 'm to the left of it', -50.0, 50.0)
     mount_z: float = setting(0.0, 'm above it; 0: as found, where speed is known', -50.0, 50.0)

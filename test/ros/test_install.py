@@ -169,9 +169,9 @@ def test_the_permissions_are_what_the_node_uses(node_and_bench):
     def used(function):
         return {name for name, _ in getattr(seen, function)('calibrator', '/')}
 
-    # ~/check: with check_only, test_check_only.py has it
+    # ~/check: with check_only, test_check_only.py has it; /tf_static: with publish_tf
     assert used('get_publisher_names_and_types_by_node') == (
-        allowed('topic', 'publish') - {'/calibrator/check'})
+        allowed('topic', 'publish') - {'/calibrator/check', '/tf_static'})
     heard = used('get_subscriber_names_and_types_by_node')
     assert heard <= allowed('topic', 'subscribe') and '/image_raw' in heard
     assert used('get_service_names_and_types_by_node') == allowed('service', 'reply')
