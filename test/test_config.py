@@ -43,8 +43,8 @@ def test_about_twenty_settings_are_for_users_and_come_first():
     experts = [spec.metadata['expert'] for _, spec in describe()]
     assert experts == sorted(experts)
     users = {name for name in SPECS if not SPECS[name].metadata['expert']}
-    assert 10 <= len(users) <= 20
-    assert {'turns.wanted', 'turns.store', 'seed', 'threads', 'motion.rate'} <= users
+    assert 10 <= len(users) <= 16
+    assert {'turns.wanted', 'turns.store', 'threads', 'motion.rate'} <= users
     assert not {'scene.loss_px', 'intrinsics.rounds', 'verdict.max_leverage'} & users
 
 
