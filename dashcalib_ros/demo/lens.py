@@ -1,4 +1,4 @@
-"""The rendered camera: a pinhole with two radial terms, inverted exactly."""
+"""The rendered camera: a pinhole with distortion, and what stands in front of it; all exact."""
 from __future__ import annotations
 
 import math
@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats
+from dashcalib_ros.demo.glass import Glass
 from dashcalib_ros.errors import ConfigError
 
 # normalised radius within which a lens that never folds is taken as valid (about 81 degrees)
@@ -16,9 +17,10 @@ MAX_RADIUS = 6.0
 
 @dataclass(frozen=True)
 class Lens:
-    """plumb_bob with k1 and k2 only; pixel centres at integers, the first one's at (0, 0).
+    """plumb_bob, with k1 and k2 alone as a rule; pixel centres at integers, the first at (0, 0).
 
-    width, height, fx, fy, cx, cy in pixels. x_d = x_u (1 + k1 r^2 + k2 r^4), u = fx x_d + cx.
+    width, height, fx, fy, cx, cy in pixels. x_d = x_u (1 + k1 r^2 + k2 r^4 + k3 r^6), p1 and p2
+    as in OpenCV; u = fx x_d + cx. glass: moves what the lens sees over the picture; None: nothing.
     Raises ConfigError if the picture reaches beyond the radius where the distortion folds over.
     """
 
@@ -30,6 +32,10 @@ class Lens:
     cy: float
     k1: float = 0.0
     k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    glass: Glass | None = None
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 16 or min(self.fx, self.fy) <= 0.0:
@@ -65,20 +71,19 @@ class Lens:
     @property
     def distortion(self) -> Floats:
         """Return OpenCV's (k1, k2, p1, p2, k3), (5,) float64."""
-        return np.array([self.k1, self.k2, 0.0, 0.0, 0.0])
+        return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
     @property
     def valid_radius(self) -> float:
         """Return the undistorted radius up to which the distortion is monotonic."""
-        # derivative 1 + 3 k1 q + 5 k2 q^2 with q = r^2; its smallest positive root folds
-        roots = np.roots([5.0 * self.k2, 3.0 * self.k1, 1.0])
+        # derivative 1 + 3 k1 q + 5 k2 q^2 + 7 k3 q^3, q = r^2; its smallest positive root folds
+        roots = np.roots([7.0 * self.k3, 5.0 * self.k2, 3.0 * self.k1, 1.0])
         real = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0.0]
         return min(math.sqrt(min(real)), MAX_RADIUS) if real else MAX_RADIUS
 
     def distorted_radius(self, radius: float) -> float:
-        """Return the distorted of an undistorted normalised radius."""
-        q = radius * radius
-        return radius * (1.0 + q * (self.k1 + q * self.k2))
+        """Return the distorted of an undistorted normalised radius; p1 and p2 aside."""
+        return radius * float(self._stretch(np.float64(radius * radius)))
 
     def project(self, points: npt.ArrayLike) -> Floats:
         """Return pixels (n, 2) of points (n, 3) in the camera's frame (z forward, metres).
@@ -88,39 +93,67 @@ class Lens:
         xyz = np.asarray(points, np.float64).reshape(-1, 3)
         with np.errstate(divide='ignore', invalid='ignore'):
             xy = xyz[:, :2] / xyz[:, 2:]
-        q = np.sum(xy * xy, axis=1)
-        pixels: Floats = xy * (1.0 + q * (self.k1 + q * self.k2))[:, None]
-        pixels = pixels * (self.fx, self.fy) + (self.cx, self.cy)
-        pixels[(xyz[:, 2] <= 0.0) | (q > self.valid_radius ** 2)] = np.nan
-        return pixels
+        pixels: Floats = self._distorted(xy) * (self.fx, self.fy) + (self.cx, self.cy)
+        pixels[(xyz[:, 2] <= 0.0) | (np.sum(xy * xy, axis=1) > self.valid_radius ** 2)] = np.nan
+        return pixels if self.glass is None else self.glass.behind(pixels, self.size)
 
     def undistort(self, pixels: npt.ArrayLike) -> Floats:
         """Return undistorted normalised coordinates (n, 2) of pixels (n, 2); exact to 1e-10."""
         uv = np.asarray(pixels, np.float64).reshape(-1, 2)
+        if self.glass is not None:
+            uv = self.glass.before(uv, self.size)
         distorted = (uv - (self.cx, self.cy)) / (self.fx, self.fy)
-        radius_d = np.hypot(distorted[:, 0], distorted[:, 1])
-        radius = self._undistorted_radius(radius_d)
-        scale = np.where(radius_d > 1e-12, radius / np.maximum(radius_d, 1e-12), 1.0)
-        return distorted * scale[:, None]
+        if self.p1 == self.p2 == 0.0:
+            return self._undistorted_radially(distorted)
+        # p1 and p2 are small: what they add hardly depends on where exactly
+        found = self._undistorted_radially(distorted)
+        for _ in range(50):
+            error = self._distorted(found) - distorted
+            if float(np.max(np.abs(error), initial=0.0)) < 1e-12:
+                break
+            distorted_by_radius = found * self._stretch(_square(found)) - error
+            found = self._undistorted_radially(distorted_by_radius)
+        return found
 
-    def _undistorted_radius(self, radius_d: Floats) -> Floats:
-        """Return the inverse of distorted_radius: a table's guess, then Newton's method.
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return (width, height) of the picture."""
+        return self.width, self.height
 
-        The function is monotonic up to the valid radius, and the guess close: it cannot jump.
+    def _stretch(self, q: Floats) -> Floats:
+        return np.asarray(1.0 + q * (self.k1 + q * (self.k2 + q * self.k3)))
+
+    def _distorted(self, xy: Floats) -> Floats:
+        """Return distorted of undistorted normalised coordinates (n, 2)."""
+        q = _square(xy)
+        both = 2.0 * xy[:, :1] * xy[:, 1:]
+        return np.asarray(xy * self._stretch(q) + both * (self.p1, self.p2)
+                          + (q + 2.0 * xy * xy) * (self.p2, self.p1))
+
+    def _undistorted_radially(self, distorted: Floats) -> Floats:
+        """Return the inverse of the radial terms: a table's guess, then Newton's method.
+
+        They are monotonic up to the valid radius, and the guess close: it cannot jump.
         """
+        radius_d = np.hypot(distorted[:, 0], distorted[:, 1])
         table = np.linspace(0.0, self.valid_radius, 20001)
-        square = table * table
-        radius = np.interp(radius_d, table * (1.0 + square * (self.k1 + square * self.k2)), table)
+        radius = np.interp(radius_d, table * self._stretch(table * table), table)
         for _ in range(20):
             q = radius * radius
-            error = radius * (1.0 + q * (self.k1 + q * self.k2)) - radius_d
+            error = radius * self._stretch(q) - radius_d
             if float(np.max(np.abs(error), initial=0.0)) < 1e-13:
                 break
-            radius -= error / np.maximum(1.0 + q * (3.0 * self.k1 + 5.0 * q * self.k2), 1e-9)
-        return np.asarray(radius)
+            slope = 1.0 + q * (3.0 * self.k1 + q * (5.0 * self.k2 + 7.0 * q * self.k3))
+            radius -= error / np.maximum(slope, 1e-9)
+        scale = np.where(radius_d > 1e-12, radius / np.maximum(radius_d, 1e-12), 1.0)
+        return distorted * scale[:, None]
 
     def _corner_radius(self) -> float:
         """Return the largest distorted normalised radius in the picture (pixels' outer edges)."""
         x = max(self.cx + 0.5, self.width - 0.5 - self.cx) / self.fx
         y = max(self.cy + 0.5, self.height - 0.5 - self.cy) / self.fy
         return math.hypot(x, y)
+
+
+def _square(xy: Floats) -> Floats:
+    return np.asarray(np.sum(xy * xy, axis=1, keepdims=True))

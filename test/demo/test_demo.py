@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dashcalib_ros.demo import Drive, DriveSpec, Lens, Stop, Turn, demo_drive
+from dashcalib_ros.demo import Drive, DriveSpec, Glass, Lens, Stop, Turn, demo_drive
 from dashcalib_ros.demo.atlas import pack
 from dashcalib_ros.demo.quads import Quads
 from dashcalib_ros.demo.raycast import Raycaster
@@ -293,3 +293,24 @@ def test_compression_loses_little(drive):
 def test_impossible_drives_are_refused(wrong):
     with pytest.raises(ConfigError):
         DriveSpec(**wrong)
+
+
+def test_a_lens_with_all_coefficients_is_opencvs_plumb_bob():
+    lens = dataclasses.replace(LENS, p1=0.0016, p2=-0.0011, k3=-0.02)
+    points = np.random.default_rng(0).uniform((-0.6, -0.3, 1.0), (0.6, 0.3, 1.0), (200, 3))
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)[0]
+    np.testing.assert_allclose(lens.project(points), expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(lens.undistort(lens.project(points)), points[:, :2], atol=1e-9)
+
+
+@pytest.mark.parametrize('look', ['windscreen', 'rectified'])
+def test_glass_moves_the_picture_by_what_it_says_and_no_lens_does_that(look):
+    lens = dataclasses.replace(LENS, glass=Glass(2.0, look, seed=5))
+    x, y = np.meshgrid(np.linspace(0.0, 639.0, 41), np.linspace(0.0, 359.0, 25))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    moved = lens.glass.displacement(pixels, lens.size)
+    assert np.sqrt(np.mean(np.sum(moved**2, axis=1))) == pytest.approx(2.0, rel=0.05)
+    rays = np.column_stack([lens.undistort(pixels), np.ones(len(pixels))])
+    np.testing.assert_allclose(lens.project(rays), pixels, atol=1e-6)
+    plain = dataclasses.replace(lens, glass=None)
+    np.testing.assert_allclose(plain.project(rays), pixels - moved, atol=1e-6)
