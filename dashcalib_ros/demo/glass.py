@@ -6,12 +6,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from dashcalib_ros.arrays import Floats
 
 Look = Literal['windscreen', 'rectified']
-# of a windscreen's waves, in widths of the picture: pressed glass is smooth
-WAVELENGTHS = (0.7, 2.5)
+# of a windscreen, in widths of the picture: pressed glass is smooth
+WAVES, WAVELENGTHS = 8, (0.7, 2.5)
+# of x and y together: higher ones were not found in KITTI's pictures, and lower ones weigh more
+DEGREE = 5
 # fixed-point steps of the inverse; the largest fields need them all, in the corners
 STEPS = 30
 
@@ -20,9 +23,8 @@ STEPS = 30
 class Glass:
     """A smooth displacement over the picture that no lens with five coefficients takes up.
 
-    rms_px: over the picture. look: a 'windscreen' is waves in all directions; 'rectified' is rings
-    about a point beside the middle, as a rectification with too few coefficients leaves them, and
-    weaker waves. The same seed gives the same glass.
+    rms_px: over the picture. look: a 'windscreen' is waves in all directions; 'rectified' is a
+    polynomial, as KITTI's rectification left one. The same seed gives the same glass.
     """
 
     rms_px: float
@@ -61,18 +63,20 @@ def _fitted(glass: Glass, size: tuple[int, int]) -> tuple[Floats, float]:
 def _shape(glass: Glass, places: Floats) -> Floats:
     """Return (n, 2) the displacement in any unit; places (n, 2) from the middle, half widths."""
     rng = np.random.default_rng([glass.seed, 11])
-    waves = np.zeros_like(places)
-    for _ in range(8):
+    moved = np.zeros_like(places)
+    if glass.look == 'rectified':
+        for i, j in np.ndindex(DEGREE + 1, DEGREE + 1):
+            if 2 <= i + j <= DEGREE:
+                both = legendre.legval(places[:, 0], np.eye(DEGREE + 1)[i]) \
+                    * legendre.legval(places[:, 1], np.eye(DEGREE + 1)[j])
+                moved += both[:, None] * rng.normal(size=2) / (i + j - 1)
+        return moved
+    for _ in range(WAVES):
         angle, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
         number = np.pi / rng.uniform(*WAVELENGTHS)
         along = places @ (number * np.array([np.cos(angle), np.sin(angle)]))
-        waves += np.cos(along + phase)[:, None] * rng.normal(size=2) / number
-    if glass.look == 'windscreen':
-        return waves
-    from_point = places - rng.uniform(-0.15, 0.15, 2)
-    radius = np.linalg.norm(from_point, axis=1, keepdims=True)
-    rings = from_point * np.sin(4.0 * radius + rng.uniform(0.0, 2.0 * np.pi))
-    return np.asarray(rings + 0.1 * waves)
+        moved += np.cos(along + phase)[:, None] * rng.normal(size=2) / number
+    return moved
 
 
 def moves_of_a_lens(places: Floats) -> Floats:
