@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from dashcalib_ros.camera import MODELS
+from dashcalib_ros.camera.camera import PINHOLE
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
@@ -26,6 +27,7 @@ from dashcalib_ros.judge.calibration import Verdict, Witnesses
 from dashcalib_ros.judge.next_turn import next_turn
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.solve.fixed_camera import FixedCameraTest, largest_crop
+from dashcalib_ros.solve.knowledge import LEAST_GAIN
 from dashcalib_ros.solve.solution import Solution
 
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
@@ -334,11 +336,17 @@ def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
 
 
 def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """Doubt a fisheye that explains the turns hardly better than a pinhole far from it."""
+    """Doubt a lens that explains the turns hardly better than a simpler one of the other kind.
+
+    A fisheye must explain them far better, as it was tried only where a pinhole left much: a
+    pinhole with all its coefficients clearly better.
+    """
     camera = solution.camera
     for each in solution.tried:
         model = MODELS[each.model]
         if model.family == camera.family or len(model.names()) >= len(camera.names()):
+            continue
+        if camera.family == PINHOLE and each.loses_by > LEAST_GAIN:
             continue
         alike_px = MAX_KIND_SIGMAS * solution.picture.rms
         far = each.apart_px is None or each.apart_px > alike_px

@@ -13,7 +13,8 @@ from dashcalib_ros.solve.fitting import retriangulate_all
 from dashcalib_ros.solve.knowledge import is_clear
 from dashcalib_ros.solve.normal import Normal, noise_in, normal_equations
 from dashcalib_ros.solve.prior import loss_px_of, wider_prior
-from dashcalib_ros.solve.steps import Fit
+from dashcalib_ros.solve.shutter import readout
+from dashcalib_ros.solve.steps import Fit, is_rolling, without_shutter
 
 # px: of the loss in the first rounds; a windscreen's 2 px would be cut off by the usual one. In
 # the last rounds it is the usual one
@@ -25,12 +26,23 @@ LAST_LOSSES = (0.0, 0.0)
 def with_field(first: Fit) -> Fit:
     """Return the fit with the field taken out of its tracks, where the turns confirm one.
 
-    Where only the evidence speaks for a field, the fit keeps its prior, for its sigma. What the
-    removal of a rolling shutter leaves looks like a field: behind one, none is looked for.
+    Where only the evidence speaks for a field, the fit keeps its prior, for its sigma. A field
+    looks like a rolling shutter, too: where one was found, the field is sought without, and is
+    there only if no rolling shutter is left beside it.
     """
-    settings, size = first.config.intrinsics, first.camera.image_size
-    if len(first.scenes) < 2 or first.readout_s:
+    if len(first.scenes) < 2:
         return first
+    if not first.readout_s:
+        return _with_field(first)
+    found = _with_field(without_shutter(first))
+    if found.used_field is None or is_rolling(*readout(
+            found.scenes, found.camera, found.solver.loss_px, found.prior)):
+        return first
+    return found
+
+
+def _with_field(first: Fit) -> Fit:
+    settings, size = first.config.intrinsics, first.camera.image_size
     none = FoundField(Field(size, np.zeros((2, len(TERMS)))), field_basis(first.camera), np.inf)
     usual = loss_px_of(first.scenes, first.camera, settings)
     evidence = _problem(first, none, usual)[1].evidence(size[0])
@@ -77,6 +89,8 @@ def _rounds(first: Fit, losses: Sequence[float]) -> Fit | None:
             return None
         now = replace(now, scenes=scenes, camera=camera, field=FoundField(
             field, found.basis, evidence.sigma_px, evidence.inflation))
+        # one step of all at once leaves poses behind, and the next one would go astray
+        now = replace(now, solver=replace(now.solver, loss_px=loss_px)).adjusted()
     return now
 
 

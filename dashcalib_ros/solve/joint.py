@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import AUTO
+from dashcalib_ros.camera import AUTO, MODELS
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruct.scene import Profile, Scene
@@ -20,6 +20,7 @@ from dashcalib_ros.solve.model_choice import (
     chosen_of,
     compared_with_others,
     refitted,
+    refitted_without_shutter,
     with_few_tracks,
     with_model_chosen,
 )
@@ -63,7 +64,7 @@ def solve(per_turn: Sequence[Scene], config: Config,
         return None
     start, tried = _best_of(begun)
     progress('looking for a field', 0.0)
-    fit = _steadied(with_field(start.fit))
+    fit = _steadied(_with_field(start.fit))
     fit = with_all_tracks(replace(fit, measured={
         scene.turn: _without_distortions(fit, scene) for scene in fit.measured.values()}),
         per_turn)
@@ -77,7 +78,10 @@ def solve(per_turn: Sequence[Scene], config: Config,
         progress('choosing the lens model', 0.0)
         fit, others = with_model_chosen(fit)
         tried = _merged(tried, others)
-    elif config.model != AUTO:
+    elif config.model == AUTO:
+        # models of the same kind were compared with the field in the tracks
+        tried = tuple(each for each in tried if MODELS[each.model].family != fit.camera.family)
+    else:
         progress('comparing the lens model with others', 0.0)
         tried = compared_with_others(fit)
     progress('trying other focal lengths', 0.0)
@@ -88,6 +92,23 @@ def solve(per_turn: Sequence[Scene], config: Config,
     except np.linalg.LinAlgError:
         # nothing limits a direction of the parameters: pictures that slide past show no depth
         return None
+
+
+def _with_field(first: Fit) -> Fit:
+    """Return the fit with the field that the turns confirm, and that no wider model explains.
+
+    A decentred lens bends the picture, too, and also where no track goes.
+    """
+    found = with_field(first)
+    wider = type(first.camera.widened())
+    if (found.used_field is None or first.config.model != AUTO
+            or isinstance(first.camera, wider)):
+        return found
+    few = with_few_tracks(first)
+    plain, decentred = refitted(few, type(first.camera)), refitted_without_shutter(few, wider)
+    if plain is None or decentred is None or chosen_of([plain, decentred])[0] is plain:
+        return found
+    return first if with_field(decentred).used_field is None else found
 
 
 def _without_distortions(fit: Fit, scene: Scene) -> Scene:

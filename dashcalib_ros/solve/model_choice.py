@@ -41,12 +41,13 @@ def with_model_chosen(first: Fit) -> tuple[Fit, tuple[Candidate, ...]]:
         return first, ()
     models = larger_models(camera)
     few = with_few_tracks(first)
-    found = [refitted(few, type(camera)), *(_without_shutter(few, model) for model in models)]
+    found = [refitted(few, type(camera)),
+             *(refitted_without_shutter(few, model) for model in models)]
     chosen, tried = chosen_of([result for result in found if result is not None])
     model = type(chosen.camera)
     if model is type(camera):
         return first, tried
-    return _without_shutter(first, model) or first, tried
+    return refitted_without_shutter(first, model) or first, tried
 
 
 def compared_with_others(asked: Fit) -> tuple[Candidate, ...]:
@@ -64,7 +65,7 @@ def compared_with_others(asked: Fit) -> tuple[Candidate, ...]:
         return ()
     for model in calibrated_models():
         if model is not type(camera):
-            fitted = _without_shutter if model in larger else refitted
+            fitted = refitted_without_shutter if model in larger else refitted
             found.append(fitted(few, model))
     chosen, tried = chosen_of([result for result in found if result is not None])
     # the result is adjusted with all tracks
@@ -135,7 +136,7 @@ def with_few_tracks(fit: Fit) -> Fit:
                   for turn, scene in fit.measured.items()})
 
 
-def _without_shutter(first: Fit, model: type[Camera]) -> Fit | None:
+def refitted_without_shutter(first: Fit, model: type[Camera]) -> Fit | None:
     """Return the result with another model and a global shutter; None where that is not enough.
 
     A decentred lens looks like a short rolling shutter, and what the removal of a true one leaves

@@ -241,6 +241,14 @@ def _without_rolling_shutter(fit: Fit, readout_s: float) -> Fit:
     return replace(fit, scenes=moved, readout_s=readout_s).retriangulated()
 
 
+def without_shutter(fit: Fit) -> Fit:
+    """Return the fit of a part of the tracks, these as they were measured, adjusted again."""
+    measured = {turn: subsample_tracks(scene, FIRST_TRACKS)
+                for turn, scene in fit.measured.items()}
+    scenes = [replace(scene, tracks=measured[scene.turn].tracks) for scene in fit.scenes]
+    return replace(fit, scenes=scenes, readout_s=0.0).retriangulated().adjusted().retriangulated()
+
+
 def _changed(before: Fit, after: Fit) -> float:
     """Return the share of the observations that are used in only one of the two."""
     used = {scene.turn: scene.structure.used for scene in after.scenes}
