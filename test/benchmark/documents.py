@@ -10,7 +10,8 @@ DOCS = Path(__file__).resolve().parents[2] / 'docs' / 'notebook'
 # which document has which table
 TABLES = {'accuracy': 'accuracy.md', 'attacks': 'accuracy.md', 'hostile': 'accuracy.md',
           'joined': 'accuracy.md', 'rivals': 'speed.md', 'speed': 'speed.md',
-          'node_latency': 'speed.md', 'real': 'accuracy.md', 'mount': 'accuracy.md'}
+          'node_latency': 'speed.md', 'real': 'accuracy.md', 'mount': 'accuracy.md',
+          'glass': 'accuracy.md'}
 
 
 def write_table(name: str, text: str, commits: Iterable[str], docs: Path = DOCS) -> Path:

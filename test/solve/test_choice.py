@@ -129,6 +129,15 @@ def test_a_fisheye_is_doubted_where_a_pinhole_far_from_it_is_nearly_as_good(
     assert any('do not tell whether' in reason for reason in reasons) == doubted
 
 
+@pytest.mark.parametrize(('loses_by', 'doubted'), [(20.0, True), (400.0, False)])
+def test_a_decentred_pinhole_is_doubted_where_a_fisheye_is_nearly_as_good(
+        brown, loses_by, doubted):
+    fisheye = Candidate('fisheye', loses_by, 11.0 * brown.picture.rms, False, 1.2)
+    tried = (fisheye, Candidate('brown', 0.0, 0.0, True))
+    reasons = judge(replace(brown, tried=tried), CONFIG.verdict).reasons
+    assert any('do not tell whether' in reason for reason in reasons) == doubted
+
+
 def test_a_pinhole_that_all_turns_were_taken_for_a_fisheye_is_one():
     taken = as_model(LENS, Fisheye)
     sure = Profile(np.array([0.5, 0.65, 0.8]), np.array([1.2, 1.0, 1.3]), 100)

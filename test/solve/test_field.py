@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_calibration import make_calibration
 from scipy.spatial.transform import Rotation
-from solving import CONFIG, scenes_of, solved
+from solving import CONFIG, scenes_of, solved, z_of
 from synthetic import LENS, SIZE
 
 from dashcalib_ros.camera.field import TERMS, Field
@@ -29,6 +29,11 @@ def a_field(rms_px: float, seed: int = 3) -> Field:
     field = Field(SIZE, (basis @ inside).reshape(2, -1))
     size = np.sqrt(np.mean(field.over(LENS)**2))
     return dataclasses.replace(field, coefficients=field.coefficients * rms_px / size)
+
+
+def behind(field: Field, scenes):
+    return [dataclasses.replace(scene, tracks=dataclasses.replace(
+        scene.tracks, xy=field.observed(scene.tracks.xy))) for scene in scenes]
 
 
 @pytest.fixture
@@ -74,9 +79,7 @@ def test_a_sound_lens_has_none(no_profile):
 
 def test_a_windscreen_is_found_and_the_lens_behind_it(no_profile):
     field = a_field(1.0)
-    bent = [dataclasses.replace(scene, tracks=dataclasses.replace(
-        scene.tracks, xy=field.observed(scene.tracks.xy)))
-        for scene in scenes_of(5, tracks=250, noise_px=0.15)]
+    bent = behind(field, scenes_of(5, tracks=250, noise_px=0.15))
     found = solved(bent)
     assert found.field is not None and found.field.used
     seen = np.concatenate([scene.tracks.xy[scene.structure.used] for scene in bent])[::20]
@@ -95,6 +98,27 @@ def test_a_windscreen_is_found_and_the_lens_behind_it(no_profile):
     # what camera_info cannot say is in the sigma over the picture, and not in that of the rays
     assert found.picture.rms > 0.8
     assert found.rays_sigma_px < found.picture.rms
+
+
+@pytest.mark.parametrize(('rms_px', 'seed'), [
+    (2.5, 4),  # a single step of everything at once goes astray here
+    (1.0, 18),  # it looks like a rolling shutter of 2.5 ms
+    (1.0, 14)])  # and like a decentred lens
+def test_strong_and_misleading_fields_are_found(no_profile, rms_px, seed):
+    field = a_field(rms_px, seed)
+    found = solved(behind(field, scenes_of(5, tracks=250, noise_px=0.15)))
+    assert found.field is not None and found.field.used and not found.readout_s
+    assert abs(z_of(found)[0]) < 2.0 and found.sigma[0] < 0.012 * LENS.fx
+    grid = np.stack(np.meshgrid(np.linspace(0, SIZE[0] - 1, 25), np.linspace(0, SIZE[1] - 1, 15)),
+                    axis=-1).reshape(-1, 2)
+    ours, true = found.field.field.displacement(grid).ravel(), field.displacement(grid).ravel()
+    assert ours @ true > 0.8 * np.linalg.norm(ours) * np.linalg.norm(true)
+
+
+def test_a_rolling_shutter_is_no_field(no_profile):
+    found = solved(scenes_of(5, tracks=250, noise_px=0.15, readout_s=0.02))
+    assert found.readout_s == pytest.approx(0.02, abs=0.002)
+    assert found.field is None or not found.field.used
 
 
 def test_what_one_turn_shows_is_no_field(no_profile):
