@@ -88,7 +88,7 @@ class Calibrator:
         if self._detection.frames == 1:
             self._scenes.load(frame.frame_id)
         if new:
-            self._scenes.submit()
+            self._scenes.submit(more_to_come=True)
         self._detect_s += time.monotonic() - started
         self._scenes.make_room()
         return self.status()

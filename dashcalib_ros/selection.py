@@ -4,6 +4,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Set
 from typing import Any
 
+from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
@@ -25,6 +26,8 @@ NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow en
             'the car hardly moved')
 ALONE = 'this drive has no turn that could agree with it'
 OTHER_CAMERA = 'the turns of this drive are of another camera'
+# turns that wait in memory for better ones: with three, a fifth fewer are reconstructed in vain
+WAITING = 2
 
 
 class SceneSelection:
@@ -55,6 +58,8 @@ class SceneSelection:
         self._closed = False
         # the turns whose scenes were written to turns.store
         self._stored_turns: Set[TurnId] = frozenset()
+        # where the ego vehicle is not, by turn
+        self._valid: dict[TurnId, Mask | None] = {}
         # why turns were taken out
         self._rejected: dict[TurnId, str] = {}
         # turns of earlier drives that this drive contradicts; on disk they stay
@@ -84,9 +89,10 @@ class SceneSelection:
         self._config = self._config.replace({'turns.wanted': turns})
         self._places = turns
 
-    def submit(self, replace_failed: bool = False) -> None:
+    def submit(self, more_to_come: bool = False, replace_failed: bool = False) -> None:
         """Have the best turns reconstructed; live: all, as a scene is a fiftieth of its images.
 
+        more_to_come: the least of them wait, for better ones may take their places.
         replace_failed: turns that gave no scene are replaced by the next best. Only calibrations
         do that: which turns are reconstructed must not depend on the speed of the workers.
         """
@@ -95,14 +101,20 @@ class SceneSelection:
         built = self._pool.scenes()
         self._pool.keep_only(set(turns))
         self._rejected = {key: why for key, why in self._rejected.items() if key in turns}
-        places = self._places + self.more
+        # the mask of when a turn was found: what waits must not change its scene
+        now = self._detection.valid()
+        self._valid = {key: self._valid.get(key, now) for key in turns}
+        places, ready = self._places + self.more, []
         for key in self._ranked():
             turn = turns.get(key)
             if turn is not None and (places > 0 or self._live) and turn.frames:
-                self._pool.submit(turn, self._detection.valid())
-                self._detection.release(turn.center)
+                ready.append(turn)
             if not (replace_failed and key in built and built[key] is None):
                 places -= 1
+        waiting = 0 if self._live or not more_to_come else WAITING
+        for turn in ready[:max(len(ready) - waiting, 0)]:
+            self._pool.submit(turn, self._valid[turn.id])
+            self._detection.release(turn.center)
 
     def chosen(self) -> list[Scene]:
         """Return the scenes that a calibration would use now, best first."""
@@ -161,7 +173,7 @@ class SceneSelection:
     def make_room(self) -> None:
         """Wait, unless live, until few turns wait in memory; raises what a worker raised."""
         if not self._live:
-            self._pool.wait(lambda: len(self._pool.unbuilt()) <= 2 * self._config.threads)
+            self._pool.wait(lambda: len(self._pool.unbuilt()) <= self._config.threads)
 
     def wanted(self, tell: Progress, final: bool) -> list[Scene]:
         """Wait for the best turns' scenes and return them.
