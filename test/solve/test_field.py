@@ -14,6 +14,7 @@ from synthetic import LENS, SIZE
 from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.cli import main
 from dashcalib_ros.judge.calibration import LensField
+from dashcalib_ros.judge.focal_by_turn import focal_alone
 from dashcalib_ros.report import load_calibration, result_json
 from dashcalib_ros.solve import focal
 from dashcalib_ros.solve.field import displacements, field_basis, without_field
@@ -95,6 +96,10 @@ def test_a_windscreen_is_found_and_the_lens_behind_it(no_profile):
     assert off < 2 * found.rays_sigma_px
     none = solved(bent, CONFIG.replace({'intrinsics.least_field_nats': 1e6}))
     assert off < 0.7 * off_px(none.camera, seen)
+    # the turns agree better than with the field in their pictures
+    after, before = ([each.fx for each in focal_alone(found, with_field).values()]
+                     for with_field in (True, False))
+    assert np.std(after) < 0.6 * np.std(before)
     # what camera_info cannot say is in the sigma over the picture, and not in that of the rays
     assert found.picture.rms > 0.8
     assert found.rays_sigma_px < found.picture.rms
