@@ -40,8 +40,11 @@ class Field:
     coefficients: Floats
 
     def displacement(self, pixels: Floats) -> Floats:
-        """Return (..., 2) the field at observed pixels (..., 2), px."""
-        return np.asarray(field_terms(pixels, self.image_size) @ self.coefficients.T)
+        """Return (..., 2) the field at observed pixels (..., 2), px; NaN where these are."""
+        known = np.isfinite(pixels).all(axis=-1)
+        found = np.full(pixels.shape, np.nan)
+        found[known] = field_terms(pixels[known], self.image_size) @ self.coefficients.T
+        return found
 
     def ideal(self, pixels: Floats) -> Floats:
         """Return (..., 2) where the model alone would see what is observed at pixels (..., 2)."""
@@ -64,9 +67,9 @@ class Field:
 
 
 def field_terms(pixels: Floats, image_size: tuple[int, int]) -> Floats:
-    """Return (..., len(TERMS)) the values of all terms at pixels (..., 2); finite at NaN."""
+    """Return (..., len(TERMS)) the values of all terms at pixels (..., 2)."""
     # the picture's edges are at -1 and 1
-    places = ((np.nan_to_num(pixels) + 0.5) / np.array(image_size) * 2 - 1).clip(-BEYOND, BEYOND)
+    places = ((pixels + 0.5) / np.array(image_size) * 2 - 1).clip(-BEYOND, BEYOND)
     x, y = (legendre.legvander(places[..., axis], DEGREE) for axis in (0, 1))
     i, j = np.array(TERMS).T
     return np.asarray(x[..., i] * y[..., j])

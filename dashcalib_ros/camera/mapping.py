@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
@@ -19,6 +20,10 @@ GRID = (25, 15)
 UNSEEN_PX = 100.0
 # degrees off the axis; cameras that do not see behind are compared up to here
 IN_FRONT_DEG = 88.0
+# of the search for the best rotation: steps at the most, and the relative gain that ends it
+ROTATIONS, SETTLED = 30, 1e-12
+# px; cameras that are this near need no fit
+SAME_PX = 1e-6
 
 
 def grid_of(camera: Camera) -> Floats:
@@ -71,9 +76,6 @@ def apart(camera: Camera, reference: Camera) -> Apart | None:
     kind can see (unseen_share()). None when the reference has no ray for a pixel of the grid, or
     the camera cannot see one of the others.
     """
-    from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
-
     pixels = grid_of(reference)
     rays = reference.rays(pixels)
     if not np.isfinite(rays).all():
@@ -81,17 +83,22 @@ def apart(camera: Camera, reference: Camera) -> Apart | None:
     possible = _possible(camera, rays)
     pixels, rays = pixels[possible], rays[possible]
 
-    def residual(rotation: Floats) -> Floats:
-        return (camera.project(Rotation.from_rotvec(rotation).apply(rays)) - pixels).ravel()
-
-    with np.errstate(all='ignore'):
-        if not np.isfinite(residual(np.zeros(3))).all():
-            return None
-        try:
-            rest = least_squares(residual, np.zeros(3)).fun
-        except ValueError:  # a ray left the camera's view on the way
-            return None
-    return Apart(pixels, np.asarray(rest.reshape(-1, 2)))
+    best = np.full(pixels.shape, np.inf)
+    for _ in range(ROTATIONS):
+        # (SciPy's optimiser takes longer to load than this takes)
+        with np.errstate(all='ignore'):
+            off = camera.project(rays) - pixels
+        if not np.isfinite(off).all():
+            return None  # a ray is out of the camera's view, perhaps on the way
+        gain = np.sum(best**2) - np.sum(off**2)
+        if gain > 0:
+            best = off
+        if gain <= SETTLED * np.sum(best**2):
+            break
+        by_rotation = (camera.derivatives(rays)[1] @ turned(rays)).reshape(-1, 3)
+        step, *_ = np.linalg.lstsq(by_rotation, -off.ravel(), rcond=None)
+        rays = rays @ cv2.Rodrigues(step)[0].T
+    return Apart(pixels, best)
 
 
 def unseen_share(camera: Camera, reference: Camera) -> float:
@@ -127,12 +134,16 @@ def _derivatives(camera: Camera, pixels: Floats) -> tuple[Floats, Floats, Floats
     """
     rays = camera.rays(pixels)
     known = np.isfinite(rays[:, 0])
-    by_params, by_point, _ = camera.derivatives(rays[known])
-    x, y, z = rays[known].T
-    zero = np.zeros_like(x)
-    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+    by_params, by_ray, _ = camera.derivatives(rays[known])
     return (pixels[known], by_params.reshape(-1, by_params.shape[2]),
-            (by_point @ turned).reshape(-1, 3))
+            (by_ray @ turned(rays[known])).reshape(-1, 3))
+
+
+def turned(rays: Floats) -> Floats:
+    """Return (m, 3, 3) derivatives of rays (m, 3) by a small rotation of all."""
+    x, y, z = rays.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
 
 
 def as_model(camera: Camera, model: type[Camera], pixels: Floats | None = None) -> Camera:
@@ -140,7 +151,6 @@ def as_model(camera: Camera, model: type[Camera], pixels: Floats | None = None) 
 
     pixels: (n, 2) where; None: all over the picture.
     """
-    from scipy.optimize import least_squares
     pixels = grid_of(camera) if pixels is None else pixels
     rays = camera.rays(pixels)
     known = np.isfinite(rays[:, 0])
@@ -158,5 +168,9 @@ def as_model(camera: Camera, model: type[Camera], pixels: Floats | None = None) 
         return np.clip(np.nan_to_num(off, nan=UNSEEN_PX), -UNSEEN_PX, UNSEEN_PX).ravel()
 
     with np.errstate(all='ignore'):
-        found = least_squares(residual, start / scale, loss='soft_l1').x
+        found = start / scale
+        if np.abs(residual(found)).max() > SAME_PX:
+            # it takes 0.4 s to load
+            from scipy.optimize import least_squares
+            found = least_squares(residual, found, loss='soft_l1').x
     return model.of(camera.image_size, found * scale)

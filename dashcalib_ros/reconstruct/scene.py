@@ -136,6 +136,14 @@ def residuals_px(scene: Scene, camera: Camera) -> Floats:
     return np.asarray(camera.project(local) - scene.tracks.xy)
 
 
+def projected_px(scene: Scene, camera: Camera) -> Floats:
+    """Return (n, 2) where the points of the used observations are projected, image by image."""
+    structure = scene.structure
+    image, point = np.nonzero(structure.used)
+    local = np.einsum('nij,nj->ni', structure.rotations[image], structure.points[point])
+    return camera.project(local + structure.translations[image])
+
+
 def truncated_cost(scene: Scene, camera: Camera, limit_px: float) -> float:
     """Return the mean squared error over every observation, px^2, each cut at the limit.
 

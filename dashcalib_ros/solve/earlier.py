@@ -114,7 +114,7 @@ def _compared(solution: Solution) -> Comparison:
     the covariance T, so then it has the mean T (T + S)^-1 d and the covariance T - T (T + S)^-1 T.
     The joint camera takes over the share of it that the earlier turns have in the information.
     """
-    from scipy import stats
+    from scipy import special
     known = solution.known
     own, earlier = (known.of(n for n, scene in enumerate(solution.scenes)
                              if scene.turn.of_this_drive == this_drive)
@@ -130,5 +130,5 @@ def _compared(solution: Solution) -> Comparison:
                             earlier.sum(known.own).at_noise(known.noise).hessian)
     doubt = share @ (np.outer(mean, mean) + before - gain @ before) @ share.T
     moves, _ = sensitivity(solution.camera)
-    return Comparison(float(stats.norm.isf(stats.chi2.sf(distance, len(by_unit)) / 2)),
+    return Comparison(float(-special.ndtri(special.chdtrc(len(by_unit), distance) / 2)),
                       _rms(moves @ difference), np.asarray(doubt + doubt.T) / 2)

@@ -16,8 +16,8 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import TERMS, Field, field_terms
-from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.reconstruct.scene import Scene, residuals_px
+from dashcalib_ros.camera.mapping import sensitivity, turned
+from dashcalib_ros.reconstruct.scene import Scene, projected_px
 from dashcalib_ros.solve.quadratic import Quadratic
 
 # px of 1000 px of width: sizes of the field among which the evidence chooses
@@ -60,10 +60,9 @@ class FoundField:
         return float(self.sigma_px * np.sqrt(np.mean(np.sum(one**2, axis=(1, 2)))))
 
     def columns(self, scene: Scene, camera: Camera) -> Floats:
-        """Return (k, t, 2, f) derivatives of the observations by the field's free directions."""
+        """Return (n, 2, f) derivatives of the used observations by the field's directions."""
         # where the points project to: the errors of observations would correlate with the terms
-        pixels = scene.tracks.xy + residuals_px(scene, camera)
-        return displacements(pixels, camera.image_size, self.basis)
+        return displacements(projected_px(scene, camera), camera.image_size, self.basis)
 
 
 def displacements(pixels: Floats, image_size: tuple[int, int], basis: Floats) -> Floats:
@@ -85,23 +84,15 @@ def field_basis(camera: Camera) -> Floats:
     moves, pixels = sensitivity(camera)
     fields = displacements(pixels, camera.image_size, np.eye(2 * len(TERMS)))
     # rotations of the camera move all pixels, and sensitivity() leaves them out
-    by_camera = np.concatenate([moves, _rotations(camera, pixels)], axis=2).reshape(
-        -1, moves.shape[2] + 3)
+    rays = camera.rays(pixels)
+    by_rotation = camera.derivatives(rays)[1] @ turned(rays)
+    by_camera = np.concatenate([moves, by_rotation], axis=2).reshape(-1, moves.shape[2] + 3)
     made, _ = np.linalg.qr(by_camera / np.linalg.norm(by_camera, axis=0))
     _, parts, rows = np.linalg.svd(made.T @ fields.reshape(len(made), -1))
     free = rows[int((parts > LEAST_PART * parts[0]).sum()):].T
     degree = np.maximum(np.array(TERMS).sum(axis=1) - 1, 1)
     precision = free.T * np.tile(degree.astype(np.float64)**2, 2) @ free
     return np.asarray(free @ np.linalg.inv(np.linalg.cholesky(precision)).T)
-
-
-def _rotations(camera: Camera, pixels: Floats) -> Floats:
-    """Return (m, 2, 3) by how much small rotations of the camera move pixels (m, 2)."""
-    x, y, z = camera.rays(pixels).T
-    _, by_point, _ = camera.derivatives(np.stack([x, y, z], axis=1))
-    zero = np.zeros_like(x)
-    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    return np.asarray(by_point @ turned)
 
 
 @dataclass(frozen=True)

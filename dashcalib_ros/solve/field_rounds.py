@@ -21,6 +21,8 @@ from dashcalib_ros.solve.steps import Fit, is_rolling, without_shutter
 LOSSES = (2.0, 1.0, 0.5, 0.0, 0.0)
 # with all tracks
 LAST_LOSSES = (0.0, 0.0)
+# relative change of the cost that ends an adjustment: another follows each
+ROUGH = 1e-3
 
 
 def with_field(first: Fit) -> Fit:
@@ -90,8 +92,8 @@ def _rounds(first: Fit, losses: Sequence[float]) -> Fit | None:
         now = replace(now, scenes=scenes, camera=camera, field=FoundField(
             field, found.basis, evidence.sigma_px, evidence.inflation))
         # one step of all at once leaves poses behind, and the next one would go astray
-        now = replace(now, solver=replace(now.solver, loss_px=loss_px)).adjusted()
-    return now
+        now = replace(now, solver=replace(now.solver, loss_px=loss_px, tolerance=ROUGH)).adjusted()
+    return replace(now, solver=replace(now.solver, tolerance=first.solver.tolerance))
 
 
 def _field_of(fit: Fit) -> FoundField:

@@ -18,7 +18,7 @@ from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.reconstruct.scene import Scene, residuals_px
+from dashcalib_ros.reconstruct.scene import Scene, projected_px
 from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.normal import (
     IMAGE,
@@ -137,8 +137,9 @@ def problem_of(scenes: Sequence[Scene], camera: Camera, centred: Camera, loss_px
                sigmas: Sequence[float] = ()) -> Problem:
     """Return the linearised problem of scenes at their solution.
 
-    centred: the camera that priors are about. by_shared: for each scene (k, t, 2, e) derivatives
-    by parameters that follow the wider model's; sigmas: (e,) of their priors.
+    centred: the camera that priors are about. by_shared: for each scene (n, 2, e) derivatives of
+    its used observations by parameters that follow the wider model's; sigmas: (e,) of their
+    priors.
     """
     normals = tuple(
         normal_equations(scene, camera, loss_px, by_shared[n] if by_shared else None,
@@ -205,7 +206,8 @@ def fixed_camera_tests(scenes: Sequence[Scene], camera: Camera, centred: Camera,
     """
     columns, sigmas = [], []
     if rolling:
-        columns.append([row_shift(scene, camera)[..., None] for scene in scenes])
+        columns.append([row_shift(scene, camera)[scene.structure.used][..., None]
+                        for scene in scenes])
         sigmas.append(READOUT_S)
     if found is not None:
         columns.append([found.columns(scene, camera) for scene in scenes])
@@ -252,18 +254,18 @@ def largest_crop(crops: Crops) -> float:
 
 
 def _bends(scene: Scene, camera: Camera) -> Floats:
-    """Return (k, t, 2, 2 f) derivatives by a smooth field's displacements at f places.
+    """Return (n, 2, 2 f) derivatives by a smooth field's displacements at f places.
 
     The weights of the places at an observation sum to 1.
     """
     size = np.array(scene.tracks.image_size)
     # not as observed: errors would correlate with the weights
-    places = np.nan_to_num((scene.tracks.xy + residuals_px(scene, camera)) / size)
+    places = projected_px(scene, camera) / size
     columns, rows = ((np.arange(count) + 0.5) / count for count in BENDS)
     across = np.exp(-0.5 * ((places[..., :1] - columns) * BENDS[0])**2)
     down = np.exp(-0.5 * ((places[..., 1:] - rows) * BENDS[1])**2)
-    weight = (across[..., :, None] * down[..., None, :]).reshape(*places.shape[:2], 1, -1)
+    weight = (across[..., :, None] * down[..., None, :]).reshape(len(places), 1, -1)
     weight /= np.maximum(weight.sum(axis=-1, keepdims=True), 1e-9)
     zero = np.zeros_like(weight)
     return np.concatenate([np.concatenate([weight, zero], axis=-1),
-                           np.concatenate([zero, weight], axis=-1)], axis=2)
+                           np.concatenate([zero, weight], axis=-1)], axis=1)

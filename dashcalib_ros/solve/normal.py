@@ -146,8 +146,8 @@ def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_shared: Fl
     """Return the normal equations of a scene at the solution.
 
     loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply.
-    by_shared: (k, t, 2, e) derivatives of the observations by e more parameters that all turns
-    share. by_image: with the parameters of each image.
+    by_shared: (n, 2, e) derivatives of the n used observations, in the order of their images, by
+    e more parameters that all turns share. by_image: with the parameters of each image.
     """
     used = scene.structure.used
     linear = _linearised(scene, camera, loss_px, by_shared, by_image)
@@ -216,7 +216,7 @@ def _linearised(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats 
         parts += [shift, (projected - middle)[:, :, None]]
     parts.append(by_camera)
     if by_shared is not None:
-        parts.append(by_shared[rows, columns])
+        parts.append(by_shared)
     wide = np.concatenate(parts, axis=2)
     return _Linear(wide * weight[:, None, None], by_local @ rotation * weight[:, None, None],
                    residual, weight)

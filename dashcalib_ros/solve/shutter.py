@@ -64,7 +64,7 @@ def readout(scenes: Sequence[Scene], camera: Camera, loss_px: float, prior: Floa
     if not any(shift.any() for shift in shifts):
         return 0.0, float(np.inf)
     known = Knowledge(camera, tuple(
-        turn_cost(scene, camera, loss_px, shift[..., None])
+        turn_cost(scene, camera, loss_px, shift[scene.structure.used][..., None])
         for scene, shift in zip(scenes, shifts, strict=True)),
         Quadratic.prior(prior, np.zeros(1)), np.zeros(len(prior)))
     # the camera is at its optimum: only the readout has a gradient

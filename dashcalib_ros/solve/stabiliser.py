@@ -46,7 +46,8 @@ def without_stabiliser(given: Fit, rounds: int) -> Fit:
         shutter = [row_shift(scene, now.camera) for scene in now.scenes] if now.readout_s else []
         problem = problem_of(now.scenes, now.camera, now.centred, now.solver.loss_px,
                              now.config.intrinsics,
-                             [shift[..., None] for shift in shutter],
+                             [shift[scene.structure.used][..., None]
+                              for scene, shift in zip(now.scenes, shutter, strict=False)],
                              [READOUT_S] * bool(shutter))
         now, strength = _step(now, problem, shutter)
         now = now.adjusted(problem.noise).retriangulated()

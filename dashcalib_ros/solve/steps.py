@@ -124,10 +124,10 @@ class Fit:
             one_turn_sigma=left * self.config.intrinsics.one_turn_sigma * camera.fx)
 
     def _by_shared(self, scene: Scene) -> Floats | None:
-        """Return (k, t, 2, e) derivatives by the readout and by the directions of the field."""
+        """Return (n, 2, e) derivatives by the readout and by the directions of the field."""
         columns = []
         if self.readout_s:
-            columns.append(row_shift(scene, self.camera)[..., None])
+            columns.append(row_shift(scene, self.camera)[scene.structure.used][..., None])
         if self.field is not None:
             columns.append(self.field.columns(scene, self.camera))
         return np.concatenate(columns, axis=-1) if columns else None
