@@ -8,6 +8,7 @@ import numpy as np
 from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
 from dashcalib_ros.config import Config
 from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge.calibration import Mount
 
 SIZE = (1242, 375)
 TRUTH = Radial(SIZE, 721.5377, 724.25, 609.5593, 172.854, -0.363, 0.151)
@@ -19,6 +20,11 @@ EACH_MODEL = {
     'rational_polynomial': Rational.of(
         SIZE, [*TRUTH.params, 0.00034, -0.0012, -0.004, 0.02, -0.003, 0.0011]),
     'fisheye': Fisheye(SIZE, 420.0, 421.5, 615.0, 180.0, -0.021, 0.0043, -0.0021, 0.00034)}
+
+
+MOUNT = Mount('accepted', (), 2.0, -1.0, None, 1.4, {
+    'yaw_left_deg': 0.1, 'pitch_up_deg': 0.1, 'roll_right_deg': None, 'height_m': 0.03},
+    (600.0, 170.0), 0.5, 300.0)
 
 
 def calibration_of(camera, level='accepted', **changes):

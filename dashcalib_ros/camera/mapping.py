@@ -20,8 +20,9 @@ GRID = (25, 15)
 UNSEEN_PX = 100.0
 # degrees off the axis; cameras that do not see behind are compared up to here
 IN_FRONT_DEG = 88.0
-# of the search for the best rotation: steps at the most, and the relative gain that ends it
-ROTATIONS, SETTLED = 30, 1e-12
+# of the search for the best rotation: steps at the most, parts of one that are tried, and the
+# relative gain that ends it
+ROTATIONS, PARTS, SETTLED = 50, tuple(0.5**n for n in range(8)), 1e-12
 # px; cameras that are this near need no fit
 SAME_PX = 1e-6
 
@@ -83,21 +84,28 @@ def apart(camera: Camera, reference: Camera) -> Apart | None:
     possible = _possible(camera, rays)
     pixels, rays = pixels[possible], rays[possible]
 
-    best = np.full(pixels.shape, np.inf)
-    for _ in range(ROTATIONS):
-        # (SciPy's optimiser takes longer to load than this takes)
+    def off(rays: Floats) -> Floats:
         with np.errstate(all='ignore'):
-            off = camera.project(rays) - pixels
-        if not np.isfinite(off).all():
-            return None  # a ray is out of the camera's view, perhaps on the way
-        gain = np.sum(best**2) - np.sum(off**2)
-        if gain > 0:
-            best = off
-        if gain <= SETTLED * np.sum(best**2):
-            break
+            return np.asarray(camera.project(rays) - pixels)
+
+    # Gauss-Newton: SciPy's optimiser takes longer to load than this takes
+    best = off(rays)
+    if not np.isfinite(best).all():
+        return None
+    for _ in range(ROTATIONS):
         by_rotation = (camera.derivatives(rays)[1] @ turned(rays)).reshape(-1, 3)
-        step, *_ = np.linalg.lstsq(by_rotation, -off.ravel(), rcond=None)
-        rays = rays @ cv2.Rodrigues(step)[0].T
+        step, *_ = np.linalg.lstsq(by_rotation, -best.ravel(), rcond=None)
+        for part in PARTS:
+            moved = rays @ cv2.Rodrigues(part * step)[0].T
+            found = off(moved)
+            gain = float(np.sum(best**2) - np.sum(found**2))
+            if gain > 0:
+                break
+        else:
+            break
+        rays, best = moved, found
+        if gain <= SETTLED * float(np.sum(best**2)):
+            break
     return Apart(pixels, best)
 
 

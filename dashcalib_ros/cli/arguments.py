@@ -213,6 +213,8 @@ def _add_check(commands: Any) -> None:
                         help="true poses, in KITTI's or TUM's format, or a GPS track (GPX, a bag "
                              'with NavSatFix): compare the rotation and the scale that each '
                              'camera finds with them')
+    parser.add_argument('--mount', action='store_true', dest='mounting',
+                        help='a camera that was moved on the car is wrong, too')
     parser.add_argument('--out', type=path_or('--out is a folder'), metavar='DIR',
                         help='with --poses: write a plot of the paths, and the paths for evo')
     parser.add_argument('--json', action='store_true', help='print JSON')

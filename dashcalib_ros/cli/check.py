@@ -34,7 +34,9 @@ from dashcalib_ros.judge import (
 )
 from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.camera_file import load_with_faults
+from dashcalib_ros.report.compare import mount_dict
 from dashcalib_ros.report.tables import TextTable, labelled
+from dashcalib_ros.report.wording import mounts_text
 from dashcalib_ros.standard_streams import write_stdout
 
 COLOURS = {'right': 'bold green', 'wrong': 'bold red', 'cannot tell': 'bold yellow'}
@@ -57,6 +59,9 @@ def check(args: argparse.Namespace) -> int:
         named = load_with_faults(args.calibration, args.topic)
     else:
         named = load_with_faults(args.calibration)
+    if args.mounting and named.mount is None:
+        raise UsageError(f'{named.name} does not say how the camera sits on the car: give a '
+                         f'result.json or calibration.yaml that dashcalib run has written')
     given = named.camera
     poses, track = _poses(args)
     if args.out is not None:
@@ -79,15 +84,24 @@ def check(args: argparse.Namespace) -> int:
         if poses is not None and given.image_size == calibration.image_size:
             motion = calibrator.odometry(given, calibration, poses, stages.show)
     warn((*source.warnings, *calibration.warnings))
+    now, before = calibration.mount, named.mount
     if args.json:
-        write_stdout(json.dumps(answer_dict(found, changes, motion), indent=2, allow_nan=False))
+        write_stdout(json.dumps(answer_dict(found, changes, motion, mount_dict(now, before)),
+                                indent=2, allow_nan=False))
     else:
         _show(found, motion, changes)
+        if now is not None and before is not None:
+            show(Text(f'- {mounts_text(now, before)}'))
+        elif args.mounting:
+            show(Text('- mounting: the drive does not tell it: drive straight on for longer'))
     if motion is not None and args.out is not None:
         for name, text in path_files(motion).items():
             write_text(args.out / name, text)
         if not args.json:
             write_stdout(f'written: {args.out / "paths.svg"}, and beside it the paths for evo')
+    if args.mounting and found.answer == 'right' and (
+            now is None or before is None or now.moved_from(before)):
+        return NOT_ENOUGH if now is None else WRONG
     return EXIT_CODES[found.answer]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from dashcalib_ros import stages
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.fleet.clip_shares import ClipShare, ClipTurn, contradicting, shares_of
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
@@ -165,7 +166,8 @@ def _judged(solution: Solution | None, clips: Sequence[Clip], stored: Sequence[S
         image_size=first.origin.image_size if first else (0, 0),
         frames=sum(clip.gathered.frames for clip in clips), turns=(), built={},
         magnitudes=np.zeros((0, 2)), mask=None, scale=first.origin.scale if first else FULL_SIZE,
-        timing={}, warnings=warnings, stored=tuple(stored))
+        timing={}, warnings=warnings, stored=tuple(stored),
+        straights=StraightCollector().straights())  # none are gathered: the turns' paths tell
     calibration = stages.judge(solution, evidence, config)
     if solution is None:
         return replace(calibration, verdict=Verdict('refused', (_nothing_found(clips),)))

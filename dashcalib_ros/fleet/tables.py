@@ -19,6 +19,7 @@ from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.posterior import Final
 from dashcalib_ros.fleet.storage import Folder
 from dashcalib_ros.fleet.tasks import ClipResult, camera_folder
+from dashcalib_ros.judge.calibration import ANGLES, Mount
 from dashcalib_ros.reconstruct.scene_file import DATES_S
 from dashcalib_ros.report.result import plain_values
 
@@ -53,6 +54,7 @@ def camera_row(camera: str, make: str, final: Final | None, failure: str,
         'sigma_px_worst': None if picture is None else picture.worst,
         'readout_ms': None if shutter is None else shutter.readout_ms,
         'reprojection_error_px': None if c is None else c.reprojection_error_px,
+        **_mount(None if c is None else c.mount),
         'clips': len(clips), **{f'clips_{name}': _count(clips, status) for name, status in (
             ('used', 'used'), ('left_out', 'left out'), ('unreadable', 'unreadable'))},
         'turns': sum(row['turns'] for row in clips),
@@ -65,6 +67,14 @@ def camera_row(camera: str, make: str, final: Final | None, failure: str,
         'drift_percent_per_year': drift, 'drift_sigma': drift_sigma,
         'reasons': [failure] if c is None else list(c.verdict.reasons),
         'warnings': [] if c is None else list(c.warnings), 'folder': camera_folder(camera)}
+
+
+def _mount(mount: Mount | None) -> dict[str, Any]:
+    """Return how the camera sits on the car, by columns; None where that is not known."""
+    return {'mount_verdict': None if mount is None else mount.verdict, **{
+        name: value for key in (*ANGLES, 'height_m') for name, value in (
+            (f'mount_{key}', None if mount is None else getattr(mount, key)),
+            (f'sigma_mount_{key}', None if mount is None else mount.sigma[key]))}}
 
 
 def clip_row(row: Row, camera: str, make: str, result: ClipResult, share: ClipShare | None

@@ -152,6 +152,12 @@ class LensField:
     sigma_px: float
 
 
+# of a mounting, and what its sigmas are named by
+ANGLES = ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg')
+# mountings that differ by less, in degrees or in sigmas, are the same
+MOVED_DEG, MOVED_SIGMAS = 0.5, 3.0
+
+
 @dataclass(frozen=True)
 class Mount:
     """How the camera sits on the car, relative to the direction of travel and to the road.
@@ -192,6 +198,21 @@ class Mount:
         from scipy.spatial.transform import Rotation
         x, y, z, w = Rotation.from_matrix(self.rotation).as_quat().tolist()
         return x, y, z, w
+
+    def apart(self, other: Mount) -> dict[str, tuple[float, float]]:
+        """Return how far each angle that both know is from the other's, and the sigma, degrees."""
+        found = {}
+        for name in ANGLES:
+            sigma, its_sigma = self.sigma[name], other.sigma[name]
+            if sigma is not None and its_sigma is not None:
+                found[name] = (getattr(self, name) - getattr(other, name),
+                               math.hypot(sigma, its_sigma))
+        return found
+
+    def moved_from(self, other: Mount) -> bool:
+        """Return whether an angle is another one, by MOVED_SIGMAS and by MOVED_DEG."""
+        return any(abs(degrees) > max(MOVED_DEG, MOVED_SIGMAS * sigma)
+                   for degrees, sigma in self.apart(other).values())
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,7 @@ from dashcalib_ros.report.named_camera import (
     no_intrinsics,
     read_covariance,
     read_field,
+    read_mount,
     read_number,
     read_sigma,
     read_sigma_px,
@@ -315,7 +316,7 @@ def _opencv(data: Data, keys: Mapping[str, str], path: Path) -> NamedCamera:
     verdict = own.get('verdict')
     return NamedCamera(str(path), camera, read_sigma(own.get('sigma'), camera),
                        None if verdict is None else str(verdict),
-                       faults=ros_faults(camera, k, r, p))
+                       mount=read_mount(own.get('mount')), faults=ros_faults(camera, k, r, p))
 
 
 def _kalibr(data: Data, path: Path) -> Camera:
@@ -442,7 +443,7 @@ def _result(data: Data, path: Path) -> NamedCamera:
     return NamedCamera(str(path), camera, sigma, str(data['verdict']),
                        read_covariance(data.get('details'), camera, sigma),
                        read_sigma_px(data.get('sigma_px')),
-                       read_field(data.get('field'), size))
+                       read_field(data.get('field'), size), read_mount(data.get('mount')))
 
 
 def _no_model(name: Any, path: Path) -> str:

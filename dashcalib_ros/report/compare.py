@@ -9,12 +9,13 @@ from typing import Any
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.difference import Difference as WholeDifference
 from dashcalib_ros.judge.difference import difference_between
 from dashcalib_ros.judge.wording import answers_of
 from dashcalib_ros.report.named_camera import NamedCamera
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.report.wording import digits_of, number, optional
+from dashcalib_ros.report.wording import digits_of, mounts_text, number, optional
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,18 @@ class Comparison:
             'mapping_px': self.mapping_px, 'worst_px': self.whole.worst_px,
             'unseen': self.unseen, 'sigma_px': self.whole.sigma_px,
             'told_apart': self.whole.told_apart, 'matters': self.whole.matters,
-            'distance': self.whole.distance, 'limit': self.whole.limit})
+            'distance': self.whole.distance, 'limit': self.whole.limit,
+            'mount': mount_dict(self.a.mount, self.b.mount)})
         return plain
+
+
+def mount_dict(mount: Mount | None, other: Mount | None) -> dict[str, Any] | None:
+    """Return how far two mountings are apart as values of JSON; None where one is not known."""
+    if mount is None or other is None:
+        return None
+    return {'moved': mount.moved_from(other), **{
+        name: {'difference': degrees, 'sigma': sigma}
+        for name, (degrees, sigma) in mount.apart(other).items()}}
 
 
 def compare(a: NamedCamera, b: NamedCamera) -> Comparison:
@@ -114,6 +125,8 @@ def answers(found: Comparison) -> list[str]:
     if found.unseen and found.whole.apart is not None:
         lines[0] += (f', without the {100 * found.unseen:.0f} % of the picture that the '
                      f'{found.a.camera.model} model cannot see')
+    if found.a.mount is not None and found.b.mount is not None:
+        lines.append(mounts_text(found.a.mount, found.b.mount))
     return lines
 
 

@@ -15,6 +15,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.calibration import ANGLES, Mount
 from dashcalib_ros.limits import SIDE
 from dashcalib_ros.solve.knowledge import PictureSigma
 
@@ -27,7 +28,8 @@ class NamedCamera:
     known. verdict: accepted or weak; None where the file has none (a truth, another tool's file).
     covariance: (n, n) of the parameters, as the picture shows them, and sigma_px: over the
     picture; None where the file does not say.
-    field: what its lens model leaves over, where a result.json has one that is used.
+    field: what its lens model leaves over, where a result.json has one that is used. mount: how it
+    sits on the car, where the file says.
     faults: in words, of what else stands beside the camera (ROS's K, R and P).
     """
 
@@ -38,6 +40,7 @@ class NamedCamera:
     covariance: Floats | None = default(default=None, compare=False)
     sigma_px: PictureSigma | None = None
     field: Field | None = default(default=None, compare=False)
+    mount: Mount | None = default(default=None, compare=False)
     faults: tuple[str, ...] = ()
 
     def without_faults(self) -> NamedCamera:
@@ -60,7 +63,7 @@ def calibrated_camera(calibration: Calibration, name: str = 'estimate') -> Named
     return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
                        read_covariance(calibration.details, calibration.camera,
                                        calibration.sigma),
-                       calibration.sigma_px)
+                       calibration.sigma_px, mount=calibration.mount)
 
 
 def read_size(width: Any, height: Any, *, path: str | Path) -> tuple[int, int]:
@@ -145,6 +148,24 @@ def read_field(data: Any, image_size: tuple[int, int]) -> Field | None:
     if coefficients.shape != (2, len(TERMS)) or not np.isfinite(coefficients).all():
         raise InputError('its field has no coefficients that can be read; calibrate again')
     return Field(image_size, coefficients)
+
+
+def read_mount(data: Any) -> Mount | None:
+    """Return a file's mounting; a missing one, or one that cannot be read, is no error."""
+    try:
+        travel, sigma = ([float(value) for value in data['travel_px']],
+                         {name: None if data['sigma'][name] is None
+                          else read_number(data['sigma'], name, '')
+                          for name in (*ANGLES, 'height_m')})
+        roll, height = (None if data[name] is None else read_number(data, name, '')
+                        for name in ('roll_right_deg', 'height_m'))
+        return Mount('accepted' if data['verdict'] == 'accepted' else 'weak',
+                     tuple(map(str, data['reasons'])), read_number(data, 'yaw_left_deg', ''),
+                     read_number(data, 'pitch_up_deg', ''), roll, height, sigma,
+                     (travel[0], travel[1]), read_number(data, 'travel_sigma_px', ''),
+                     read_number(data, 'straight_m', ''))
+    except (KeyError, IndexError, TypeError, ValueError, InputError):
+        return None
 
 
 def read_sigma_px(data: Any) -> PictureSigma | None:

@@ -197,13 +197,14 @@ def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
             if key != 'id'}
 
 
-def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None
-                ) -> dict[str, Any]:
+def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None,
+                mount: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return what a drive says of a given calibration as types of strict JSON.
 
     changes: of the camera during the drive, in words. motion: the comparison with true poses.
+    mount: how far the mounting is from the calibration's.
     """
-    values: dict[str, Any] = plain_values(found) | {'changes': list(changes)}
+    values: dict[str, Any] = plain_values(found) | {'changes': list(changes), 'mount': mount}
     if motion is not None:
         values |= motion.medians()
         values['turns'] = [{'center': turn.turn.number, 'true_deg': turn.angle_deg,

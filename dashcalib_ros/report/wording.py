@@ -100,6 +100,15 @@ def lines_text(lines: Bend) -> str:
             f'{lines.k1:+.4f} ± {lines.sigma:.4f}')
 
 
+def mounts_text(mount: Mount, other: Mount) -> str:
+    """Return how far a mounting is from another one, and whether the camera was moved."""
+    apart = mount.apart(other)
+    parts = [f'{degrees:+.2f} ± {sigma:.2f} ° {words}' for words, (degrees, sigma) in zip(
+        ('to the left', 'upwards', 'rolled right'), apart.values(), strict=False)]
+    moved = 'the camera was moved' if mount.moved_from(other) else 'it sits as before'
+    return f'mounting: {", ".join(parts)}: {moved}'
+
+
 def mount_text(mount: Mount) -> str:
     """Return how the camera sits on the car, with its verdict."""
     def angle(name: str, value: float | None, words: tuple[str, str]) -> str:

@@ -22,8 +22,6 @@ STATIC = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE,
 TOPIC = '/tf_static'
 # s; so long others may take to say that they have the frame
 LISTEN_S = 2.0
-# degrees, and sigmas; a mounting that differs by less is the same
-MOVED_DEG, MOVED_SIGMAS = 0.5, 3.0
 # variance of an angle of which nothing is known, rad^2
 UNKNOWN = math.pi**2 / 3
 
@@ -126,17 +124,9 @@ class Mounting:
 
 
 def differs(mount: Mount, other: Mount) -> bool:
-    """Return whether two mountings differ by more than their sigmas, and by half a degree."""
-    for name in ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg'):
-        one, two = getattr(mount, name), getattr(other, name)
-        if one is None or two is None:
-            if one is not two:
-                return True
-            continue
-        sigma = math.hypot(mount.sigma[name] or 0.0, other.sigma[name] or 0.0)
-        if abs(one - two) > max(MOVED_DEG, MOVED_SIGMAS * sigma):
-            return True
-    return False
+    """Return whether a mounting is another one than before, or knows its roll now."""
+    return (mount.moved_from(other)
+            or (mount.roll_right_deg is None) != (other.roll_right_deg is None))
 
 
 def text_of(mount: Mount) -> str:

@@ -2,12 +2,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from fakes import stands_in_for
-from made_calibration import TRUTH, make_calibration
+from made_calibration import MOUNT, TRUTH, make_calibration
 from made_drives import START, drive, images, info_of, write_bag
 
 from dashcalib_ros.calibrator import Calibrator
@@ -16,6 +17,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import Path, TurnOdometry
+from dashcalib_ros.report import result_json
 from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.quadratic import Quadratic
 
@@ -27,6 +29,7 @@ class FakeCalibrator:
     answer = 'right'
     asked: object = None
     fits = 5
+    mount = None
 
     def __init__(self, config=None, mask=None, verbose=False):
         pass
@@ -38,7 +41,7 @@ class FakeCalibrator:
         return ()
 
     def calibrate(self, progress=None):
-        return make_calibration(warnings=('dark',))
+        return make_calibration(warnings=('dark',), mount=self.mount)
 
     def check(self, given, calibration, progress=None):
         type(self).asked = given
@@ -92,6 +95,27 @@ def test_a_bag_s_own_calibration_is_checked(files, tmp_path, capfd):
     write_bag(tmp_path / 'without', images(drive(3)))
     assert main(['check', 'without']) == 2
     assert 'there is none' in capfd.readouterr().err
+
+
+def _shown(capfd):
+    return ' '.join(capfd.readouterr().out.split())
+
+
+@pytest.mark.parametrize(('now', 'code', 'said'), [
+    (MOUNT, 0, 'sits as before'), (replace(MOUNT, pitch_up_deg=1.0), 1, 'camera was moved'),
+    (None, 3, 'drive straight on')])
+def test_a_camera_that_was_moved_is_wrong_where_that_is_asked(files, tmp_path, monkeypatch, capfd,
+                                                              now, code, said):
+    assert main([*files, '--mount']) == 2
+    assert 'how the camera sits' in capfd.readouterr().err
+    (tmp_path / 'result.json').write_text(result_json(make_calibration(mount=MOUNT)))
+    monkeypatch.setattr(FakeCalibrator, 'mount', now)
+    asked = ['check', 'result.json', *files[2:]]
+    assert main(asked) == 0 and (now is None) == (said not in _shown(capfd))
+    assert main([*asked, '--mount']) == code and said in _shown(capfd)
+    assert main([*asked, '--mount', '--json']) == code
+    mount = json.loads(capfd.readouterr().out)['mount']
+    assert mount is None if now is None else mount['moved'] == bool(code)
 
 
 def test_json_has_what_programs_need(files, capfd):

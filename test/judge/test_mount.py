@@ -114,6 +114,7 @@ def test_it_is_never_better_than_the_lens(solution):
     assert mount_of(pairs, None, known, 'accepted', 1.0, None).verdict == 'accepted'
     weak = mount_of(pairs, None, known, 'weak', 1.0, None)
     assert weak.verdict == 'weak' and 'the lens is weak' in weak.reasons[0]
+    assert mount_of(pairs, None, known, 'refused', 1.0, None).verdict == 'weak'
     # 5 px of cy are half a degree of pitch, but not of the pixel of travel
     vague = np.array(solution.covariance)
     vague[3, 3] = 5.0**2
@@ -169,3 +170,19 @@ def test_a_failure_does_not_cost_the_lens(solution, monkeypatch):
         straights=pairs_of(mounted(0, 0, 0), count=2))
     found = conclude.conclude(solution, evidence, Config())
     assert found.mount is None and found.camera is not None
+
+
+def test_a_camera_that_was_moved(solution):
+    known = replace(solution, camera=LENS, scenes=())
+    here, nearby, moved = (mount_of(pairs_of(mounted(yaw, 0.0, 0.0), seed=seed), None, known,
+                                    'accepted', 1.0, None)
+                           for seed, yaw in enumerate((0.0, 0.3, 1.0)))
+    degrees, sigma = moved.apart(here)['yaw_left_deg']
+    assert abs(degrees - 1.0) < 2 * sigma < 0.5
+    assert moved.moved_from(here) and here.moved_from(moved)
+    # 0.3 degrees are what a load in the boot makes
+    assert not nearby.moved_from(here)
+    vague = replace(moved, sigma=dict.fromkeys(moved.sigma, 0.5))
+    assert not vague.moved_from(here)
+    # an angle that one does not know is not compared
+    assert set(moved.apart(here)) == {'yaw_left_deg', 'pitch_up_deg'}

@@ -8,7 +8,14 @@ import re
 
 import numpy as np
 import pytest
-from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
+from made_calibration import (
+    EACH_MODEL,
+    MOUNT,
+    SIGMA,
+    TRUTH,
+    calibration_of,
+    make_calibration,
+)
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +30,7 @@ from dashcalib_ros.report import (
     load_camera,
     result_json,
 )
+from dashcalib_ros.report.compare import answers
 from dashcalib_ros.report.page import difference_html
 from dashcalib_ros.solve.knowledge import PictureSigma
 
@@ -339,3 +347,32 @@ def test_result_json_keeps_the_covariance_of_the_picture(tmp_path):
         (tmp_path / 'result.json').write_text(json.dumps(data))
         camera = load_camera(tmp_path)
         assert camera.covariance is None and camera.sigma_px is None
+
+
+@pytest.mark.parametrize('name', ['result.json', 'calibration.yaml'])
+def test_how_the_camera_sits_is_compared_where_both_files_say(tmp_path, name):
+    def of(mount):
+        found, path = make_calibration(mount=mount), tmp_path / name
+        path.write_text(result_json(found) if name == 'result.json' else calibration_yaml(found))
+        return load_camera(path)
+
+    before, now = of(MOUNT), of(dataclasses.replace(MOUNT, yaw_left_deg=3.0, roll_right_deg=1.0))
+    assert before.mount == MOUNT and of(None).mount is None
+    found = compare(now, before)
+    mount = found.as_dict()['mount']
+    assert mount['moved'] and set(mount) == {'moved', 'yaw_left_deg', 'pitch_up_deg'}
+    assert mount['yaw_left_deg'] == pytest.approx({'difference': 1.0, 'sigma': 0.1 * 2**0.5})
+    assert '+1.00 ± 0.14 ° to the left' in answers(found)[-1] and 'moved' in answers(found)[-1]
+    assert 'sits as before' in answers(compare(before, before))[-1]
+    assert compare(now, of(None)).as_dict()['mount'] is None
+    assert not any('mounting' in line for line in answers(compare(now, of(None))))
+
+
+@pytest.mark.parametrize('spoiled', [
+    {'sigma': 3}, {'travel_px': [1.0]}, {'yaw_left_deg': 'left'}, {'verdict': 7, 'reasons': None}])
+def test_a_mounting_that_cannot_be_read_costs_nothing_else(tmp_path, spoiled):
+    data = json.loads(result_json(make_calibration(mount=MOUNT)))
+    data['mount'] |= spoiled
+    (tmp_path / 'result.json').write_text(json.dumps(data))
+    found = load_camera(tmp_path / 'result.json')
+    assert found.mount is None and found.camera == TRUTH
