@@ -113,7 +113,8 @@ class Witness:
     much fx would have to change to agree with the sensor, of fx; fx_sigma_percent: with what the
     sensor's own scale may be off. agrees: no contradiction beyond 3 sigmas of both.
     camera_from_sensor: (3, 3) row by row, from the sensor's axes to the camera's; bias_rad_s: (3,)
-    of the sensor's rates; both None where a sensor has none.
+    of the sensor's rates; both None where a sensor has none. scale_by_gps: a gyro's angles over
+    those of GPS headings, and the sigma: taken out of scale; None where they say nothing.
     """
 
     time_offset_s: float | None
@@ -126,6 +127,7 @@ class Witness:
     camera_from_sensor: tuple[tuple[float, ...], ...] | None = None
     alignment_sigma_deg: float | None = None
     bias_rad_s: tuple[float, ...] | None = None
+    scale_by_gps: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge.calibration import Witness, Witnesses
+from dashcalib_ros.judge.gyro_scale import scale_by_gps
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
 from dashcalib_ros.solve.earlier import with_doubt
 from dashcalib_ros.solve.normal import normal_equations, used_keyframes
@@ -117,10 +118,13 @@ def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s:
                  and (steps := steps_of(scene, solution, loss_px, start_s)) is not None]
         if stream.rate is not None:
             fit = _with_clocks(fit_to(turns, stream.rate), turns, stream.rate)
-            gyro, line = _gyro(fit, solution, config)
-            lines.append(line)
+            own = _own_scale(stream.rate, stream.position, config.motion.gyro_scale_sigma)
+            fit = None if fit is None else replace(
+                fit, inverse_scale=fit.inverse_scale * own.scale)
+            gyro, line = _gyro(fit, solution, own)
+            lines += [own.contradiction, line]
             if fit is not None and gyro is not None and gyro.agrees:
-                informed = _informed(solution, fit, config)
+                informed = _informed(solution, fit, own, config)
         if stream.position is not None:
             gps, line = _gps(turns, stream.position, solution)
             lines.append(line)
@@ -130,7 +134,35 @@ def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s:
     return Asked(kept, Witnesses(gyro, gps), tuple(line for line in lines if line))
 
 
-def _informed(solution: Solution, fit: Fit, config: Config) -> Solution | None:
+@dataclass(frozen=True)
+class _OwnScale:
+    """A gyro's angles over the true ones, without any picture, and the sigma.
+
+    by_gps: what the headings of GPS alone say, where they do. contradiction: of them and of
+    gyro_scale_sigma, in a line.
+    """
+
+    scale: float
+    sigma: float
+    by_gps: tuple[float, float] | None = None
+    contradiction: str = ''
+
+
+def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnScale:
+    """Return what is known of a gyro's scale. prior: its sigma, without GPS."""
+    found = None if position is None else scale_by_gps(rate, position)
+    if found is None:
+        return _OwnScale(1.0, prior)
+    scale, sigma = found
+    if abs(scale - 1) > CONTRADICTED * np.hypot(sigma, prior):
+        return _OwnScale(scale, sigma, found, (
+            f'the gyro is {scale:.4f} ± {sigma:.4f} times what GPS headings say, and that is '
+            f'used: set motion.gyro_scale_sigma, {prior:g}, higher'))
+    share = prior**2 / (prior**2 + sigma**2)
+    return _OwnScale(1 + share * (scale - 1), sigma * float(np.sqrt(share)), found)
+
+
+def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config) -> Solution | None:
     """Return the solution with the gyro's angles as information; None where they have little.
 
     They are one more measurement of the camera's parameters (a Kalman update); then the turns'
@@ -139,7 +171,7 @@ def _informed(solution: Solution, fit: Fit, config: Config) -> Solution | None:
     from dashcalib_ros.solve.fitting import scene_with
     along = solution.covariance @ fit.by_camera
     own = float(fit.by_camera @ along)
-    known = float(fit.covariance[6, 6]) + config.motion.gyro_scale_sigma**2
+    known = float(fit.covariance[6, 6]) + gyro.sigma**2
     if config.motion.use != 'information' or known > (WORTH * np.sqrt(own))**2:
         return None
     gain = along / (own + known)
@@ -153,7 +185,7 @@ def _informed(solution: Solution, fit: Fit, config: Config) -> Solution | None:
     return with_doubt(moved, -np.outer(gain, along))
 
 
-def _gyro(fit: Fit | None, solution: Solution, config: Config) -> tuple[Witness | None, str]:
+def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness | None, str]:
     """Return what the gyro says, or why it says nothing."""
     if fit is None:
         return None, ('the gyro is not used: it has no samples during the turns, within 0.5 s of '
@@ -171,9 +203,9 @@ def _gyro(fit: Fit | None, solution: Solution, config: Config) -> tuple[Witness 
         return None, (f'the gyro is not used: its stamps and those of the pictures do not keep '
                       f'pace (turns are {1e3 * fit.skew_s:.0f} ms apart): check --fps, and that '
                       f'no images are missing')
-    own = config.motion.gyro_scale_sigma
     kappa_sigma = float(np.sqrt(fit.covariance[6, 6]))
-    return _witness(fit.inverse_scale, kappa_sigma, own, fit.by_camera, solution, fit), ''
+    said = _witness(fit.inverse_scale, kappa_sigma, own.sigma, fit.by_camera, solution, fit)
+    return replace(said, scale_by_gps=own.by_gps), ''
 
 
 def _witness(inverse_scale: float, sigma: float, own_sigma: float, by_camera: Floats,

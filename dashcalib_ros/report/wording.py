@@ -134,6 +134,8 @@ def witness_text(name: str, said: Witness) -> str:
     if said.time_offset_s is not None and said.time_sigma_s is not None:
         text += (f', its stamps late by {1e3 * said.time_offset_s:.0f} ± '
                  f'{max(1e3 * said.time_sigma_s, 0.1):.1f} ms')
+    if said.scale_by_gps is not None:
+        text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*said.scale_by_gps)
     return text
 
 

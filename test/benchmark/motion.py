@@ -1,6 +1,7 @@
 """What a gyro and GPS say of fx: rendered drives, and real ones with poses or sensors.
 
     python test/benchmark/motion.py --data data
+    python test/benchmark/motion.py --towns 40
 
 A gyro is made from true poses: 100 Hz, 0.1 deg/s/sqrt(Hz), bias 0.2 deg/s, 40 ms late, mounted at
 any angle.
@@ -10,11 +11,15 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import cv2
 import numpy as np
+from made_motion import town
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from dashcalib_ros.arrays import Floats
@@ -25,6 +30,7 @@ from dashcalib_ros.demo.drive import MARGIN_S
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import Samples, SensorStream, local_metres
+from dashcalib_ros.judge.gyro_scale import scale_by_gps
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.judge.witnesses import ask_sensors
 from dashcalib_ros.solve.fitting import scene_with
@@ -120,12 +126,33 @@ def table(path: Path) -> dict[str, Floats]:
     return {name: np.array([float(line[name]) for line in rows]) for name in rows[0]}
 
 
+TOWNS: dict[str, dict[str, float]] = {
+    '10 Hz, 2 cm': {'noise_m': 0.02, 'rate_hz': 10.0}, '1 Hz, 0.5 m': {},
+    '1 Hz, 3 m': {'noise_m': 3.0}, '1 Hz, 3 m, 30 turns': {'noise_m': 3.0, 'turns': 30},
+    '1 Hz, 0.5 m, 5 % jump by 30 m': {'jumps': 0.05}, '1 Hz, 0.5 m, 0.4 s late': {'late_s': 0.4}}
+
+
+def towns(count: int) -> None:
+    """Print how well GPS knows a gyro's scale: drives of 12 turns on paper, 2 % off."""
+    print('| GPS | answers | sigma, % | error over sigma: RMS, largest |\n|---|---|---|---|')
+    for name, given in TOWNS.items():
+        found = [scale_by_gps(*town(seed, scale=1.02, **given)) for seed in range(count)]
+        known = np.array([each for each in found if each is not None])
+        off = (known[:, 0] - 1.02) / known[:, 1]
+        print(f'| {name} | {len(known)} of {count} | {100 * np.median(known[:, 1]):.2f} | '
+              f'{np.sqrt(np.mean(off**2)):.2f}, {np.abs(off).max():.1f} |')
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--towns', type=int, default=0, help='drives on paper for GPS and gyro')
     parser.add_argument('--data', type=Path)
     parser.add_argument('--seeds', type=int, default=3)
     parser.add_argument('--single', type=int, default=0, help='single turns that are rendered')
     args = parser.parse_args()
+    if args.towns:
+        towns(args.towns)
+        return
     print('| drive | sensor | verdict | offset ms | scale | fx by pictures, % | by it, % | agrees '
           '|\n|---|---|---|---|---|---|---|---|')
     for seed in range(1, args.seeds + 1):

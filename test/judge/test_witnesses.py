@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from made_motion import town
 from scipy.spatial.transform import Rotation
 from solving import CONFIG, YAWS, solved
 from synthetic import LENS, synthetic_turn
@@ -207,3 +208,37 @@ def test_a_gyro_hardly_moves_what_many_turns_know(drive):
     found = ask_sensors(solution, gyro(drive), START_S, CALIBRATED).solution
     assert abs(found.camera.fx - solution.camera.fx) < solution.sigma[0]
     assert found.sigma[0] <= solution.sigma[0]
+
+
+def with_town(drive, scale, seed=3, **given):
+    """Return what a gyro sees of the turns, and after them of a town, where GPS is received."""
+    turns = gyro(drive, scale, density_deg=0.005)
+    rate, position = town(seed, scale=scale, turns=30, mounting=MOUNT, noise_m=0.05, rate_hz=5.0,
+                          **given)
+    later = turns.rate.stamps_s[-1] + 60.0
+    bias = turns.rate.values.mean(axis=0)
+    return SensorStream(rate=Samples(
+        np.r_[turns.rate.stamps_s, rate.stamps_s + later],
+        np.concatenate([turns.rate.values, rate.values + bias])), position=position.shifted(later))
+
+
+@pytest.mark.parametrize('scale', [1.0, 1.02])
+def test_gps_calibrates_a_gyro_of_unknown_scale(drive, scale):
+    solution = alone(drive, 0)
+    found = ask_sensors(solution, with_town(drive, scale), START_S, CONFIG)
+    said = found.witnesses.gyro
+    assert found.unused == () and said.agrees
+    own, sigma = said.scale_by_gps
+    assert abs(own - scale) < 3 * sigma < 0.01
+    # the scale is known now: so its angles are information
+    assert found.solution.alone is solution
+    assert found.solution.sigma[0] < 0.8 * solution.sigma[0]
+    assert abs(found.solution.camera.fx - LENS.fx) < 3 * found.solution.sigma[0]
+
+
+def test_a_scale_that_gps_contradicts_is_named_and_not_used(drive):
+    solution = alone(drive, 0)
+    found = ask_sensors(solution, with_town(drive, 1.03), START_S, CALIBRATED)
+    assert any('gyro_scale_sigma, 0.001, higher' in line for line in found.unused)
+    assert found.witnesses.gyro.agrees
+    assert abs(found.solution.camera.fx - LENS.fx) < 3 * found.solution.sigma[0]

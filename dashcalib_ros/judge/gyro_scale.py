@@ -1,0 +1,155 @@
+"""The scale of a gyro, from the headings of GPS: no picture has a part in it.
+
+Between two straights of a drive a car turned by the difference of their headings, whatever the
+camera is, and the gyro by s times that, and by its bias times the time between. A line through
+all such differences, by generalised least squares, has s as its slope: neighbours share a heading,
+and a gyro's noise adds up with the time between.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.input.motion import Samples
+
+# degrees a second, and the seconds over which they are taken; a straight has less
+STRAIGHT_DEG_S, RATE_OVER_S = 2.0, 1.0
+# s, m and fixes of a straight at the least; s that are left out at both ends, as clocks differ
+# and receivers filter
+STRAIGHT_S, STRAIGHT_M, FIXES, ENDS_S = 2.0, 20.0, 3, 0.7
+# degrees; what a heading is not better than: the aerial's place, and cambers
+HEADING_FLOOR_DEG = 0.3
+# degrees; a heading that is known worse says nothing
+HEADING_SIGMA_DEG = 5.0
+# m; fixes of one receiver share errors of this size, which no residual shows
+LEAST_NOISE_M = 0.05
+# of the median distance from a straight; fixes beyond have jumped
+JUMP = 4.0
+# degrees a root of a second: noise of cheap gyros
+GYRO_NOISE_DEG = 0.1
+# s between straights at the most; the bias drifts over more
+APART_S = 60.0
+# straights, and degrees between them in all, at the least
+LEAST_STRAIGHTS, LEAST_TURNED_DEG = 6, 240.0
+# a scale farther off is one of units, or of another drive
+SCALES = (0.7, 1.4)
+# one that is known worse tells less than that a gyro is no worse than 3 %
+LARGEST_SIGMA = 0.05
+# s between samples of a gyro; over more the angle between them is not known
+LONGEST_GAP_S = 0.35
+
+
+@dataclass(frozen=True)
+class _Straight:
+    """stamp_s: of its middle. heading: of GPS, rad; yaw: of the gyro; piece: between its gaps.
+
+    off_m2, spread_m2: sums of squares of the n fixes, across and along the way.
+    """
+
+    stamp_s: float
+    heading: float
+    off_m2: float
+    spread_m2: float
+    fixes: int
+    yaw: float = 0.0
+    piece: int = 0
+
+
+def scale_by_gps(rate: Samples, position: Samples) -> tuple[float, float] | None:
+    """Return a gyro's angles over the true ones, and the sigma; None where too little tells.
+
+    rate: rad/s about the sensor's axes, mounted in any way. position: m, east and north first.
+    """
+    _, axes = np.linalg.eigh(rate.values.T @ rate.values)
+    about_upright = rate.values @ axes[:, -1]
+    found = [each for sign in (1, -1)
+             if (each := _fitted(_straights(rate.stamps_s, sign * about_upright, position)))]
+    # about the wrong way, the headings do not follow
+    scale, sigma = max(found, default=(0.0, 0.0))
+    return (scale, sigma) if SCALES[0] < scale < SCALES[1] and sigma < LARGEST_SIGMA else None
+
+
+def _straights(stamps_s: Floats, rate: Floats, position: Samples) -> list[_Straight]:
+    """Return where the car drove straight on. rate: (n,) rad/s to the left."""
+    yaw = np.r_[0.0, np.cumsum(np.diff(stamps_s) * (rate[1:] + rate[:-1]) / 2)]
+    half = RATE_OVER_S / 2
+    turning = np.interp(stamps_s + half, stamps_s, yaw) - np.interp(stamps_s - half, stamps_s, yaw)
+    gap = np.r_[False, np.diff(stamps_s) > LONGEST_GAP_S]
+    piece = np.cumsum(gap)
+    straight = np.abs(turning) < np.radians(STRAIGHT_DEG_S) * RATE_OVER_S
+    edges = np.flatnonzero(np.diff(np.r_[False, straight, False].astype(int)) | np.r_[gap, False])
+    found = []
+    for first, past in pairwise(edges):
+        if straight[first]:
+            each = _straight(stamps_s[first] + ENDS_S, stamps_s[past - 1] - ENDS_S, position)
+            if each is not None:
+                found.append(replace(each, piece=int(piece[first]), yaw=float(
+                    np.interp(each.stamp_s, stamps_s, yaw))))
+    return found
+
+
+def _straight(begin_s: float, end_s: float, position: Samples) -> _Straight | None:
+    """Return a straight without what the gyro says; None where fixes tell no heading."""
+    inside = (position.stamps_s >= begin_s) & (position.stamps_s <= end_s)
+    when, where = position.stamps_s[inside], position.values[inside, :2]
+    for _ in range(2):
+        if len(where) < FIXES or np.ptp(when) < STRAIGHT_S:
+            return None
+        away = where - np.median(where, axis=0)
+        direction = np.linalg.svd(where - where.mean(axis=0), full_matrices=False)[2][0]
+        off = np.abs(away @ np.array([-direction[1], direction[0]]))
+        kept = off <= max(JUMP * float(np.median(off)), LEAST_NOISE_M)
+        when, where = when[kept], where[kept]
+    if len(where) < FIXES or np.ptp(when) < STRAIGHT_S:
+        return None
+    away = where - where.mean(axis=0)
+    direction = np.linalg.svd(away, full_matrices=False)[2][0]
+    direction = direction * np.sign(direction @ (where[-1] - where[0]))
+    along, left = away @ direction, away @ np.array([-direction[1], direction[0]])
+    if np.ptp(along) < STRAIGHT_M:
+        return None
+    return _Straight(float(when.mean()), float(np.arctan2(direction[1], direction[0])),
+                     float(left @ left), float(along @ along), len(where))
+
+
+def _fitted(straights: list[_Straight]) -> tuple[float, float] | None:
+    """Return the slope of the gyro's angles over the headings', and its sigma."""
+    if len(straights) < LEAST_STRAIGHTS:
+        return None
+    off_m2, spread_m2, fixes = (np.array([getattr(each, name) for each in straights])
+                                for name in ('off_m2', 'spread_m2', 'fixes'))
+    own_m = np.sqrt(off_m2 / (fixes - 2))
+    # three fixes may lie in a line by chance
+    noise_m = np.maximum(own_m, max(float(np.median(own_m)), LEAST_NOISE_M))
+    sigma = np.hypot(noise_m / np.sqrt(spread_m2), np.radians(HEADING_FLOOR_DEG))
+    usable = sigma < np.radians(HEADING_SIGMA_DEG)
+    straights = [each for each, fits in zip(straights, usable, strict=True) if fits]
+    sigma = sigma[usable]
+    pairs = [n for n, (a, b) in enumerate(pairwise(straights))
+             if a.piece == b.piece and b.stamp_s - a.stamp_s < APART_S]
+    if len(pairs) < LEAST_STRAIGHTS - 1:
+        return None
+    heading, yaw, stamps_s = (np.array([getattr(each, name) for each in straights])
+                              for name in ('heading', 'yaw', 'stamp_s'))
+    difference = np.zeros((len(pairs), len(straights)))
+    difference[np.arange(len(pairs)), pairs] = -1
+    difference[np.arange(len(pairs)), np.array(pairs) + 1] = 1
+    measured, apart_s = difference @ yaw, difference @ stamps_s
+    # headings are known but for whole turns: the nearest to what the gyro says
+    turned = difference @ heading
+    turned = measured + np.angle(np.exp(1j * (turned - measured)))
+    if np.degrees(np.abs(turned).sum()) < LEAST_TURNED_DEG:
+        return None
+    noise = np.diag(np.radians(GYRO_NOISE_DEG)**2 * apart_s)
+    covariance = difference * sigma**2 @ difference.T + noise
+    columns = np.stack([turned, apart_s], axis=1)
+    information = np.linalg.inv(covariance)
+    known = np.linalg.inv(columns.T @ information @ columns)
+    found = known @ columns.T @ information @ measured
+    left = measured - columns @ found
+    # what differs by more than it should makes the sigma larger
+    ratio = max(1.0, float(left @ information @ left) / max(len(pairs) - 2, 1))
+    return float(found[0]), float(np.sqrt(ratio * known[0, 0]))
