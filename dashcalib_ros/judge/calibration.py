@@ -168,7 +168,8 @@ class Mount:
     camera is turned clockwise, as seen from behind; None where nothing tells it. height_m: above
     the road; None where the speed is not known. sigma: by these four names. travel_px: the pixel
     (u, v) in which the car travels, with its sigma: less than that of the angles, which have the
-    centre's, too. straight_m: of straight driving.
+    centre's, too. straight_m: of straight driving. moved_s: stamp after which the camera was
+    moved, so that only what came later counts; None where it was not.
     """
 
     verdict: Literal['accepted', 'weak']
@@ -181,6 +182,7 @@ class Mount:
     travel_px: tuple[float, float]
     travel_sigma_px: float
     straight_m: float
+    moved_s: float | None = None
 
     @property
     def rotation(self) -> Floats:

@@ -155,6 +155,10 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
                              f'camera_info cannot say that, and sigma over the picture allows '
                              f'for it; `dashcalib export --to rays` has it',)
             mount = _mount(solution, evidence, verdict.level, config)
+            if mount is not None and mount.moved_s is not None:
+                warnings += (f'the camera was moved on the car '
+                             f'{mount.moved_s - evidence.start_s:.0f} s into the drive: how it '
+                             f'sits is told from there on',)
             if solution.readout_s:
                 shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.crops:

@@ -16,7 +16,7 @@ from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
-from dashcalib_ros.judge.calibration import Mount
+from dashcalib_ros.judge.calibration import MOVED_DEG, MOVED_SIGMAS, Mount
 from dashcalib_ros.reconstruct.heading import MAD, heading
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.solution import Solution
@@ -32,6 +32,10 @@ STRAIGHT_DEG_S = 2.0
 MOST_PAIR_SIGMA, PAIR_SCATTER_DEG = 1.0, 0.2
 # pairs are judged in so many blocks: neighbours share tracks and bumps
 BLOCKS, LEAST_PAIRS = 12, 8
+# pairs on either side of the moment in which a camera was moved; degrees, by which one may seem
+# to point elsewhere on other roads (KITTI 03 by 0.5 between its ends), and beyond which single
+# pairs do not count
+LEAST_SIDE, PLACES_DEG, OUTLIER_DEG = 20, 0.15, 2.0
 # degrees of yaw and of pitch; with more it is weak. openpilot's spread on one car is as large
 ACCEPTED_DEG = 0.2
 # degrees; what no source is better than: slopes, crowns and bumps, between places
@@ -76,7 +80,15 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
     pairs = _fitted(camera, _without_field(straights, solution))
     kept = (np.abs(pairs.rate_deg_s) < STRAIGHT_DEG_S) & (pairs.sigma_deg < MOST_PAIR_SIGMA)
     roll = _roll(solution.scenes, lines, camera)
-    found = _heading(pairs, kept, straights, solution.scenes, np.radians(roll[0] if roll else 0.0))
+    scenes: Sequence[Scene] = solution.scenes
+    moved_s = _moved_s(pairs, kept, straights.stamps_s)
+    if moved_s is not None:
+        # what was before is another mounting
+        kept &= straights.stamps_s > moved_s
+        scenes = [scene for scene in scenes if scene.turn.of_this_drive
+                  and scene.tracks.stamps_ns[0] / 1e9 > moved_s]
+        roll = _roll(scenes, lines and lines.chosen(lines.stamps_s > moved_s), camera)
+    found = _heading(pairs, kept, scenes, np.radians(roll[0] if roll else 0.0))
     if found is None:
         return None
     angles, sigma = found
@@ -103,7 +115,7 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
                'height_m': None if height is None else height[1]},
         travel_px=(float((travel[0] + 0.5) * px - 0.5), float((travel[1] + 0.5) * px - 0.5)),
         travel_sigma_px=float(px * np.radians(np.hypot(*sigma)) * camera.fx / np.sqrt(2)),
-        straight_m=metres)
+        straight_m=metres, moved_s=moved_s)
 
 
 def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[str, ...]:
@@ -193,21 +205,14 @@ def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
 
 # -- yaw and pitch -----------------------------------------------------------------------------
 
-def _heading(pairs: _Pairs, kept: Mask, straights: Straights, scenes: Sequence[Scene],
-             roll: float) -> tuple[Floats, Floats] | None:
+def _heading(pairs: _Pairs, kept: Mask, scenes: Sequence[Scene], roll: float
+             ) -> tuple[Floats, Floats] | None:
     """Return (2,) yaw and pitch, degrees, and their sigmas without those of the lens."""
     values, sigmas = [], []
     if kept.sum() >= LEAST_PAIRS:
-        angles = _angles(pairs.ahead[kept], roll)
-        weights = 1 / (pairs.sigma_deg[kept]**2 + PAIR_SCATTER_DEG**2)
-        rate = pairs.rate_deg_s[kept]
-        blocks = np.arange(len(weights)) * BLOCKS // len(weights)
-        without = np.array([_at_rest(angles[blocks != n], rate[blocks != n], weights[blocks != n])
-                            for n in range(blocks.max() + 1)])
-        count = len(without)
-        values.append(_at_rest(angles, rate, weights))
-        sigmas.append(np.sqrt((count - 1) / count * np.sum(
-            (without - without.mean(axis=0))**2, axis=0)))
+        value, sigma = _of_pairs(pairs, kept, roll)
+        values.append(value)
+        sigmas.append(sigma)
     for scene in scenes:
         found = heading(scene)
         if found is not None:
@@ -220,6 +225,42 @@ def _heading(pairs: _Pairs, kept: Mask, straights: Straights, scenes: Sequence[S
     both = [_averaged(np.array(values)[:, n], np.array(sigmas)[:, n], HEADING_FLOOR_DEG)
             for n in range(2)]
     return np.array([value for value, _ in both]), np.array([sigma for _, sigma in both])
+
+
+def _of_pairs(pairs: _Pairs, kept: Mask, roll: float) -> tuple[Floats, Floats]:
+    """Return (2,) yaw and pitch, degrees, of these pairs, and their sigmas (jackknife)."""
+    angles, rate = _angles(pairs.ahead[kept], roll), pairs.rate_deg_s[kept]
+    weights = 1 / (pairs.sigma_deg[kept]**2 + PAIR_SCATTER_DEG**2)
+    blocks = np.arange(len(weights)) * BLOCKS // len(weights)
+    without = np.array([_at_rest(angles[blocks != n], rate[blocks != n], weights[blocks != n])
+                        for n in range(blocks.max() + 1)])
+    count = len(without)
+    return _at_rest(angles, rate, weights), np.sqrt((count - 1) / count * np.sum(
+        (without - without.mean(axis=0))**2, axis=0))
+
+
+def _moved_s(pairs: _Pairs, kept: Mask, stamps_s: Floats) -> float | None:
+    """Return the stamp after which the camera points elsewhere, s; None where it does not.
+
+    The place where both sides differ most is asked with the sigmas of both.
+    """
+    places = np.flatnonzero(kept)
+    if len(places) < 2 * LEAST_SIDE:
+        return None
+    angles = _angles(pairs.ahead[kept], 0.0)
+    middle = np.median(angles, axis=0)
+    angles = np.clip(angles, middle - OUTLIER_DEG, middle + OUTLIER_DEG)
+    splits = range(LEAST_SIDE, len(places) - LEAST_SIDE + 1)
+    apart = [np.abs(angles[:n].mean(axis=0) - angles[n:].mean(axis=0)).max()
+             * np.sqrt(n * (len(places) - n)) for n in splits]
+    split = splits[int(np.argmax(apart))]
+    sides = [np.isin(np.arange(len(kept)), part) for part in (places[:split], places[split:])]
+    (before, its_sigma), (after, sigma) = (_of_pairs(pairs, side, 0.0) for side in sides)
+    floor = np.sqrt(2) * PLACES_DEG
+    limit = np.maximum(MOVED_DEG, MOVED_SIGMAS * np.sqrt(its_sigma**2 + sigma**2 + floor**2))
+    if (np.abs(after - before) <= limit).all():
+        return None
+    return float(stamps_s[places[split - 1]])
 
 
 def _at_rest(angles: Floats, rate: Floats, weights: Floats) -> Floats:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from solving import LENS, scenes_of, solved
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect.straights import PAIRS, POINTS, StraightCollector
+from dashcalib_ros.detect.straights import PAIRS, POINTS, StraightCollector, Straights
 from dashcalib_ros.input.scale import FULL_SIZE
 from dashcalib_ros.judge import conclude
 from dashcalib_ros.judge.calibration import OPTICAL, Mount
@@ -186,3 +186,32 @@ def test_a_camera_that_was_moved(solution):
     assert not vague.moved_from(here)
     # an angle that one does not know is not compared
     assert set(moved.apart(here)) == {'yaw_left_deg', 'pitch_up_deg'}
+
+
+def joined(before, after):
+    """Return the pairs of two drives, one behind the other."""
+    later = before.stamps_s[-1] + 1.0
+    return Straights(*(np.concatenate([getattr(before, name), getattr(after, name) + more])
+                       for name, more in (('before', 0), ('after', 0), ('stamps_s', later),
+                                          ('apart_s', 0))))
+
+
+@pytest.mark.parametrize('moved', [(1.5, 1.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 2.0, 0.0)])
+def test_a_camera_that_is_moved_during_the_drive_begins_anew(solution, moved):
+    known = replace(solution, camera=LENS, scenes=())
+    first, then = pairs_of(mounted(0.5, 1.0, 0.0), count=60), pairs_of(mounted(*moved), count=25,
+                                                                       seed=1)
+    found = mount_of(joined(first, then), None, known, 'accepted', 1.0, None)
+    assert found.moved_s == pytest.approx(first.stamps_s[-1], abs=3.0)
+    assert abs(found.yaw_left_deg - moved[0]) < 0.3 and abs(found.pitch_up_deg - moved[1]) < 0.3
+    assert mount_of(first, None, known, 'accepted', 1.0, None).moved_s is None
+
+
+def test_a_camera_that_stays_is_not_said_to_be_moved(solution):
+    known = replace(solution, camera=LENS, scenes=())
+    for seed in range(10):
+        # other roads: 0.3 degrees
+        first, then = (pairs_of(mounted(0.5 + more, 1.0, 0.0), seed=2 * seed + n)
+                       for n, more in enumerate((0.0, 0.3)))
+        found = mount_of(joined(first, then), None, known, 'accepted', 1.0, None)
+        assert found.moved_s is None

@@ -357,7 +357,8 @@ def test_how_the_camera_sits_is_compared_where_both_files_say(tmp_path, name):
         return load_camera(path)
 
     before, now = of(MOUNT), of(dataclasses.replace(MOUNT, yaw_left_deg=3.0, roll_right_deg=1.0))
-    assert before.mount == MOUNT and of(None).mount is None
+    moved = dataclasses.replace(MOUNT, moved_s=17.5)
+    assert before.mount == MOUNT and of(moved).mount == moved and of(None).mount is None
     found = compare(now, before)
     mount = found.as_dict()['mount']
     assert mount['moved'] and set(mount) == {'moved', 'yaw_left_deg', 'pitch_up_deg'}
