@@ -325,11 +325,11 @@ def scatter_between_turns(turns: Sequence[Quadratic], covariance: Floats, basis:
     return float(squares / max(freedom, 1) * tail**2)
 
 
-def is_clear(gains: Floats) -> bool:
+def is_clear(gains: Floats, least: float = LEAST_GAIN) -> bool:
     """Return whether the gains (n,) of turns, in noise variances of a track, are clear evidence.
 
-    They must be larger in sum than chance explains, and not come from one turn.
+    They must be larger in sum than least, and not come from one turn.
     """
     several = len(gains) < 2 or (np.sum(np.sort(gains)[:-1]) > 0
                                  and np.sum(gains > 0) > len(gains) / 2)
-    return bool(gains.sum() > LEAST_GAIN and several)
+    return bool(gains.sum() > least and several)
