@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dashcalib_ros.errors import DashcalibError, WorkerError, one_line
-from dashcalib_ros.fleet.extra import needs
+from dashcalib_ros.fleet.storage import needs
 from dashcalib_ros.fleet.tasks import one_thread
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.worker import THREAD_VARIABLES, Worker, WorkerDiedError

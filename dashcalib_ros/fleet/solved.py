@@ -14,8 +14,7 @@ from dashcalib_ros.camera import Camera, camera_of
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError, one_line
-from dashcalib_ros.fleet.clip_shares import ClipShare
-from dashcalib_ros.fleet.fuse import Fused
+from dashcalib_ros.fleet.fuse import ClipShare, Fused
 from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report.result import plain_values

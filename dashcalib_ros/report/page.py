@@ -14,18 +14,19 @@ import numpy as np
 from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.judge import Calibration
+from dashcalib_ros.report.camera_file import NamedCamera, calibrated_camera
 from dashcalib_ros.report.charts import magnitude_svg, mask_data_uri, segments
 from dashcalib_ros.report.compare import Comparison, answers, compare, comparison_rows
 from dashcalib_ros.report.lens import (
     WIDTH,
     Drawing,
     evidence_of,
+    field_of,
+    mounting_of,
     sigma_svg,
     slider_of,
     uncertainty_of,
 )
-from dashcalib_ros.report.mounting import field_of, mounting_of
-from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
 from dashcalib_ros.report.turns import turn_rows, turn_sections
 from dashcalib_ros.report.wording import (
     ADVICE,

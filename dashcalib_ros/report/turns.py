@@ -11,9 +11,8 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge import Calibration, TurnSummary
-from dashcalib_ros.judge.agreement import leverages
+from dashcalib_ros.judge.agreement import focal_alone, leverages
 from dashcalib_ros.judge.calibration import Material, StoredTurnSummary
-from dashcalib_ros.judge.focal_by_turn import focal_alone
 from dashcalib_ros.reconstruct.picture import TurnPicture
 from dashcalib_ros.reconstruct.scene import Scene, residuals_px
 from dashcalib_ros.report.charts import dots, jpeg_data_uri, line, segments, svg, text

@@ -8,7 +8,7 @@ import pytest
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import FleetConfig
-from dashcalib_ros.fleet.clip_shares import ClipShare
+from dashcalib_ros.fleet.fuse import ClipShare
 from dashcalib_ros.fleet.lens_prior import (
     LensPrior,
     Unit,
