@@ -1,7 +1,6 @@
 """A camera's own result as a JSON text, from which its calibration can be made again."""
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,16 +10,13 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera, camera_of
-from dashcalib_ros.config import Config
-from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError, one_line
 from dashcalib_ros.fleet.fuse import ClipShare, Fused
-from dashcalib_ros.judge import Calibration, Verdict
-from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.report.result import calibration_of, plain_values, result_dict
 from dashcalib_ros.solve.knowledge import PictureSigma
 
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -75,23 +71,14 @@ def _estimate(fused: Fused) -> Estimate | None:
 
 def encoded(solved: Solved) -> bytes:
     """Return the JSON text; the same result gives the same bytes."""
-    c, estimate = solved.calibration, solved.estimate
+    estimate = solved.estimate
     data = plain_values({
-        'format': FORMAT, 'camera': solved.camera, 'make': solved.make,
-        'shares': {name: dataclasses.asdict(share) for name, share in solved.shares.items()},
+        'format': FORMAT, 'camera': solved.camera, 'make': solved.make, 'shares': solved.shares,
         'estimate': None if estimate is None else {
-            'model': estimate.camera.model, 'params': estimate.camera.params,
-            'image_size': estimate.camera.image_size, 'covariance': estimate.covariance,
-            'of_its_noise': estimate.of_its_noise,
-            'sigma_px': estimate.sigma_px, 'sound': estimate.sound,
-            'reprojection_error_px': estimate.reprojection_error_px},
-        'calibration': {
-            'verdict': c.verdict.level, 'reasons': c.verdict.reasons, 'frames': c.frames,
-            'image_size': c.image_size, 'versions': c.versions, 'warnings': c.warnings,
-            'details': c.details, 'config': c.config.flat(), 'shutter': c.rolling_shutter,
-            'stabiliser': c.stabiliser,
-            'turns': [{**dataclasses.asdict(turn), 'id': turn.id.number}
-                      for turn in c.stored_turns]}})
+            **vars(estimate), 'camera': None, 'model': estimate.camera.model,
+            'params': estimate.camera.params, 'image_size': estimate.camera.image_size},
+        # a make's prior moves the camera, and these are of the one before
+        'calibration': result_dict(replace(solved.calibration, field=None, held_out=()))})
     return json.dumps(data, allow_nan=False, sort_keys=True).encode()
 
 
@@ -103,7 +90,8 @@ def decoded(data: bytes, name: str) -> Solved:
             raise ValueError(f'it has format {content["format"]}, this version has {FORMAT}')
         estimate = _decoded_estimate(content['estimate'])
         return Solved(
-            content['camera'], content['make'], _calibration(content, estimate), estimate,
+            content['camera'], content['make'], _calibration(content['calibration'], estimate),
+            estimate,
             {clip: ClipShare(**share) for clip, share in content['shares'].items()})
     except Exception as error:  # damaged files raise errors of all kinds
         raise InputError(f'{name} is no result of a camera ({one_line(error, 120)}); remove it, '
@@ -113,7 +101,7 @@ def decoded(data: bytes, name: str) -> Solved:
 def _decoded_estimate(data: Mapping[str, Any] | None) -> Estimate | None:
     if data is None:
         return None
-    camera = camera_of(data['model'], _size(data['image_size']), data['params'])
+    camera = camera_of(data['model'], tuple(data['image_size']), data['params'])
     # JSON has no infinity: what was not finite is not known at all
     covariance, of_its_noise = (
         np.array([[np.inf if value is None else value for value in row] for row in table], float)
@@ -122,33 +110,16 @@ def _decoded_estimate(data: Mapping[str, Any] | None) -> Estimate | None:
                     data['reprojection_error_px'], data['sound'])
 
 
-def _calibration(content: Mapping[str, Any], estimate: Estimate | None) -> Calibration:
-    c = content['calibration']
-    verdict = Verdict(c['verdict'], tuple(c['reasons']))
-    known = estimate if verdict.level != 'refused' else None
-    return Calibration(
-        verdict=verdict, image_size=_size(c['image_size']),
-        camera=None if known is None else known.camera,
-        sigma=None if known is None else sigmas(known.camera, known.covariance), turns=(),
-        frames=c['frames'], timing={}, versions=c['versions'],
-        reprojection_error_px=None if known is None else known.reprojection_error_px,
-        config=Config().replace(c['config']), input_name=content['camera'],
-        warnings=tuple(c['warnings']), details=c['details'],
-        stored_turns=tuple(StoredTurnSummary(**{**turn, 'id': TurnId.stored(turn['id'])})
-                           for turn in c['turns']),
-        rolling_shutter=None if c['shutter'] is None else Shutter(**c['shutter']),
-        stabiliser=None if c['stabiliser'] is None else Stabiliser(**c['stabiliser']),
-        sigma_px=None if known is None else known.sigma_px)
+def _calibration(data: Mapping[str, Any], estimate: Estimate | None) -> Calibration:
+    if estimate is None or data['verdict'] == 'refused':
+        return calibration_of(data, None)
+    return replace(calibration_of(data, estimate.camera),
+                   sigma=sigmas(estimate.camera, estimate.covariance), sigma_px=estimate.sigma_px)
 
 
 def sigmas(camera: Camera, covariance: Floats) -> dict[str, float]:
     """Return the standard deviations by the parameters' names."""
     return dict(zip(camera.names(), np.sqrt(np.diag(covariance)).tolist(), strict=True))
-
-
-def _size(data: Any) -> tuple[int, int]:
-    width, height = data
-    return int(width), int(height)
 
 
 def _picture(data: Mapping[str, Any]) -> PictureSigma:

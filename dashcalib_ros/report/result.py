@@ -100,12 +100,12 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     refused = data.get('verdict') == 'refused'
     camera = None if refused else parse_camera(text, place).camera
     try:
-        return _calibration(data, camera)
+        return calibration_of(data, camera)
     except (KeyError, TypeError, ValueError, AttributeError, DashcalibError) as error:
         raise InputError(f'{place} is damaged ({one_line(error)}); calibrate again') from error
 
 
-def _calibration(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
+def calibration_of(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
     """Return the calibration that result_dict() gave these values."""
     def made(kind: type[Any], key: str) -> Any:
         return None if data.get(key) is None else kind(**data[key])
