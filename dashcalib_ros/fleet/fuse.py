@@ -16,6 +16,7 @@ from dashcalib_ros.config import Config, VerdictConfig
 from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
+from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.judge.agreement import turns_of_another_camera
 from dashcalib_ros.judge.conclude import Evidence
@@ -113,15 +114,11 @@ def _other_sizes(clips: Sequence[Clip]) -> dict[str, str]:
     if len(origins) < 2:
         return {}
     main = max(origins, key=weight)
-    return {clip.name: f'is {_by(clip.gathered.origin.image_size)}, most of this camera are '
-                       f'{_by(main.image_size)}'
+    return {clip.name: f'is {by(clip.gathered.origin.image_size)}, most of this camera are '
+                       f'{by(main.image_size)}'
             if clip.gathered.origin.image_size != main.image_size else
             'was gathered with other settings of max_width or min_width than most'
             for clip in clips if clip.gathered.origin != main}
-
-
-def _by(size: tuple[int, int]) -> str:
-    return f'{size[0]}x{size[1]}'
 
 
 def _numbered(clips: Sequence[Clip]) -> dict[TurnId, ClipTurn]:

@@ -23,6 +23,7 @@ from dashcalib_ros.input.source import (
     FrameSource,
     Picture,
     Reading,
+    by,
     by_name,
     is_bag_file,
     os_error,
@@ -351,12 +352,12 @@ class JoinedSource(FrameSource):
     def __init__(self, parts: Sequence[FrameSource], warnings: tuple[str, ...] = ()) -> None:
         self._parts = tuple(parts)
         first = self._parts[0]
-        sized = [part for part in self._parts if part.size is not None]
-        for part in sized:
-            if part.size != sized[0].size:
+        sized = [(part.name, part.size) for part in self._parts if part.size is not None]
+        for name, size in sized:
+            if size != sized[0][1]:
                 raise InputError(
-                    f'{part.name} is {_by(part)} and {sized[0].name} is {_by(sized[0])}: a '
-                    f'calibration holds for one size; calibrate each size on its own')
+                    f'{name} is {by(size)} and {sized[0][0]} is {by(sized[0][1])}: a calibration '
+                    f'holds for one size; calibrate each size on its own')
         counts = [part.count for part in self._parts]
         lengths = [part.length_ns for part in self._parts]
         super().__init__(
@@ -453,11 +454,6 @@ class _Place:
         if step > 0:
             return _Joint(0, gap=step > CONTINUES_NS)
         return _Joint(self._next_ns - stamp_ns, gap=True)
-
-
-def _by(part: FrameSource) -> str:
-    width, height = part.size or (0, 0)
-    return f'{width}x{height}'
 
 
 def _together(told: Sequence[tuple[str, Sequence[str]]]) -> tuple[str, ...]:

@@ -11,14 +11,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as default
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.solve.knowledge import PictureSigma, SigmaMap, sigma_over
 from dashcalib_ros.solve.solution import Solution
 
@@ -213,23 +217,42 @@ def difference_of(given: Camera, solution: Solution, px: float
         PictureSigma(solution.picture.rms * px, solution.picture.worst * px))
 
 
-class Known(Protocol):
-    """A camera of a file, with what the file says of its uncertainty; None: nothing."""
+@dataclass(frozen=True)
+class NamedCamera:
+    """A camera as a file or a truth has it, with its name, sigma and verdict.
+
+    name: where it is from, for messages. sigma: by the parameters' names; None unless all are
+    known. verdict: accepted or weak; None where the file has none (a truth, another tool's file).
+    covariance: (n, n) of the parameters, as the picture shows them, and sigma_px: over the
+    picture; None where the file does not say.
+    field: what its lens model leaves over, where a result.json has one that is used. mount: how it
+    sits on the car, where the file says.
+    faults: in words, of what else stands beside the camera (ROS's K, R and P).
+    """
+
+    name: str
+    camera: Camera
+    sigma: Mapping[str, float] | None = None
+    verdict: str | None = None
+    covariance: Floats | None = default(default=None, compare=False)
+    sigma_px: PictureSigma | None = None
+    field: Field | None = default(default=None, compare=False)
+    mount: Mount | None = default(default=None, compare=False)
+    faults: tuple[str, ...] = ()
+
+    def without_faults(self) -> NamedCamera:
+        """Return it; raises InputError where something beside the camera is wrong."""
+        if self.faults:
+            raise InputError(f'{self.name}: {"; ".join(self.faults)}; no model here has that')
+        return self
 
     @property
-    def camera(self) -> Camera:
-        """Return the camera."""
-
-    @property
-    def covariance(self) -> Floats | None:
-        """Return the (n, n) covariance of its parameters, the one behind sigma_px."""
-
-    @property
-    def sigma_px(self) -> PictureSigma | None:
-        """Return its sigma over the picture."""
+    def image_size(self) -> tuple[int, int]:
+        """Return (width, height) in pixels."""
+        return self.camera.image_size
 
 
-def difference_between(given: Known, found: Known) -> Difference:
+def difference_between(given: NamedCamera, found: NamedCamera) -> Difference:
     """Compare two cameras of which there is no more than what their files say."""
     # in the parameters of one whose covariance is known, so that theirs together has full rank
     base = found if found.covariance is not None else given

@@ -1,6 +1,7 @@
 """calibration.yaml, result.json, report.html; comparisons; what a terminal shows: tables.py."""
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.report.camera_file import NamedCamera, calibrated_camera, load_camera
+from dashcalib_ros.judge.difference import NamedCamera
+from dashcalib_ros.report.camera_file import calibrated_camera, load_camera
 from dashcalib_ros.report.camera_yaml import calibration_yaml
 from dashcalib_ros.report.compare import compare
 from dashcalib_ros.report.files import (

@@ -14,8 +14,6 @@ import struct
 import xml.etree.ElementTree as ElementTree
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from dataclasses import field as default
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,6 +41,7 @@ from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.source import os_error
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import ANGLES, Mount
+from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import (
     JSON_BYTES,
     SIDE,
@@ -55,43 +54,6 @@ from dashcalib_ros.limits import (
 from dashcalib_ros.solve.knowledge import PictureSigma
 
 Data = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class NamedCamera:
-    """A camera with its name, sigma and verdict.
-
-    name: where it is from, for messages. sigma: by the parameters' names; None unless all are
-    known. verdict: accepted or weak; None where the file has none (a truth, another tool's file).
-    covariance: (n, n) of the parameters, as the picture shows them, and sigma_px: over the
-    picture; None where the file does not say.
-    field: what its lens model leaves over, where a result.json has one that is used. mount: how it
-    sits on the car, where the file says.
-    faults: in words, of what else stands beside the camera (ROS's K, R and P).
-    """
-
-    name: str
-    camera: Camera
-    sigma: Mapping[str, float] | None = None
-    verdict: str | None = None
-    covariance: Floats | None = default(default=None, compare=False)
-    sigma_px: PictureSigma | None = None
-    field: Field | None = default(default=None, compare=False)
-    mount: Mount | None = default(default=None, compare=False)
-    faults: tuple[str, ...] = ()
-
-    def without_faults(self) -> NamedCamera:
-        """Return it; raises InputError where something beside the camera is wrong."""
-        if self.faults:
-            raise InputError(f'{self.name}: {"; ".join(self.faults)}; no model here has that')
-        return self
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Return (width, height) in pixels."""
-        return self.camera.image_size
-
-
 # reads one camera of a file; one that says nothing but the camera gives just that
 Reader = Callable[[], Camera | NamedCamera]
 

@@ -11,8 +11,7 @@ from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.difference import Difference as WholeDifference
-from dashcalib_ros.judge.difference import answers_of, difference_between
-from dashcalib_ros.report.camera_file import NamedCamera
+from dashcalib_ros.judge.difference import NamedCamera, answers_of, difference_between
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.wording import digits_of, mounts_text, number, optional
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.report.camera_file import NamedCamera, load_camera
+from dashcalib_ros.judge.difference import NamedCamera
+from dashcalib_ros.report.camera_file import load_camera
 from dashcalib_ros.report.camera_yaml import CAMERA_NAME, calibration_yaml
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.result import result_json

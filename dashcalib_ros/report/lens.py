@@ -15,11 +15,10 @@ from dashcalib_ros.judge.calibration import Material, Mount
 from dashcalib_ros.reconstruct.scene import Profile, Scene, residuals_px
 from dashcalib_ros.report.charts import (
     Axes,
+    data_uri,
     dots,
-    jpeg_data_uri,
     line,
     log_ticks,
-    png_data_uri,
     polyline,
     segments,
     svg,
@@ -87,7 +86,7 @@ def slider_of(c: Calibration) -> Slider | None:
     camera = c.camera.resized(width / c.image_size[0], (width, height))
     straight, bent_grid, straight_grid, moved = undistorted(image, camera, c.config.rectified)
     moved *= c.image_size[0] / width
-    return Slider(jpeg_data_uri(image), jpeg_data_uri(straight), bent_grid, straight_grid, width,
+    return Slider(data_uri(image), data_uri(straight), bent_grid, straight_grid, width,
                   height, f'The orange grid is of the same rays on both sides. The lens moves '
                           f'points by up to {moved:.0f} px.')
 
@@ -338,7 +337,8 @@ def _heat(share: Floats, width: float, height: float) -> str:
     colour = RAMP[below] * (1 - part) + RAMP[below + 1] * part
     image = np.dstack([colour, np.where(known, 255, 0)]).round().astype(np.uint8)
     smooth = '' if share.shape[1] > 40 else ' style="image-rendering:pixelated"'
-    return (f'<image href="{png_data_uri(image)}" width="{width:g}" height="{height:g}" '
+    href = data_uri(image, 'png')
+    return (f'<image href="{href}" width="{width:g}" height="{height:g}" '
             f'preserveAspectRatio="none"{smooth}/>')
 
 
@@ -424,7 +424,7 @@ def _horizon(c: Calibration, mount: Mount, camera: Camera) -> Drawing:
     pictures = {} if c.material is None else c.material.pictures
     shown = next((pictures[turn.id].image for turn in c.turns if turn.id in pictures), None)
     below = '' if shown is None else (
-        f'<image href="{jpeg_data_uri(shown)}" width="{WIDTH}" height="{height * small:g}" '
+        f'<image href="{data_uri(shown)}" width="{WIDTH}" height="{height * small:g}" '
         f'preserveAspectRatio="none"/>')
     u, v = small * mount.travel_px[0], small * mount.travel_px[1]
     marks = ''.join([polyline(small * seen[inside], 'ruler') if inside.sum() > 1 else '',
