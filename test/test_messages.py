@@ -46,7 +46,12 @@ PARTS = {
         'it is no file of turns, or one of an older version', '… is not finite, or too large',
         'it is compressed in an unknown way', '… is smaller than its header says'},
     'turn_store.py': {'set turns.store to a folder you may write to'},
-    'cli/run.py': {'written: … with … messages on …'},
+    'cli/run.py': {
+        'written: … with … messages on …', 'rendered and calibrated in … s',
+        'no estimate to compare with the truth', '…\nnext: dashcalib run, with the same INPUT',
+        '…\nnext: record a drive with turns at crossings, in daylight',
+        'prominence: how far a turn stands out from the driving before and after it, as a share '
+        'of the picture width; frames are counted from 0'},
     'workers/child.py': {'used no processor time for … s'},
     'workers/inline.py': {' in the environment before Python starts'},
     'workers/pool.py': {'…; … is tried again'},
