@@ -19,7 +19,6 @@ from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.judge import Calibration, Check, Odometry, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import (
     LensField,
-    Mount,
     Shutter,
     Stabiliser,
     StoredTurnSummary,
@@ -27,7 +26,7 @@ from dashcalib_ros.judge.calibration import (
     Witnesses,
 )
 from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, read_text
-from dashcalib_ros.report.camera_file import parse_camera
+from dashcalib_ros.report.camera_file import parse_camera, read_mount
 from dashcalib_ros.solve.cross_validation import LeftOut
 from dashcalib_ros.solve.knowledge import PictureSigma
 
@@ -140,7 +139,7 @@ def calibration_of(data: Mapping[str, Any], camera: Camera | None) -> Calibratio
         field=None if field is None else LensField(
             Field(size, np.array(field['coefficients'], np.float64)), bool(field['used']),
             field['rms_px'], field['worst_px'], field['sigma_px']),
-        mount=mount_of(data.get('mount')),
+        mount=read_mount(data.get('mount')),
         held_out=tuple(held_out), straight_lines=made(Bend, 'straight_lines'),
         witnesses=_witnesses(data.get('witnesses') or {}))
 
@@ -152,14 +151,6 @@ def _witnesses(data: Mapping[str, Any]) -> Witnesses:
     return Witnesses(**{
         name: Witness(**{key: frozen(value) for key, value in said.items()})
         for name, said in data.items() if said is not None})
-
-
-def mount_of(values: Mapping[str, Any] | None) -> Mount | None:
-    """Return the mount that result_dict() gave these values; None for None."""
-    if values is None:
-        return None
-    u, v = values['travel_px']
-    return Mount(**{**values, 'reasons': tuple(values['reasons']), 'travel_px': (u, v)})
 
 
 def plain_values(value: Any) -> Any:
