@@ -15,7 +15,7 @@ from dashcalib_ros.fleet import lens_prior, overview, tables
 from dashcalib_ros.fleet.engine import Died, Engine, Task
 from dashcalib_ros.fleet.fuse import ClipShare
 from dashcalib_ros.fleet.manifest import Row, by_camera
-from dashcalib_ros.fleet.posterior import Final, unit_of
+from dashcalib_ros.fleet.solved import Final, unit_of
 from dashcalib_ros.fleet.storage import Folder
 from dashcalib_ros.fleet.tasks import (
     ClipResult,

@@ -15,7 +15,7 @@ import numpy as np
 from dashcalib_ros.camera import calibrated_models
 from dashcalib_ros.fleet.fuse import ClipShare
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.posterior import Final
+from dashcalib_ros.fleet.solved import Final
 from dashcalib_ros.fleet.storage import Folder, has
 from dashcalib_ros.fleet.tasks import ClipResult, camera_folder
 from dashcalib_ros.judge.calibration import ANGLES, Mount

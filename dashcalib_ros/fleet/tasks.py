@@ -25,7 +25,7 @@ from dashcalib_ros.fleet import solved
 from dashcalib_ros.fleet.fuse import Clip, fuse
 from dashcalib_ros.fleet.lens_prior import Verdict
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.posterior import Final, final_of
+from dashcalib_ros.fleet.solved import Final, final_of
 from dashcalib_ros.fleet.storage import Folder, clip_files, is_url, local_copy, stamp
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.inputs import open_frames

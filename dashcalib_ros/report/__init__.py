@@ -2,7 +2,6 @@
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.report.camera_file import calibrated_camera, load_camera
-from dashcalib_ros.report.camera_yaml import calibration_yaml
 from dashcalib_ros.report.compare import compare
 from dashcalib_ros.report.files import (
     Written,
@@ -16,6 +15,7 @@ from dashcalib_ros.report.files import (
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.result import (
     answer_dict,
+    calibration_yaml,
     load_calibration,
     result_dict,
     result_json,

@@ -29,7 +29,7 @@ from dashcalib_ros.report import (
     write_text,
 )
 from dashcalib_ros.report.camera_file import parse_camera, read_mount
-from dashcalib_ros.report.camera_yaml import matrix_block, yaml_text
+from dashcalib_ros.report.result import matrix_block, yaml_text
 from dashcalib_ros.whole_files import remove_leftovers
 
 # camera_info_manager's

@@ -18,8 +18,7 @@ from dashcalib_ros.fleet.lens_prior import (
     lens_prior,
     priors,
 )
-from dashcalib_ros.fleet.posterior import conditioned, final_of, unit_of
-from dashcalib_ros.fleet.solved import Estimate, Solved
+from dashcalib_ros.fleet.solved import Estimate, Solved, conditioned, final_of, unit_of
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge import Verdict as OwnVerdict
 from dashcalib_ros.solve.knowledge import PictureSigma
