@@ -60,7 +60,7 @@ class Frame:
     frame_id: the message header's; empty where there is none.
     after_gap: images are missing before it, or it is of another drive.
     perhaps_after_gap: the first of another file that may or may not go on where the one before
-    ended, as the next video of a dashcam; how the picture moves tells (motion/continuity.py).
+    ended, as the next video of a dashcam; how the picture moves tells (detect/continuity.py).
     Raises InputError for a stamp that is no finite number of 64 bits.
     """
 
