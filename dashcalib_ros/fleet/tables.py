@@ -175,8 +175,8 @@ def _plain(value: Any) -> Any:
     return value if not isinstance(value, float) or np.isfinite(value) else None
 
 
-_WORDS = ('camera', 'make', 'verdict', 'verdict_alone', 'model', 'prior_note', 'folder', 'clip',
-          'status', 'reason', 'content', 'file')
+_WORDS = ('camera', 'make', 'verdict', 'verdict_alone', 'mount_verdict', 'model', 'prior_note',
+          'folder', 'clip', 'status', 'reason', 'content', 'file')
 _NUMBERS = ('width', 'height', 'clips', 'clips_used', 'clips_left_out', 'clips_unreadable',
             'turns', 'turns_used', 'prior_units', 'row', 'frames', 'scenes')
 
