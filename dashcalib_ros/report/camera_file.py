@@ -591,7 +591,8 @@ def read_mount(data: Any) -> Mount | None:
                      tuple(map(str, data['reasons'])), read_number(data, 'yaw_left_deg', ''),
                      read_number(data, 'pitch_up_deg', ''), roll, height, sigma,
                      (travel[0], travel[1]), read_number(data, 'travel_sigma_px', ''),
-                     read_number(data, 'straight_m', ''))
+                     read_number(data, 'straight_m', ''),
+                     None if data.get('moved_s') is None else read_number(data, 'moved_s', ''))
     except (KeyError, IndexError, TypeError, ValueError, InputError):
         return None
 
