@@ -145,6 +145,6 @@ def read(scenes: Sequence[Scene], camera: Camera, config: Config,
 
     camera: of the scenes' pictures.
     """
-    from dashcalib_ros.judge.reading import reading_of
+    from dashcalib_ros.judge.monitor import reading_of
     progress('the turns with the camera in use', 0.0)
     return tuple(reading_of(scene, camera, config) for scene in scenes)

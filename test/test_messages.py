@@ -9,15 +9,14 @@ from messages import PACKAGE, messages_in
 
 DOCUMENT = Path(__file__).parents[1] / 'docs' / 'troubleshooting.md'
 EXPLAINED = ('judge/agreement.py', 'judge/calibration.py', 'judge/conclude.py',
-             'judge/focal_by_turn.py', 'judge/mount.py', 'judge/next_turn.py',
-             'judge/verdict.py', 'judge/witnesses.py',
+             'judge/mount.py', 'judge/verdict.py', 'judge/witnesses.py',
              'selection.py', 'input', 'detect',
              'reconstruct/scene_file.py', 'turn_store.py', 'workers', 'cli/run.py')
 # texts that are no messages: parts of others that are shown with them, SQL, code
 PARTS = {
     'judge/calibration.py': {'from one turn alone, which nothing confirms'},
     'judge/conclude.py': {'…, with … times the error of a camera of its own'},
-    'judge/next_turn.py': {'…: fx to about … %'},
+    'judge/agreement.py': {'…: fx to about … %'},
     'judge/witnesses.py': {'write rad/s, not degrees a second'},
     'judge/verdict.py': {
         'check its scale, its clock and that it is of this drive, and leave it away if it is '
@@ -30,14 +29,13 @@ PARTS = {
         'no car turns at … rad/s; write rad/s, not degrees a second',
         'they are not of one drive'},
     'input/motion_files.py': {'stamp_s and any of …'},
-    'input/joined.py': {' (and … more like it)'},
     'input/bag_write.py': {
         'compressed must be jpeg, png or None, not …',
         "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"},
     'input/bag_salvage.py': {'… does not start like a bag', '… has a broken chunk (…)'},
-    'input/bag_source.py': {'… images; how many are lost is not known', '… (…, … images…)',
-                       '… of … images; … are lost', '… of … images; none is lost'},
     'input/bag_storage.py': {
+        '… images; how many are lost is not known', '… (…, … images…)',
+        '… of … images; … are lost', '… of … images; none is lost',
         "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again or record it again', 'the index does not lead to all messages'},
     'input/bag_unpack.py': {'a part of the bag', 'a packed part is cut off'},
@@ -48,7 +46,12 @@ PARTS = {
         'it is no file of turns, or one of an older version', '… is not finite, or too large',
         'it is compressed in an unknown way', '… is smaller than its header says'},
     'turn_store.py': {'set turns.store to a folder you may write to'},
-    'cli/run.py': {'written: … with … messages on …'},
+    'cli/run.py': {
+        'written: … with … messages on …', 'rendered and calibrated in … s',
+        'no estimate to compare with the truth', '…\nnext: dashcalib run, with the same INPUT',
+        '…\nnext: record a drive with turns at crossings, in daylight',
+        'prominence: how far a turn stands out from the driving before and after it, as a share '
+        'of the picture width; frames are counted from 0'},
     'workers/child.py': {'used no processor time for … s'},
     'workers/inline.py': {' in the environment before Python starts'},
     'workers/pool.py': {'…; … is tried again'},

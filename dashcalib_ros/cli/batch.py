@@ -15,11 +15,10 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.errors import counted
 from dashcalib_ros.fleet.batch import Camera, Fleet, problems, shard_of
 from dashcalib_ros.fleet.batch import batch as calibrate_fleet
-from dashcalib_ros.fleet.effort import Effort
 from dashcalib_ros.fleet.engine import Engine, OneWorker, RayEngine
 from dashcalib_ros.fleet.manifest import Row, by_camera, read_manifest
 from dashcalib_ros.fleet.storage import Folder
-from dashcalib_ros.fleet.tasks import ClipResult
+from dashcalib_ros.fleet.tasks import ClipResult, Effort
 from dashcalib_ros.standard_streams import folded, write_stderr
 
 # problems that are shown; the table has all

@@ -16,8 +16,8 @@ from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import folded, open_closed_streams, write_stderr
 
 # imported only when they are called: --help must not wait for numpy and OpenCV
-COMMANDS = {'run': 'dashcalib_ros.cli.run', 'turns': 'dashcalib_ros.cli.turns',
-            'demo': 'dashcalib_ros.cli.demo', 'compare': 'dashcalib_ros.cli.cameras',
+COMMANDS = {'run': 'dashcalib_ros.cli.run', 'turns': 'dashcalib_ros.cli.run',
+            'demo': 'dashcalib_ros.cli.run', 'compare': 'dashcalib_ros.cli.cameras',
             'export': 'dashcalib_ros.cli.cameras', 'check': 'dashcalib_ros.cli.check',
             'batch': 'dashcalib_ros.cli.batch'}
 

@@ -1,22 +1,43 @@
-"""dashcalib run: a recorded drive -> calibration.yaml, result.json, report.html."""
+"""dashcalib run, turns (detection only) and demo (a rendered drive with a known lens)."""
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import dataclasses
+import json
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
+from time import perf_counter
+from typing import Any
 
 from rich.text import Text
 
-from dashcalib_ros.cli.arguments import exit_code
-from dashcalib_ros.cli.drive import calibrate, open_drive, read_config, read_sensors
-from dashcalib_ros.cli.terminal import Screen, Stages, warn
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.camera import Radial, camera_of
+from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
+from dashcalib_ros.cli.drive import calibrate, feed, open_drive, read_config, read_sensors
+from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
+from dashcalib_ros.detect import Turn
+from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.errors import InputError, OutputError, counted
 from dashcalib_ros.input import FrameSource
+from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.report import Written, output_folder, result_json, write_results
-from dashcalib_ros.report.files import ACCEPTED
-from dashcalib_ros.report.tables import conclusion, next_step, summary
+from dashcalib_ros.report import (
+    NamedCamera,
+    Written,
+    calibrated_camera,
+    compare,
+    output_folder,
+    result_json,
+    write_results,
+    write_text,
+)
+from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE
+from dashcalib_ros.report.files import TRUTH
+from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.report.tables import TextTable, against_truth, conclusion, next_step, summary
 from dashcalib_ros.standard_streams import write_stdout
 
 
@@ -74,10 +95,98 @@ def set_aside_lines(written: Written) -> tuple[str, ...]:
     """Return a warning if an earlier calibration was set aside."""
     if written.set_aside is None:
         return ()
-    old = written.set_aside.with_name(ACCEPTED)
+    old = written.set_aside.with_name(ACCEPTED_FILE)
     return (f'the calibration that was in {old} is now {written.set_aside}',)
 
 
 def now() -> str:
     """Return the time as calibration.yaml's provenance has it."""
     return datetime.now(timezone.utc).isoformat(timespec='seconds')
+
+
+COLUMNS = ('at s', 'frame', 'from', 'to', 'images', 'prominence')
+PROMINENCE = ('prominence: how far a turn stands out from the driving before and after it, as a '
+              'share of the picture width; frames are counted from 0')
+
+
+def turns(args: argparse.Namespace) -> int:
+    """List the turns found, best first. The exit code is 0, also if there are none."""
+    config = read_config(args)
+    source, mask = open_drive(args)
+    detection = Detection(config, mask)
+    with Stages(args.quiet) as stages:
+        frames = feed(detection, source, mask, stages)
+    detection.finish()
+    found = [_row(turn) for turn in detection.turns()]
+    warn((*source.warnings, *detection.warnings()))
+    if args.json:
+        write_stdout(json.dumps(plain_values({
+            'input': source.name, 'frames': frames, 'turns': found,
+            'warnings': (*source.warnings, *detection.warnings())}), indent=2, allow_nan=False))
+        return ACCEPTED
+    if found:
+        show(TextTable(COLUMNS, [_cells(row, detection.start_s) for row in found]))
+        show(Text(PROMINENCE))
+    show(Text(_conclusion(len(found), config.turns.wanted, frames)))
+    return ACCEPTED
+
+
+def _conclusion(found: int, wanted: int, frames: int) -> str:
+    text = f'{found} of {counted(wanted, "turn")} wanted, in {counted(frames, "frame")}'
+    if found:
+        return f'{text}\nnext: dashcalib run, with the same INPUT'
+    return f'{text}\nnext: record a drive with turns at crossings, in daylight'
+
+
+def _row(turn: Turn) -> dict[str, Any]:
+    return {'center': turn.center, 'first': turn.first, 'last': turn.last,
+            'stamp': turn.stamp_s, 'prominence': turn.prominence, 'images': turn.images}
+
+
+def _cells(row: dict[str, Any], start_s: float) -> tuple[str, ...]:
+    return (f'{row["stamp"] - start_s:.1f}', str(row['center']), str(row['first']),
+            str(row['last']), str(row['images']), f'{row["prominence"]:.4f}')
+
+
+def demo(args: argparse.Namespace) -> int:
+    """Render, calibrate, compare with the truth; return the verdict's exit code."""
+    from dashcalib_ros.demo import demo_drive, render_to_bag
+    started = perf_counter()
+    config = read_config(args)
+    drive = demo_drive(config.seed)
+    with output_folder(args.out) as out:
+        with Stages(args.quiet) as stages, _bag_path(out, args.keep_bag) as bag:
+            stages.show('rendering the drive')
+            render_to_bag(drive, bag)
+            calibration = calibrate(open_frames(bag), config, None, args.verbose, stages)
+        calibration = dataclasses.replace(calibration, input_name=f'demo drive {config.seed}')
+        size = calibration.image_size
+        truth = NamedCamera('truth', camera_of(Radial.model, size, list(drive.truth.values())))
+        written = write_results(calibration, out, created=now(), truth=truth)
+        values = {**drive.truth, 'width': size[0], 'height': size[1]}
+        write_text(out / TRUTH, json.dumps(values, allow_nan=False) + '\n')
+    warn((*calibration.warnings, *set_aside_lines(written)))
+    files = [*written.files, out / TRUTH, *([out / 'bag'] if args.keep_bag else [])]
+    screen = Screen(args.quiet)
+    screen.show(conclusion(calibration.verdict))
+    screen.show(summary(calibration))
+    if calibration.camera is None:
+        screen.show(Text('no estimate to compare with the truth'))
+    else:
+        screen.show(Text('\nagainst the truth'))
+        screen.show(against_truth(compare(calibrated_camera(calibration), truth)))
+    screen.show(Text(files_line(out, files)))
+    screen.show(Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'))
+    screen.show(next_step(calibration.verdict))
+    return exit_code(calibration.verdict.level)
+
+
+@contextmanager
+def _bag_path(out: Path, keep: bool) -> Iterator[Path]:
+    if keep:
+        if (out / 'bag').exists():
+            raise OutputError(f'{out / "bag"} exists; remove it or choose another --out')
+        yield out / 'bag'
+        return
+    with tempfile.TemporaryDirectory(prefix='dashcalib-demo-') as folder:
+        yield Path(folder) / 'bag'

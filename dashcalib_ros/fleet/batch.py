@@ -12,14 +12,14 @@ from typing import Any
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, one_line
 from dashcalib_ros.fleet import lens_prior, overview, tables
-from dashcalib_ros.fleet.clip_shares import ClipShare
-from dashcalib_ros.fleet.effort import Effort
 from dashcalib_ros.fleet.engine import Died, Engine, Task
+from dashcalib_ros.fleet.fuse import ClipShare
 from dashcalib_ros.fleet.manifest import Row, by_camera
-from dashcalib_ros.fleet.posterior import Final, unit_of
+from dashcalib_ros.fleet.solved import Final, unit_of
 from dashcalib_ros.fleet.storage import Folder
 from dashcalib_ros.fleet.tasks import (
     ClipResult,
+    Effort,
     gather_clip,
     publish_camera,
     set_aside,

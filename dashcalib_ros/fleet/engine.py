@@ -9,14 +9,15 @@ import math
 import os
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from dashcalib_ros.errors import DashcalibError, WorkerError, one_line
-from dashcalib_ros.fleet.extra import needs
+from dashcalib_ros.fleet.storage import needs
 from dashcalib_ros.fleet.tasks import one_thread
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.worker import THREAD_VARIABLES, Worker, WorkerDiedError
@@ -54,34 +55,36 @@ def _known(error: Exception) -> DashcalibError:
                        f'dashcalib: report it with the clip')
 
 
-class Engine(Protocol):
+class Engine(ABC):
     """Runs tasks; outcomes come in any order."""
+
+    def __init__(self, attempts: int) -> None:
+        self._waiting: deque[Task] = deque()
+        self._attempts = attempts
 
     def submit(self, task: Task, first: bool = False) -> None:
         """Take a task; first: before all that wait."""
+        (self._waiting.appendleft if first else self._waiting.append)(task)
 
+    @abstractmethod
     def outcomes(self) -> Iterator[tuple[tuple[str, str], Any]]:
         """Yield (key, result), until no task is left; tasks may be submitted meanwhile.
 
         A result is what the function returned, the DashcalibError that it raised, or Died.
         """
 
+    @abstractmethod
     def close(self) -> None:
         """End the workers."""
 
 
-class OneWorker:
+class OneWorker(Engine):
     """One worker, one task after the other; see Engine."""
 
     def __init__(self, attempts: int, worker: Worker | None = None) -> None:
         """worker: a child process where None is given."""
-        self._waiting: deque[Task] = deque()
-        self._attempts = attempts
+        super().__init__(attempts)
         self._worker = worker or ChildWorker()
-
-    def submit(self, task: Task, first: bool = False) -> None:
-        """Take a task; see Engine."""
-        (self._waiting.appendleft if first else self._waiting.append)(task)
 
     def outcomes(self) -> Iterator[tuple[tuple[str, str], Any]]:
         """Yield the outcomes; see Engine."""
@@ -105,7 +108,7 @@ class OneWorker:
         self._worker.close()
 
 
-class RayEngine:
+class RayEngine(Engine):
     """Ray's workers, one thread and one task each; see Engine.
 
     A task whose node was lost is tried again without being counted: that is no fault of its own.
@@ -117,13 +120,12 @@ class RayEngine:
 
         Raises ConfigError without Ray, WorkerError where it does not start.
         """
+        super().__init__(attempts)
         self._ray = needs('ray', 'several workers (--workers 1 does without)')
-        self._waiting: deque[Task] = deque()
         self._running: dict[Any, Task] = {}
         self._died: dict[tuple[str, str], int] = {}
         self._lost_nodes = 0
         self._places, self._counted_at = 0, -math.inf
-        self._attempts = attempts
         environment = {name: '1' for name in THREAD_VARIABLES}
         if not address:
             # as a child process finds it; another machine has other paths
@@ -143,10 +145,6 @@ class RayEngine:
                               f'address, or use --workers 1') from error
         self._remote = self._ray.remote(num_cpus=1, max_retries=0, memory=memory_mb * 2**20)(
             one_thread)
-
-    def submit(self, task: Task, first: bool = False) -> None:
-        """Take a task; see Engine."""
-        (self._waiting.appendleft if first else self._waiting.append)(task)
 
     def outcomes(self) -> Iterator[tuple[tuple[str, str], Any]]:
         """Yield the outcomes; see Engine. Raises WorkerError when Ray itself has ended."""

@@ -14,7 +14,7 @@ from typing import Any
 
 from dashcalib_ros.errors import ConfigError, InputError, one_line, shortened
 from dashcalib_ros.fleet import storage
-from dashcalib_ros.fleet.extra import needs
+from dashcalib_ros.fleet.storage import needs
 from dashcalib_ros.input.inputs import VIDEO_SUFFIXES
 from dashcalib_ros.input.source import IMAGE_SUFFIXES, is_bag_file
 from dashcalib_ros.reconstruct.scene_file import LAST_S

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import importlib
 import os
 import posixpath
 import re
@@ -16,10 +17,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from dashcalib_ros.errors import InputError, OutputError, one_line
-from dashcalib_ros.fleet.extra import needs
+from dashcalib_ros.errors import ConfigError, InputError, OutputError, one_line
 from dashcalib_ros.input.inputs import named_like
 from dashcalib_ros.limits import CLIP_BYTES, CLIP_FILES, check_file, read_file
 from dashcalib_ros.whole_files import write_whole
@@ -228,3 +229,22 @@ def _system(url: str) -> tuple[Any, str]:
     if 'file' in system.protocol:
         raise InputError(f'{url} is a file of this machine: give its path')
     return system, str(path)
+
+
+def needs(library: str, what: str) -> ModuleType:
+    """Import a library of the extra; raises ConfigError that says how to install it."""
+    found = has(library)
+    if found is None:
+        raise ConfigError(f"{what} need {library}: install it with pip install "
+                          f"'dashcalib_ros[fleet]'")
+    return found
+
+
+def has(library: str) -> ModuleType | None:
+    """Import a library of the extra, if it is installed."""
+    try:
+        return importlib.import_module(library)
+    except ModuleNotFoundError as error:
+        if error.name != library.partition('.')[0]:
+            raise
+        return None

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from dashcalib_ros.camera import calibrated_models
-from dashcalib_ros.fleet.clip_shares import ClipShare
-from dashcalib_ros.fleet.extra import has
+from dashcalib_ros.fleet.fuse import ClipShare
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.posterior import Final
-from dashcalib_ros.fleet.storage import Folder
+from dashcalib_ros.fleet.solved import Final
+from dashcalib_ros.fleet.storage import Folder, has
 from dashcalib_ros.fleet.tasks import ClipResult, camera_folder
 from dashcalib_ros.judge.calibration import ANGLES, Mount
 from dashcalib_ros.reconstruct.scene_file import DATES_S
@@ -176,8 +175,8 @@ def _plain(value: Any) -> Any:
     return value if not isinstance(value, float) or np.isfinite(value) else None
 
 
-_WORDS = ('camera', 'make', 'verdict', 'verdict_alone', 'model', 'prior_note', 'folder', 'clip',
-          'status', 'reason', 'content', 'file')
+_WORDS = ('camera', 'make', 'verdict', 'verdict_alone', 'mount_verdict', 'model', 'prior_note',
+          'folder', 'clip', 'status', 'reason', 'content', 'file')
 _NUMBERS = ('width', 'height', 'clips', 'clips_used', 'clips_left_out', 'clips_unreadable',
             'turns', 'turns_used', 'prior_units', 'row', 'frames', 'scenes')
 

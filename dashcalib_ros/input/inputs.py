@@ -1,4 +1,4 @@
-"""The table of input kinds; open_frames() finds what its paths are.
+"""The table of input kinds; open_frames() finds what its paths are, and joins several.
 
 Nothing here loads OpenCV or rosbags before a drive is opened: `--help` stays quick.
 """
@@ -8,20 +8,27 @@ import glob
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
+from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.source import (
     IMAGE_SUFFIXES,
     METADATA,
     FrameSource,
+    Picture,
+    Reading,
+    by,
     by_name,
     is_bag_file,
     os_error,
 )
-from dashcalib_ros.limits import check_file, irregular_entry
+from dashcalib_ros.limits import PICTURE_BYTES, check_file, irregular_entry, read_file
 
 # not whatever FFmpeg takes: it would play a text file
 VIDEO_SUFFIXES = frozenset(
@@ -144,7 +151,6 @@ def _left_out(where: str, count: int) -> tuple[str, ...]:
 
 def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> FrameSource:
     """Open all recordings of all groups as one drive; those that cannot be read are left out."""
-    from dashcalib_ros.input.joined import JoinedSource
     parts: list[FrameSource] = []
     warnings = [line for group in groups for line in group.warnings]
     failures: list[str] = []
@@ -220,7 +226,7 @@ def fits_bag(path: Path) -> bool:
 
 
 def _open_bag(path: Path, topic: str | None, fps: float | None) -> FrameSource:
-    from dashcalib_ros.input.bag_source import BagSource
+    from dashcalib_ros.input.bag_storage import BagSource
     return BagSource(path, topic, fps)
 
 
@@ -229,13 +235,59 @@ def _open_video(path: Path, topic: str | None, fps: float | None) -> FrameSource
     return VideoSource(path, topic, fps)
 
 
-def _open_folder(path: Path, topic: str | None, fps: float | None) -> FrameSource:
-    from dashcalib_ros.input.folder import FolderSource
-    return FolderSource(path, topic, fps)
-
-
 def _is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
+
+
+DEFAULT_FPS = 10.0  # Hz; the rate the paper works at
+
+
+class FolderSource(FrameSource):
+    """The images of a folder, by name; numbers in names count as numbers: 2.png before 10.png.
+
+    Stamps are index / fps. Raises InputError for a folder without images.
+    """
+
+    def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:
+        names = [entry.name for entry in path.iterdir()]
+        self._path = path
+        self._names = sorted(filter(_is_image, names), key=by_name)
+        if not self._names:
+            raise InputError(_no_images(path, names))
+        self._fps = fps or DEFAULT_FPS
+        warnings = []
+        if fps is None:
+            warnings.append(f'{path} is taken as {DEFAULT_FPS:g} images per second: '
+                            f'give --fps if it is not')
+        if topic is not None:
+            warnings.append(f'{path} is a folder of images: topic {topic} is ignored')
+        super().__init__(str(path), len(self._names), warnings=tuple(warnings))
+        self.length_ns = round(len(self._names) * 1e9 / self._fps)
+
+    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
+        from dashcalib_ros.input.decode import BitDepth, decode_file
+        depth = BitDepth()
+        reading.images = len(self._names)
+
+        def image(name: str, colour: bool = False) -> Pixels:
+            return decode_file(read_file(self._path / name, PICTURE_BYTES, name), depth, name,
+                               colour)
+
+        for index in range(math.ceil(start_ns * self._fps / 1e9), len(self._names)):
+            yield Picture(index, round(index * 1e9 / self._fps),
+                          partial(image, self._names[index]))
+
+
+def _is_image(name: str) -> bool:
+    return Path(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith('.')
+
+
+def _no_images(path: Path, names: list[str]) -> str:
+    if not names:
+        return f'{path} is empty: give a folder of images, a bag or a video'
+    return (f'{path} has no images (png, jpg, bmp, tif, pgm, ppm, webp) and is no bag: '
+            f'it has {", ".join(sorted(names)[:3])}{" ..." if len(names) > 3 else ""}; '
+            f'give the folder or the file that has them')
 
 
 Opener = Callable[[Path, str | None, float | None], FrameSource]
@@ -243,7 +295,7 @@ Opener = Callable[[Path, str | None, float | None], FrameSource]
 #: open_frames() has them; it loads its libraries). The first that fits is taken: a folder with a
 #: bag in it is no folder of images
 KINDS: tuple[tuple[Callable[[Path], bool], Opener], ...] = (
-    (fits_bag, _open_bag), (_is_video, _open_video), (Path.is_dir, _open_folder))
+    (fits_bag, _open_bag), (_is_video, _open_video), (Path.is_dir, FolderSource))
 
 
 def _opener_of(path: Path) -> Opener | None:
@@ -278,3 +330,143 @@ def _unknown(path: Path) -> str:
         return f'{path} is a single image: give the folder of all images of the drive'
     return (f'{path} is no kind of drive known here: give a bag (.mcap, .db3, .bag), '
             f'a video (.mp4, .avi, .mkv ...) or a folder of images')
+
+
+# a later recording that begins within this goes on with the one before; split bags do
+CONTINUES_NS = 1_000_000_000
+# ns; the step to the next file after one with a single image
+STEP_NS = 100_000_000
+
+
+class JoinedSource(FrameSource):
+    """The images of several sources, one after the other; index and stamps go on.
+
+    No video or folder tells whether it follows the one before without a loss: each begins perhaps
+    after a gap (Frame.perhaps_after_gap), and its stamps go on as if there was none. A bag's
+    stamps are kept where they are later than those before; they tell where there is a gap.
+
+    A source that cannot be read is left out, with a warning. Raises InputError where two that
+    tell their size have different ones.
+    """
+
+    def __init__(self, parts: Sequence[FrameSource], warnings: tuple[str, ...] = ()) -> None:
+        self._parts = tuple(parts)
+        first = self._parts[0]
+        sized = [(part.name, part.size) for part in self._parts if part.size is not None]
+        for name, size in sized:
+            if size != sized[0][1]:
+                raise InputError(
+                    f'{name} is {by(size)} and {sized[0][0]} is {by(sized[0][1])}: a calibration '
+                    f'holds for one size; calibrate each size on its own')
+        counts = [part.count for part in self._parts]
+        lengths = [part.length_ns for part in self._parts]
+        super().__init__(
+            f'{first.name} and {len(self._parts) - 1} more',
+            None if None in counts else sum(filter(None, counts)), first.topic,
+            (*warnings, *_together([(part.name, part.warnings) for part in self._parts])))
+        self.contradictions = tuple(dict.fromkeys(
+            line for part in self._parts for line in part.contradictions))
+        self.length_ns = None if None in lengths else sum(filter(None, lengths))
+
+    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
+        place = _Place(start_ns)
+        told = []
+        for part in self._parts:
+            inner = Reading()
+            try:
+                with closing(place.pictures(part, inner)) as pictures:
+                    yield from pictures
+            except (InputError, OSError) as error:
+                reading.warnings.append(f'{part.name} is left out from image {inner.images} on: '
+                                        f'{error}')
+            told.append((part.name, inner.summary()))
+            place.index += inner.images
+        reading.images = place.index
+        reading.warnings += _together(told)
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """How a source follows the one before. shift_ns: what is added to its stamps."""
+
+    shift_ns: int
+    gap: bool = False
+    perhaps_gap: bool = False
+
+
+class _Place:
+    """Where the next source begins in the drive: index of its first image, and its time in ns.
+
+    start_ns: of the excerpt, from the drive's first image on.
+    """
+
+    def __init__(self, start_ns: int) -> None:
+        self.index = 0
+        self._start_ns = start_ns
+        self._first_ns: int | None = None
+        self._next_ns = self._last_ns = 0
+        self._recorded = False
+
+    def pictures(self, part: FrameSource, reading: Reading) -> Generator[Picture, None, None]:
+        """Yield a source's pictures with the drive's index and stamps."""
+        left = 0 if part.recorded else self._left_ns()
+        if part.length_ns is not None and part.length_ns <= left:
+            reading.images = part.count or 0
+            self._next_ns += part.length_ns
+            return
+        before: int | None = None
+        with closing(part._pictures(reading, left)) as pictures:
+            for picture in pictures:
+                if before is None:
+                    joint = self._joint(part, picture.stamp_ns)
+                    before = picture.stamp_ns - STEP_NS
+                stamp_ns = picture.stamp_ns + joint.shift_ns
+                if self._first_ns is None:
+                    self._first_ns = stamp_ns
+                self._last_ns = stamp_ns
+                self._next_ns = stamp_ns + picture.stamp_ns - before
+                before = picture.stamp_ns
+                # what a bag has before the start is left out here; it is not decoded yet
+                if stamp_ns - self._first_ns >= self._start_ns:
+                    yield replace(picture, index=self.index + picture.index, stamp_ns=stamp_ns,
+                                  file=part.name, after_gap=joint.gap,
+                                  perhaps_after_gap=joint.perhaps_gap)
+                    joint = _Joint(joint.shift_ns)
+        if before is None:
+            self._next_ns += part.length_ns or 0  # all of it was before the excerpt
+        self._recorded = part.recorded
+
+    def _left_ns(self) -> int:
+        """Return how much of the next source is before the excerpt, if it follows directly."""
+        if self._first_ns is None:
+            self._first_ns = self._next_ns
+        return max(0, self._start_ns - (self._next_ns - self._first_ns))
+
+    def _joint(self, part: FrameSource, stamp_ns: int) -> _Joint:
+        """Return how a source follows the one before. stamp_ns: its first one."""
+        if not part.recorded:
+            return _Joint(self._next_ns, perhaps_gap=self.index > 0)
+        if self.index == 0:
+            return _Joint(0)
+        if not self._recorded:
+            return _Joint(self._next_ns - stamp_ns, perhaps_gap=True)
+        step = stamp_ns - self._last_ns
+        if step > 0:
+            return _Joint(0, gap=step > CONTINUES_NS)
+        return _Joint(self._next_ns - stamp_ns, gap=True)
+
+
+def _together(told: Sequence[tuple[str, Sequence[str]]]) -> tuple[str, ...]:
+    """Return the warnings of all sources; what several say in the same words is said once.
+
+    told: names and warnings.
+    """
+    first: dict[str, str] = {}
+    counts: Counter[str] = Counter()
+    for name, warnings in told:
+        for warning in warnings:
+            words = warning.replace(name, '')
+            first.setdefault(words, warning if name in warning else f'{name}: {warning}')
+            counts[words] += 1
+    return tuple(line + (f' (and {counts[words] - 1} more like it)' if counts[words] > 1 else '')
+                 for words, line in first.items())

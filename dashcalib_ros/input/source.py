@@ -30,6 +30,11 @@ def by_name(name: str) -> tuple[list[tuple[int, str]], str]:
     return [(int(part), '') if part[0] in '0123456789' else (-1, part) for part in parts], name
 
 
+def by(size: tuple[int, int]) -> str:
+    """Return (width, height) as messages have it."""
+    return f'{size[0]}x{size[1]}'
+
+
 def is_bag_file(name: str) -> bool:
     """Tell whether this is the name of a bag's storage file, compressed or not."""
     return name.lower().removesuffix('.zstd').removesuffix('.active').endswith(BAG_SUFFIXES)
@@ -55,7 +60,7 @@ class Frame:
     frame_id: the message header's; empty where there is none.
     after_gap: images are missing before it, or it is of another drive.
     perhaps_after_gap: the first of another file that may or may not go on where the one before
-    ended, as the next video of a dashcam; how the picture moves tells (motion/continuity.py).
+    ended, as the next video of a dashcam; how the picture moves tells (detect/continuity.py).
     Raises InputError for a stamp that is no finite number of 64 bits.
     """
 
@@ -224,8 +229,8 @@ class FrameSource(ABC):
                 size = size or frame.size
                 if frame.size != size:
                     raise InputError(
-                        f'{picture.file or self.name}: image {frame.index} is {_by(frame.size)}, '
-                        f'those before are {_by(size)}: a calibration holds for one size; '
+                        f'{picture.file or self.name}: image {frame.index} is {by(frame.size)}, '
+                        f'those before are {by(size)}: a calibration holds for one size; '
                         f'split the drive there')
                 reading.decoded += 1
                 after_gap = perhaps = False
@@ -258,7 +263,3 @@ class FrameSource(ABC):
 
         start_ns: what is earlier, counted from the drive's first image, is left out.
         """
-
-
-def _by(size: tuple[int, int]) -> str:
-    return f'{size[0]}x{size[1]}'

@@ -4,13 +4,17 @@ Does a given calibration explain a drive? Solution and camera -> Check; with pos
 turn by turn: scene and camera -> Reading; readings -> Monitor, which names changes.
 """
 from dashcalib_ros.judge.calibration import Calibration, TurnSummary, Verdict
-from dashcalib_ros.judge.check import Check, check, with_faults
-from dashcalib_ros.judge.monitor import Change, Monitor, watch
-from dashcalib_ros.judge.odometry import Odometry, odometry, trivial_guess
-from dashcalib_ros.judge.paths import path_files
-from dashcalib_ros.judge.poses import Poses, read_poses, track_poses
-from dashcalib_ros.judge.reading import Reading
-from dashcalib_ros.judge.witness import with_lines
+from dashcalib_ros.judge.check import Check, check, with_faults, with_lines
+from dashcalib_ros.judge.monitor import Change, Monitor, Reading, watch
+from dashcalib_ros.judge.odometry import (
+    Odometry,
+    Poses,
+    odometry,
+    path_files,
+    read_poses,
+    track_poses,
+    trivial_guess,
+)
 
 __all__ = ['Calibration', 'Change', 'Check', 'Monitor', 'Odometry', 'Poses', 'Reading',
            'TurnSummary', 'Verdict', 'check', 'odometry', 'path_files', 'read_poses',

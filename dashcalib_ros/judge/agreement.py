@@ -1,7 +1,8 @@
-"""Whether the turns agree on one camera, and how much each of them contributes to fx."""
+"""Whether the turns agree on one camera, and what each of them, and one more, tells of fx."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -81,3 +82,72 @@ def leverages(solution: Solution) -> dict[TurnId, float]:
     total = max(sum(shares), LEAST_SHARE)
     return {scene.turn: share / total
             for scene, share in zip(solution.scenes, shares, strict=True)}
+
+
+@dataclass(frozen=True)
+class FocalEstimate:
+    """fx and its standard deviation, px of the scenes' images."""
+
+    fx: float
+    sigma: float
+
+
+def focal_alone(solution: Solution, with_field: bool = True) -> dict[TurnId, FocalEstimate]:
+    """Return what each turn says of fx alone, linearised at the common result.
+
+    A field is fixed, as it is shared; with_field: False leaves it in the tracks. Sigma cannot hold
+    how much turns differ: one turn does not show that.
+    """
+    known, found = replace(solution.known, one_turn_sigma=0.0), {}
+    to_no_field = np.zeros(len(known.turns[0].score))
+    if not with_field and solution.field is not None and solution.field.used:
+        directions = solution.field.directions
+        to_no_field[-len(directions):] = -directions
+    for n, scene in enumerate(solution.scenes):
+        alone = known.of([n])
+        own = alone.with_prior(alone.each(known.own)).covariance
+        score = alone.turns[0].moved(to_no_field).score[known.own]
+        offset = float(own[0] @ score / alone.noise)
+        found[scene.turn] = FocalEstimate(solution.camera.fx + offset,
+                                          float(np.sqrt(alone.covariance[0, 0])))
+    return found
+
+
+def sigma_by_count(solution: Solution) -> list[float]:
+    """Return the sigma of fx with the first turn, with the first two, ... and with all, px."""
+    return [float(np.sqrt(solution.known.of(range(count)).covariance[0, 0]))
+            for count in range(1, len(solution.known.turns) + 1)]
+
+
+# of fx; a larger sigma helps nobody to decide
+TOLD = 0.2
+
+
+def next_turn(solution: Solution) -> str:
+    """Return what one more turn would bring, in words; '' where nobody can tell."""
+    # how much two turns differ is chance; so a single one is told what two more bring
+    more = 1 if len(solution.known.turns) > 1 else 2
+    sigma = with_right_angles(solution, more)
+    if not sigma < TOLD:
+        return ''
+    # one digit is all that is known
+    return (f'{("one more right angle", "two more right angles")[more - 1]}: fx to about '
+            f'{float(f"{100 * sigma:.1g}"):g} %')
+
+
+def with_right_angles(solution: Solution, more: int) -> float:
+    """Return the sigma of fx, of fx, that a calibration with more right angles would state.
+
+    Each is taken to know as much as the turn here that knows most, and turns to differ as they do
+    here. How much a single turn differs is not known: it is taken to be its own sigma.
+    """
+    known, shares = solution.known, leverages(solution)
+    best = known.turns[max(range(len(known.turns)),
+                           key=lambda n: shares[solution.scenes[n].turn])]
+    another = replace(best, score=np.zeros_like(best.score))
+    later = replace(known, turns=(*known.turns, *[another] * more))
+    own = replace(known, floor=np.zeros_like(known.floor)).own_covariance[0, 0]
+    # information grows, and all that makes turns differ goes down with it
+    after = own * later.total.covariance[0, 0] / known.total.covariance[0, 0]
+    step = float(later.step_to_wider_model[0])
+    return float(np.sqrt(after + step**2 + known.floor[0]**2) / solution.camera.fx)

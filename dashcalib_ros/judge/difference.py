@@ -8,16 +8,21 @@ far is asked by leaving them out: what the rest alone is away from its own distr
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as default
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.solve.knowledge import PictureSigma, SigmaMap, sigma_over
 from dashcalib_ros.solve.solution import Solution
 
@@ -212,23 +217,42 @@ def difference_of(given: Camera, solution: Solution, px: float
         PictureSigma(solution.picture.rms * px, solution.picture.worst * px))
 
 
-class Known(Protocol):
-    """A camera of a file, with what the file says of its uncertainty; None: nothing."""
+@dataclass(frozen=True)
+class NamedCamera:
+    """A camera as a file or a truth has it, with its name, sigma and verdict.
+
+    name: where it is from, for messages. sigma: by the parameters' names; None unless all are
+    known. verdict: accepted or weak; None where the file has none (a truth, another tool's file).
+    covariance: (n, n) of the parameters, as the picture shows them, and sigma_px: over the
+    picture; None where the file does not say.
+    field: what its lens model leaves over, where a result.json has one that is used. mount: how it
+    sits on the car, where the file says.
+    faults: in words, of what else stands beside the camera (ROS's K, R and P).
+    """
+
+    name: str
+    camera: Camera
+    sigma: Mapping[str, float] | None = None
+    verdict: str | None = None
+    covariance: Floats | None = default(default=None, compare=False)
+    sigma_px: PictureSigma | None = None
+    field: Field | None = default(default=None, compare=False)
+    mount: Mount | None = default(default=None, compare=False)
+    faults: tuple[str, ...] = ()
+
+    def without_faults(self) -> NamedCamera:
+        """Return it; raises InputError where something beside the camera is wrong."""
+        if self.faults:
+            raise InputError(f'{self.name}: {"; ".join(self.faults)}; no model here has that')
+        return self
 
     @property
-    def camera(self) -> Camera:
-        """Return the camera."""
-
-    @property
-    def covariance(self) -> Floats | None:
-        """Return the (n, n) covariance of its parameters, the one behind sigma_px."""
-
-    @property
-    def sigma_px(self) -> PictureSigma | None:
-        """Return its sigma over the picture."""
+    def image_size(self) -> tuple[int, int]:
+        """Return (width, height) in pixels."""
+        return self.camera.image_size
 
 
-def difference_between(given: Known, found: Known) -> Difference:
+def difference_between(given: NamedCamera, found: NamedCamera) -> Difference:
     """Compare two cameras of which there is no more than what their files say."""
     # in the parameters of one whose covariance is known, so that theirs together has full rank
     base = found if found.covariance is not None else given
@@ -254,3 +278,103 @@ def _carried(covariance: Floats, camera: Camera, to: Camera) -> Floats:
     carry, *_ = np.linalg.lstsq(others[theirs].reshape(-1, others.shape[2]),
                                 moves[mine].reshape(-1, moves.shape[2]), rcond=None)
     return np.asarray(carry @ covariance @ carry.T)
+
+
+# of the width; a centre that is farther off looks like that of a part of the picture
+CROPPED = 0.04
+
+
+def answers_of(found: Difference, whose: str) -> tuple[str, ...]:
+    """Return what a difference says: how far, whether it can be told, whether it matters.
+
+    whose: the sigma is.
+    """
+    far = ('apart: unknown, a lens model is blind in parts of the picture' if found.apart is None
+           else f'apart: {found.apart.rms:.2f} px over the picture, {found.apart.worst:.2f} px at '
+                f'the worst, best rotation removed')
+    sigma = None if found.sigma_px is None else found.sigma_px.rms
+    told = ('unknown, neither file has a covariance: give a result.json of dashcalib run'
+            if sigma is None or found.told_apart is None else
+            f'{"yes" if found.told_apart else "no, chance explains it"}; the sigma of {whose} is '
+            f'{sigma:.2f} px')
+    return (far, f'told apart: {told}', f'matters: {_matters(found)}')
+
+
+def _matters(found: Difference) -> str:
+    limit = f'{found.relevant_px:.1f} px, as of a focal length {100 * RELEVANT:.0f} % off'
+    if found.matters:
+        return (f'yes, good calibrations of one lens differ by less: '
+                f'{100 * ALLOWED_FOCAL:.1f} % of the focal length ({found.allowed_px:.1f} px over '
+                f'the picture), {ALLOWED_CENTRE_PX:.0f} px of the centre')
+    if found.sigma_px is None:
+        return (f'no, good calibrations of one lens differ by up to {found.allowed_px:.1f} px, as '
+                f'of a focal length {100 * ALLOWED_FOCAL:.1f} % off')
+    if found.matters is None and found.bound_px <= found.relevant_px:
+        return ('cannot be told: good calibrations of one lens hardly differ as much, but chance '
+                'may explain the rest')
+    if found.matters is None:
+        return f'cannot be told: an error of {limit}, may be there'
+    return f'no, with 95 % it is below {found.bound_px:.1f} px; the limit is {limit}'
+
+
+def reasons_of(found: Difference) -> tuple[str, ...]:
+    """Return in words what the difference from a drive's own camera says."""
+    parts = ([_PARTS[way](found, offsets) for way, offsets in found.ways().items()]
+             if found.matters else [])
+    return (*answers_of(found, 'the drive'), *(text for text in parts if text))
+
+
+def _focal(found: Difference, offsets: Floats) -> str:
+    shares = offsets / [found.found.fx, found.found.fy]
+    if max(abs(shares)) == 0:
+        return ''
+    if abs(shares[0] - shares[1]) < 0.5 * max(abs(shares)):
+        share = float(shares.mean())
+        return (f'focal length: {100 * abs(share):.1f} % too {"long" if share > 0 else "short"}')
+    names = [f'{name} {100 * abs(share):.1f} % too {"long" if share > 0 else "short"}'
+             for name, share in zip(('fx', 'fy'), shares, strict=True)
+             if abs(share) > 0.25 * max(abs(shares))]
+    return f'focal length: {", ".join(names)}'
+
+
+def _centre(found: Difference, offsets: Floats) -> str:
+    x, y = offsets
+    sides = [f'{abs(value):.1f} px too far {way[int(value > 0)]}'
+             for value, way in ((x, ('left', 'right')), (y, ('up', 'down')))
+             if abs(value) > 0.25 * max(abs(x), abs(y))]
+    text = f'centre: {" and ".join(sides)}'
+    if max(abs(x), abs(y)) > CROPPED * found.given.image_size[0]:
+        text += ': is the calibration for another part of the picture?'
+    return text
+
+
+def _distortion(found: Difference, offsets: Floats) -> str:
+    names = found.found.names()[4:]
+    values = [f'{name} {value:+.3f}' for name, value in zip(names, offsets, strict=True)]
+    return f'distortion: off by {", ".join(values)}'
+
+
+_PARTS = {'focal length': _focal, 'centre': _centre, 'distortion': _distortion}
+
+
+# combined sigmas; a larger difference is a contradiction
+CONTRADICTION = 3.0
+# of fx; least sigma: good calibrations of one lens differ by this much, also with smaller sigmas
+LEAST_SIGMA = 0.0025
+# in every model fx and fy are the scale on the axis, so that two models of one lens agree in them;
+# the coefficients of distortion are not compared: they are correlated with the focal length
+COMPARED = ('fx', 'fy', 'cx', 'cy')
+
+
+def contradicted(old: Camera, old_sigma: Mapping[str, float] | None, new: Camera,
+                 new_sigma: Mapping[str, float]) -> list[str]:
+    """Return texts for the parameters in which the two contradict each other."""
+    found = []
+    floor = LEAST_SIGMA * old.fx
+    for name in COMPARED:
+        before, after = getattr(old, name), getattr(new, name)
+        own = old_sigma[name] if old_sigma is not None else 0.0
+        spread = math.hypot(max(own, floor), max(new_sigma[name], floor))
+        if abs(after - before) > CONTRADICTION * spread:
+            found.append(f'{name} {after:.1f} instead of {before:.1f} px')
+    return found

@@ -1,5 +1,8 @@
 """How well a camera finds the car's true motion: the turns' rotations and scales beside poses.
 
+The poses are of GPS/IMU, lidar or SLAM, in KITTI's or TUM's format, or a GPS track. The turns'
+paths become files in TUM's format, which evo reads, and a plot.
+
 Each turn is adjusted with each camera held, all alike. The angle of a turn's rotation is the same
 in every frame that is fixed to the car: nothing has to be known of where the poses' sensor sits.
 """
@@ -7,15 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
+from pathlib import Path
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats, Ints
+from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.judge.poses import Poses
+from dashcalib_ros.input.motion import Samples
+from dashcalib_ros.limits import read_text
 from dashcalib_ros.reconstruct.scene import Scene
 
 # keyframes with poses; a turn with fewer says nothing
@@ -23,7 +29,7 @@ LEAST_KEYFRAMES = 4
 
 
 @dataclass(frozen=True)
-class Path:
+class TurnPath:
     """Where a turn's keyframes were. rotations: (k, 3, 3) to the world; positions: (k, 3)."""
 
     rotations: Floats
@@ -39,8 +45,8 @@ class TurnOdometry:
 
     turn: TurnId
     stamps_ns: Ints
-    true: Path
-    paths: Mapping[str, Path]
+    true: TurnPath
+    paths: Mapping[str, TurnPath]
 
     @property
     def angle_deg(self) -> float:
@@ -123,9 +129,9 @@ def _turn(scene: Scene, cameras: Mapping[str, Camera], poses: Poses, config: Con
     paths = {}
     for name, each in structures.items():
         turned = each.rotations[common].transpose(0, 2, 1)
-        paths[name] = Path(turned, -np.einsum('kij,kj->ki', turned, each.translations[common]))
+        paths[name] = TurnPath(turned, -np.einsum('kij,kj->ki', turned, each.translations[common]))
     return TurnOdometry(scene.turn, tracks.stamps_ns[common],
-                        Path(rotations[common], positions[common]), paths)
+                        TurnPath(rotations[common], positions[common]), paths)
 
 
 def angle_deg(rotations: Floats) -> float:
@@ -140,3 +146,221 @@ def angle_deg(rotations: Floats) -> float:
 def length(positions: Floats) -> float:
     """Return how long the way through positions (k, 3) is."""
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+# of a file of poses: an hour at 100 Hz
+POSES_BYTES = 2**26
+# values in a line; KITTI's 12 may have a time before them, which is not used
+KITTI, KITTI_TIMED, TUM = 12, 13, 8
+# s between two poses; over more they are not interpolated
+LONGEST_GAP_S = 0.5
+# s to either side, over which a track has a heading; m in that time, with less it stands
+COURSE_S, STANDING_M = 1.0, 2.0
+# of a rotation matrix; KITTI rounds them to 7 digits
+NOT_A_ROTATION = 1e-2
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of a vehicle, or of anything that is fixed to the camera.
+
+    rotations: (n, 3, 3) to the world; positions: (n, 3) in metres. stamps_s: (n,) ascending, or
+    None where the poses are those of the input's frames, one by one.
+    """
+
+    rotations: Floats
+    positions: Floats
+    stamps_s: Floats | None = None
+
+    def at(self, frames: Ints, stamps_ns: Ints) -> tuple[Floats, Floats, Mask]:
+        """Return rotations (k, 3, 3), positions (k, 3) and which of them are known (k,).
+
+        frames: (k,) indices of the input's frames; stamps_ns: (k,) when they were taken.
+        """
+        if self.stamps_s is None:
+            known = np.asarray(frames < len(self.positions), bool)
+            rows = np.where(known, frames, 0)
+            return self.rotations[rows], self.positions[rows], known
+        from scipy.spatial.transform import Rotation, Slerp
+        # nanoseconds since 1970 do not fit a float: differences do
+        start = int(self.stamps_s[0])
+        own = self.stamps_s - start
+        wanted = (np.asarray(stamps_ns) - start * 10**9) / 1e9
+        after = np.clip(np.searchsorted(own, wanted), 1, len(own) - 1)
+        inside = (wanted >= own[0]) & (wanted <= own[-1])
+        known = np.asarray(inside & (own[after] - own[after - 1] <= LONGEST_GAP_S), bool)
+        held = np.clip(wanted, own[0], own[-1])
+        share = ((held - own[after - 1]) / (own[after] - own[after - 1]))[:, None]
+        positions = self.positions[after - 1] * (1 - share) + self.positions[after] * share
+        rotations = Slerp(own, Rotation.from_matrix(self.rotations))(held).as_matrix()
+        return np.asarray(rotations), np.asarray(positions), known
+
+
+def read_poses(path: Path) -> Poses:
+    """Read poses in KITTI's format (12 numbers a line) or TUM's (t x y z qx qy qz qw).
+
+    Raises InputError for anything else.
+    """
+    lines = [line for line in read_text(path, POSES_BYTES, f'the poses {path}').splitlines()
+             if line.strip() and not line.lstrip().startswith('#')]
+    counts = {len(line.split()) for line in lines}
+    if len(counts) != 1 or not counts <= {KITTI, KITTI_TIMED, TUM} or len(lines) < 2:
+        raise InputError(f"{path} has no poses in KITTI's format (12 numbers a line, one line for "
+                         f"each frame) nor in TUM's (t x y z qx qy qz qw)")
+    try:
+        table = np.array([[float(value) for value in line.split()] for line in lines])
+    except ValueError as error:
+        raise InputError(f'{path} has a line that is not all numbers: {error}') from error
+    if not np.isfinite(table).all():
+        raise InputError(f'{path} has numbers that are not finite; leave these poses out')
+    return _tum(table, path) if counts == {TUM} else _kitti(table[:, -KITTI:], path)
+
+
+def track_poses(position: Samples, start_s: float) -> Poses:
+    """Return the poses of a GPS track: its headings and places; it knows neither pitch nor roll.
+
+    position: m, east, north and up; stamps in s since the drive's first image, which was at
+    start_s. The heading is that of the way, a second to either side. Raises InputError where the
+    track is shorter.
+    """
+    from scipy.spatial.transform import Rotation
+    stamps, places = position.stamps_s, position.values
+    inside = stamps[(stamps >= stamps[0] + COURSE_S) & (stamps <= stamps[-1] - COURSE_S)]
+    if len(inside) < 2:
+        raise InputError('the GPS track is too short for headings: record it during the drive')
+
+    def at(when: Floats) -> Floats:
+        return np.stack([np.interp(when, stamps, column) for column in places.T], axis=1)
+
+    way = at(inside + COURSE_S) - at(inside - COURSE_S)
+    heading = np.arctan2(way[:, 1], way[:, 0])
+    # one that stands has no heading: it keeps the one before
+    moves = np.linalg.norm(way[:, :2], axis=1) > STANDING_M
+    if not moves.any():
+        raise InputError('the GPS track does not move: record it during the drive')
+    last = np.maximum.accumulate(np.where(moves, np.arange(len(moves)), int(np.argmax(moves))))
+    # to the world (east, north, up), from axes as a camera's: right, down, ahead
+    axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    turned = Rotation.from_rotvec(heading[last][:, None] * [0.0, 0.0, 1.0]).as_matrix() @ axes
+    return Poses(np.asarray(turned), at(inside), inside + start_s)
+
+
+def _kitti(table: Floats, path: Path) -> Poses:
+    poses = table.reshape(-1, 3, 4)
+    rotations = poses[:, :, :3]
+    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
+    if off > NOT_A_ROTATION or (np.linalg.det(rotations) < 0).any():
+        raise InputError(f'{path} has matrices that are no rotations: are they 3x4, row by row?')
+    return Poses(rotations, poses[:, :, 3])
+
+
+def _tum(table: Floats, path: Path) -> Poses:
+    from scipy.spatial.transform import Rotation
+    stamps, quaternions = table[:, 0], table[:, 4:]
+    if not (np.diff(stamps) > 0).all():
+        raise InputError(f'{path}: the stamps of the poses do not ascend; sort them')
+    if (np.linalg.norm(quaternions, axis=1) < 0.5).any():
+        raise InputError(f'{path} has quaternions that are no rotations: is the order t x y z qx '
+                         f'qy qz qw?')
+    return Poses(Rotation.from_quat(quaternions).as_matrix(), table[:, 1:4], stamps)
+
+
+TRUE = 'poses'
+# px of a turn's panel, and its margin
+PANEL, MARGIN = 320, 28
+COLUMNS = 3
+COLOURS = ('#d62728', '#1f77b4', '#7f7f7f', '#2ca02c', '#9467bd')
+
+
+def path_files(found: Odometry) -> dict[str, str]:
+    """Return texts by the names of their files: paths.svg, and for each turn and camera a .tum.
+
+    TURN_poses.tum has the true path with the camera's orientation, so that evo can compare the
+    others with it: evo_rpe tum turn_000094_poses.tum turn_000094_ours.tum --align --correct_scale
+    """
+    texts = {'paths.svg': paths_svg(found)}
+    mounted = mounting(found)
+    for turn in found.turns:
+        true = TurnPath(turn.true.rotations @ mounted, turn.true.positions)
+        for name, path in {TRUE: true, **turn.paths}.items():
+            texts[f'turn_{turn.turn.number:06}_{name}.tum'] = _tum_text(turn, path)
+    return texts
+
+
+def mounting(found: Odometry) -> Floats:
+    """Return (3, 3) the rotation from the camera to the frame of the poses (hand-eye).
+
+    From the turns' rotations as the second camera has them, which is the drive's own.
+    """
+    from scipy.spatial.transform import Rotation
+    name = found.names[min(1, len(found.names) - 1)]
+    true, seen = (np.concatenate([_since_first(path) for path in paths]) for paths in (
+        [turn.true for turn in found.turns], [turn.paths[name] for turn in found.turns]))
+    rotation, _ = Rotation.align_vectors(true, seen)
+    return np.asarray(rotation.as_matrix())
+
+
+def _since_first(path: TurnPath) -> Floats:
+    """Return (k - 1, 3) the rotation vectors since the first keyframe."""
+    from scipy.spatial.transform import Rotation
+    return np.asarray(Rotation.from_matrix(
+        path.rotations[0].T @ path.rotations[1:]).as_rotvec())
+
+
+def _tum_text(turn: TurnOdometry, path: TurnPath) -> str:
+    from scipy.spatial.transform import Rotation
+    quaternions = Rotation.from_matrix(path.rotations).as_quat()
+    lines = []
+    for stamp_ns, place, quaternion in zip(turn.stamps_ns.tolist(), path.positions, quaternions,
+                                           strict=True):
+        # as text: a float has too few digits for nanoseconds since 1970
+        stamp = f'{stamp_ns // 10**9}.{stamp_ns % 10**9:09}'
+        lines.append(' '.join([stamp, *(f'{value:.9f}' for value in (*place, *quaternion))]))
+    return '\n'.join(lines) + '\n'
+
+
+def paths_svg(found: Odometry) -> str:
+    """Return a plot of each turn from above: the true path, and each camera's, fitted to it."""
+    rows = -(-len(found.turns) // COLUMNS)
+    columns = min(COLUMNS, len(found.turns))
+    panels = ''.join(_panel(turn, found.names, n % COLUMNS * PANEL, n // COLUMNS * PANEL)
+                     for n, turn in enumerate(found.turns))
+    names = [('black', TRUE), *zip(COLOURS, found.names, strict=False)]
+    legend = ''.join(
+        f'<text x="{MARGIN + 150 * n}" y="{rows * PANEL + 18}" fill="{colour}">{escape(name)}'
+        f'</text>' for n, (colour, name) in enumerate(names))
+    width = max(columns * PANEL, MARGIN + 150 * len(names))
+    return (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {rows * PANEL + 28}" '
+            f'font-family="sans-serif" font-size="13"><rect width="100%" height="100%" '
+            f'fill="white"/>{panels}{legend}</svg>\n')
+
+
+def _panel(turn: TurnOdometry, names: tuple[str, ...], left: int, top: int) -> str:
+    true = turn.true.positions
+    middle = true.mean(axis=0)
+    # the ground is the plane in which the path extends most
+    ground = np.linalg.svd(true - middle, full_matrices=False)[2][:2]
+    flat = [(true - middle) @ ground.T, *(
+        (_fitted(turn.paths[name].positions, true) - middle) @ ground.T for name in names)]
+    extent = max(float(np.ptp(flat[0], axis=0).max()), 1e-9)
+    scale = (PANEL - 2 * MARGIN) / extent
+    centre = (flat[0].max(axis=0) + flat[0].min(axis=0)) / 2
+    lines = ''.join(
+        f'<polyline fill="none" stroke="{colour}" stroke-width="{width}" points="'
+        + ' '.join(f'{left + PANEL / 2 + scale * (x - centre[0]):.1f},'
+                   f'{top + PANEL / 2 + scale * (y - centre[1]):.1f}' for x, y in path) + '"/>'
+        for colour, width, path in zip(('black', *COLOURS), (3, *[1.5] * len(names)), flat,
+                                       strict=False))
+    missed = ', '.join(f'{name} {turn.rotation_deg(name):.2f}°' for name in names)
+    return (f'<text x="{left + 8}" y="{top + 16}">frame {turn.turn.number}: '
+            f'{turn.angle_deg:.0f}°, {turn.length_m:.0f} m; missed by</text>'
+            f'<text x="{left + 8}" y="{top + 32}">{escape(missed)}</text>{lines}')
+
+
+def _fitted(path: Floats, true: Floats) -> Floats:
+    """Return the path (k, 3) scaled, turned and moved onto the true one (Umeyama)."""
+    own, other = path - path.mean(axis=0), true - true.mean(axis=0)
+    u, values, v = np.linalg.svd(other.T @ own)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    scale = float((values * signs).sum() / max(float((own**2).sum()), 1e-12))
+    return np.asarray(scale * own @ ((u * signs) @ v).T + true.mean(axis=0))

@@ -21,10 +21,10 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.agreement import (
     focal_disagreement,
     leverages,
+    next_turn,
     turns_of_another_camera,
 )
 from dashcalib_ros.judge.calibration import Verdict, Witnesses
-from dashcalib_ros.judge.next_turn import next_turn
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.solve.fixed_camera import FixedCameraTest, largest_crop
 from dashcalib_ros.solve.knowledge import LEAST_GAIN

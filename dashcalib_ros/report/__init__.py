@@ -1,7 +1,7 @@
 """calibration.yaml, result.json, report.html; comparisons; what a terminal shows: tables.py."""
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.report.camera_file import load_camera
-from dashcalib_ros.report.camera_yaml import calibration_yaml
+from dashcalib_ros.judge.difference import NamedCamera
+from dashcalib_ros.report.camera_file import calibrated_camera, load_camera
 from dashcalib_ros.report.compare import compare
 from dashcalib_ros.report.files import (
     Written,
@@ -12,10 +12,10 @@ from dashcalib_ros.report.files import (
     write_results,
     write_text,
 )
-from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.result import (
     answer_dict,
+    calibration_yaml,
     load_calibration,
     result_dict,
     result_json,

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import (
     FISHEYE,
     MODELS,
@@ -32,30 +33,25 @@ from dashcalib_ros.camera import (
     ros_faults,
 )
 from dashcalib_ros.camera.camera import HALF_PIXEL
+from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.input.bag_write import first_camera_info
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.source import os_error
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.calibration import ANGLES, Mount
+from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import (
     JSON_BYTES,
+    SIDE,
     check_file,
     parse_json,
     parse_yaml,
     read_file,
     read_text,
 )
-from dashcalib_ros.report.named_camera import (
-    NamedCamera,
-    check_focal,
-    no_intrinsics,
-    read_covariance,
-    read_field,
-    read_mount,
-    read_number,
-    read_sigma,
-    read_sigma_px,
-    read_size,
-)
+from dashcalib_ros.solve.knowledge import PictureSigma
 
 Data = Mapping[str, Any]
 # reads one camera of a file; one that says nothing but the camera gives just that
@@ -485,3 +481,132 @@ def _arrays(path: Path) -> Data:
         raise
     except Exception as error:  # a damaged file makes numpy raise nearly anything
         raise InputError(f'{path} is no .npz that can be read; write it anew') from error
+
+
+def calibrated_camera(calibration: Calibration, name: str = 'estimate') -> NamedCamera:
+    """Return the camera of a calibration. Raises InputError when it was refused."""
+    if calibration.camera is None:
+        raise InputError(no_intrinsics(name, calibration.verdict.level,
+                                        calibration.verdict.reasons))
+    return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
+                       read_covariance(calibration.details, calibration.camera,
+                                       calibration.sigma),
+                       calibration.sigma_px, mount=calibration.mount)
+
+
+def read_size(width: Any, height: Any, *, path: str | Path) -> tuple[int, int]:
+    """Check an image size that was read from a file. Raises InputError."""
+    for key, value in (('width', width), ('height', height)):
+        if value is None:
+            raise InputError(f'{path} does not say the image {key}; add image_{key}, in pixels')
+        if type(value) is float and value.is_integer():
+            value = int(value)
+        if type(value) is not int or value <= 0:
+            raise InputError(f'{path}: the image {key} must be a positive integer, not '
+                             f'{shortened(repr(value))}')
+        if value > SIDE:
+            raise InputError(f'{path}: the image {key} must be {SIDE} at the most; is it in px?')
+    return int(width), int(height)
+
+
+def read_number(data: Mapping[str, Any], key: str, path: str | Path,
+                default: float | None = None) -> float:
+    """Return data[key] as a finite float. Raises InputError."""
+    if key not in data and default is not None:
+        return default
+    value = data.get(key)
+    try:
+        # text, too: yaml-cpp writes 1e-05, which YAML 1.1 (and so PyYAML) reads as text
+        number = math.nan if value is None or isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        what = f'no {key}' if value is None else f'{key} = {shortened(repr(value))}'
+        raise InputError(f'{path} has {what}; give a complete calibration with finite numbers')
+    return number
+
+
+def check_focal(fx: float, fy: float, path: str | Path) -> None:
+    """Raise InputError for the focal lengths of a camera that is not calibrated."""
+    if not (fx > 0 and fy > 0):
+        raise InputError(f'{path} is uncalibrated: its focal length is not positive')
+
+
+def read_sigma(data: Any, camera: Camera) -> dict[str, float] | None:
+    """Return the sigmas where all are known, else None: a missing sigma is no error."""
+    if not isinstance(data, Mapping):
+        return None
+    try:
+        return {name: read_number(data, name, '') for name in camera.names()}
+    except InputError:
+        return None
+
+
+def read_covariance(details: Any, camera: Camera, sigma: Mapping[str, float] | None
+                    ) -> Floats | None:
+    """Return the covariance in result.json's details, None where there is none that can be one.
+
+    That of the picture may be of the wider model's parameters: the camera's own come first. Files
+    of 0.2.0 have the correlations only, which say nearly the same.
+    """
+    data, count = details if isinstance(details, Mapping) else {}, len(camera.params)
+    try:
+        covariance = np.array(data.get('picture_covariance'), np.float64)
+        if covariance.ndim == 2:
+            covariance = covariance[:count, :count]
+        if 'picture_covariance' not in data and sigma is not None:
+            each = [sigma[name] for name in camera.names()]
+            covariance = np.array(data.get('correlation'), np.float64) * np.outer(each, each)
+        if covariance.shape == (count, count) and np.isfinite(covariance).all():
+            np.linalg.cholesky(covariance)
+            return covariance
+    except (TypeError, ValueError, np.linalg.LinAlgError):
+        pass
+    return None
+
+
+def read_field(data: Any, image_size: tuple[int, int]) -> Field | None:
+    """Return result.json's field, None where there is none that is used."""
+    if not isinstance(data, Mapping) or data.get('used') is not True:
+        return None
+    try:
+        coefficients = np.array(data['coefficients'], np.float64)
+    except (KeyError, TypeError, ValueError):
+        coefficients = np.zeros(0)
+    if coefficients.shape != (2, len(FIELD_TERMS)) or not np.isfinite(coefficients).all():
+        raise InputError('its field has no coefficients that can be read; calibrate again')
+    return Field(image_size, coefficients)
+
+
+def read_mount(data: Any) -> Mount | None:
+    """Return a file's mounting; a missing one, or one that cannot be read, is no error."""
+    try:
+        travel, sigma = ([float(value) for value in data['travel_px']],
+                         {name: None if data['sigma'][name] is None
+                          else read_number(data['sigma'], name, '')
+                          for name in (*ANGLES, 'height_m')})
+        roll, height = (None if data[name] is None else read_number(data, name, '')
+                        for name in ('roll_right_deg', 'height_m'))
+        return Mount('accepted' if data['verdict'] == 'accepted' else 'weak',
+                     tuple(map(str, data['reasons'])), read_number(data, 'yaw_left_deg', ''),
+                     read_number(data, 'pitch_up_deg', ''), roll, height, sigma,
+                     (travel[0], travel[1]), read_number(data, 'travel_sigma_px', ''),
+                     read_number(data, 'straight_m', ''),
+                     None if data.get('moved_s') is None else read_number(data, 'moved_s', ''))
+    except (KeyError, IndexError, TypeError, ValueError, InputError):
+        return None
+
+
+def read_sigma_px(data: Any) -> PictureSigma | None:
+    """Return result.json's sigma over the picture; a missing one is no error."""
+    try:
+        return PictureSigma(*(read_number(data, key, '') for key in ('rms', 'worst')))
+    except (AttributeError, TypeError, InputError):
+        return None
+
+
+def no_intrinsics(name: str, verdict: Any, reasons: Any) -> str:
+    """Return the message for a refused calibration, which has no intrinsics."""
+    known = '; '.join(map(str, reasons)) if isinstance(reasons, (list, tuple)) else ''
+    return (f'{name} has no intrinsics to compare, its verdict is {verdict}'
+            + (f': {known}' if known else '') + '; calibrate a drive with more turns')

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -159,18 +159,12 @@ def magnitude_svg(magnitudes: Floats, turns: Sequence[TurnSummary],
     return svg(axes.width, axes.height, 'turning magnitude over time', frame + found + lines)
 
 
-def jpeg_data_uri(image: npt.NDArray[Any]) -> str:
-    """Return an image (h, w) or (h, w, 3) BGR as a JPEG data URI."""
+def data_uri(image: npt.NDArray[Any], kind: Literal['jpeg', 'png'] = 'jpeg') -> str:
+    """Return an image (h, w), (h, w, 3) BGR, as a PNG also (h, w, 4) BGRA, as a data URI."""
     import cv2
-    _, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return 'data:image/jpeg;base64,' + base64.b64encode(data.tobytes()).decode('ascii')
-
-
-def png_data_uri(image: npt.NDArray[Any]) -> str:
-    """Return an image (h, w), (h, w, 3) BGR or (h, w, 4) BGRA as a PNG data URI."""
-    import cv2
-    _, data = cv2.imencode('.png', image)
-    return 'data:image/png;base64,' + base64.b64encode(data.tobytes()).decode('ascii')
+    _, data = cv2.imencode(f'.{kind}', image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+                           if kind == 'jpeg' else [])
+    return f'data:image/{kind};base64,' + base64.b64encode(data.tobytes()).decode('ascii')
 
 
 def mask_data_uri(mask: Mask) -> str:
@@ -178,7 +172,7 @@ def mask_data_uri(mask: Mask) -> str:
     step = max(1, -(-mask.shape[1] // MASK_WIDTH))
     tint = np.zeros((*mask[::step, ::step].shape, 4), np.uint8)
     tint[~mask[::step, ::step]] = 255, 90, 150, 110
-    return png_data_uri(tint)
+    return data_uri(tint, 'png')
 
 
 def _mark(number: int, turn: TurnSummary, x: float, row: int, axes: Axes) -> str:

@@ -11,9 +11,7 @@ from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.difference import Difference as WholeDifference
-from dashcalib_ros.judge.difference import difference_between
-from dashcalib_ros.judge.wording import answers_of
-from dashcalib_ros.report.named_camera import NamedCamera
+from dashcalib_ros.judge.difference import NamedCamera, answers_of, difference_between
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.wording import digits_of, mounts_text, number, optional
 

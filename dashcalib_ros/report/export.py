@@ -23,7 +23,7 @@ from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.report.camera_file import EQUIDISTANT, RATIONAL, TERMS
-from dashcalib_ros.report.camera_yaml import camera_info_yaml
+from dashcalib_ros.report.result import camera_info_yaml
 
 # a resized picture's columns and rows may round differently by so much
 ROUNDING_PX = 1.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from functools import lru_cache
-from importlib import resources
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -14,18 +13,20 @@ import numpy as np
 from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.difference import NamedCamera
+from dashcalib_ros.report.camera_file import calibrated_camera
 from dashcalib_ros.report.charts import magnitude_svg, mask_data_uri, segments
 from dashcalib_ros.report.compare import Comparison, answers, compare, comparison_rows
 from dashcalib_ros.report.lens import (
     WIDTH,
     Drawing,
     evidence_of,
+    field_of,
+    mounting_of,
     sigma_svg,
     slider_of,
     uncertainty_of,
 )
-from dashcalib_ros.report.mounting import field_of, mounting_of
-from dashcalib_ros.report.named_camera import NamedCamera, calibrated_camera
 from dashcalib_ros.report.turns import turn_rows, turn_sections
 from dashcalib_ros.report.wording import (
     ADVICE,
@@ -88,13 +89,7 @@ def difference_html(found: Comparison) -> str:
         head=head, rows=rows, maps=_maps(found))
 
 
-def page_style() -> str:
-    """Return the style sheet of the report, for other pages of the same look."""
-    folder = resources.files('dashcalib_ros.report')
-    return folder.joinpath('templates/style.css').read_text('utf-8')
-
-
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=3)
 def template(name: str) -> jinja2.Template:
     """Return a page's template."""
     # loaded here: only who writes a report needs it

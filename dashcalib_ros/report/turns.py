@@ -11,12 +11,11 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge import Calibration, TurnSummary
-from dashcalib_ros.judge.agreement import leverages
+from dashcalib_ros.judge.agreement import focal_alone, leverages
 from dashcalib_ros.judge.calibration import Material, StoredTurnSummary
-from dashcalib_ros.judge.focal_by_turn import focal_alone
 from dashcalib_ros.reconstruct.picture import TurnPicture
 from dashcalib_ros.reconstruct.scene import Scene, residuals_px
-from dashcalib_ros.report.charts import dots, jpeg_data_uri, line, segments, svg, text
+from dashcalib_ros.report.charts import data_uri, dots, line, segments, svg, text
 from dashcalib_ros.report.wording import optional, since_start
 
 # keyframes before and after the picture whose observations are drawn as a track
@@ -163,7 +162,7 @@ def picture_svg(picture: TurnPicture, scene: Scene | None, camera: Camera | None
     camera: of the scene's images. mask_id: of an element of the page that is the mask.
     """
     height, width = picture.image.shape[:2]
-    parts = [f'<image href="{jpeg_data_uri(picture.image)}" width="{width}" height="{height}"/>']
+    parts = [f'<image href="{data_uri(picture.image)}" width="{width}" height="{height}"/>']
     if mask_id is not None:
         parts.append(f'<svg width="{width}" height="{height}" viewBox="0 0 100 100" '
                      f'preserveAspectRatio="none"><use href="#{mask_id}"/></svg>')

@@ -22,7 +22,7 @@ from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.report.camera_yaml import check_camera_name
+from dashcalib_ros.report.result import check_camera_name
 from dashcalib_ros.ros.background import (
     Activity,
     Learner,

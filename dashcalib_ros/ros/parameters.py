@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 
 from dashcalib_ros.config import Config, describe
 from dashcalib_ros.errors import ConfigError
-from dashcalib_ros.report.camera_yaml import CAMERA_NAME
+from dashcalib_ros.report.result import CAMERA_NAME
 from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig
 
 # of the QoS that users may override: durability is not among them, as a latched topic that is not

@@ -12,7 +12,7 @@ from typing import Literal
 
 from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.judge.contradiction import contradicted
+from dashcalib_ros.judge.difference import contradicted
 from dashcalib_ros.judge.verdict import STEADY
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.wording import digits_of

@@ -28,9 +28,8 @@ from dashcalib_ros.report import (
     set_aside,
     write_text,
 )
-from dashcalib_ros.report.camera_file import parse_camera
-from dashcalib_ros.report.camera_yaml import matrix_block, yaml_text
-from dashcalib_ros.report.result import mount_of
+from dashcalib_ros.report.camera_file import parse_camera, read_mount
+from dashcalib_ros.report.result import matrix_block, yaml_text
 from dashcalib_ros.whole_files import remove_leftovers
 
 # camera_info_manager's
@@ -115,7 +114,7 @@ class Kept:
         edited = not older and own.get(CHECKSUM) != _checksum(document)
         return cls(camera, None if frame_id is None else str(frame_id), text,
                    count if type(count) is int and count > 0 else 0, edited,
-                   None if edited else _mount_in(own))
+                   None if edited else read_mount(own.get('mount')))
 
     def rectified(self, rectified: str) -> Kept:
         """Return it with the P of a setting, itself where the file has that already.
@@ -135,14 +134,6 @@ class Kept:
         document = parse_yaml(self.text, self.camera.name)
         document['dashcalib'][COUNT] = times
         return replace(self, text=yaml_text(document), contradictions=times)
-
-
-def _mount_in(own: dict[str, Any]) -> Mount | None:
-    """Return the mounting in a file's block; None where there is none, or a damaged one."""
-    try:
-        return mount_of(own.get('mount'))
-    except (KeyError, TypeError, ValueError):
-        return None
 
 
 class Store:

@@ -28,7 +28,7 @@ from fleet_clips import bends, cuts, fleet, street, unit_of, write_clip
 from measure import commit, load, parser_with, save, table
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.fleet import lens_prior, posterior, solved
+from dashcalib_ros.fleet import lens_prior, solved
 from dashcalib_ros.fleet.fuse import Clip, fuse
 
 # every result of the fleet, whoever made it
@@ -162,11 +162,11 @@ def prior(work: Path, cache: Path, videos: int, seeds: Sequence[int]) -> list[di
     for seed in seeds:
         units = [(lens, zoom, solved.solved_of(f'u{n:02}', 'model', fuse(
             [Clip('bend', clip)], config))) for n, (lens, zoom, clip) in enumerate(bends(seed))]
-        known = [unit for _, _, result in units if (unit := posterior.unit_of(result))]
+        known = [unit for _, _, result in units if (unit := solved.unit_of(result))]
         priors = lens_prior.priors(known, config.fleet)
         rows = []
         for lens, zoom, result in units:
-            final = posterior.final_of(result, priors.get(result.camera))
+            final = solved.final_of(result, priors.get(result.camera))
             row = {'zoom': zoom, 'prior': bool(final.prior_units), 'thrown': final.other_mode}
             if result.estimate is not None and final.sigma_alone is not None:
                 row['alone'] = result.estimate.camera.fx / lens.fx - 1

@@ -30,9 +30,8 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.input import Frame
 from dashcalib_ros.judge import Poses, read_poses, trivial_guess
-from dashcalib_ros.judge.odometry import Path as TruePath
-from dashcalib_ros.judge.odometry import angle_deg, length, odometry
-from dashcalib_ros.judge.paths import COLOURS, path_files
+from dashcalib_ros.judge.odometry import COLOURS, angle_deg, length, odometry, path_files
+from dashcalib_ros.judge.odometry import TurnPath as TruePath
 from dashcalib_ros.reconstruct.build import chain_scene
 from dashcalib_ros.reconstruct.scene import Profile, Scene
 from dashcalib_ros.reconstruct.structure import Structure

@@ -57,7 +57,7 @@ def test_an_output_that_cannot_be_written(tmp_path, capsys):
 
 
 def test_several_workers_without_ray(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr('dashcalib_ros.fleet.extra.has', lambda name: None)
+    monkeypatch.setattr('dashcalib_ros.fleet.storage.has', lambda name: None)
     (tmp_path / 'm.csv').write_text('clip\na.avi\n')
     code, _, err = run(capsys, tmp_path / 'm.csv', '--out', tmp_path / 'out', '--workers', '2')
     assert code == 2 and "pip install 'dashcalib_ros[fleet]'" in err and '--workers 1' in err

@@ -16,7 +16,7 @@ from dashcalib_ros.cli import main
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
-from dashcalib_ros.judge.odometry import Path, TurnOdometry
+from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
 from dashcalib_ros.report import result_json
 from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.quadratic import Quadratic
@@ -50,7 +50,7 @@ class FakeCalibrator:
 
     def odometry(self, given, calibration, poses, progress=None):
         rotations, places = np.array([np.eye(3)] * 4), np.arange(12.0).reshape(4, 3)
-        path = Path(rotations, places)
+        path = TurnPath(rotations, places)
         turn = TurnOdometry(TurnId.at(88), np.arange(4) * 10**8, path,
                             {'given': path, 'ours': path, 'guess': path})
         return Odometry(('given', 'ours', 'guess'), (turn,))

@@ -108,7 +108,7 @@ class FakeDetection:
 @pytest.fixture
 def fake_detection(monkeypatch):
     """Put the fake in the place of the first stage; nobody may calibrate."""
-    monkeypatch.setattr('dashcalib_ros.cli.turns.Detection', FakeDetection)
+    monkeypatch.setattr('dashcalib_ros.cli.run.Detection', FakeDetection)
     monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', None)
     return FakeDetection
 
@@ -443,9 +443,9 @@ def test_progress_is_drawn_on_a_terminal(fake, drive, monkeypatch):
 def rendered(fake, drive, monkeypatch):
     """Let the demo's drive be the folder of pictures, and its truth 7 px of fx away."""
     truth = {**TRUTH.named, 'fx': TRUTH.fx - 7}
-    monkeypatch.setattr('dashcalib_ros.cli.demo.demo_drive', create_autospec(
+    monkeypatch.setattr('dashcalib_ros.demo.demo_drive', create_autospec(
         demo_drive, return_value=create_autospec(Drive, instance=True, truth=truth)))
-    monkeypatch.setattr('dashcalib_ros.cli.demo.render_to_bag', create_autospec(
+    monkeypatch.setattr('dashcalib_ros.demo.render_to_bag', create_autospec(
         render_to_bag, side_effect=lambda rendered, path: shutil.copytree(drive, path)))
 
 

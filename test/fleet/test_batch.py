@@ -108,7 +108,9 @@ def test_the_tables_tell_everything(reference):
         assert 0 < row['prior_share'] < 1
         assert row['sigma_fx_alone'] > 0 and row['sigma_k1_alone'] > 0
         folder = out / row['folder']
-        assert json.loads((folder / 'result.json').read_text())['intrinsics']['fx'] == row['fx']
+        result = json.loads((folder / 'result.json').read_text())
+        assert result['intrinsics']['fx'] == row['fx']
+        assert result['mount']['verdict'] == row['mount_verdict'] == 'weak'
         assert (folder / 'calibration.weak.yaml').exists()
     page = (out / 'overview.html').read_text()
     assert '6 cameras, 10 clips' in page and camera_folder('cam 1').split('/')[1] in page

@@ -72,6 +72,6 @@ def test_ray_that_has_ended_is_one_line(monkeypatch):
 
 
 def test_several_workers_say_which_extra_they_need(monkeypatch):
-    monkeypatch.setattr('dashcalib_ros.fleet.extra.has', lambda name: None)
+    monkeypatch.setattr('dashcalib_ros.fleet.storage.has', lambda name: None)
     with pytest.raises(ConfigError, match=r'several workers .* need ray: .*\[fleet\]'):
         RayEngine(3, 100, workers=2)

@@ -63,6 +63,7 @@ def test_a_solved_camera_comes_back_from_its_file(fused):
     found = solved.decoded(text, 'file')
     assert solved.encoded(found) == text
     assert found.calibration.camera == fused.calibration.camera
+    assert found.calibration.mount == fused.calibration.mount
     assert found.calibration.sigma == pytest.approx(dict(fused.calibration.sigma))
     np.testing.assert_array_equal(found.estimate.covariance, fused.solution.covariance)
 

@@ -10,9 +10,14 @@ from made_drives import smooth, write_folder, write_video
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.fleet import tasks
-from dashcalib_ros.fleet.gather import content_hash, gather, settings_hash
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.tasks import gather_clip, gathered_file
+from dashcalib_ros.fleet.tasks import (
+    content_hash,
+    gather,
+    gather_clip,
+    gathered_file,
+    settings_hash,
+)
 from dashcalib_ros.reconstruct.scene_file import decoded, encoded
 
 

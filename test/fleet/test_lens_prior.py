@@ -8,7 +8,7 @@ import pytest
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import FleetConfig
-from dashcalib_ros.fleet.clip_shares import ClipShare
+from dashcalib_ros.fleet.fuse import ClipShare
 from dashcalib_ros.fleet.lens_prior import (
     LensPrior,
     Unit,
@@ -18,8 +18,7 @@ from dashcalib_ros.fleet.lens_prior import (
     lens_prior,
     priors,
 )
-from dashcalib_ros.fleet.posterior import conditioned, final_of, unit_of
-from dashcalib_ros.fleet.solved import Estimate, Solved
+from dashcalib_ros.fleet.solved import Estimate, Solved, conditioned, final_of, unit_of
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge import Verdict as OwnVerdict
 from dashcalib_ros.solve.knowledge import PictureSigma

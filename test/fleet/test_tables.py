@@ -10,7 +10,7 @@ from browser import BROWSER, found_by_the_browser
 from page_reader import Page
 
 from dashcalib_ros.fleet import tables
-from dashcalib_ros.fleet.clip_shares import ClipShare
+from dashcalib_ros.fleet.fuse import ClipShare
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.overview import overview_html
 from dashcalib_ros.fleet.storage import Folder

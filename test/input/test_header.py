@@ -13,8 +13,7 @@ from fakes import compressed_message, image_message
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import decode as decoding
-from dashcalib_ros.input.decode import decode_compressed, decode_file, message_size
-from dashcalib_ros.input.header import encoded_size
+from dashcalib_ros.input.decode import decode_compressed, decode_file, encoded_size, message_size
 from dashcalib_ros.limits import PIXELS
 
 SUFFIXES = ['.jpg', '.png', '.webp', '.bmp', '.tif', '.pgm', '.ppm']

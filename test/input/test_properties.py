@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.decode import BitDepth, decode, message_size
-from dashcalib_ros.input.header import encoded_size
+from dashcalib_ros.input.decode import BitDepth, decode, encoded_size, message_size
 from dashcalib_ros.input.source import LAST_NS, Frame, by_name, is_bag_file
 from dashcalib_ros.input.stamps import StampGate
 

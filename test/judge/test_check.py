@@ -13,8 +13,7 @@ from dashcalib_ros import stages
 from dashcalib_ros.camera import Brown, Fisheye
 from dashcalib_ros.camera.mapping import apart, as_model
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.judge.difference import Difference, difference_of, distance
-from dashcalib_ros.judge.wording import answers_of
+from dashcalib_ros.judge.difference import Difference, answers_of, difference_of, distance
 from dashcalib_ros.report import NamedCamera, compare
 from dashcalib_ros.solve.knowledge import PictureSigma
 

@@ -7,7 +7,7 @@ import re
 import pytest
 from solving import CONFIG, scenes_of, solved
 
-from dashcalib_ros.judge.next_turn import next_turn, with_right_angles
+from dashcalib_ros.judge.agreement import next_turn, with_right_angles
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.solve.solution import Solution
 

@@ -10,9 +10,14 @@ from synthetic import LENS, rotation, synthetic_turn
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.motion import Samples
-from dashcalib_ros.judge.odometry import odometry
-from dashcalib_ros.judge.paths import mounting, path_files
-from dashcalib_ros.judge.poses import Poses, read_poses, track_poses
+from dashcalib_ros.judge.odometry import (
+    Poses,
+    mounting,
+    odometry,
+    path_files,
+    read_poses,
+    track_poses,
+)
 
 STAMPS = np.array([10.0, 10.5, 11.0])
 

@@ -25,8 +25,8 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Verdict
+from dashcalib_ros.judge.agreement import focal_alone, sigma_by_count
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.judge.focal_by_turn import focal_alone, sigma_by_count
 from dashcalib_ros.recorded import with_source
 from dashcalib_ros.report import NamedCamera, report_html, write_results
 from dashcalib_ros.report.lens import undistorted

@@ -56,9 +56,13 @@ CANNOT = [(kind, model) for kind, models in LACKS.items() for model in models]
 
 
 def lenses(*kinds):
-    """Return a mark: one test for each kind and each lens that it can describe."""
+    """Return a mark: one test for each kind and each lens that it can describe.
+
+    What has a value for each pixel is of small pictures.
+    """
     return pytest.mark.parametrize(('kind', 'lens'), [
-        pytest.param(kind, lens, id=f'{kind}-{model}') for kind in kinds
+        pytest.param(kind, lens.resized(1 / 3, (414, 125)) if kind in ('rays', 'maps') else lens,
+                     id=f'{kind}-{model}') for kind in kinds
         for model, lens in EACH_MODEL.items() if (kind, model) not in CANNOT])
 
 
@@ -89,7 +93,7 @@ def test_each_export_is_read_back(lens, kind, tmp_path):
 def test_rays_are_those_of_each_pixel(lens, kind, tmp_path):
     rays = np.load(written(lens, kind, tmp_path))['rays']
     assert rays.dtype == np.float32 and rays.shape == (*lens.image_size[::-1], 3)
-    for x, y in ((0, 0), (700, 20), (1241, 374)):
+    for x, y in ((0, 0), (233, 7), (413, 124)):
         np.testing.assert_allclose(rays[y, x], lens.rays(np.array([x, y], float)), atol=1e-7)
 
 

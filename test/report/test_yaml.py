@@ -16,8 +16,8 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.report import calibration_yaml, load_camera
 from dashcalib_ros.report.camera_file import load_with_faults
-from dashcalib_ros.report.camera_yaml import camera_info_yaml
 from dashcalib_ros.report.export import exported
+from dashcalib_ros.report.result import camera_info_yaml
 from dashcalib_ros.ros.store import Kept, Whose
 
 PARSERS_KEYS = ['image_width', 'image_height', 'camera_name', 'camera_matrix',

@@ -13,8 +13,8 @@ from synthetic import LENS, SIZE
 
 from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.cli import main
+from dashcalib_ros.judge.agreement import focal_alone
 from dashcalib_ros.judge.calibration import LensField
-from dashcalib_ros.judge.focal_by_turn import focal_alone
 from dashcalib_ros.report import load_calibration, result_json
 from dashcalib_ros.solve import focal
 from dashcalib_ros.solve.field import displacements, field_basis, without_field
