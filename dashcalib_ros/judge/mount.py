@@ -98,7 +98,8 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
     total = np.hypot(sigma, own)
     down = _direction(np.array([0.0, 90.0]), np.radians(roll[0] if roll else 0.0))
     # where the speed is not known, a second is the unit
-    way = straights.apart_s * (1.0 if speed is None else speed(straights.stamps_s))
+    halfway_s = straights.stamps_s - straights.apart_s / 2
+    way = straights.apart_s * (1.0 if speed is None else speed(halfway_s))
     height = _height(pairs, kept, way, _level(down, ahead))
     metres = float(way[kept].sum() / 2)
     if speed is None:
