@@ -22,7 +22,7 @@ FAR_M = 100.0
 class RoadSpec(DriveSpec):
     """A drive on a road that is not level.
 
-    slope_percent: the whole town lies on a hill that rises so much along the first street. The
+    slope_percent: the whole town lies on a hill that falls so much along the first street. The
     frame of the world lies in the road: what is upright leans the other way.
     crown_percent: the road falls so much from its middle to the right. The car in the right lane
     leans so, against the plane of its path and against what is upright; the drawn road is flat.
