@@ -100,6 +100,8 @@ def test_turns_alone_tell_all_angles(solution):
     found = mount_of(none, None, solution, 'accepted', 1.0, None)
     for key in ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg'):
         assert abs(getattr(found, key)) < 2 * found.sigma[key] + 0.1, key
+    # a crowned road of 2 % leans the car by 1.15 degrees in all turns alike
+    assert 2 * found.sigma['roll_right_deg'] > 1.15
     assert found.straight_m == 0.0
 
 
