@@ -4,9 +4,9 @@
     python test/benchmark/mount.py [--data DIR] [--cache DIR] [--seeds N ...] [--out DIR] [--docs]
 
 Rendered: seven lenses, mounted by up to 4 degrees in each angle, 300 m of straights, a body that
-sways, leans and dives. Real: KITTI 03 and 07 beside the direction of travel of their poses, which
-have an error of their own (the sensor is elsewhere), and the nominal height of 1.65 m, with the
-poses' speed on straights.
+sways, leans and dives; one of them on a hill, and on a crowned road. Real: KITTI 03 and 07 beside
+the direction of travel of their poses, which have an error of their own (the sensor is elsewhere),
+and the nominal height of 1.65 m. All with the car's true speed.
 """
 from __future__ import annotations
 
@@ -31,29 +31,41 @@ from drives import (
     drive_of,
     pictures_of,
 )
+from hill import OnRoad, RoadSpec
 from measure import commit, complain, done, isolated, load, parser_with, save, table
 
 from dashcalib_ros import Calibrator, Config, open_frames
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.demo import Drive
+from dashcalib_ros.demo.vehicle import MARGIN_S
+from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge import read_poses
 from dashcalib_ros.report.result import plain_values
 
 LENSES = {'demo': DEMO, 'KITTI raw': KITTI_RAW, '48 deg': NARROW, 'no distortion': PINHOLE,
           'off-centre': SHIFTED, '640x480': VGA, '115 deg': WIDE}
 SPEC = replace(STREET, straight_m=50.0, lead_m=50.0, mount_deg=4.0)
+ROADS = {'hill, 6 %': {'slope_percent': 6.0}, 'crown, 2 %': {'crown_percent': 2.0}}
 ANGLES = ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg')
 # images between two poses of a direction of travel; degrees a second; m
 APART, STRAIGHT, LEAST_M = 4, 2.0, 1.2
 FRAME_S, NOMINAL_M = 0.1036, 1.65
 
 
-def found(frames: Any, config: Config) -> dict[str, Any]:
+def found(frames: Any, config: Config, speed: SensorStream) -> dict[str, Any]:
     """Calibrate; return the mount and the lens's verdict."""
     with Calibrator(config) as calibrator:
+        calibrator.sense(speed)
         for frame in frames:
             calibrator.push(frame)
         result = calibrator.calibrate()
     return {'lens': result.verdict.level, 'mount': plain_values(result.mount)}
+
+
+def speed_of(times: Floats, positions: Floats) -> SensorStream:
+    """Return the speed. times: (n,) s since the first image; positions: (n, 3) m."""
+    way = np.linalg.norm(np.diff(positions, axis=0), axis=1) / np.diff(times)
+    return SensorStream(speed=Samples((times[1:] + times[:-1]) / 2, way[:, None]))
 
 
 def true_angles(drive: Drive) -> dict[str, float]:
@@ -64,8 +76,8 @@ def true_angles(drive: Drive) -> dict[str, float]:
                                         np.arctan2(-up[0], -up[1])]).tolist(), strict=True))
 
 
-def by_poses(path: Path) -> tuple[dict[str, float], float]:
-    """Return yaw and pitch of the direction of travel on straights, degrees, and its speed."""
+def by_poses(path: Path) -> tuple[dict[str, float], SensorStream]:
+    """Return yaw and pitch of the direction of travel on straights, degrees, and the speed."""
     poses = read_poses(path)
     half = poses.rotations[APART // 2:len(poses.rotations) - APART + APART // 2]
     way = poses.positions[APART:] - poses.positions[:-APART]
@@ -77,7 +89,7 @@ def by_poses(path: Path) -> tuple[dict[str, float], float]:
     angles = np.degrees(np.column_stack([np.arctan2(ahead[:, 0], ahead[:, 2]),
                                          np.arcsin(ahead[:, 1])]))[straight]
     return (dict(zip(ANGLES, np.median(angles, axis=0).tolist(), strict=False)),
-            float(np.mean(length[straight]) / (APART * FRAME_S)))
+            speed_of(FRAME_S * np.arange(len(poses.positions)), poses.positions))
 
 
 def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -86,7 +98,7 @@ def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
     for name, row in rows.items():
         mount, truth = row.get('mount'), row.get('truth', {})
         if mount is None:
-            lines.append([name, row.get('lens', 'failed'), *[''] * 6])
+            lines.append([name, row.get('lens', 'failed'), *[''] * 7])
             continue
         cells = []
         for key in ANGLES:
@@ -100,10 +112,12 @@ def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
             else:
                 cells.append('' if value is None else f'({value:+.2f})')
         height = mount['height_m']
-        lines.append([name, row['lens'], mount['verdict'], *cells,
-                      f'{mount["straight_m"]:.0f}', '' if height is None else f'{height:.3f}'])
+        true_height = truth.get('height_m', NOMINAL_M)
+        lines.append([name, row['lens'], mount['verdict'], *cells, f'{mount["straight_m"]:.0f}',
+                      '' if height is None else f'{height:.3f} ({mount["sigma"]["height_m"]:.3f})',
+                      '' if height is None else f'{100 * (height / true_height - 1):+.1f}'])
     text = table(['drive', 'lens', 'mount', 'yaw off, ° (σ)', 'pitch off', 'roll off',
-                  'straight m', 'height m'], lines)
+                  'straight m', 'height m (σ)', 'off, %'], lines)
     if offs:
         text = (f'Rendered, {len(offs)} angles: median {np.median(offs):.3f}°, worst '
                 f'{max(offs):.2f}°, within 2σ {np.mean(np.array(ratios) <= 2):.0%}, median of '
@@ -132,16 +146,22 @@ def main() -> None:
             truth, speed = by_poses(folder / 'poses.txt')
             pictures = open_frames(folder / ('bag' if name == 'kitti03' else 'images'),
                                    fps=None if name == 'kitti03' else 1 / FRAME_S)
-            keep(name, isolated(found, pictures, Config().replace(
-                {'mount.speed_kmh': 3.6 * speed})), False, truth)
+            keep(name, isolated(found, pictures, Config(), speed), False, truth)
         for seed in arguments.seeds:
-            for lens in LENSES:
-                name = f'{lens}, seed {seed}'
+            drives = {name: drive_of(Setting(f'mount, {name}', lens, SPEC), seed)
+                      for name, lens in LENSES.items()}
+            lens, spec = drives['demo'].lens, drives['demo'].spec
+            drives |= {name: OnRoad(lens, RoadSpec(**vars(spec) | road))
+                       for name, road in ROADS.items()}
+            for each, drive in drives.items():
+                name = f'{each}, seed {seed}'
                 if done(rows.get(name)) and not arguments.again:
                     continue
-                drive = drive_of(Setting(f'mount, {lens}', LENSES[lens], SPEC), seed)
                 pictures = pictures_of(drive, arguments.cache or Path(passing))
-                keep(name, isolated(found, pictures, Config(seed=seed)), True, true_angles(drive))
+                truth = {**true_angles(drive), 'height_m': drive.spec.height_m}
+                times = np.arange(0.0, drive.times[-1], 0.01)
+                speed = speed_of(times, drive.ride.camera_at(times + MARGIN_S)[1])
+                keep(name, isolated(found, pictures, Config(seed=seed), speed), True, truth)
     text = summary(rows)
     print(text)
     if arguments.docs:

@@ -100,7 +100,21 @@ def test_turns_alone_tell_all_angles(solution):
     found = mount_of(none, None, solution, 'accepted', 1.0, None)
     for key in ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg'):
         assert abs(getattr(found, key)) < 2 * found.sigma[key] + 0.1, key
+    # a crowned road of 2 % leans the car by 1.15 degrees in all turns alike
+    assert 2 * found.sigma['roll_right_deg'] > 1.15
     assert found.straight_m == 0.0
+
+
+def test_height_follows_the_speed_halfway(solution):
+    # it brakes: a pair's second image is slower than the way between both says
+    known, pairs = replace(solution, camera=LENS, scenes=()), pairs_of(mounted(0.5, 0.5, 0.0))
+    at_second = {stamp - SPACING_S / 2: SPEED for stamp in pairs.stamps_s}
+
+    def braking(stamps_s):
+        return np.array([at_second.get(stamp, SPEED / 2) for stamp in stamps_s])
+
+    found = mount_of(pairs, None, known, 'accepted', 1.0, braking)
+    assert abs(found.height_m - HEIGHT_M) < 2 * found.sigma['height_m']
 
 
 def test_nothing_seen_is_no_mount(solution):
@@ -122,6 +136,34 @@ def test_it_is_never_better_than_the_lens(solution):
     assert found.verdict == 'weak' and 'drive more turns' in found.reasons[0]
     assert found.sigma['pitch_up_deg'] > np.degrees(5.0 / LENS.fy)
     assert found.travel_sigma_px == weak.travel_sigma_px
+
+
+@pytest.fixture(scope='module')
+def drives():
+    none = StraightCollector().straights()
+    return [none, *(pairs_of(mounted(*angles), count=count, noise_px=noise, seed=count)
+                    for angles, count, noise in (((1.0, -2.0, 0.0), 60, 0.05),
+                                                 ((0.0, 0.0, 0.0), 30, 0.3),
+                                                 ((4.0, 4.0, 2.0), 12, 2.0)))]
+
+
+@settings(max_examples=40, deadline=None)
+@given(which=st.integers(0, 3), level=st.sampled_from(['weak', 'refused']),
+       scale=st.floats(1e-8, 10.0), px=st.floats(0.5, 4.0), speed=st.floats(0.0, 40.0),
+       turns=st.integers(0, 3))
+def test_a_lens_that_is_not_accepted_never_has_an_accepted_mount(
+        solution, drives, which, level, scale, px, speed, turns):
+    known = replace(solution, covariance=scale * np.eye(len(solution.covariance)),
+                    scenes=solution.scenes[:turns])
+    found = mount_of(drives[which], None, known, level, px, at(speed) if speed else None)
+    if found is None:
+        assert which == 0 and turns == 0
+        return
+    assert found.verdict == 'weak' and f'the lens is {level}' in found.reasons[0]
+    # with the same evidence, only sigma decides for an accepted lens
+    better = mount_of(drives[which], None, known, 'accepted', px, None)
+    known_well = max(better.sigma['yaw_left_deg'], better.sigma['pitch_up_deg']) <= 0.2
+    assert (better.verdict == 'accepted') == known_well
 
 
 def test_few_straights_say_to_drive_on(solution):
