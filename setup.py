@@ -54,7 +54,8 @@ setup(
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'completion': ['argcomplete>=3'],
         'segmentation': ['onnxruntime>=1.17'],
-        'motion': ['gpxpy>=1.5'],
+        # its wheels end at Python 3.12
+        'motion': ['gpxpy>=1.5', 'telemetry-parser>=0.3; python_version < "3.13"'],
         'fleet': ['ray>=2.40', 'pyarrow>=15', 'fsspec>=2024.2'],
         'test': ['pytest>=8', 'pytest-xdist>=3', 'hypothesis>=6', 'ruff', 'mypy', 'types-PyYAML',
                  'gpxpy>=1.5',

@@ -4,7 +4,7 @@ Each message is one line that says what is wrong and names the cure.
 """
 
 
-def one_line(error: Exception, limit: int = 160) -> str:
+def one_line(error: BaseException, limit: int = 160) -> str:
     """Return another library's error message, or else its type, on one short line."""
     return shortened(' '.join(str(error).split()) or type(error).__name__, limit)
 

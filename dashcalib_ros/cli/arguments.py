@@ -284,7 +284,8 @@ def _add_motion(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--motion', type=Path, metavar='FILE',
                         help="the car's own sensors: a CSV (head line: stamp_s from the first "
                              'image on, and any of gyro_x, gyro_y, gyro_z [rad/s], speed [m/s], '
-                             'latitude, longitude, altitude), a GPX, or a KITTI oxts folder')
+                             'latitude, longitude, altitude), a GPX, a KITTI oxts folder, or a '
+                             'video that has them inside')
     for name, what in (('imu', 'Imu'), ('gps', 'NavSatFix'), ('odom', 'Odometry or Twist')):
         parser.add_argument(f'--{name}', metavar='TOPIC',
                             help=f"the bag's {what} topic, where it has several")

@@ -1,4 +1,4 @@
-"""Motion streams from files and bags: CSV, GPX, KITTI's oxts folders, and a bag's own topics."""
+"""Motion streams: from CSV, GPX, KITTI's oxts folders, inside videos, and a bag's own topics."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.errors import InputError, shortened
+from dashcalib_ros.errors import InputError, one_line, shortened
+from dashcalib_ros.input.inputs import VIDEO_SUFFIXES
 from dashcalib_ros.input.motion import (
     EPOCH_S,
     SAMPLES,
@@ -17,7 +18,8 @@ from dashcalib_ros.input.motion import (
     local_metres,
     sensor_stream,
 )
-from dashcalib_ros.limits import irregular_entry, read_text
+from dashcalib_ros.input.source import os_error
+from dashcalib_ros.limits import check_file, irregular_entry, read_text
 
 # of a CSV or GPX: ten hours of a gyro at 100 Hz
 MOTION_BYTES = 2**29
@@ -29,19 +31,23 @@ COLUMNS = {'rate': ('gyro_x', 'gyro_y', 'gyro_z'), 'speed': ('speed',),
 HEAD = f'stamp_s and any of {", ".join(name for names in COLUMNS.values() for name in names)}'
 # places in a line of KITTI's oxts: latitude, longitude, altitude; forward speed; rates x, y, z
 OXTS_POSITION, OXTS_SPEED, OXTS_RATE, OXTS_VALUES = slice(0, 3), 8, slice(17, 20), 30
+# of a GoPro's blocks of GPS: the key of the kind of fix (2: without height, 3: with it), and s
+GOPRO_FIX, GOPRO_BLOCK_S = '0x47505346', 1.0
 # message types by the option that chooses one of their topics
 TYPES = {'imu': ('sensor_msgs/msg/Imu',), 'gps': ('sensor_msgs/msg/NavSatFix',),
          'odom': ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/TwistStamped')}
 
 
 def read_motion(path: Path) -> SensorStream:
-    """Read what sensors say of a drive from a CSV, a GPX or a KITTI oxts folder.
+    """Read what sensors say of a drive from a CSV, a GPX, a KITTI oxts folder, or a video.
 
     Raises InputError for what is none of these. What is damaged inside is left out, with a
     warning in the stream.
     """
     if path.is_dir():
         return _oxts(path)
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return _inside_video(path)
     text = read_text(path, MOTION_BYTES, f'the motion file {path}')
     if path.suffix.lower() == '.gpx':
         return _gpx(text, path)
@@ -115,6 +121,47 @@ def _gpx(text: str, path: Path) -> SensorStream:
                                                  point.elevation) for point in points),
                                               strict=True)))
     return sensor_stream({'position': (stamps, metres)}, str(path), absolute=True)
+
+
+def _inside_video(path: Path) -> SensorStream:
+    """Read the gyro, and of a GoPro GPS, that a camera has written into its video."""
+    try:
+        check_file(path, f'the video {path}')
+    except OSError as error:
+        raise InputError(os_error(path, error)) from error
+    try:
+        import telemetry_parser
+    except ImportError as error:
+        raise InputError(f"{path} is a video, whose gyro and GPS telemetry-parser reads: pip "
+                         f"install 'dashcalib_ros[motion]'") from error
+    values: dict[str, tuple[Floats, Floats]] = {}
+    try:
+        parser = telemetry_parser.Parser(str(path))
+        seen = [sample for sample in parser.normalized_imu() if sample.get('gyro')]
+        if seen:
+            values['rate'] = (np.array([sample['timestamp_ms'] for sample in seen]) / 1e3,
+                              np.radians([sample['gyro'] for sample in seen]))
+        fixes = [fix for block in parser.telemetry() for fix in _gopro_fixes(block.get('GPS'))]
+        if fixes:
+            stamps, latitude, longitude, altitude, speed = np.array(fixes).T
+            values['position'] = stamps, local_metres(latitude, longitude, altitude)
+            values['speed'] = stamps, speed[:, None]
+    except (KeyboardInterrupt, SystemExit, MemoryError):
+        raise
+    except BaseException as error:  # the library's own panics are no Exception
+        raise InputError(f'{path} has no motion data that can be read '
+                         f'({shortened(one_line(error))}): give a CSV or a GPX') from error
+    return sensor_stream(values, str(path))
+
+
+def _gopro_fixes(block: Mapping[str, Any] | None) -> Iterator[tuple[float, ...]]:
+    """Yield stamp in s, latitude, longitude, altitude and speed of a block of GPS5 or GPS9."""
+    if not block or block.get(GOPRO_FIX, 3) < 2:
+        return
+    rows, scale = block['Data'], np.array(block['Scale'], np.float64)[:4]
+    for number, row in enumerate(rows):
+        stamp_s = block['TimestampUs'] / 1e6 + number * GOPRO_BLOCK_S / len(rows)
+        yield (stamp_s, *(np.array(row[:4], np.float64) / scale).tolist())
 
 
 def _epoch_s(time: Any) -> float:

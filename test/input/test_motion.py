@@ -2,10 +2,12 @@
 from __future__ import annotations
 
 import builtins
+import sys
 
 import numpy as np
 import pytest
 from made_drives import ROS2, START, drive, head, images, write_bag
+from made_gopro import gopro
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.motion import (
@@ -116,6 +118,41 @@ def test_without_gpxpy_the_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, '__import__', without)
     with pytest.raises(InputError, match=r'dashcalib_ros\[motion\]'):
         read_motion(write(tmp_path / 'track.gpx', gpx([])))
+
+
+def test_a_gopro_has_gyro_and_gps_inside(tmp_path):
+    pytest.importorskip('telemetry_parser')
+    times = np.arange(2000) / 200
+    rates = np.stack([0.1 * np.sin(times), np.full(2000, 0.5), -0.2 * np.cos(times)], axis=1)
+    (tmp_path / 'GX010001.MP4').write_bytes(gopro(rates, latitude=48.0, speed=10.0))
+    found = read_motion(tmp_path / 'GX010001.MP4')
+    assert not found.absolute and found.warnings == ()
+    np.testing.assert_allclose(found.rate.stamps_s, times, atol=1e-6)
+    # the library sorts the axes by the camera's orientation: any mounting is found later
+    np.testing.assert_allclose(np.linalg.norm(found.rate.values, axis=1),
+                               np.linalg.norm(rates, axis=1), atol=2e-3)
+    assert np.ptp(found.position.stamps_s) == pytest.approx(10.0, abs=0.1)
+    np.testing.assert_allclose(found.speed.values, 10.0)
+    assert np.ptp(found.position.values[:, 1]) > 1.0
+
+
+@pytest.mark.parametrize('content', [b'', b'\0' * 1000, None])
+def test_a_video_without_motion_data_is_named(tmp_path, content):
+    pytest.importorskip('telemetry_parser')
+    whole = gopro(np.zeros((400, 3)), latitude=48.0, speed=10.0)
+    (tmp_path / 'drive.mp4').write_bytes(whole[:len(whole) // 2] if content is None else content)
+    try:
+        found = read_motion(tmp_path / 'drive.mp4')
+    except InputError as error:
+        assert 'drive.mp4' in str(error)
+    else:
+        assert found.empty or found.rate is not None
+
+
+def test_without_its_reader_the_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'telemetry_parser', None)
+    with pytest.raises(InputError, match=r'dashcalib_ros\[motion\]'):
+        read_motion(write(tmp_path / 'drive.mp4', 'x'))
 
 
 def test_a_kitti_oxts_folder_counts_from_its_first_image(tmp_path):
