@@ -120,6 +120,14 @@ def test_a_zoom_between_turns_is_named(turns):
         zoom for turn, zoom in zooms.items() if turn not in larger)
 
 
+def test_a_slow_zoom_is_named_in_noise_too():
+    scenes = [moved([scene], lambda each, n=n: zoomed(each, 1 + 0.012 * n))[0]
+              for n, scene in enumerate(scenes_of(5, noise_px=0.45))]
+    solution = solved(scenes)
+    assert solution.fixed_camera[0].kind == 'zoom' and solution.fixed_camera[0].clear
+    assert judge(solution, CONFIG.verdict).level == 'weak'
+
+
 def test_every_other_picture_zoomed_is_named():
     def breathing(scene: Scene) -> np.ndarray:
         odd = np.arange(len(scene.tracks.frames)) % 2
