@@ -20,6 +20,7 @@ from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge import Calibration, Check, Monitor
 from dashcalib_ros.judge.agreement import outdated, turns_of_another_camera
 from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.ros.memory import mapped_copy
 from dashcalib_ros.status import Status, View
 
 # s between two checks whether enough turns are built: scenes are finished without a push
@@ -336,7 +337,7 @@ class Learner:
         """Search an image for turns, and hand it on to who watches."""
         bank = self._now
         try:
-            image = whole(message, size, bank.depth)
+            image = mapped_copy(whole(message, size, bank.depth))
             status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
             bank.start_s = stamp_ns / 1e9 if bank.start_s is None else bank.start_s
             if self._viewer.wanted():

@@ -1,11 +1,9 @@
 """From the command line to a spinning node and back to an exit code."""
 from __future__ import annotations
 
-import ctypes
 import re
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any
 
 import rclpy
@@ -18,6 +16,7 @@ from rclpy.node import Node
 from dashcalib_ros.errors import ConfigError, DashcalibError
 from dashcalib_ros.ros.calibrator_node import CalibratorNode
 from dashcalib_ros.ros.check_node import CheckNode
+from dashcalib_ros.ros.memory import reuse_image_buffers
 from dashcalib_ros.ros.node import CameraNode, SetupError
 from dashcalib_ros.ros.stopping import Stopping
 from dashcalib_ros.standard_streams import write_stderr
@@ -25,9 +24,6 @@ from dashcalib_ros.standard_streams import write_stderr
 FAILED = 2
 # s; the wait after a failed callback doubles from the first to the second while all fail
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.01, 1.0
-# bytes; images are larger, most else is smaller
-LARGE = 262_144
-M_MMAP_THRESHOLD = -3
 
 
 def run(argv: Sequence[str], lifecycle: bool, stopping: Stopping) -> int:
@@ -36,7 +32,7 @@ def run(argv: Sequence[str], lifecycle: bool, stopping: Stopping) -> int:
     argv: ROS's arguments. lifecycle: it waits for configure and activate.
     """
     node: CameraNode | None = None
-    give_images_back()
+    reuse_image_buffers()
     try:
         start_ros(argv)
         if not stopping.requested:
@@ -119,15 +115,3 @@ def spin(node: CameraNode, stopping: Stopping) -> None:
                 node.survive(error)
                 time.sleep(wait_s)
                 wait_s = min(2 * wait_s, LONGEST_WAIT_S)
-
-
-def give_images_back() -> None:
-    """Have glibc return each image to the system as soon as it is freed.
-
-    glibc maps large blocks separately, but when the first one is freed it raises the threshold, up
-    to 32 MB. From then on images are in the heap among small blocks, and are not returned: 360 MB
-    after four turns of 1280x720 were reconstructed, instead of 155. Setting the threshold keeps it
-    fixed; detection takes 8 % longer. Nothing is done with other C libraries.
-    """
-    with suppress(AttributeError, OSError):
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE)

@@ -1,0 +1,38 @@
+"""Where images are in memory: what lasts for one message is reused, what is kept is apart.
+
+glibc maps large blocks separately and returns them as soon as they are freed. Every image then
+costs the system new pages, three times over (received, converted, grey): a third of the node's
+processor time. Kept in the heap they are reused; but then those that wait in a turn for seconds
+lie among small blocks, and are never returned. So these are copied out of it.
+"""
+from __future__ import annotations
+
+import ctypes
+import mmap
+from contextlib import suppress
+
+import numpy as np
+
+from dashcalib_ros.arrays import GreyImage
+
+# glibc's names for its settings, and bytes: the largest block that is not mapped, what may lie
+# free at the heap's end, and how many heaps there are
+M_MMAP_THRESHOLD, LARGEST = -3, 2**25
+M_TRIM_THRESHOLD, FREE = -1, 2**24
+M_ARENA_MAX, HEAPS = -8, 1
+
+
+def reuse_image_buffers() -> None:
+    """Have glibc keep the buffers of images; nothing is done with other C libraries."""
+    with suppress(AttributeError, OSError):
+        library = ctypes.CDLL(None)
+        for setting, value in ((M_MMAP_THRESHOLD, LARGEST), (M_TRIM_THRESHOLD, FREE),
+                               (M_ARENA_MAX, HEAPS)):
+            library.mallopt(setting, value)
+
+
+def mapped_copy(image: GreyImage) -> GreyImage:
+    """Return a copy in pages of its own, which go back to the system when it is freed."""
+    copy = np.frombuffer(mmap.mmap(-1, image.nbytes), np.uint8).reshape(image.shape)
+    copy[:] = image
+    return copy
