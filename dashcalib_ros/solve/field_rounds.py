@@ -21,6 +21,8 @@ from dashcalib_ros.solve.steps import Fit, is_rolling, without_shutter
 LOSSES = (2.0, 1.0, 0.5, 0.0, 0.0)
 # with all tracks
 LAST_LOSSES = (0.0, 0.0)
+# of evidence; from here on a field counts in sigma. Sound lenses have -0.1 to 0.9
+DOUBT_NATS = 1.0
 # noise variances of a track by which turns that did not make a field must be predicted better:
 # half of what a lens model needs, as the evidence spoke for the field before (KITTI 07: 29)
 LEAST_GAIN = 15.0
@@ -51,9 +53,11 @@ def _with_field(first: Fit) -> Fit:
     none = FoundField(Field(size, np.zeros((2, len(TERMS)))), field_basis(first.camera), np.inf)
     usual = loss_px_of(first.scenes, first.camera, settings)
     evidence = _problem(first, none, usual)[1].evidence(size[0])
-    if evidence.nats < settings.least_field_nats:
+    if evidence.nats < DOUBT_NATS:
         return first
     doubtful = replace(first, field=replace(none, sigma_px=evidence.sigma_px))
+    if evidence.nats < settings.least_field_nats:
+        return doubtful
     found = _rounds(replace(first, field=none), LOSSES)
     if found is None:
         return doubtful

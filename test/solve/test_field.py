@@ -119,6 +119,14 @@ def test_strong_and_misleading_fields_are_found(no_profile, rms_px, seed):
     assert ours @ true > 0.8 * np.linalg.norm(ours) * np.linalg.norm(true)
 
 
+def test_a_slight_field_is_not_used_and_makes_sigma_larger(no_profile):
+    scenes = scenes_of(5, tracks=130, noise_px=0.15)
+    sound, found = solved(scenes), solved(behind(a_field(0.05, 1), scenes))
+    assert sound.field is None
+    assert found.field is not None and not found.field.used
+    assert found.sigma[0] > 1.5 * sound.sigma[0] and abs(z_of(found)[0]) < 2.0
+
+
 def test_a_rolling_shutter_is_no_field(no_profile):
     found = solved(scenes_of(5, tracks=130, noise_px=0.15, readout_s=0.02))
     assert found.readout_s == pytest.approx(0.02, abs=0.002)
