@@ -52,7 +52,10 @@ BENT = ('bent', 'windscreen', 'lens seems')
 REPEATED = ('repeat', 'same place', 'turns could be used')
 RENDERED = ('dashcam: bonnet, text', 'KITTI raw lens, 1392x512', '640x480, fy/fx 1.01, noise 3',
             '48 deg, pincushion')
-FILMS = ('kitti03', 'ntu_campus', *RENDERED, 'fisheye 150 deg, bonnet, text', 'p1, p2 0.003')
+RECORDED = {'kitti03': ('bag', None), 'kitti07': ('images', 9.65), 'ntu_campus': ('images', 3.0)}
+# the frames in the middle of the turns
+TURNS = {'kitti03': (88,), 'kitti07': (25, 137)}
+FILMS = (*RECORDED, *RENDERED, 'fisheye 150 deg, bonnet, text', 'p1, p2 0.003')
 MOST_FX_PERCENT = 3.0
 MOST_SIGMAS = 5.0
 
@@ -342,7 +345,7 @@ BY_ATTACK = {attack.name: attack for attack in ATTACKS}
 
 def film_of(name: str, seed: int, data: Path | None, cache: Path) -> Film:
     """Return a drive to attack; it is rendered on the way."""
-    if name in ('kitti03', 'ntu_campus'):
+    if name in RECORDED:
         assert data is not None
         return _recorded(name, data)
     if name in WIDE:
@@ -364,14 +367,14 @@ def _film(frames: Iterable[Frame], truth: Mapping[str, Any], drive: Any) -> Film
 def _recorded(name: str, data: Path) -> Film:
     truth = {key: value for key, value in json.loads((data / name / 'truth.json').read_text()
                                                      ).items() if not isinstance(value, list)}
-    if name == 'kitti03':
-        frames = list(open_frames(data / name / 'bag'))
-        poses = np.loadtxt(data / name / 'poses.txt')[:, 1:].reshape(-1, 3, 4)
+    folder, fps = RECORDED[name]
+    frames = list(open_frames(data / name / folder, fps=fps))
+    if name != 'ntu_campus':
+        poses = np.loadtxt(data / name / 'poses.txt')[:, -12:].reshape(-1, 3, 4)
         ahead = poses[:, :, 2]
         yaw = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))
         pitch = np.arctan2(ahead[:, 1], np.hypot(ahead[:, 0], ahead[:, 2]))
-        return Film(frames, truth, yaw, pitch, (88,))
-    frames = list(open_frames(data / name / 'images', fps=3.0))
+        return Film(frames, truth, yaw, pitch, TURNS[name])
     # by how much the pictures' middles move; the camera's own yaw is not known
     turning = np.zeros(len(frames))
     middles = [frame.image[100:260].astype(np.float32) for frame in frames]
@@ -471,8 +474,7 @@ def main() -> None:
     cache.mkdir(parents=True, exist_ok=True)
     for seed in () if options.summary else options.seeds:
         for film in options.films:
-            recorded = film in ('kitti03', 'ntu_campus')
-            if recorded and (options.data is None or seed != options.seeds[0]):
+            if film in RECORDED and (options.data is None or seed != options.seeds[0]):
                 continue
             for name in names:
                 key = f'{name} | {film} | {seed}'
