@@ -10,6 +10,7 @@ verdicts, how often the trouble was named, and the worst error of those accepted
 """
 from __future__ import annotations
 
+import io
 import json
 import os
 import time
@@ -18,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +50,7 @@ Grey = npt.NDArray[np.uint8]
 # the words by which a result names the trouble; any of them will do
 STABILISED = ('stabil',)
 ZOOMED = ('zoom', 'focus', 'camera far better', 'disagree')
+SHIFTED = (*STABILISED, *ZOOMED, 'moves')
 BENT = ('bent', 'windscreen', 'lens seems')
 REPEATED = ('repeat', 'same place', 'turns could be used')
 RENDERED = ('dashcam: bonnet, text', 'KITTI raw lens, 1392x512', '640x480, fy/fx 1.01, noise 3',
@@ -300,6 +303,104 @@ def mirrored(film: Film, rng: np.random.Generator) -> Film:
     return with_pictures(film, (frame.image[:, ::-1] for frame in film.frames), **changed)
 
 
+def cropped(left: float = 0.0, above: float = 0.0) -> Callable[[Film, np.random.Generator], Film]:
+    """Cut a share of the width off on the left, and of the height above."""
+    def change(film: Film, rng: np.random.Generator) -> Film:
+        height, width = film.frames[0].image.shape
+        x, y = round(left * width), round(above * height)
+        return with_pictures(film, (frame.image[y:, x:] for frame in film.frames),
+                             cx=film.truth['cx'] - x, cy=film.truth['cy'] - y)
+
+    return change
+
+
+def stretched(factor: float) -> Callable[[Film, np.random.Generator], Film]:
+    """Make the picture wider, as one of 4:3 that is stored as 16:9."""
+    def change(film: Film, rng: np.random.Generator) -> Film:
+        height, width = film.frames[0].image.shape
+        size = round(factor * width), height
+        exact = size[0] / width
+        method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+        return with_pictures(
+            film, (cv2.resize(frame.image, size, interpolation=method) for frame in film.frames),
+            fx=film.truth['fx'] * exact, cx=(film.truth['cx'] + 0.5) * exact - 0.5)
+
+    return change
+
+
+def in_turns(percent: float) -> Callable[[Film, np.random.Generator], Film]:
+    """Zoom with the speed of turning, all turns alike."""
+    def change(film: Film, rng: np.random.Generator) -> Film:
+        rate = np.abs(np.gradient(gaussian_filter1d(film.yaw, 5.0)))
+        return zoomed(lambda seconds, count: 1 + percent / 100 * rate / rate.max())(film, rng)
+
+    return change
+
+
+def shifted(share: float) -> Callable[[Film, np.random.Generator], Film]:
+    """Move the picture sideways by a share of its width after half of the drive."""
+    def change(film: Film, rng: np.random.Generator) -> Film:
+        count, width = len(film.frames), film.frames[0].image.shape[1]
+        return with_pictures(film, (
+            warped(frame.image, np.array([[1.0, 0.0, share * width * (2 * n > count)],
+                                          [0.0, 1.0, 0.0]]))
+            for n, frame in enumerate(film.frames)))
+
+    return change
+
+
+def blended(film: Film, rng: np.random.Generator) -> Film:
+    """Mix each picture with the next in a share that goes round, as a changed rate does."""
+    images = [frame.image for frame in film.frames]
+    mixed = []
+    for n, (now, then) in enumerate(zip(images, [*images[1:], images[-1]], strict=True)):
+        share = (n % 5) / 5
+        mixed.append(np.asarray(cv2.addWeighted(now, 1 - share, then, share, 0)))
+    return with_pictures(film, mixed)
+
+
+def frozen(film: Film, rng: np.random.Generator) -> Film:
+    """Show every fourth picture in the place of the one after it, too."""
+    return with_pictures(film, (film.frames[n - (n % 4 == 3)].image
+                                for n in range(len(film.frames))))
+
+
+def picture_in_picture(film: Film, rng: np.random.Generator) -> Film:
+    """Show the drive itself, a quarter as large and later, in a corner."""
+    height, width = film.frames[0].image.shape
+    size = width // 4, height // 4
+    shown = []
+    for n, frame in enumerate(film.frames):
+        image = frame.image.copy()
+        later = film.frames[(n + 40) % len(film.frames)].image
+        image[:size[1], :size[0]] = cv2.resize(later, size, interpolation=cv2.INTER_AREA)
+        shown.append(image)
+    return with_pictures(film, shown)
+
+
+def compressed(bits_per_pixel: float) -> Callable[[Film, np.random.Generator], Film]:
+    """Encode the film as H.264 with few bits, as a cheap dashcam does."""
+    def change(film: Film, rng: np.random.Generator) -> Film:
+        height, width = (side // 2 * 2 for side in film.frames[0].image.shape)
+        rate = round(1 / float(np.median(np.diff(film.seconds))))
+        data = io.BytesIO()
+        with av.open(data, 'w', format='mp4') as box:
+            stream = box.add_stream('libx264', rate=rate)
+            stream.width, stream.height, stream.pix_fmt = width, height, 'yuv420p'
+            stream.bit_rate = round(bits_per_pixel * width * height * rate)
+            for frame in film.frames:
+                image = np.ascontiguousarray(frame.image[:height, :width])
+                picture = av.VideoFrame.from_ndarray(image, format='gray')
+                box.mux(stream.encode(picture))
+            box.mux(stream.encode())
+        data.seek(0)
+        with av.open(data) as box:
+            decoded = [picture.to_ndarray(format='gray') for picture in box.decode(video=0)]
+        return with_pictures(film, decoded)
+
+    return change
+
+
 ATTACKS = (
     *(Attack(f'stabilised, {100 * limit:.0f} %, lag {lag} s', stabilised(limit, lag), STABILISED)
       for limit in (0.02, 0.05, 0.10) for lag in (0.2, 0.5, 1.0)),
@@ -337,6 +438,16 @@ ATTACKS = (
     Attack('letterbox', painted(letterbox)),
     Attack('rain', painted(rain)),
     Attack('reflection', painted(reflection)),
+    *(Attack(f'{100 * left:.0f} % cut off on the left', cropped(left)) for left in (0.1, 0.25)),
+    *(Attack(f'{100 * above:.0f} % cut off above', cropped(above=above)) for above in (0.2, 0.4)),
+    *(Attack(f'{factor} times as wide', stretched(factor)) for factor in (0.75, 1.1, 1.33)),
+    *(Attack(f'zoom {percent} % in turns', in_turns(percent), ZOOMED) for percent in (2, 5)),
+    *(Attack(f'shifted by {100 * share:.0f} % after half', shifted(share), SHIFTED)
+      for share in (0.01, 0.03)),
+    Attack('pictures blended', blended),
+    Attack('every fourth picture frozen', frozen),
+    Attack('picture in picture', picture_in_picture),
+    *(Attack(f'H.264, {bits} bits per pixel', compressed(bits)) for bits in (0.1, 0.03)),
     Attack('JPEG 10', painted(jpeg(10))),
     Attack('none', lambda film, rng: film),
 )
