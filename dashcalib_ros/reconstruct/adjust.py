@@ -14,7 +14,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel, Prior
 from dashcalib_ros.reconstruct.colmap import pyceres, pycolmap
-from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.reconstruct.scene import Scene, projected_px
 
 # no lens has a coefficient beyond this: the scene has diverged
 MAX_DISTORTION = 1.0
@@ -73,13 +73,14 @@ def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
     adjuster.solve()
     moved = _updated(scenes, adjustable, reconstruction)
     if free == 'nothing':
-        return moved, camera
+        return _projected(moved, camera), camera
     found = camera.params
     found[:len(model.places)] = model.params(reconstruction.cameras[1].params)
     # the conversion from COLMAP's pixels rounds: keep what was fixed exact
     first, end = {'one focal length': (2, 4), 'everything': (0, 0)}.get(free, (0, 4))
     found[first:end] = camera.params[first:end]
-    return moved, camera.with_params(found)
+    camera = camera.with_params(found)
+    return _projected(moved, camera), camera
 
 
 def _in_front(scenes: Sequence[Scene]) -> list[Scene]:
@@ -96,6 +97,22 @@ def _in_front(scenes: Sequence[Scene]) -> list[Scene]:
         used = structure.used & ahead
         used &= used.sum(axis=0) >= 2
         found.append(replace(scene, structure=replace(structure, used=used)))
+    return found
+
+
+def _projected(scenes: Sequence[Scene], camera: Camera) -> list[Scene]:
+    """Return the scenes without the observations of points that are behind the camera now.
+
+    They have no residual: one is enough to make noise and sigma NaN.
+    """
+    found = []
+    for scene in scenes:
+        ahead = np.isfinite(projected_px(scene, camera)).all(axis=1)
+        if not ahead.all():
+            used = scene.structure.used.copy()
+            used[used] = ahead
+            scene = replace(scene, structure=replace(scene.structure, used=used))
+        found.append(scene)
     return found
 
 

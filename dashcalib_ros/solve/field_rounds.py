@@ -90,11 +90,13 @@ def _rounds(first: Fit, losses: Sequence[float]) -> Fit | None:
         field = Field(camera.image_size, found.field.coefficients
                       + (found.basis @ step[len(problem.lens.score):]).reshape(2, -1))
         camera = camera.with_params(camera.params + step[:len(camera.names())])
+        if not camera.covers_picture():
+            return None
         scenes = [replace(_with_other(scene, found.field, field),
                           structure=normal.eliminated.moved(scene.structure, step))
                   for scene, normal in zip(now.scenes, normals, strict=True)]
         scenes = retriangulate_all(scenes, camera, limits)
-        if len(scenes) < len(first.scenes) or not camera.covers_picture():
+        if len(scenes) < len(first.scenes):
             return None
         now = replace(now, scenes=scenes, camera=camera, field=FoundField(
             field, found.basis, evidence.sigma_px, evidence.inflation))

@@ -58,6 +58,14 @@ def solve(per_turn: Sequence[Scene], config: Config,
     both are tried with a part of the tracks. Larger lens models are tried where they may explain
     what is left of the errors.
     """
+    try:
+        return _solved(per_turn, config, progress)
+    except np.linalg.LinAlgError:
+        # nothing limits a direction of the parameters: pictures that slide past show no depth
+        return None
+
+
+def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> Solution | None:
     begun = [found for kind in kinds_of_lenses(per_turn)
              if (found := _begun(kind, per_turn, config, progress)) is not None]
     if not begun:
@@ -87,11 +95,7 @@ def solve(per_turn: Sequence[Scene], config: Config,
     progress('trying other focal lengths', 0.0)
     around = profile_around(fit.scenes, fit.camera, start.profile, config)
     progress('estimating the uncertainty', 0.0)
-    try:
-        return _solution(fit, per_turn, (start.profile, around), tried)
-    except np.linalg.LinAlgError:
-        # nothing limits a direction of the parameters: pictures that slide past show no depth
-        return None
+    return _solution(fit, per_turn, (start.profile, around), tried)
 
 
 def _with_field(first: Fit) -> Fit:

@@ -344,6 +344,18 @@ def test_scenes_without_any_point_are_no_crash(turn):
     assert adjust.adjust([nothing], LENS, Solver(), 'first distortion')[1] == LENS
 
 
+def test_an_adjustment_uses_no_point_behind_the_camera(turn):
+    scene = turn.scene(LENS)
+    points, [track] = scene.structure.points.copy(), np.flatnonzero(scene.structure.used[0])[:1]
+    points[track] = [0, 0, -1e3]
+    scene = replace(scene, structure=replace(scene.structure, points=points))
+    [found], camera = everything([scene], LENS, Solver(0.5, 3), NO_PRIOR, FREE)
+    assert np.isfinite(residuals_px(found, camera)[found.structure.used]).all()
+    others = np.arange(len(points)) != track
+    np.testing.assert_array_equal(found.structure.used[:, others],
+                                  scene.structure.used[:, others])
+
+
 # against COLMAP's own synthetic scenes
 
 F, CX, CY, K1, K2 = 900.0, 520.0, 380.0, -0.12, 0.03

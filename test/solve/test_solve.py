@@ -31,7 +31,7 @@ from dashcalib_ros.reconstruct.scene import (
     retriangulated,
     truncated_cost,
 )
-from dashcalib_ros.solve import fitting, focal, steps
+from dashcalib_ros.solve import fitting, focal, joint, steps
 from dashcalib_ros.solve.fitting import misfits
 from dashcalib_ros.solve.focal import summed
 from dashcalib_ros.solve.joint import solve
@@ -55,6 +55,15 @@ def good() -> Solution:
 
 
 # the adjustment
+
+def test_equations_that_nothing_solves_give_no_solution(monkeypatch):
+    def singular(*_):
+        raise np.linalg.LinAlgError('Singular matrix')
+
+    scenes = scenes_of(2)
+    monkeypatch.setattr(joint, 'with_all_tracks', singular)
+    assert solve(scenes, CONFIG) is None
+
 
 @pytest.mark.parametrize(('settled', 'rounds'), [(0.0, 3), (0.5, 1)])
 def test_step_2_ends_where_a_round_would_change_little(monkeypatch, no_profile, settled, rounds):
