@@ -303,8 +303,8 @@ def _on_bound(solution: Solution, config: VerdictConfig) -> Finding | None:
     if not names:
         return None
     return Finding('weak', f'the search for {", ".join(names)} ended at the limit of what lenses '
-                           f'have', 'record another drive; mirrors and lenses of more than 190° '
-                                    'cannot be calibrated')
+                           f'have', 'give the whole picture, or record another drive; mirrors '
+                                    'and lenses of more than 190° cannot be calibrated')
 
 
 def _folds_over(solution: Solution, config: VerdictConfig) -> Finding | None:

@@ -24,7 +24,7 @@ from dashcalib_ros.solve.model_choice import (
     with_few_tracks,
     with_model_chosen,
 )
-from dashcalib_ros.solve.prior import bounds_of
+from dashcalib_ros.solve.prior import bounds_of, centre_pull
 from dashcalib_ros.solve.solution import Candidate, Solution
 from dashcalib_ros.solve.stabiliser import without_crops, without_stabiliser
 from dashcalib_ros.solve.steps import (
@@ -204,10 +204,11 @@ def _solution(fit: Fit, per_turn: Sequence[Scene], profiles: tuple[Profile, Prof
     """Return the solution with its covariance. profiles: the coarse one, and that around it."""
     tests = fit.fixed_camera_tests()
     known = replace(fit.known, systematic=max(1.0, *(each.strength for each in tests)))
+    covariance = known.covariance[np.ix_(known.own, known.own)]
+    pull = centre_pull(fit.camera, covariance)
     return Solution(
         camera=fit.camera, centred=fit.centred, scenes=tuple(fit.scenes), known=known,
-        covariance=(known.covariance[np.ix_(known.own, known.own)]
-                    + np.diag(_shared_with_field(fit)**2)),
+        covariance=covariance + np.outer(pull, pull) + np.diag(_shared_with_field(fit)**2),
         coarse=profiles[0], around=profiles[1],
         bounds=np.array(bounds_of(fit.centred)), readout_s=fit.readout_s,
         readout_sigma_s=known.readout_sigma if fit.readout_s else 0.0,

@@ -17,9 +17,9 @@ from dashcalib_ros.solve.quadratic import Quadratic
 LEAST_LOSS_PX = 0.05
 # of the width: how far lenses sit off the middle of their sensors
 CENTRE_SIGMA = 0.02
-# how far parameters may go from the centred camera: fx and fy of its focal length, the centre of
-# the picture's size (AliceVision's bound); no lens has larger k1 and k2
-FOCAL_BOUND, CENTRE_BOUND, DISTORTION_BOUND = 0.15, 0.1, 1.0
+# how far parameters may go from the centred camera: fx and fy of its focal length; the centre of
+# the picture's width and height, as a third may be cut off on one side; no lens has larger k1, k2
+FOCAL_BOUND, CENTRE_BOUND, DISTORTION_BOUND = 0.15, (0.2, 0.3), 1.0
 # systematic errors of the tracking: of fx, for fx and fy; of the width, for cx and cy
 FOCAL_FLOOR, CENTRE_FLOOR = 0.0005, 0.0003
 # of fx, the same behind a field: KITTI 03 and 07 are so far from true rotations; behind a field
@@ -49,7 +49,7 @@ def bounds_of(camera: Camera) -> tuple[Floats, Floats]:
     width, height = camera.image_size
     reach = np.full(len(camera.names()), DISTORTION_BOUND)
     reach[:4] = (camera.fx * FOCAL_BOUND, camera.fx * FOCAL_BOUND,
-                 width * CENTRE_BOUND, height * CENTRE_BOUND)
+                 width * CENTRE_BOUND[0], height * CENTRE_BOUND[1])
     return _undistorted(camera) - reach, _undistorted(camera) + reach
 
 
@@ -61,6 +61,16 @@ def _undistorted(camera: Camera) -> Floats:
 def prior_information(camera: Camera, config: IntrinsicsConfig) -> Floats:
     """Return the prior's information (n, n): the inverse of its covariance at unit noise."""
     return np.asarray(np.linalg.inv(prior_of(camera, config, 1.0).covariance), np.float64)
+
+
+def centre_pull(camera: Camera, covariance: Floats) -> Floats:
+    """Return (n,) how far the prior of the centre has drawn the camera with this covariance.
+
+    The prior is right for lenses; a picture of which a side was cut off has its centre elsewhere.
+    """
+    width, height = camera.image_size
+    off = np.array([(width - 1) / 2, (height - 1) / 2]) - [camera.cx, camera.cy]
+    return np.asarray(covariance[:, 2:4] @ off / (CENTRE_SIGMA * width)**2)
 
 
 def extra_sigma_of(camera: Camera) -> Floats:

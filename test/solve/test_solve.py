@@ -37,6 +37,7 @@ from dashcalib_ros.solve.focal import summed
 from dashcalib_ros.solve.joint import solve
 from dashcalib_ros.solve.knowledge import Knowledge, scatter_between_turns
 from dashcalib_ros.solve.normal import noise_in, turn_cost
+from dashcalib_ros.solve.prior import centre_pull
 from dashcalib_ros.solve.quadratic import Quadratic, TurnCost, noise_of
 from dashcalib_ros.solve.solution import Solution
 
@@ -55,6 +56,19 @@ def good() -> Solution:
 
 
 # the adjustment
+
+@pytest.mark.parametrize(('cx', 'cy'), [(0.64, 0.5), (0.5, 0.72)])
+def test_a_picture_of_which_a_side_was_cut_off_is_calibrated(no_profile, cx, cy):
+    width, height = SIZE
+    cut = replace(LENS, cx=cx * width, cy=cy * height)
+    solution = solved(scenes_of(4, cut, start=Radial.centred(SIZE, 1.03 * LENS.fx, -0.2)))
+    assert np.abs(z_of(solution, cut)).max() < 3
+    assert solution.sigma[0] < 0.02 * LENS.fx
+    # the prior of the centre has drawn it away: that is in its sigma
+    drawn = centre_pull(solution.camera, solution.covariance)
+    assert np.abs(drawn[2:4]).max() > 0.01
+    assert (solution.sigma[:4] >= np.abs(drawn[:4])).all()
+
 
 def test_equations_that_nothing_solves_give_no_solution(monkeypatch):
     def singular(*_):
