@@ -24,6 +24,7 @@ from dashcalib_ros.input.inputs import Paths, fits_bag, open_frames
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
 from dashcalib_ros.judge import Check
+from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import Progress
 
@@ -86,7 +87,7 @@ def check(given: Camera, path: Paths, fps: float | None = None,
     """
     source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
     with _fed(source, config, mask, tell) as calibrator:
-        return calibrator.check(given, calibrator.calibrate(tell), tell)
+        return Questions(calibrator).check(given, calibrator.calibrate(tell), tell)
 
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,

@@ -33,7 +33,8 @@ WAITING = 2
 class SceneSelection:
     """Lets the pool reconstruct the best turns; chooses scenes among these and stored turns.
 
-    warnings: about turns.store, and about turns that ended the workers.
+    config: turns.wanted is what want() was told last. warnings: about turns.store, and about turns
+    that ended the workers.
 
     All methods are for the Calibrator's thread, but close(), which is for any.
     """
@@ -48,8 +49,8 @@ class SceneSelection:
         # how many turns are used: more than wanted once these have left a result weak
         self._places = config.turns.wanted
         # turns of this drive that are used beyond that
-        self.more = 0
-        self._config = config
+        self._more = 0
+        self.config = config
         self._detection = detection
         self._live = live
         self._use_stored = use_stored
@@ -84,10 +85,15 @@ class SceneSelection:
         self._kept.load(Origin(self._detection.size, self._detection.scale, frame_id),
                            self._use_stored)
 
-    def want(self, turns: int) -> None:
-        """Use so many turns from now on; more again where these leave a result weak."""
-        self._config = self._config.replace({'turns.wanted': turns})
-        self._places = turns
+    def want(self, turns: int, more: int = 0) -> None:
+        """Use so many turns from the next calibration on, turns.capacity at the most.
+
+        more: turns of this drive are used beyond those.
+        """
+        self._more = more
+        if turns != self.config.turns.wanted:
+            self.config = self.config.replace({'turns.wanted': turns})
+            self._places = turns
 
     def submit(self, more_to_come: bool = False, replace_failed: bool = False) -> None:
         """Have the best turns reconstructed; live: all, as a scene is a fiftieth of its images.
@@ -104,7 +110,7 @@ class SceneSelection:
         # the mask of when a turn was found: what waits must not change its scene
         now = self._detection.valid()
         self._valid = {key: self._valid.get(key, now) for key in turns}
-        places, ready = self._places + self.more, []
+        places, ready = self._places + self._more, []
         for key in self._ranked():
             turn = turns.get(key)
             if turn is not None and (places > 0 or self._live) and turn.frames:
@@ -162,7 +168,7 @@ class SceneSelection:
     def _best(self, among: Collection[TurnId]) -> list[TurnId]:
         """Return the turns to use, best first; none where none is of this drive."""
         ranked = [key for key in self._ranked() if key in among]
-        own = [key for key in ranked if key.of_this_drive][:self._places + self.more]
+        own = [key for key in ranked if key.of_this_drive][:self._places + self._more]
         return own + ranked[len(own):self._places] if own else []
 
     def _undecided(self) -> bool:
@@ -173,7 +179,7 @@ class SceneSelection:
     def make_room(self) -> None:
         """Wait, unless live, until few turns wait in memory; raises what a worker raised."""
         if not self._live:
-            self._pool.wait(lambda: len(self._pool.unbuilt()) <= self._config.threads)
+            self._pool.wait(lambda: len(self._pool.unbuilt()) <= self.config.threads)
 
     def wanted(self, tell: Progress, final: bool) -> list[Scene]:
         """Wait for the best turns' scenes and return them.
@@ -221,12 +227,12 @@ class SceneSelection:
             return scenes, {}
         # in a worker: it takes seconds for many turns, and a live drive goes on meanwhile
         found: tuple[list[Scene], dict[TurnId, TurnId]] = self.run(
-            without_repeated, scenes, self._config.scene.min_images)
+            without_repeated, scenes, self.config.scene.min_images)
         return found
 
     def widen(self) -> bool:
         """Use more turns, up to turns.at_most; return False if there are no more to use."""
-        turns = self._config.turns
+        turns = self.config.turns
         most = max(turns.at_most, turns.wanted)
         if self._places >= most or len(self._ranked()) <= self._places:
             return False
@@ -268,8 +274,8 @@ class SceneSelection:
                for turn in self._detection.turns() if (scene := built.get(turn.id)) is not None}
         self._kept.mirror({**self._kept.turns, **own})
 
-    def forget_stored(self, but: Set[TurnId]) -> None:
-        """Drop the turns of earlier drives but these, on disk too."""
+    def forget_stored(self, but: Set[TurnId] = frozenset()) -> None:
+        """Drop the turns of earlier drives but these, on disk too: for a camera that changed."""
         for key in self._kept.turns.keys() - but:
             del self._kept.turns[key]
         self._store()

@@ -28,6 +28,7 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.judge import Calibration
+from dashcalib_ros.questions import Questions
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.recorded import calibrate
 from dashcalib_ros.selection import SceneSelection
@@ -123,7 +124,7 @@ def test_one_thread_and_a_child_that_is_killed_change_nothing(frames, result):
 
     def assassin(calibrator: Calibrator, ended: threading.Event) -> None:
         while not killed and not ended.wait(0.05):
-            for pid in calibrator.child_pids():
+            for pid in calibrator.scenes.child_pids():
                 time.sleep(0.5)  # in the middle of something
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
@@ -158,7 +159,7 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way(frames, resul
             # whatever waits, waits in the pool, whose queue has an end
             assert not any(turn.frames for turn in calibrator.turns())
         late = calibrator.calibrate()
-        pids = calibrator.child_pids()
+        pids = calibrator.scenes.child_pids()
         assert pids and all(os.getpriority(os.PRIO_PROCESS, pid) >= 10 for pid in pids)
     assert early.frames == 95 and early.verdict.level in ('weak', 'refused')
     assert any('only 1 of at least 2 turns' in reason for reason in early.verdict.reasons)
@@ -180,7 +181,7 @@ with Calibrator(config, inline=True) as calibrator:
     for frame in frames:
         calibrator.push(frame)
     result = calibrator.calibrate()
-    assert calibrator.child_pids() == []
+    assert calibrator.scenes.child_pids() == []
 sys.stdout.buffer.write(pickle.dumps(result))
 """
 
@@ -201,7 +202,7 @@ def test_a_turn_that_is_lost_is_told_and_tried_again(frames, result):
     with limited(Calibrator(QUICK, live=True, on_trouble=told.append)) as calibrator:
         for frame in frames:
             calibrator.push(frame)
-            pids = calibrator.child_pids()
+            pids = calibrator.scenes.child_pids()
             if pids and not killed:
                 os.kill(pids[0], signal.SIGKILL)
                 killed = True
@@ -233,17 +234,17 @@ def test_close_ends_a_calibration_that_runs(frames):
         thread.join(20)
         assert not thread.is_alive()
     assert len(outcome) == 1 and isinstance(outcome[0], WorkerError)
-    assert calibrator.child_pids() == []
+    assert calibrator.scenes.child_pids() == []
 
 
 def test_more_turns_than_the_bank_would_hold():
     config = QUICK.replace({'turns.wanted': 12, 'turns.capacity': 3})
     with Calibrator(config) as calibrator:
-        assert calibrator._detection._turns.config.capacity == 12
+        assert calibrator.detection._turns.config.capacity == 12
     # what the user has set is what is written down
     assert config.turns.capacity == 3
     with Calibrator(QUICK) as calibrator:
-        assert calibrator._detection._turns.config.capacity == QUICK.turns.capacity
+        assert calibrator.detection._turns.config.capacity == QUICK.turns.capacity
 
 
 # drives that add up
@@ -346,7 +347,7 @@ def test_stored_turns_of_another_size_are_left_out_and_told(tmp_path):
         result = calibrator.calibrate()
         assert result.verdict.level == 'refused'
         assert 'could agree' in result.stored_turns[0].unused_because
-        calibrator.forget_stored()
+        calibrator.scenes.forget_stored()
         assert calibrator.status().turns == 0 and list(tmp_path.iterdir()) == []
 
 
@@ -361,14 +362,15 @@ def test_a_camera_in_use_is_compared_with_stored_turns(tmp_path):
     sigma = dict.fromkeys(lens.names(), 0.1)
     with Calibrator(QUICK.replace({'turns.store': str(tmp_path)})) as calibrator:
         calibrator.push(pictures(1, 640, 360)[0])
-        assert calibrator.watch(lens, sigma).lens is None
-        change, = calibrator.watch(replace(lens, fx=10 * lens.fx), sigma).changes
+        questions = Questions(calibrator)
+        assert questions.watch(lens, sigma).lens is None
+        change, = questions.watch(replace(lens, fx=10 * lens.fx), sigma).changes
         assert change.kind == 'lens' and change.since == TurnId.stored(0)
         # of other turns than these it knows nothing
-        assert not calibrator.watch(lens, sigma).agrees
-        calibrator.forget_stored({TurnId.stored(1)})
+        assert not questions.watch(lens, sigma).agrees
+        calibrator.scenes.forget_stored({TurnId.stored(1)})
         assert calibrator.status().reconstructed == (TurnId.stored(1),)
-        assert len(calibrator.watch(lens, sigma).readings) == len(list(tmp_path.iterdir())) == 1
+        assert len(questions.watch(lens, sigma).readings) == len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize(('own', 'more', 'used'), [
@@ -378,7 +380,7 @@ def test_turns_of_this_drive_come_before_more_prominent_ones_of_earlier_drives(o
     turns = tuple(types.SimpleNamespace(id=TurnId.at(n), prominence=0.01) for n in range(own))
     selection = SceneSelection(QUICK.replace({'turns.wanted': 3}),
                                types.SimpleNamespace(turns=lambda: turns))
-    selection.more = more
+    selection.want(3, more)
     selection._pool._scenes = {turn.id: replace(scene, turn=turn.id) for turn in turns}
     selection._kept.turns = {key: StoredTurn(replace(scene, turn=key), 0.0, 0.9)
                              for key in map(TurnId.stored, range(5))}
@@ -396,10 +398,10 @@ def test_turns_that_are_rejected_leave_the_store(tmp_path):
                           TurnId.at(9): StoredTurn(other, 50.0, 0.8)})
     with Calibrator(QUICK.replace({'turns.store': str(tmp_path)}), live=True) as calibrator:
         first, second = calibrator.push(pictures(1, 640, 360)[0]).reconstructed
-        calibrator.reject([first])
+        calibrator.scenes.reject({first: 'moved'})
         assert calibrator.status().reconstructed == (second,) and calibrator.status().turns == 1
         assert len(list(tmp_path.iterdir())) == 1
-        calibrator.reject([first, TurnId.at(77)])  # gone, and never there
+        calibrator.scenes.reject({first: 'moved', TurnId.at(77): 'moved'})  # gone, and never there
         assert calibrator.status().reconstructed == (second,)
 
 
@@ -527,7 +529,7 @@ def test_a_change_of_size_is_named(frames):
 def test_large_pictures_are_shrunk_for_everything(monkeypatch):
     sizes = []
     with Calibrator(QUICK.replace({'max_width': 320})) as calibrator:
-        motion = calibrator._detection._motion
+        motion = calibrator.detection._motion
         push = motion.push
         monkeypatch.setattr(motion, 'push', lambda frame: sizes.append(frame.size) or push(frame))
         for frame in pictures(5, 642, 362, 2):
@@ -541,7 +543,7 @@ def test_large_pictures_are_shrunk_for_everything(monkeypatch):
 def test_small_pictures_are_enlarged_for_everything(monkeypatch):
     sizes = []
     with Calibrator(QUICK) as calibrator:
-        motion = calibrator._detection._motion
+        motion = calibrator.detection._motion
         push = motion.push
         monkeypatch.setattr(motion, 'push', lambda frame: sizes.append(frame.size) or push(frame))
         for frame in pictures(5, 320, 180, 2):

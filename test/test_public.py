@@ -12,6 +12,7 @@ from made_calibration import TRUTH, make_calibration
 import dashcalib_ros
 from dashcalib_ros import Calibrator, calibrate, check, recorded
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.questions import Questions
 
 NAMES = ('calibrate', 'check', 'load_camera', 'open_frames', 'Calibration', 'Calibrator', 'Config',
          'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye', 'Rational')
@@ -45,9 +46,6 @@ class FakeCalibrator:
         progress('solving', 1.0)
         return make_calibration()
 
-    def check(self, given, calibration, progress=None):
-        progress('checking', 1.0)
-
     def __enter__(self):
         return self
 
@@ -55,9 +53,21 @@ class FakeCalibrator:
         pass
 
 
+@stands_in_for(Questions)
+class FakeQuestions:
+    """Asks nothing."""
+
+    def __init__(self, calibrator):
+        pass
+
+    def check(self, given, calibration, progress=None):
+        progress('checking', 1.0)
+
+
 @pytest.fixture
 def drive(tmp_path, monkeypatch):
     monkeypatch.setattr(recorded, 'Calibrator', FakeCalibrator)
+    monkeypatch.setattr(recorded, 'Questions', FakeQuestions)
     (tmp_path / 'drive').mkdir()
     for n in range(4):
         cv2.imwrite(str(tmp_path / 'drive' / f'{n}.png'), np.full((48, 64), 60 + n, np.uint8))

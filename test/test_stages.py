@@ -22,6 +22,7 @@ from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.judge.conclude import evidence_of_detection
+from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import calibration_yaml, load_camera, result_dict
 
 # one term is all that this lens has
@@ -122,7 +123,8 @@ def test_the_stages_give_what_the_calibrator_gives(frames, detection):
         for frame in frames:
             calibrator.push(frame)
         whole = calibrator.calibrate()
-        asked = calibrator.check(TRUE, whole), calibrator.check(LONGER, whole)
+        questions = Questions(calibrator)
+        asked = questions.check(TRUE, whole), questions.check(LONGER, whole)
     # in a child process, as the calibration
     assert [each.answer for each in asked] == ['right', 'wrong']
     assert asked[1].loss > abs(asked[0].loss)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 from rich.text import Text
 
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
 from dashcalib_ros.cli.drive import (
@@ -32,6 +31,7 @@ from dashcalib_ros.judge import (
     track_poses,
     with_faults,
 )
+from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.camera_file import load_with_faults
 from dashcalib_ros.report.compare import mount_dict
@@ -74,15 +74,15 @@ def check(args: argparse.Namespace) -> int:
         if sensors is not None:
             calibrator.sense(sensors)
         feed(calibrator, source, mask, stages)
-        calibration = calibrator.calibrate(stages.show)
-        found = with_faults(calibrator.check(given, calibration, stages.show), named.faults)
+        calibration, questions = calibrator.calibrate(stages.show), Questions(calibrator)
+        found = with_faults(questions.check(given, calibration, stages.show), named.faults)
         # one for pictures of another size is wrong, and explains no motion
-        changes = _changes(calibrator, given, calibration)
+        changes = _changes(questions, given, calibration)
         if track is not None and track.position is not None:
             since = track.since(calibration.start_s).position or track.position
             poses = track_poses(since, calibration.start_s)
         if poses is not None and given.image_size == calibration.image_size:
-            motion = calibrator.odometry(given, calibration, poses, stages.show)
+            motion = questions.odometry(given, calibration, poses, stages.show)
     warn((*source.warnings, *calibration.warnings))
     now, before = calibration.mount, named.mount
     if args.json:
@@ -121,11 +121,11 @@ def _poses(args: argparse.Namespace) -> tuple[Poses | None, SensorStream | None]
     return None, track
 
 
-def _changes(calibrator: Calibrator, given: Camera, calibration: Calibration) -> list[str]:
+def _changes(questions: Questions, given: Camera, calibration: Calibration) -> list[str]:
     """Return in words what has changed during the drive: a long one may be of two cameras."""
     if given.image_size != calibration.image_size:
         return []
-    return [str(change) for change in calibrator.watch(given).changes]
+    return [str(change) for change in questions.watch(given).changes]
 
 
 def _show(found: Check, motion: Odometry | None, changes: Sequence[str]) -> None:

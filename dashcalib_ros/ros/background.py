@@ -19,6 +19,8 @@ from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge import Calibration, Check, Monitor
 from dashcalib_ros.judge.agreement import outdated, turns_of_another_camera
+from dashcalib_ros.judge.conclude import CONTRADICTS
+from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.memory import mapped_copy
 from dashcalib_ros.status import Status, View
@@ -175,6 +177,7 @@ class _Bank:
 
     number: int
     calibrator: Calibrator
+    questions: Questions
     depth: BitDepth = field(default_factory=BitDepth)
     tried: frozenset[TurnId] = frozenset()
     told: frozenset[TurnId] = frozenset()
@@ -215,7 +218,7 @@ class Learner:
         self._activity = Activity()
         self._closed = False
         # from here on of the background thread only
-        self._now = _Bank(0, self._calibrator(use_stored=True))
+        self._now = self._bank(0, use_stored=True)
         self._watching: NamedCamera | None = None
         self._monitor: Monitor | None = None
         self._tried_with: NamedCamera | None = None
@@ -275,13 +278,13 @@ class Learner:
         turns.store is emptied, too. keep_stored: turns.store stays and its turns are used, as the
         images are of another camera now.
         """
-        new = _Bank(self.bank + 1, self._calibrator(use_stored=keep_stored))
+        new = self._bank(self.bank + 1, use_stored=keep_stored)
         self.bank, self._more = new.number, 0
         self._inbox.put(lambda: self._begin(new, keep_stored), instead_of_images=True)
 
     def forget_stored(self, but: Set[TurnId]) -> None:
         """Drop the turns of earlier drives but these: the camera has changed since."""
-        self._inbox.put(lambda: self._now.calibrator.forget_stored(but))
+        self._inbox.put(lambda: self._now.calibrator.scenes.forget_stored(but))
 
     def close(self) -> None:
         """End the thread and every child process."""
@@ -316,18 +319,19 @@ class Learner:
             self._tell(Trouble('failed', f'the turns could not be changed: {_named(error)}'))
         return True
 
-    def _calibrator(self, use_stored: bool) -> Calibrator:
-        return Calibrator(self._config, mask=self._mask, live=True, use_stored=use_stored,
-                          warn=lambda text: self._tell(Trouble('store', text)),
-                          on_trouble=lambda text: self._tell(Trouble('workers', text)),
-                          on_wait=self._serve)
+    def _bank(self, number: int, use_stored: bool) -> _Bank:
+        calibrator = Calibrator(
+            self._config, mask=self._mask, live=True, use_stored=use_stored,
+            warn=lambda text: self._tell(Trouble('store', text)),
+            on_trouble=lambda text: self._tell(Trouble('workers', text)), on_wait=self._serve)
+        return _Bank(number, calibrator, Questions(calibrator))
 
     def _begin(self, new: _Bank, keep_stored: bool) -> None:
         old, self._now = self._now, new
         self._activity = replace(self._activity, status=NOTHING)
         old.calibrator.close()
         if not keep_stored:
-            old.calibrator.clear_store()
+            old.calibrator.scenes.clear_store()
 
     def _request(self) -> None:
         self._now.requested = True
@@ -341,7 +345,7 @@ class Learner:
             status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
             bank.start_s = stamp_ns / 1e9 if bank.start_s is None else bank.start_s
             if self._viewer.wanted():
-                self._viewer.show(Picture(message.header, image, bank.calibrator.view()))
+                self._viewer.show(Picture(message.header, image, _view(bank.calibrator)))
         except InputError as error:
             self._tell(Trouble('undecodable', str(error)))
         except Exception as error:
@@ -353,7 +357,7 @@ class Learner:
     def _look(self, bank: _Bank) -> None:
         """See which turns are built now."""
         try:
-            bank.calibrator.want(self._config.turns.wanted, self._more)
+            bank.calibrator.scenes.want(self._config.turns.wanted, self._more)
             status = bank.calibrator.status()
         except Exception as error:
             self._tell(Trouble('failed', f'the turns could not be counted: {_named(error)}'))
@@ -376,12 +380,12 @@ class Learner:
         # the same turns alone are not tried again
         bank.read |= turns
         try:
-            found = bank.calibrator.watch(camera.camera, camera.sigma)
+            found = bank.questions.watch(camera.camera, camera.sigma)
             if bank.earlier is not None:
                 found = reduce(Monitor.after, found.readings, bank.earlier)
             if found.lens and found.lens.confirmed and found.lens.since.of_this_drive:
                 # those of earlier drives are of the camera before the change
-                bank.calibrator.forget_stored()
+                bank.calibrator.scenes.forget_stored()
         except Exception as error:
             if bank is self._now and not self._closed:
                 self._tell(Trouble('failed_watches', f'new turns could not be compared with the '
@@ -415,10 +419,11 @@ class Learner:
                 # both have the same clock, whichever it is
                 bank.calibrator.sense(replace(stream.shifted(-bank.start_s), absolute=False))
             calibration = bank.calibrator.calibrate(self._progress, final=False)
-            check = None if given is None else bank.calibrator.check(
+            check = None if given is None else bank.questions.check(
                 given.camera, calibration, self._progress)
             of_another = turns_of_another_camera(calibration.misfits, self._config.verdict)
-            bank.calibrator.reject(outdated(of_another | calibration.used_turns, of_another))
+            bank.calibrator.scenes.reject(dict.fromkeys(
+                outdated(of_another | calibration.used_turns, of_another), CONTRADICTS))
         except Exception as error:
             self._failed(bank, error)
             return
@@ -450,6 +455,11 @@ def whole(message: Any, size: tuple[int, int], depth: BitDepth | None = None) ->
         raise InputError(f'an image is {image.shape[1]}x{image.shape[0]} but its header says '
                          f'{size[0]}x{size[1]}: the camera driver is broken')
     return image
+
+
+def _view(calibrator: Calibrator) -> View:
+    found = calibrator.detection
+    return View(found.points(), found.valid())
 
 
 def new_turns(told: Set[TurnId], now: Status) -> list[NewTurn]:

@@ -17,6 +17,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
+from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import result_json
 from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.quadratic import Quadratic
@@ -26,9 +27,6 @@ from dashcalib_ros.solve.quadratic import Quadratic
 class FakeCalibrator:
     """Answers at once with what the test wants."""
 
-    answer = 'right'
-    asked: object = None
-    fits = 5
     mount = None
 
     def __init__(self, config=None, mask=None, verbose=False):
@@ -42,6 +40,21 @@ class FakeCalibrator:
 
     def calibrate(self, progress=None):
         return make_calibration(warnings=('dark',), mount=self.mount)
+
+    def close(self):
+        pass
+
+
+@stands_in_for(Questions)
+class FakeQuestions:
+    """Answers at once with what the test wants."""
+
+    answer = 'right'
+    asked: object = None
+    fits = 5
+
+    def __init__(self, calibrator):
+        pass
 
     def check(self, given, calibration, progress=None):
         type(self).asked = given
@@ -60,14 +73,12 @@ class FakeCalibrator:
                 for n in range(5)]
         return watch(seen, camera, sigma, Config().monitor)
 
-    def close(self):
-        pass
-
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     """Make a drive, a calibration and a file of poses; return the command's first arguments."""
     monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', FakeCalibrator)
+    monkeypatch.setattr('dashcalib_ros.cli.check.Questions', FakeQuestions)
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'drive').mkdir()
     for n in range(3):
@@ -80,17 +91,17 @@ def files(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(('answer', 'code'), [('right', 0), ('wrong', 1), ('cannot tell', 3)])
 def test_the_answer_is_shown_and_is_the_exit_code(files, monkeypatch, capfd, answer, code):
-    monkeypatch.setattr(FakeCalibrator, 'answer', answer)
+    monkeypatch.setattr(FakeQuestions, 'answer', answer)
     assert main(files) == code
     out, errors = capfd.readouterr()
     assert out.splitlines()[0] == f'answer: {answer}' and 'it is 0.2 px off' in out
-    assert 'dark' in errors and FakeCalibrator.asked == TRUTH
+    assert 'dark' in errors and FakeQuestions.asked == TRUTH
 
 
 def test_a_bag_s_own_calibration_is_checked(files, tmp_path, capfd):
     write_bag(tmp_path / 'bag', [*images(drive(3)), ('/camera_info', START, info_of(TRUTH))])
-    FakeCalibrator.asked = None
-    assert main(['check', 'bag']) == 0 and FakeCalibrator.asked == TRUTH
+    FakeQuestions.asked = None
+    assert main(['check', 'bag']) == 0 and FakeQuestions.asked == TRUTH
     assert main(['check', 'bag', '--topic', '/camera']) == 0
     write_bag(tmp_path / 'without', images(drive(3)))
     assert main(['check', 'without']) == 2
@@ -152,13 +163,13 @@ def test_wrong_motion_arguments_are_one_line(files, tmp_path, capfd, more, line)
 
 
 def test_a_change_during_the_drive_is_told(files, monkeypatch, capfd):
-    monkeypatch.setattr(FakeCalibrator, 'fits', 3)
+    monkeypatch.setattr(FakeQuestions, 'fits', 3)
     assert main(files) == 0
     assert 'since the turn at frame 3' in capfd.readouterr().out
 
 
 def test_a_calibration_that_never_fitted_has_not_changed(files, monkeypatch, capfd):
-    monkeypatch.setattr(FakeCalibrator, 'fits', 0)
+    monkeypatch.setattr(FakeQuestions, 'fits', 0)
     assert main(files) == 0
     assert 'since' not in capfd.readouterr().out
 

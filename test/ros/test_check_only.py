@@ -25,11 +25,13 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
+from dashcalib_ros.questions import Questions
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros import background, node
 from dashcalib_ros.ros.calibrator_node import camera_info
 from dashcalib_ros.ros.images import LASTING
 from dashcalib_ros.ros.settings import NodeConfig
+from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.status import Status
 
@@ -49,7 +51,7 @@ class Core:
 
     def __init__(self, config=None, mask=None, verbose=False, live=False, use_stored=True,
                  warn=None, inline=False, on_trouble=None, on_wait=None):
-        self.ready, self.strangers = (), ()
+        self.ready, self.strangers, self.scenes = (), (), Scenes()
         Core.newest = self
 
     def push(self, frame):
@@ -65,15 +67,13 @@ class Core:
         return Calibration(Verdict('accepted'), (320, 240), FIRST, SIGMA, turns, 10, 0.3, {}, {},
                            Config())
 
-    def check(self, given, calibration, progress=None):
-        right = given.fx == calibration.camera.fx
-        if self.dark:
-            return Check('cannot tell', ('too dark',))
-        return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
+    def close(self):
+        pass
 
-    def watch(self, camera, sigma=None):
-        return watch((Reading(turn, KNOWS, None, turn not in self.strangers)
-                      for turn in self.ready), camera, sigma, Config().monitor)
+
+@stands_in_for(SceneSelection)
+class Scenes:
+    """In the SceneSelection's place: it has none."""
 
     def forget_stored(self, but=frozenset()):
         pass
@@ -81,20 +81,36 @@ class Core:
     def want(self, turns, more=0):
         pass
 
-    def reject(self, turns):
-        pass
-
-    def close(self):
+    def reject(self, reasons):
         pass
 
     def clear_store(self):
         pass
 
 
+@stands_in_for(Questions)
+class Asked:
+    """In the Questions' place: answers with what the core's turns show."""
+
+    def __init__(self, calibrator):
+        self.core = calibrator
+
+    def check(self, given, calibration, progress=None):
+        right = given.fx == calibration.camera.fx
+        if self.core.dark:
+            return Check('cannot tell', ('too dark',))
+        return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
+
+    def watch(self, camera, sigma=None):
+        return watch((Reading(turn, KNOWS, None, turn not in self.core.strangers)
+                      for turn in self.core.ready), camera, sigma, Config().monitor)
+
+
 @pytest.fixture
 def desk(make_desk, monkeypatch):
     """Make a node with such a core; with a driver and a reader of ~/check beside it."""
     monkeypatch.setattr(background, 'Calibrator', Core)
+    monkeypatch.setattr(background, 'Questions', Asked)
     monkeypatch.setattr(background, 'LOOK_S', 0.05)
     monkeypatch.setattr(node, 'PERIOD_S', 0.1)
 

@@ -19,6 +19,7 @@ from dashcalib_ros.detect.motion import TrackedPoints
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.judge.calibration import StoredTurnSummary
+from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros import background as room
 from dashcalib_ros.ros.background import (
@@ -29,8 +30,9 @@ from dashcalib_ros.ros.background import (
     Trouble,
     Watched,
 )
+from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve.quadratic import Quadratic
-from dashcalib_ros.status import Status, View
+from dashcalib_ros.status import Status
 
 LIMIT = 20.0
 CONFIG = Config().replace({'turns.wanted': 2})
@@ -57,6 +59,10 @@ class Core:
         self.strangers, self.watched, self.checked = (), [], []
         self.hold, self.closed = threading.Event(), threading.Event()
         self.hold.set()
+        self.scenes = Scenes()
+        self.scenes.core = self
+        self.detection = types.SimpleNamespace(
+            points=lambda: TrackedPoints(None, None), valid=lambda: None)
         Core.made.append(self)
 
     def push(self, frame):
@@ -88,41 +94,52 @@ class Core:
         return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG,
                            stored_turns=stored)
 
-    def watch(self, camera, sigma=None):
-        self.watched.append((camera, self.ready))
-        if Core.failures:
-            raise Core.failures.pop()
-        return watch((Reading(turn, ZERO, None, explained=turn not in self.strangers)
-                      for turn in self.ready), camera, sigma, CONFIG.monitor)
-
-    def check(self, given, calibration, progress=None):
-        self.checked.append(given)
-        return Check('right', ('it fits',), 0.5, 1.0)
-
-    def want(self, turns, more=0):
-        self.wanted = turns + more
-
-    def view(self):
-        return View(TrackedPoints(None, None), None)
-
-    def reject(self, turns):
-        self.ready = tuple(turn for turn in self.ready if turn not in turns)
-
     def close(self):
         self.closed.set()
         self.done.append('close')
 
+
+@stands_in_for(SceneSelection)
+class Scenes:
+    """In the SceneSelection's place: of such a core."""
+
+    def want(self, turns, more=0):
+        self.core.wanted = turns + more
+
+    def reject(self, reasons):
+        self.core.ready = tuple(turn for turn in self.core.ready if turn not in reasons)
+
     def clear_store(self):
-        self.done.append('clear')
+        self.core.done.append('clear')
 
     def forget_stored(self, but=frozenset()):
-        self.done.append('forget')
+        self.core.done.append('forget')
+
+
+@stands_in_for(Questions)
+class Asked:
+    """In the Questions' place: answers with the turns of such a core."""
+
+    def __init__(self, calibrator):
+        self.core = calibrator
+
+    def watch(self, camera, sigma=None):
+        self.core.watched.append((camera, self.core.ready))
+        if Core.failures:
+            raise Core.failures.pop()
+        return watch((Reading(turn, ZERO, None, explained=turn not in self.core.strangers)
+                      for turn in self.core.ready), camera, sigma, CONFIG.monitor)
+
+    def check(self, given, calibration, progress=None):
+        self.core.checked.append(given)
+        return Check('right', ('it fits',), 0.5, 1.0)
 
 
 @pytest.fixture
 def desk(monkeypatch):
     """A learner over such cores, and all it tells."""
     monkeypatch.setattr(room, 'Calibrator', Core)
+    monkeypatch.setattr(room, 'Questions', Asked)
     Core.made, Core.failures = [], []
     heard = types.SimpleNamespace(results=[], troubles=[], statuses=[], turns=[], begun=[],
                                   pictures=[], watching=False, watched=[])
@@ -353,12 +370,12 @@ def test_a_failing_core_ends_no_thread(desk, monkeypatch):
             raise RuntimeError('status')
         return Core.status(core)
 
-    def reject(turns):
+    def reject(reasons):
         if 'reject' in failures:
             failures.remove('reject')
             raise RuntimeError('reject')
     core.ready = at(10, 20)
-    core.status, core.reject = status, reject
+    core.status, core.scenes.reject = status, reject
     until(lambda: desk.results)
     assert failures == []
     # the first look at the turns may come before status is replaced, never after two results

@@ -22,6 +22,7 @@ from ros_desk import STAMPS
 from sensor_msgs.msg import CompressedImage
 
 from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.ros import preview as room
 
 LENS = Radial((320, 240), 260.0, 261.0, 165.0, 118.0, -0.25, 0.05)
@@ -93,7 +94,7 @@ def test_points_are_told_in_pixels_of_the_input():
         for n in range(8):
             image = np.ascontiguousarray(wide[:, 3 * n:3 * n + 320])
             calibrator.push(Frame(n, n * 10**8, image))
-        points = calibrator.view().points
+        points = calibrator.detection.points()
     moved = points.now - points.before
     followed = np.linalg.norm(moved, axis=1) > 0
     assert followed.sum() > 50
@@ -109,7 +110,7 @@ def drawings(monkeypatch):
     """Count what is drawn; the drawing waits while `hold` is cleared."""
     made = type('Drawings', (), {'count': 0, 'views': 0, 'hold': threading.Event()})()
     made.hold.set()
-    draw, view = room.overlay, Calibrator.view
+    draw, points = room.overlay, Detection.points
 
     def counted(*arguments):
         made.count += 1
@@ -118,10 +119,10 @@ def drawings(monkeypatch):
 
     def viewed(self):
         made.views += 1
-        return view(self)
+        return points(self)
 
     monkeypatch.setattr(room, 'overlay', counted)
-    monkeypatch.setattr(Calibrator, 'view', viewed)
+    monkeypatch.setattr(Detection, 'points', viewed)
     return made
 
 

@@ -1,0 +1,97 @@
+"""What the turns of a drive say of other cameras than their own: given ones, one in use."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dashcalib_ros import stages
+from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.detect import TurnId
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.judge import (
+    Calibration,
+    Check,
+    Monitor,
+    Odometry,
+    Poses,
+    Reading,
+    watch,
+    with_lines,
+)
+from dashcalib_ros.selection import Progress
+
+
+class Questions:
+    """Asks the turns of a calibrator, in its workers; for the calibrator's thread.
+
+    All cameras are of the full-size pictures.
+    """
+
+    def __init__(self, calibrator: Calibrator) -> None:
+        self._asked = calibrator
+        # what turns say of the camera that watch() was asked about last, resized
+        self._watched: Camera | None = None
+        self._read: dict[TurnId, Reading] = {}
+
+    def check(self, given: Camera, calibration: Calibration, progress: Progress | None = None
+              ) -> Check:
+        """Say whether a given camera explains the drive.
+
+        calibration: what the last calibrate() returned. progress: as for calibrate().
+        """
+        config = self._asked.scenes.config
+        found: Check = self._run(
+            stages.check, given, calibration.image_size, self._asked.solution,
+            calibration.verdict, config, progress=progress)
+        lines = self._asked.detection.lines()
+        return with_lines(found, given, lines, calibration.image_size, config)
+
+    def odometry(self, given: Camera, calibration: Calibration, poses: Poses,
+                 progress: Progress | None = None) -> Odometry | None:
+        """Compare the motion that cameras find in the turns with true poses.
+
+        The cameras: given, the drive's own, and a trivial guess. given, calibration: as for
+        check(). Returns None where the drive has no camera of its own. Raises InputError where
+        given is for pictures of another size, or no turn has poses.
+        """
+        if self._asked.solution is None:
+            return None
+        found: Odometry = self._run(
+            stages.odometry, given, calibration.image_size, self._asked.solution, poses,
+            self._asked.scenes.config, progress=progress)
+        return found
+
+    def watch(self, camera: Camera, sigma: Mapping[str, float] | None = None,
+              progress: Progress | None = None) -> Monitor:
+        """Return whether the turns so far show that a camera in use has changed.
+
+        sigma: of its parameters; None for a camera that is not known to have fitted any turns
+        before these: then only turns behind one that it explains can show a change. Turns that
+        were read with the same camera before are not read again. progress: as for calibrate().
+        Raises InputError where the camera is for pictures of another size.
+        """
+        size, scale = self._asked.detection.size, self._asked.detection.scale
+        scenes, config = self._asked.scenes.all_scenes(), self._asked.scenes.config
+        if camera.image_size != size:
+            raise InputError(f'the camera in use is for pictures of another size: '
+                             f'{camera.image_size[0]}x{camera.image_size[1]}')
+        small = camera.resized(1 / scale.px, scale.size(size))
+        if self._watched != small:
+            self._watched, self._read = small, {}
+        new = [scene for turn, scene in scenes.items() if turn not in self._read]
+        if new:
+            readings: tuple[Reading, ...] = self._run(stages.read, new, small, config,
+                                                      progress=progress)
+            self._read |= {reading.turn: reading for reading in readings}
+        # fx, fy, cx and cy are pixels
+        scaled = None if sigma is None else {
+            name: value / scale.px if name in small.names()[:4] else value
+            for name, value in sigma.items()}
+        # a stored turn that was driven again counts once
+        return watch((reading for turn, reading in sorted(self._read.items())
+                      if turn.of_this_drive or turn in scenes), small, scaled, config.monitor)
+
+    def _run(self, stage: Any, *arguments: Any, progress: Progress | None) -> Any:
+        return self._asked.scenes.run(stage, *arguments,
+                                      progress=progress or (lambda stage, done: None))
