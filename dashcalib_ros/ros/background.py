@@ -415,7 +415,7 @@ class Learner:
         self._tell(Started(self._activity.status))
         try:
             stream = self._sensors.stream()
-            if bank.start_s is not None and not stream.empty:
+            if bank.start_s is not None and (stream.warnings or not stream.empty):
                 # both have the same clock, whichever it is
                 bank.calibrator.sense(replace(stream.shifted(-bank.start_s), absolute=False))
             calibration = bank.calibrator.calibrate(self._progress, final=False)

@@ -23,6 +23,7 @@ from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.result import check_camera_name
+from dashcalib_ros.report.wording import witness_texts
 from dashcalib_ros.ros.background import (
     Activity,
     Learner,
@@ -133,6 +134,8 @@ class CameraNode(Node, ABC):
         self._mail = Mailbox(self, self.survive)
         self._changes = Changes(self._log)
         self._verdict: Verdict | None = None
+        # what the car's own sensors say of the last calibration, in words
+        self._witnesses: list[str] = []
         self._watched: NamedCamera | None = None
         # not the ROS clock: diagnostics must also be published while a simulation is paused
         self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -285,7 +288,7 @@ class CameraNode(Node, ABC):
         self._set_goal()
 
     def _forget(self, keep_stored: bool = False) -> None:
-        self._verdict = None
+        self._verdict, self._witnesses = None, []
         self._drop()
         self._learner.restart(keep_stored)
         self._intake.forget()
@@ -316,6 +319,9 @@ class CameraNode(Node, ABC):
         if result.bank != self._learner.bank:
             return  # a reset came in between
         self._verdict = result.calibration.verdict
+        self._witnesses = witness_texts(result.calibration.witnesses)
+        for text in self._witnesses:
+            self._log.info(text)
         for text in result.calibration.warnings:
             self._complaints.once(text)
         self._judge(result)
@@ -395,7 +401,8 @@ class CameraNode(Node, ABC):
             silence(images.topic, images.listening, intake.silent_s), activity, wanted,
             self._verdict, self._changes, warnings, health,
             {'topic': images.topic, 'reliability': images.reliability,
-             'received': intake.received, **health.counts,
+             'motion sensors': '; '.join(self._witnesses), 'received': intake.received,
+             **health.counts,
              **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},
              'pictures published': self._preview.published})
         status.name = f'{self.get_fully_qualified_name().strip("/")}: camera calibration'

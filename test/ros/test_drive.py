@@ -4,6 +4,7 @@ from __future__ import annotations
 import os
 import signal
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
@@ -15,6 +16,7 @@ from ros_bench import (
     NodeProcess,
     image_message,
 )
+from sensor_msgs.msg import Imu
 from sensor_msgs.srv import SetCameraInfo
 from synthetic import LENS as SYNTHETIC_LENS
 from synthetic import synthetic_turn
@@ -58,9 +60,10 @@ def driven(ros_context, rendered, tmp_path_factory):
     home = tmp_path_factory.mktemp('driven')
     seen = Driven()
     seen.drive, seen.frames = rendered
-    seen.node = NodeProcess(home, commit=True, commit_timeout=SOON, **QUICK)
+    seen.node = NodeProcess(home, commit=True, commit_timeout=SOON, imu_topic='/imu', **QUICK)
     seen.bench = bench = Bench(ros_context)
     seen.committed = []
+    seen.gyro = bench.node.create_publisher(Imu, '/imu', 400)
 
     def set_camera_info(request, response):
         seen.committed.append(request.camera_info)
@@ -83,7 +86,10 @@ def drive(seen):
     """
     bench, node = seen.bench, seen.node
     seen.killed, seen.asked = 0, None
+    rates = gyro_messages(seen.drive, seen.frames)
     for frame in seen.frames:
+        for message in next(rates):
+            seen.gyro.publish(message)
         bench.publish(image_message(frame.image, frame.stamp_ns))
         bench.spin(0.02)
         if not seen.killed and (children := node.children()):
@@ -101,6 +107,37 @@ def drive(seen):
     bench.publish(*seen.after)
     bench.until(lambda: len(bench.infos) >= 5, what='camera_info for each image', node=node)
     bench.until(lambda: bench.values.get('state') == 'calibrated', node=node)
+
+
+def gyro_messages(drive, frames):
+    """Yield for each image what a gyro that lies on its side, 40 ms late, sends until then.
+
+    Each tenth message comes twice, some after a later one, and some without a stamp.
+    """
+    stamps_ns, late_ns = np.array([frame.stamp_ns for frame in frames]), 40_000_000
+    rates = np.gradient(np.unwrap(drive.yaw), stamps_ns / 1e9)
+    sent = stamps_ns[0]
+    for now in stamps_ns:
+        messages = []
+        while sent <= now:
+            message = Imu()
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(int(sent), 10**9)
+            message.angular_velocity.x = float(np.interp(sent - late_ns, stamps_ns, rates))
+            messages.append(message)
+            count = int(sent - stamps_ns[0]) // 10_000_000
+            messages += [message] * (count % 10 == 0) + [Imu()] * (count % 100 == 50)
+            if count % 15 == 0:
+                messages[-2:] = messages[:-3:-1]
+            sent += 10_000_000
+        yield messages
+
+
+def test_a_gyro_with_bad_messages_is_a_witness(driven):
+    told = driven.bench.values['motion sensors']
+    assert told.startswith('the gyro agrees: fx off by'), driven.node.text
+    assert told in driven.node.text
+    late_ms = float(told.partition('late by ')[2].split()[0])
+    assert abs(late_ms - 40) < 15
 
 
 def test_nothing_is_published_before_acceptance_and_one_per_image_after(driven):

@@ -75,6 +75,9 @@ class Core:
         return Status(self.frames, len(ready), len(ready), 60.0 * len(ready), 0.1, False, ready,
                       len(self.stored), (60.0,) * len(ready), self.ready)
 
+    def sense(self, motion):
+        self.motion = motion
+
     def calibrate(self, progress=None, final=True):
         assert not final
         self.calls += 1
@@ -358,6 +361,17 @@ def test_images_that_cannot_be_used_are_told(desk):
     assert [kind for kind, _ in desk.troubles] == ['undecodable', 'undecodable', 'failed']
     desk.learner.offer(3, 3, image(), (64, 48))
     until(lambda: desk.statuses)
+
+
+def test_sensors_that_cannot_be_used_are_told_at_the_next_calibration(desk):
+    for n in range(100):
+        desk.learner.sense('rate', 7.0, (0.1 * n, 0.0, 0.0))
+    desk.learner.offer(1, 10**9, image(), (64, 48))
+    until(lambda: desk.statuses)
+    core = Core.made[0]
+    core.ready = at(10, 20)
+    until(lambda: desk.results)
+    assert core.motion.empty and 'not used' in core.motion.warnings[0]
 
 
 def test_a_failing_core_ends_no_thread(desk, monkeypatch):
