@@ -36,7 +36,7 @@ from dashcalib_ros.solve.fixed_camera import (
 from dashcalib_ros.solve.knowledge import Knowledge
 from dashcalib_ros.solve.normal import noise_in, turn_cost
 from dashcalib_ros.solve.prior import bounds_of, floor_of, loss_px_of, prior_information, prior_of
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.solve.quadratic import Quadratic, noise_of
 from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shift
 
 ByTurn = Mapping[TurnId, Scene]
@@ -120,7 +120,8 @@ class Fit:
             else None) for scene in self.scenes)
         left = LEFT_BY_FIELD if self.used_field is not None else 1.0
         return Knowledge(
-            camera, turns, self._prior_of_all(), floor_of(camera, self.used_field),
+            camera, turns, self._prior_of_all(),
+            floor_of(camera, noise_of(turns), self.used_field),
             one_turn_sigma=left * self.config.intrinsics.one_turn_sigma * camera.fx)
 
     def _by_shared(self, scene: Scene) -> Floats | None:

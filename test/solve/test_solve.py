@@ -37,7 +37,7 @@ from dashcalib_ros.solve.focal import summed
 from dashcalib_ros.solve.joint import solve
 from dashcalib_ros.solve.knowledge import Knowledge, scatter_between_turns
 from dashcalib_ros.solve.normal import noise_in, turn_cost
-from dashcalib_ros.solve.prior import centre_pull
+from dashcalib_ros.solve.prior import FOCAL_FLOOR, NOISE_FLOOR, centre_pull
 from dashcalib_ros.solve.quadratic import Quadratic, TurnCost, noise_of
 from dashcalib_ros.solve.solution import Solution
 
@@ -68,6 +68,14 @@ def test_a_picture_of_which_a_side_was_cut_off_is_calibrated(no_profile, cx, cy)
     drawn = centre_pull(solution.camera, solution.covariance)
     assert np.abs(drawn[2:4]).max() > 0.01
     assert (solution.sigma[:4] >= np.abs(drawn[:4])).all()
+
+
+def test_the_sigma_of_noisy_tracks_has_what_their_noise_may_move_in_all_turns(no_profile):
+    solution = solved(scenes_of(5, noise_px=0.6, tracks=250))
+    noise = solution.known.noise
+    assert 0.1 < noise < 0.6
+    assert solution.sigma[0] >= NOISE_FLOOR * noise * solution.camera.fx
+    assert solution.known.floor[0] > 10 * FOCAL_FLOOR * solution.camera.fx
 
 
 def test_equations_that_nothing_solves_give_no_solution(monkeypatch):
