@@ -58,10 +58,10 @@ RENDERED = ('dashcam: bonnet, text', 'KITTI raw lens, 1392x512', '640x480, fy/fx
 RECORDED = {'kitti03': ('bag', None), 'kitti07': ('images', 9.65), 'ntu_campus': ('images', 3.0)}
 # the frames in the middle of the turns
 TURNS = {'kitti03': (88,), 'kitti07': (25, 137)}
-# what is known of the truth, where that is not all; KITTI 07's K lacks a k1 of 0.022: this is what
+# what is known of the truth, where that is not all. KITTI's K lacks a k1 of 0.02: fx is what
 # pictures and true rotation together say
-KNOWN = {'kitti07': ('fx',), 'ntu_campus': ('fx', 'fy')}
-TRUE_FX = {'kitti07': 701.9}
+KNOWN = {'kitti03': ('fx',), 'kitti07': ('fx',), 'ntu_campus': ('fx', 'fy')}
+TRUE_FX = {'kitti03': 718.2, 'kitti07': 701.9}
 FILMS = (*RECORDED, *RENDERED, 'fisheye 150 deg, bonnet, text', 'p1, p2 0.003')
 MOST_FX_PERCENT = 3.0
 MOST_SIGMAS = 5.0
