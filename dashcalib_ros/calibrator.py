@@ -48,18 +48,18 @@ class Calibrator:
         live: children run at low priority, and push() never waits for them; offline it does, so
         that few turns are in memory at a time. use_stored: False does not load the turns in
         turns.store, but adds to them. warn: called with one line for each problem with
-        turns.store; the result's warnings have them, too. inline: everything runs
-        in this process, with equal results; numpy must have one thread, else WorkerError says how;
-        close() then does not end what runs. on_trouble: called with one line for each child that
-        died or hangs, and for each turn that is tried again after that, from any thread. on_wait:
-        called again and again while a worker is waited for; it may push() a frame, so that a live
-        drive goes on, and returns whether it did something.
+        turns.store; the result's warnings have them, too. inline: everything runs in this process,
+        with equal results; numpy must have one thread, else WorkerError says how; close() then
+        does not end what runs. on_trouble: called with one line for each child that died or hangs,
+        and for each turn that is tried again after that, from any thread. on_wait: called again
+        and again while a worker is waited for; it may push() a frame, so that a live drive goes
+        on, and returns whether it did something.
         """
         config = config or Config()
         searched(config.model)  # raises ConfigError for one that there is not
         self.detection = Detection(config, mask)
-        self.scenes = SceneSelection(config, self.detection, live, verbose, use_stored,
-                                      warn, inline, on_trouble, on_wait)
+        self.scenes = SceneSelection(config, self.detection, live, verbose, use_stored, warn,
+                                     inline, on_trouble, on_wait)
         self._live = live
         self.solution: Solution | None = None
         self._motion: SensorStream | None = None
@@ -112,8 +112,8 @@ class Calibrator:
             if self._motion is None:
                 solution = self.scenes.run(stages.solve, scenes, config, progress=tell)
             else:
-                asked = self.scenes.run(stages.solve_with_sensors, scenes, config,
-                                         self._motion, self.detection.start_s, progress=tell)
+                asked = self.scenes.run(stages.solve_with_sensors, scenes, config, self._motion,
+                                        self.detection.start_s, progress=tell)
                 solution = asked.solution
             contradicted = earlier_of_another_camera(scenes, solution)
             self.scenes.leave_out(contradicted)
