@@ -280,10 +280,10 @@ def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None
     if abs(aspect - 1) <= config.max_aspect:
         return None
     return Finding('weak', f'the pixels seem to be out of square (fy is {100 * (aspect - 1):+.1f} '
-                           f'% off fx), as a stretched picture, a decentred lens or a strong rolling '
-                           f'shutter makes them look',
-                   'unstretch the pictures, check the stamps (--fps), which a rolling shutter is '
-                   'found by, or try --model brown')
+                           f'% off fx), as a stretched picture, a decentred lens or a strong '
+                           f'rolling shutter makes them look',
+                   'unstretch the pictures, check the stamps (--fps), which a rolling shutter '
+                   'is found by, or try --model brown')
 
 
 def _strange_shutter(solution: Solution, config: VerdictConfig) -> Finding | None:
