@@ -15,9 +15,8 @@ from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.reconstruct.scene_file import Origin, StoredTurn
 from dashcalib_ros.turn_store import TurnStore
 from dashcalib_ros.workers.child import ChildWorker
-from dashcalib_ros.workers.inline import InlineWorker
 from dashcalib_ros.workers.pool import ScenePool
-from dashcalib_ros.workers.worker import Worker
+from dashcalib_ros.workers.worker import InlineWorker, Worker
 
 Progress = Callable[[str, float], None]
 

@@ -53,7 +53,7 @@ PARTS = {
         'prominence: how far a turn stands out from the driving before and after it, as a share '
         'of the picture width; frames are counted from 0'},
     'workers/child.py': {'used no processor time for … s'},
-    'workers/inline.py': {' in the environment before Python starts'},
+    'workers/worker.py': {' in the environment before Python starts'},
     'workers/pool.py': {'…; … is tried again'},
 }
 NO_MESSAGE = re.compile(r'\s*(SELECT|PRAGMA|import) ')

@@ -285,7 +285,7 @@ def one_thread(function: Callable[..., T], *arguments: object) -> T:
     """Run a task in this process, which must have one thread for numpy; raises WorkerError."""
     import cv2
 
-    from dashcalib_ros.workers.inline import InlineWorker
+    from dashcalib_ros.workers.worker import InlineWorker
     cv2.setNumThreads(1)
     result: T = InlineWorker().call(function, *arguments)
     return result

@@ -1,6 +1,7 @@
 """A worker in a child process: COLMAP aborts its process when a check fails.
 
-The parent sends (function, arguments) and receives progress, then a result or an exception.
+The parent sends (function, arguments) and receives progress, then a result or an exception, each
+as a pickle, and behind it its arrays as they are in memory: a turn's images are not copied.
 The child is a plain `python -c`, not multiprocessing: a child that the latter spawns would import
 the user's main script again.
 """
@@ -11,25 +12,32 @@ import io
 import os
 import pickle
 import select
+import signal
+import struct
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any, Protocol, cast
 
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.workers.messages import Parts, pack, receive, send, unpack
 from dashcalib_ros.workers.worker import THREAD_VARIABLES, Progress, WorkerDiedError
 
 # not `-m`: it would import from the current folder first, and a random.py may lie there
 START = ("import sys; sys.path[:1] = [] if sys.path[0] == '' else sys.path[:1]; "
-         'from dashcalib_ros.workers.child_main import main; main()')
+         'from dashcalib_ros.workers.child import main; main()')
 LOW_PRIORITY = 10
 # s between two looks at a child that does not answer
 LOOK_S = 1.0
 # looks without a sign of life: a child of low priority may wait for the processor for seconds
 LOOKS_TO_REPORT = 10
 LOOKS_TO_KILL = 60
+HEADER = struct.Struct('>Q')
+PROTOCOL = pickle.HIGHEST_PROTOCOL
+# a pickle, and the arrays that it leaves out
+Parts = list[Any]
 
 
 class ChildWorker:
@@ -213,3 +221,111 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         if pipe is not None:
             with contextlib.suppress(OSError):
                 pipe.close()
+
+
+# messages, at both ends -----------------------------------------------------------------------
+
+
+class Pipe(Protocol):
+    """One end of a pipe; both methods may transfer fewer bytes than given."""
+
+    def readinto(self, view: memoryview, /) -> int | None:
+        """Read what is there into the view; return how many bytes."""
+
+    def write(self, data: memoryview, /) -> int | None:
+        """Write the beginning of data; return how many bytes."""
+
+
+def pack(message: object) -> Parts:
+    """Return the pickle and the arrays that it leaves out: views, no copies."""
+    buffers: list[pickle.PickleBuffer] = []
+    head = pickle.dumps(message, PROTOCOL, buffer_callback=buffers.append)
+    return [head, *(buffer.raw() for buffer in buffers)]
+
+
+def unpack(parts: Parts) -> Any:
+    """Return the message; its arrays can be written to."""
+    return pickle.loads(parts[0], buffers=parts[1:])
+
+
+def send(pipe: Pipe, parts: Parts) -> None:
+    """Write a message; raises OSError or ValueError when nobody reads it."""
+    _write(pipe, HEADER.pack(len(parts)))
+    for part in parts:
+        _write(pipe, HEADER.pack(len(part)))
+        _write(pipe, part)
+
+
+def receive(pipe: Pipe) -> Parts:
+    """Read a message; raises EOFError, OSError or ValueError when its writer is gone."""
+    (count,) = HEADER.unpack(_read(pipe, HEADER.size))
+    return [_read(pipe, *HEADER.unpack(_read(pipe, HEADER.size))) for _ in range(count)]
+
+
+def _write(pipe: Pipe, data: bytes | memoryview) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[pipe.write(view) or 0:]
+
+
+def _read(pipe: Pipe, length: int) -> bytearray:
+    data = bytearray(length)
+    view = memoryview(data)
+    while view:
+        got = pipe.readinto(view)
+        if got == 0:
+            raise EOFError
+        view = view[got or 0:]
+    return data
+
+
+# the child -----------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Answer calls; arguments: niceness, the parent's process id, OpenCV's threads."""
+    niceness, parent, threads = (int(text) for text in sys.argv[1:4])
+    # Ctrl-C reaches the whole process group: the parent ends the child if needed
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(niceness)
+    threading.Thread(target=_watch_parent, args=(parent,), daemon=True).start()
+    requests = os.fdopen(os.dup(0), 'rb')
+    # libraries may print: they get stderr, as the pipe is for answers only
+    answers = os.fdopen(os.dup(1), 'wb', buffering=0)
+    os.dup2(2, 1)
+
+    import cv2
+    cv2.setNumThreads(threads)
+
+    def report(stage: str, done: float) -> None:
+        send(answers, pack(('progress', (stage, done))))
+
+    with contextlib.suppress(EOFError):
+        while True:
+            # no variable keeps a call's arguments in memory until the next call
+            send(answers, _answer(receive(requests), report))
+
+
+def _answer(request: Parts, report: Progress) -> Parts:
+    try:
+        function, arguments, wants_progress = unpack(request)
+        extra = {'progress': report} if wants_progress else {}
+        return pack(('result', function(*arguments, **extra)))
+    except Exception as error:
+        return pack(('error', _portable(error)))
+
+
+def _portable(error: Exception) -> Exception:
+    """Return the error, or a WorkerError with its text if it cannot be pickled."""
+    try:
+        pickle.loads(pickle.dumps(error, PROTOCOL))
+    except Exception:
+        return WorkerError(f'{type(error).__name__}: {error}')
+    return error
+
+
+def _watch_parent(parent: int) -> None:
+    """End this process when its parent is gone, even in the middle of a call."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)

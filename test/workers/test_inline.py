@@ -9,8 +9,7 @@ import pytest
 from waiting import background
 
 from dashcalib_ros.errors import InputError, WorkerError
-from dashcalib_ros.workers.inline import InlineWorker
-from dashcalib_ros.workers.worker import THREAD_VARIABLES, Worker, WorkerDiedError
+from dashcalib_ros.workers.worker import THREAD_VARIABLES, InlineWorker, Worker, WorkerDiedError
 
 
 @pytest.fixture(autouse=True)

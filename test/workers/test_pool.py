@@ -23,19 +23,17 @@ from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.reconstruct import build
 from dashcalib_ros.workers import child as child_module
-from dashcalib_ros.workers import jobs
 from dashcalib_ros.workers import pool as pool_module
 from dashcalib_ros.workers.child import ChildWorker
-from dashcalib_ros.workers.inline import InlineWorker
 from dashcalib_ros.workers.pool import ATTEMPTS, ScenePool
-from dashcalib_ros.workers.worker import THREAD_VARIABLES, WorkerDiedError
+from dashcalib_ros.workers.worker import THREAD_VARIABLES, InlineWorker, WorkerDiedError
 
 at = TurnId.at
 
 
 @pytest.fixture(autouse=True)
 def hurried(monkeypatch) -> None:
-    monkeypatch.setattr(jobs, 'BACK_OFF_S', 0.01)
+    monkeypatch.setattr(pool_module, 'BACK_OFF_S', 0.01)
 
 
 @pytest.fixture
@@ -252,7 +250,7 @@ def test_a_child_that_dies_in_the_second_half_loses_no_turn(pool, monkeypatch, t
 
 
 def test_what_failed_is_not_kept_for_a_turn_that_left(pool, monkeypatch, tmp_path):
-    monkeypatch.setattr(jobs, 'BACK_OFF_S', 1000.0)
+    monkeypatch.setattr(pool_module, 'BACK_OFF_S', 1000.0)
     use(monkeypatch, child_tasks.build_fails_at_first)
     pool.submit(turn(10, tmp_path / 'flag'), None)
     wait_for(lambda: pool._jobs.turns() and pool._errors)
@@ -296,13 +294,13 @@ def test_a_hung_child_is_told_of_and_its_turn_tried_again(pool, trouble, monkeyp
 
 
 def test_the_pauses_grow_and_have_an_end(monkeypatch):
-    monkeypatch.setattr(jobs, 'BACK_OFF_S', 1.0)
-    assert [jobs.back_off_s(n) for n in (1, 2, 3, 4, 100, 2000)] == [1, 2, 4, 8, 60, 60]
+    monkeypatch.setattr(pool_module, 'BACK_OFF_S', 1.0)
+    assert [pool_module.back_off_s(n) for n in (1, 2, 3, 4, 100, 2000)] == [1, 2, 4, 8, 60, 60]
 
 
 def test_a_job_that_failed_waits_while_others_do_not():
-    waiting = jobs.Jobs(None)
-    first, second = jobs.Job(turn(10), None), jobs.Job(turn(20), None)
+    waiting = pool_module.Jobs(None)
+    first, second = pool_module.Job(turn(10), None), pool_module.Job(turn(20), None)
     waiting.put(replace(first, not_before=time.monotonic() + 1000.0))
     waiting.put(second)
     assert waiting.take() == second and waiting.take() is None
