@@ -6,14 +6,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import TracebackType
 
 from dashcalib_ros import stages
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.camera import searched
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect import Turn
+from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import SensorStream
@@ -23,7 +23,29 @@ from dashcalib_ros.judge.witnesses import Asked
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.status import Status
+
+
+@dataclass(frozen=True)
+class Status:
+    """The calibrator's state after a frame.
+
+    frames: pushed so far. turns: in the bank and stored. built: how many scenes a calibration
+    would use now; ready: their turns; yaw_deg: the sum of their yaw. stored: how many turns are of
+    earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
+    yaws_deg: of the turns in ready, in their order. reconstructed: the turns that watch() has
+    scenes of, chosen or not.
+    """
+
+    frames: int
+    turns: int
+    built: int
+    yaw_deg: float
+    magnitude: float
+    standing: bool
+    ready: tuple[TurnId, ...] = ()
+    stored: int = 0
+    yaws_deg: tuple[float, ...] = ()
+    reconstructed: tuple[TurnId, ...] = ()
 
 
 class Calibrator:

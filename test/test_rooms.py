@@ -12,7 +12,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / 'dashcalib_ros'
 # in the order in which data flows: a room imports from those above it
 ROOMS = ('arrays', 'camera', 'input', 'detect', 'reconstruct', 'solve', 'turn_store', 'judge',
-         'report', 'stages', 'workers', 'selection', 'status', 'calibrator', 'questions',
+         'report', 'stages', 'workers', 'selection', 'calibrator', 'questions',
          'recorded', 'standard_streams', 'fleet', 'ros', 'demo', 'cli')
 EVERYWHERE = {'config', 'errors', 'arrays', 'limits', 'whole_files'}
 # what is not simply "all rooms above"

@@ -1,8 +1,10 @@
 """The ROS 2 node; the only room that imports rclpy, and only when the node is started."""
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Sequence
+from types import FrameType
 
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, write_stdout
@@ -13,12 +15,33 @@ INSTALL = ("calibrator: error: the Python package {name} is missing: source your
 ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
                 'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
                 'std_srvs')
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stopping:
+    """SIGINT and SIGTERM end the node cleanly: at any time, any number of times.
+
+    Neither raises; `requested` is True after one of them.
+    rclpy's own handlers, installed later by rclpy.init, end the spinning and call these too.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        for name in SIGNALS:
+            signal.signal(name, self._request)
+
+    def ignore_signals(self) -> None:
+        """Ignore both signals while the interpreter ends: by default they would kill it."""
+        for name in SIGNALS:
+            signal.signal(name, signal.SIG_IGN)
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node until it is stopped; return its exit code. argv: without the program's name."""
     # the handlers come first: Ctrl-C may be pressed while the imports still run
-    from dashcalib_ros.ros.stopping import Stopping
     stopping = Stopping()
     open_closed_streams()
     try:

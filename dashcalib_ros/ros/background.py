@@ -10,9 +10,10 @@ from functools import reduce
 from typing import Any, Protocol
 
 from dashcalib_ros.arrays import GreyImage, Mask
-from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
+from dashcalib_ros.detect.motion import TrackedPoints
 from dashcalib_ros.errors import DashcalibError, InputError, counted, one_line
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
@@ -23,7 +24,6 @@ from dashcalib_ros.judge.conclude import CONTRADICTS
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.memory import mapped_copy
-from dashcalib_ros.status import Status, View
 
 # s between two checks whether enough turns are built: scenes are finished without a push
 LOOK_S = 0.25
@@ -105,6 +105,17 @@ class Trouble:
 
 
 News = Status | NewTurn | Started | Trouble | Result | Watched
+
+
+@dataclass(frozen=True)
+class View:
+    """What is seen in the newest frame: for pictures that people look at.
+
+    valid: (h, w) of the frame, or of the frame resized; None: no ego vehicle is known.
+    """
+
+    points: TrackedPoints
+    valid: Mask | None
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.background import Activity, Result, Watched
+from dashcalib_ros.ros.car import Mounting, text_of
 from dashcalib_ros.ros.diagnostics import OK, WARN, Health
 from dashcalib_ros.ros.images import Source
-from dashcalib_ros.ros.mounting import Mounting, text_of
 from dashcalib_ros.ros.node import LATCHED, CameraNode
 from dashcalib_ros.ros.parameters import make_publisher
 from dashcalib_ros.ros.state import (

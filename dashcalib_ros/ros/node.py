@@ -18,6 +18,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 
+from dashcalib_ros.calibrator import Status
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.judge import Verdict
@@ -34,6 +35,7 @@ from dashcalib_ros.ros.background import (
     Trouble,
     Watched,
 )
+from dashcalib_ros.ros.car import Sensors
 from dashcalib_ros.ros.diagnostics import (
     Changes,
     Complaints,
@@ -53,8 +55,6 @@ from dashcalib_ros.ros.parameters import (
     why_read_only,
 )
 from dashcalib_ros.ros.preview import Preview
-from dashcalib_ros.ros.sensors import Sensors
-from dashcalib_ros.status import Status
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -25,10 +25,9 @@ from sensor_msgs.msg import CompressedImage
 from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.rectified import rectified_matrix
-from dashcalib_ros.ros.background import Picture
+from dashcalib_ros.ros.background import Picture, View
 from dashcalib_ros.ros.parameters import make_publisher
 from dashcalib_ros.ros.settings import NodeConfig
-from dashcalib_ros.status import View
 
 # a viewer wants the newest only; a reliable publisher reaches both kinds of subscribers
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)

@@ -14,11 +14,11 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from dashcalib_ros.errors import ConfigError, DashcalibError
+from dashcalib_ros.ros import Stopping
 from dashcalib_ros.ros.calibrator_node import CalibratorNode
 from dashcalib_ros.ros.check_node import CheckNode
 from dashcalib_ros.ros.memory import reuse_image_buffers
 from dashcalib_ros.ros.node import CameraNode, SetupError
-from dashcalib_ros.ros.stopping import Stopping
 from dashcalib_ros.standard_streams import write_stderr
 
 FAILED = 2

@@ -21,7 +21,7 @@ from made_calibration import TRUTH, make_calibration
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import AUTO, calibrated_models, ros_camera
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.terminal import Stages
@@ -34,7 +34,6 @@ from dashcalib_ros.errors import ConfigError, WorkerError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.bag_write import BagWriter
 from dashcalib_ros.standard_streams import folded
-from dashcalib_ros.status import Status
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
 

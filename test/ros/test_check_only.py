@@ -20,7 +20,7 @@ from ros_desk import FIRST, SIGMA
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from std_msgs.msg import Header, String
 
-from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import ConfigError, InputError
@@ -33,7 +33,6 @@ from dashcalib_ros.ros.images import LASTING
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve.quadratic import Quadratic
-from dashcalib_ros.status import Status
 
 TOPIC = '/camera_info'
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fakes import image_message, stands_in_for
 
-from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
@@ -32,7 +32,6 @@ from dashcalib_ros.ros.background import (
 )
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve.quadratic import Quadratic
-from dashcalib_ros.status import Status
 
 LIMIT = 20.0
 CONFIG = Config().replace({'turns.wanted': 2})

@@ -13,9 +13,8 @@ from sensor_msgs.msg import Imu, NavSatFix
 
 from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge.calibration import Mount
-from dashcalib_ros.ros import mounting
-from dashcalib_ros.ros.mounting import Mounting, differs
-from dashcalib_ros.ros.sensors import Sensors
+from dashcalib_ros.ros import car
+from dashcalib_ros.ros.car import Mounting, Sensors, differs
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.store import Kept, Whose
 
@@ -57,7 +56,7 @@ def tf2(monkeypatch):
     module = SimpleNamespace(TFMessage=TFMessage)
     monkeypatch.setitem(__import__('sys').modules, 'tf2_msgs', SimpleNamespace(msg=module))
     monkeypatch.setitem(__import__('sys').modules, 'tf2_msgs.msg', module)
-    monkeypatch.setattr(mounting, 'LISTEN_S', 0.0)
+    monkeypatch.setattr(car, 'LISTEN_S', 0.0)
     return TFMessage
 
 

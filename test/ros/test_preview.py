@@ -12,8 +12,8 @@ from dashcalib_ros.camera.rectified import rectified_matrix
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.motion import TrackedPoints
 from dashcalib_ros.input import Frame
+from dashcalib_ros.ros.background import View
 from dashcalib_ros.ros.preview import TRACK, overlay, rectified
-from dashcalib_ros.status import View
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 

@@ -12,8 +12,8 @@ pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros
 
 import rclpy
 
+from dashcalib_ros.ros import Stopping
 from dashcalib_ros.ros.program import Executor, spin
-from dashcalib_ros.ros.stopping import Stopping
 
 
 def test_a_signal_that_rclpy_did_not_hear_ends_the_spinning(make_desk, monkeypatch):
