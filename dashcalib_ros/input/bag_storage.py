@@ -21,8 +21,14 @@ from typing import Any
 import zstandard
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.bag_salvage import Damage, Record, scan
-from dashcalib_ros.input.bag_unpack import Ros1Reader, Ros2Reader, unpack_file
+from dashcalib_ros.input.bag_read import (
+    Damage,
+    Record,
+    Ros1Reader,
+    Ros2Reader,
+    scan,
+    unpack_file,
+)
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.source import (
     METADATA,

@@ -19,8 +19,8 @@ from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.camera_info import RosCamera
 from dashcalib_ros.camera.rectified import SAME
 from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.input.bag_read import Ros2Reader
 from dashcalib_ros.input.bag_storage import check_unpacked, open_bag
-from dashcalib_ros.input.bag_unpack import Ros2Reader
 from dashcalib_ros.input.source import Frame
 
 _FORMATS = {'jpeg': '.jpg', 'png': '.png'}

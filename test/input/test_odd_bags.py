@@ -26,7 +26,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from dashcalib_ros import limits
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input import bag_salvage, bag_unpack
+from dashcalib_ros.input import bag_read
 from dashcalib_ros.input.bag_write import check_bag
 from dashcalib_ros.input.inputs import open_frames
 
@@ -35,10 +35,10 @@ LAUGHS = 'a0: &a0 [lol, lol]\n' + '\n'.join(
 
 
 @pytest.mark.parametrize(('pack', 'unpacked'), [
-    (zstandard.compress, bag_unpack.unpack_zstd), (lz4.frame.compress, bag_unpack.unpack_lz4),
-    (bz2.compress, bag_unpack.unpack_bz2)])
+    (zstandard.compress, bag_read.unpack_zstd), (lz4.frame.compress, bag_read.unpack_lz4),
+    (bz2.compress, bag_read.unpack_bz2)])
 def test_what_is_packed_is_unpacked_within_the_limit(pack, unpacked):
-    for content in (b'', b'content', os.urandom(3 * bag_unpack.PIECE + 1)):
+    for content in (b'', b'content', os.urandom(3 * bag_read.PIECE + 1)):
         assert unpacked(pack(content)) == content
     bomb = pack(bytes(2**24))
     assert len(bomb) < 2**18
@@ -57,7 +57,7 @@ NO_INDEX = {'index_types': IndexType.NONE, 'repeat_channels': False, 'repeat_sch
 @pytest.fixture
 def small_chunks(monkeypatch):
     """Let a chunk have 3000 bytes, unpacked."""
-    for table in (bag_unpack.UNPACK_MCAP, bag_unpack.UNPACK_BAG):
+    for table in (bag_read.UNPACK_MCAP, bag_read.UNPACK_BAG):
         for name, unpack in table.items():
             if name != 'none':
                 monkeypatch.setitem(table, name, partial(unpack, limit=3000))
@@ -88,7 +88,7 @@ def test_messages_of_overlapping_chunks_come_by_time(tmp_path):
 def test_a_message_that_is_a_bomb_is_an_undecodable_one(tmp_path, monkeypatch):
     bag = write_bag(tmp_path / 'bag', images(drive(3)), mode=CompressionMode.MESSAGE)
     same(list(open_frames(bag)), drive(3))
-    monkeypatch.setattr(bag_salvage, 'MESSAGE_BYTES', 1000)
+    monkeypatch.setattr(bag_read, 'MESSAGE_BYTES', 1000)
     fails('a message on /camera: a part of the bag unpacks to more than', bag)
 
 
