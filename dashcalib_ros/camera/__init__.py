@@ -1,6 +1,6 @@
 """The camera models: projection, viewing rays, derivatives, limits; COLMAP's names and ROS's."""
 from dashcalib_ros.camera.camera import FISHEYE, PINHOLE, Camera
-from dashcalib_ros.camera.camera_info import ros_camera, ros_faults
+from dashcalib_ros.camera.camera_info import RECTIFIED, ros_camera, ros_faults
 from dashcalib_ros.camera.fisheye import Fisheye
 from dashcalib_ros.camera.models import (
     AUTO,
@@ -13,7 +13,6 @@ from dashcalib_ros.camera.models import (
     searched,
 )
 from dashcalib_ros.camera.pinhole import Brown, Radial, Rational
-from dashcalib_ros.camera.rectified import RECTIFIED
 
 __all__ = ['AUTO', 'FISHEYE', 'MODELS', 'PINHOLE', 'RECTIFIED', 'Brown', 'Camera', 'Fisheye',
            'Radial', 'Rational', 'calibrated_models', 'camera_from_ros', 'camera_of',

@@ -16,8 +16,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.camera import Camera, ros_camera
-from dashcalib_ros.camera.camera_info import RosCamera
-from dashcalib_ros.camera.rectified import SAME
+from dashcalib_ros.camera.camera_info import SAME, RosCamera
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.input.bag_read import Ros2Reader
 from dashcalib_ros.input.bag_storage import check_unpacked, open_bag

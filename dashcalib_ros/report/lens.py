@@ -8,7 +8,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Pixels
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.rectified import WIDEST, rectified_matrix
+from dashcalib_ros.camera.camera_info import WIDEST, rectified_matrix
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.agreement import sigma_by_count
 from dashcalib_ros.judge.calibration import Material, Mount

@@ -22,8 +22,8 @@ import numpy as np
 import yaml
 
 from dashcalib_ros.camera import Camera, ros_camera
+from dashcalib_ros.camera.camera_info import SAME
 from dashcalib_ros.camera.field import BASIS, Field
-from dashcalib_ros.camera.rectified import SAME
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, one_line, shortened

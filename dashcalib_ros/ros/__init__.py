@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         check_files(arguments)
         from dashcalib_ros.ros.program import run
-        return run(ros_arguments(arguments), lifecycle, stopping)
+        return run(ros_arguments(arguments), lifecycle, lambda: stopping.requested)
     except DashcalibError as error:
         write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
         return 2

@@ -24,7 +24,7 @@ from sensor_msgs.msg import CompressedImage
 
 from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.rectified import rectified_matrix
+from dashcalib_ros.camera.camera_info import rectified_matrix
 from dashcalib_ros.ros.background import Picture, View
 from dashcalib_ros.ros.parameters import make_publisher
 from dashcalib_ros.ros.settings import NodeConfig

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
@@ -14,7 +14,6 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from dashcalib_ros.errors import ConfigError, DashcalibError
-from dashcalib_ros.ros import Stopping
 from dashcalib_ros.ros.calibrator_node import CalibratorNode
 from dashcalib_ros.ros.check_node import CheckNode
 from dashcalib_ros.ros.memory import reuse_image_buffers
@@ -26,24 +25,25 @@ FAILED = 2
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.01, 1.0
 
 
-def run(argv: Sequence[str], lifecycle: bool, stopping: Stopping) -> int:
+def run(argv: Sequence[str], lifecycle: bool, stopped: Callable[[], bool]) -> int:
     """Run the node: 0 when it was asked to stop, 2 when its parameters are wrong.
 
-    argv: ROS's arguments. lifecycle: it waits for configure and activate.
+    argv: ROS's arguments. lifecycle: it waits for configure and activate. stopped: returns whether
+    a signal asked for the end.
     """
     node: CameraNode | None = None
     reuse_image_buffers()
     try:
         start_ros(argv)
-        if not stopping.requested:
+        if not stopped():
             node = make_node(lifecycle)
-            spin(node, stopping)
+            spin(node, stopped)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception as error:
         # a context that is shut down in the middle of a call makes rclpy raise nearly anything,
         # which may look like a wrong parameter
-        if not stopping.requested:
+        if not stopped():
             if not isinstance(error, (DashcalibError, ParameterException)):
                 raise
             write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
@@ -88,7 +88,7 @@ class Executor(SingleThreadedExecutor):
     _sigint_gc: Any = None
 
 
-def spin(node: CameraNode, stopping: Stopping) -> None:
+def spin(node: CameraNode, stopped: Callable[[], bool]) -> None:
     """Run the node's callbacks until the context is shut down, or a signal asked for the end.
 
     A signal that comes while rclpy installs its own handlers does not shut the context down; the
@@ -101,7 +101,7 @@ def spin(node: CameraNode, stopping: Stopping) -> None:
     with Executor() as executor:
         executor.add_node(node)
         wait_s = FIRST_WAIT_S
-        while executor.context.ok() and not stopping.requested:
+        while executor.context.ok() and not stopped():
             try:
                 executor.spin_once()
                 wait_s = FIRST_WAIT_S

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dashcalib_ros.camera import RECTIFIED, Brown, Camera, Fisheye, Radial, ros_camera, ros_faults
-from dashcalib_ros.camera.rectified import WIDEST, rectified_matrix
+from dashcalib_ros.camera.camera_info import WIDEST, rectified_matrix
 from dashcalib_ros.config import describe
 from dashcalib_ros.errors import ConfigError
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dashcalib_ros.camera import Fisheye, Radial
-from dashcalib_ros.camera.rectified import rectified_matrix
+from dashcalib_ros.camera.camera_info import rectified_matrix
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.motion import TrackedPoints
 from dashcalib_ros.input import Frame

@@ -12,19 +12,17 @@ pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros
 
 import rclpy
 
-from dashcalib_ros.ros import Stopping
 from dashcalib_ros.ros.program import Executor, spin
 
 
-def test_a_signal_that_rclpy_did_not_hear_ends_the_spinning(make_desk, monkeypatch):
-    monkeypatch.setattr('signal.signal', lambda number, handler: None)
-    desk, stopping = make_desk(), Stopping()
+def test_a_signal_that_rclpy_did_not_hear_ends_the_spinning(make_desk):
+    desk, stopped = make_desk(), threading.Event()
     desk.spinner.remove_node(desk.node)
-    thread = threading.Thread(target=spin, args=(desk.node, stopping), daemon=True)
+    thread = threading.Thread(target=spin, args=(desk.node, stopped.is_set), daemon=True)
     thread.start()
     time.sleep(0.3)
     assert thread.is_alive() and rclpy.ok()
-    stopping.requested = True
+    stopped.set()
     thread.join(10)
     assert not thread.is_alive() and rclpy.ok()
 
