@@ -51,7 +51,7 @@ def drive() -> Drive:
 
 @pytest.fixture(scope='session')
 def frames(drive) -> list[Frame]:
-    return list(drive.frames(processes=2))
+    return list(drive.frames())
 
 
 @contextlib.contextmanager
@@ -512,7 +512,7 @@ def test_a_picture_that_stands(frames):
 def test_a_drive_without_a_turn():
     lens = Lens.of(320, 180, 80.0, -0.25, 0.06)
     straight = Drive(lens, DriveSpec(turns=0, duration_s=8.0, seed=4))
-    assert 'no turn was found' in refused(straight.frames(processes=2))
+    assert 'no turn was found' in refused(straight.frames())
 
 
 def test_a_change_of_size_is_named(frames):

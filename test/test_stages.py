@@ -67,7 +67,7 @@ class OneTerm(Camera):
 
 @pytest.fixture(scope='module')
 def frames():
-    return list(Drive(LENS, SPEC).frames(processes=2))
+    return list(Drive(LENS, SPEC).frames())
 
 
 @pytest.fixture(scope='module')

@@ -35,7 +35,7 @@ QUICK = {'turns__wanted': 2, 'scene__tracks': 200, 'scene__profile_tracks': 100,
 def rendered():
     """Return a drive with two turns, and all its frames."""
     drive = Drive(LENS, DriveSpec(seed=0, turns=2))
-    return drive, list(drive.frames(processes=2))
+    return drive, list(drive.frames())
 
 
 def test_it_ends_cleanly_while_children_work(start_node, make_bench, rendered):

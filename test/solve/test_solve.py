@@ -734,8 +734,8 @@ def test_where_one_turn_knows_all_how_much_turns_differ_is_not_shown(no_profile)
     alike = scenes_of(4, tracks=110)
     bends = [synthetic_turn(LENS, yaw, tracks=110, keyframes=14, noise_px=0.25, world=n).scene(
         START, n) for n, yaw in enumerate((85.0, 9.0, -8.0), 10)]
-    ratios = [solved(scenes, CONFIG).sigma[0] / solved(scenes, config).sigma[0]
-              for scenes in (alike, bends)]
+    shown = [solved(scenes, CONFIG).sigma[0] for scenes in (alike, bends)]
+    ratios = [sigma / solved(scenes, config).sigma[0]
+              for sigma, scenes in zip(shown, (alike, bends), strict=True)]
     assert ratios[0] < 1.4 and ratios[1] > 1.6, ratios
-    relative = solved(bends, CONFIG).sigma[0] / LENS.fx
-    assert 0.004 < relative < 0.02
+    assert 0.004 < shown[1] / LENS.fx < 0.02
