@@ -1,8 +1,13 @@
-"""Fixtures of the tests that talk to the node; they import rclpy only when they are used."""
+"""What holds for all tests; fixtures of those that talk to the node, which import rclpy late."""
 import os
 import signal
 
 import pytest
+
+# as in a worker's process, before numpy is loaded: more threads change the last digits, and where
+# several tests run at a time they mostly wait for each other
+for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
+    os.environ.setdefault(name, '1')
 
 pytest.register_assert_rewrite('ros_bench', 'ros_desk')
 

@@ -130,7 +130,8 @@ def test_what_turns_say_alone_scatters_about_the_common_result(drawn):
         assert abs(each.fx - found.camera.fx) < 5 * each.sigma
         assert 0 < each.sigma < 0.1 * found.camera.fx
     sigmas = sigma_by_count(found)
-    assert len(sigmas) == 3 and sigmas[-1] == pytest.approx(found.sigma[0])
+    # a field that is suspected adds a little to the sigma of all turns
+    assert len(sigmas) == 3 and sigmas[-1] == pytest.approx(found.sigma[0], rel=1e-4)
 
 
 def test_a_refused_page_draws_the_evidence_and_has_no_camera(drawn):
