@@ -9,9 +9,8 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.reconstruct.picture import TurnPicture
 from dashcalib_ros.reconstruct.repeated import without_repeated
-from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.reconstruct.scene_file import Origin, StoredTurn
 from dashcalib_ros.turn_store import TurnStore
 from dashcalib_ros.workers.child import ChildWorker

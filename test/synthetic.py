@@ -7,8 +7,7 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera, Fisheye, Radial
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.reconstruct.scene import Profile, Scene, retriangulated
-from dashcalib_ros.reconstruct.structure import Structure
+from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure, retriangulated
 from dashcalib_ros.reconstruct.tracks import Tracks
 
 SIZE = (800, 450)

@@ -3,11 +3,9 @@
 Also the ego-vehicle mask, and upright lines of the world, which are a witness of the lens.
 """
 from dashcalib_ros.detect.bend import Bend, bend
-from dashcalib_ros.detect.collector import LineCollector
 from dashcalib_ros.detect.detector import TurnDetector
-from dashcalib_ros.detect.edges import Lines
-from dashcalib_ros.detect.estimator import MotionEstimator
-from dashcalib_ros.detect.motion import Motion
+from dashcalib_ros.detect.edges import LineCollector, Lines
+from dashcalib_ros.detect.estimator import Motion, MotionEstimator
 from dashcalib_ros.detect.turn import Turn, TurnId
 
 __all__ = ['Bend', 'LineCollector', 'Lines', 'Motion', 'MotionEstimator', 'Turn', 'TurnDetector',

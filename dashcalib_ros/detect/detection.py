@@ -8,11 +8,9 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect.collector import LineCollector
 from dashcalib_ros.detect.detector import TurnDetector
-from dashcalib_ros.detect.edges import Lines
-from dashcalib_ros.detect.estimator import MotionEstimator
-from dashcalib_ros.detect.motion import TrackedPoints
+from dashcalib_ros.detect.edges import LineCollector, Lines
+from dashcalib_ros.detect.estimator import MotionEstimator, TrackedPoints
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import InputError

@@ -1,4 +1,4 @@
-"""A picture -> the smooth upright edges in it, as a few points each.
+"""A picture -> the smooth upright edges in it, as a few points each; those of a whole drive.
 
 Only edges within 45 degrees of the picture's columns are looked for: poles, the edges of houses,
 doors and windows stand upright and are straight. What lies on the ground is not: kerbs and lane
@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask, Pixels
+from dashcalib_ros.config import LinesConfig
 
 # points of an edge: means over as many equal parts of it
 KNOTS = 16
@@ -33,6 +34,10 @@ BORDER = 3
 MIN_LENGTH_PX = 40
 # grey levels per px across a line; noise of 6 levels comes to 0.7
 CONTRAST = 4.0
+# edges kept of a picture, the longest: they tell most, and a fence may have hundreds
+MOST = 50
+# s between the images that are searched; more often costs time and adds little
+PERIOD_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -141,3 +146,32 @@ def _smooth(across: Floats) -> Mask:
     cubic, _ = np.linalg.qr(np.vander(along, 4))
     rest = across - across @ cubic @ cubic.T
     return np.asarray(np.sqrt(np.mean(rest**2, axis=1)) <= SMOOTH_PX)
+
+
+class LineCollector:
+    """Searches a picture every period; keeps points of edges only, never a picture."""
+
+    def __init__(self, config: LinesConfig) -> None:
+        self._config = config
+        self._period_ns = PERIOD_S * 1e9
+        self._found: list[tuple[int, Floats32]] = []
+
+    def push(self, image: GreyImage, stamp_ns: int) -> None:
+        """Take a picture of the moving car; it is searched if the last one is long enough ago."""
+        if self._found and 0 <= stamp_ns - self._found[-1][0] < self._period_ns:
+            return
+        points = upright_edges(image)
+        if len(points) > MOST:
+            height = points[:, -1, 1] - points[:, 0, 1]
+            points = points[np.sort(np.argsort(-height, kind='stable')[:MOST])]
+        self._found.append((stamp_ns, points))
+        if len(self._found) > self._config.images:
+            self._found = self._found[::2]
+            self._period_ns *= 2
+
+    def lines(self) -> Lines:
+        """Return the lines found so far."""
+        none = np.zeros((0, KNOTS, 2), np.float32)
+        return Lines(np.concatenate([none, *(points for _, points in self._found)]),
+                     np.repeat([stamp_ns / 1e9 for stamp_ns, _ in self._found],
+                               [len(points) for _, points in self._found]))

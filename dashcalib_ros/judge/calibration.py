@@ -20,11 +20,9 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.reconstruct.picture import TurnPicture
-from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.cross_validation import LeftOut
+from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.solve.knowledge import PictureSigma, sigma_over
-from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.solution import LeftOut, Solution
 
 UNKNOWN_COVARIANCE = ('this calibration does not know how its parameters are correlated: '
                       'calibrate the drive again')

@@ -41,13 +41,11 @@ from dashcalib_ros.judge.verdict import (
     verdict_of,
 )
 from dashcalib_ros.judge.witnesses import Asked
-from dashcalib_ros.reconstruct.picture import TurnPicture, picture_of
-from dashcalib_ros.reconstruct.scene import Scene, rms_px
+from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, picture_of, rms_px
 from dashcalib_ros.reconstruct.scene_file import StoredTurn
-from dashcalib_ros.solve.cross_validation import LeftOut, cross_validation
 from dashcalib_ros.solve.fixed_camera import largest_crop
 from dashcalib_ros.solve.knowledge import PictureSigma
-from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.solution import LeftOut, Solution, cross_validation
 
 # why turns are not used
 CONTRADICTS = 'the camera of the other turns does not explain it'

@@ -15,7 +15,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruct.structure import Structure
+from dashcalib_ros.reconstruct.scene import Structure
 from dashcalib_ros.reconstruct.tracks import Tracks
 
 # affine steps converge slowly; a patch that has not converged by then is dropped

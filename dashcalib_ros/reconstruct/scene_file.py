@@ -24,8 +24,7 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import one_line, shortened
 from dashcalib_ros.input.scale import FULL_SIZE, MOST, Scale
 from dashcalib_ros.limits import check_pixels
-from dashcalib_ros.reconstruct.scene import Profile, Scene, Start, errors_px
-from dashcalib_ros.reconstruct.structure import Structure
+from dashcalib_ros.reconstruct.scene import Profile, Scene, Start, Structure, errors_px
 from dashcalib_ros.reconstruct.tracks import Tracks
 
 # a layout that older readers misunderstand needs a new number

@@ -13,8 +13,7 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge import Calibration, TurnSummary
 from dashcalib_ros.judge.agreement import focal_alone, leverages
 from dashcalib_ros.judge.calibration import Material, StoredTurnSummary
-from dashcalib_ros.reconstruct.picture import TurnPicture
-from dashcalib_ros.reconstruct.scene import Scene, residuals_px
+from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, residuals_px
 from dashcalib_ros.report.charts import data_uri, dots, line, segments, svg, text
 from dashcalib_ros.report.wording import optional, since_start
 

@@ -13,7 +13,7 @@ from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.detect.motion import TrackedPoints
+from dashcalib_ros.detect.estimator import TrackedPoints
 from dashcalib_ros.errors import DashcalibError, InputError, counted, one_line
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode

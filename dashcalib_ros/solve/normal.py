@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruct.scene import Scene, residuals_px
-from dashcalib_ros.reconstruct.structure import Structure
+from dashcalib_ros.reconstruct.scene import Scene, Structure, residuals_px
 from dashcalib_ros.solve.quadratic import Quadratic, TurnCost
 
 # parameters of a pose, and of an image: its shift in x and y (px), its zoom (1 = 100 %)

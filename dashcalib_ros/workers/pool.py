@@ -13,8 +13,7 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import DashcalibError, WorkerError
-from dashcalib_ros.reconstruct.picture import TurnPicture, picture_of
-from dashcalib_ros.reconstruct.scene import Draft, Scene
+from dashcalib_ros.reconstruct.scene import Draft, Scene, TurnPicture, picture_of
 from dashcalib_ros.workers.worker import Progress, Worker, WorkerDiedError
 
 # if a worker dies on the same work this often, seconds apart, the work is the cause

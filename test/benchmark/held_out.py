@@ -21,9 +21,8 @@ from dashcalib_ros import Config
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.reconstruct.adjust import Solver
-from dashcalib_ros.solve.cross_validation import cross_validation
 from dashcalib_ros.solve.prior import loss_px_of
-from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.solution import Solution, cross_validation
 from dashcalib_ros.solve.steps import Fit, fit_all
 
 

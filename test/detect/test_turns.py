@@ -12,10 +12,9 @@ from scipy.signal import find_peaks
 
 from dashcalib_ros.config import TurnsConfig
 from dashcalib_ros.detect import TurnDetector
-from dashcalib_ros.detect.history import History
-from dashcalib_ros.detect.median import StreamingMedian
-from dashcalib_ros.detect.motion import Motion
-from dashcalib_ros.detect.peaks import SEEN, PeakFinder
+from dashcalib_ros.detect.detector import History
+from dashcalib_ros.detect.estimator import Motion
+from dashcalib_ros.detect.peaks import SEEN, PeakFinder, StreamingMedian
 from dashcalib_ros.input import Frame
 
 TINY = np.zeros((2, 2), np.uint8)

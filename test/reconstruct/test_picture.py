@@ -9,7 +9,7 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
-from dashcalib_ros.reconstruct.picture import WIDTH, picture_of
+from dashcalib_ros.reconstruct.scene import PICTURE_WIDTH, picture_of
 
 
 def turn_of(count: int, size: tuple[int, int] = SIZE, center: int = 20) -> Turn:
@@ -33,7 +33,8 @@ def test_without_a_scene_it_is_the_turn_s_middle_and_without_images_there_is_non
 
 
 @pytest.mark.parametrize(('size', 'shown'), [
-    ((1440, 810), (WIDTH, 405)), ((640, 360), (640, 360)), ((5000, 2), (WIDTH, 1))])
+    ((1440, 810), (PICTURE_WIDTH, 405)), ((640, 360), (640, 360)),
+    ((5000, 2), (PICTURE_WIDTH, 1))])
 def test_wide_pictures_are_made_smaller(size, shown):
     turn = turn_of(1, size, 0)
     image = picture_of(turn, None).image

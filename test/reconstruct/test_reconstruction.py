@@ -15,18 +15,19 @@ from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
 from dashcalib_ros.reconstruct import adjust, build
 from dashcalib_ros.reconstruct.adjust import Solver
-from dashcalib_ros.reconstruct.chain import chain
-from dashcalib_ros.reconstruct.poses import absolute_pose, relative_pose
+from dashcalib_ros.reconstruct.chain import absolute_pose, chain, relative_pose
 from dashcalib_ros.reconstruct.register import register_tracks
 from dashcalib_ros.reconstruct.scene import (
     Profile,
     Scene,
+    Structure,
     errors_px,
+    ray_errors_px,
     residuals_px,
     retriangulated,
+    triangulate,
     truncated_cost,
 )
-from dashcalib_ros.reconstruct.structure import Structure, ray_errors_px, triangulate
 from dashcalib_ros.reconstruct.tracks import Tracks, thinned, track_turn
 
 CONFIG = SceneConfig()

@@ -15,7 +15,7 @@ from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.detect.motion import TrackedPoints
+from dashcalib_ros.detect.estimator import TrackedPoints
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.judge.calibration import StoredTurnSummary

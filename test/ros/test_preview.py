@@ -10,7 +10,7 @@ import pytest
 from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.camera.camera_info import rectified_matrix
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect.motion import TrackedPoints
+from dashcalib_ros.detect.estimator import TrackedPoints
 from dashcalib_ros.input import Frame
 from dashcalib_ros.ros.background import View
 from dashcalib_ros.ros.preview import TRACK, overlay, rectified

@@ -9,7 +9,7 @@ from solving import CONFIG, scenes_of, solved
 from synthetic import LENS
 
 from dashcalib_ros.camera.mapping import mapping_error
-from dashcalib_ros.solve.cross_validation import LEAST_TURNS, cross_validation
+from dashcalib_ros.solve.solution import LEAST_TURNS, cross_validation
 
 
 @pytest.fixture(scope='module')
