@@ -130,7 +130,7 @@ def test_what_turns_say_alone_scatters_about_the_common_result(drawn):
         assert abs(each.fx - found.camera.fx) < 5 * each.sigma
         assert 0 < each.sigma < 0.1 * found.camera.fx
     sigmas = sigma_by_count(found)
-    # a field that is suspected adds a little to the sigma of all turns
+    # what the prior of the centre has drawn is in the sigma of all turns only
     assert len(sigmas) == 3 and sigmas[-1] == pytest.approx(found.sigma[0], rel=1e-4)
 
 
