@@ -39,19 +39,18 @@ def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
     """
     depth = _depths(structure, camera)
     reference = _reference_rows(structure.used, depth)
-    smooth = [cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32) for image in images]
     step = np.arange(-half_window, half_window + 1, dtype=np.float32)
     grid = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
-    template, descent, inverse = _templates(tracks, reference, smooth, grid)
+    template, descent, inverse = _templates(tracks, reference, images, grid)
     xy = np.full_like(tracks.xy, np.nan)
     every = np.arange(tracks.xy.shape[1])
-    for k, image in enumerate(smooth):
+    for k, image in enumerate(images):
         scale = depth[reference, every] / np.where(depth[k] > 0, depth[k], 1.0)
         wanted = np.flatnonzero(
             structure.used[k] & (scale < MAX_SCALE) & (scale > 1 / MAX_SCALE))
         if len(wanted) == 0:
             continue
-        found, good = _align(image, tracks.xy[k, wanted], scale[wanted], template[wanted],
+        found, good = _align(_smooth(image), tracks.xy[k, wanted], scale[wanted], template[wanted],
                              descent[wanted], inverse[wanted], grid)
         shift = np.linalg.norm(found - tracks.xy[k, wanted], axis=1)
         good &= (shift < max_shift_px) | (reference[wanted] == k)
@@ -73,6 +72,11 @@ def _reference_rows(used: Mask, depth: Floats) -> Ints:
     return np.asarray(order[middle, np.arange(used.shape[1])], np.int64)
 
 
+def _smooth(image: GreyImage) -> Floats32:
+    # again where it is needed: those of a whole turn would take half of a child's memory
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8), np.float32)
+
+
 def _sample(image: Floats32, xy: Floats) -> Floats32:
     """Return (n, p) intensities at (n, p, 2) positions.
 
@@ -84,7 +88,7 @@ def _sample(image: Floats32, xy: Floats) -> Floats32:
 
 
 def _templates(tracks: Tracks, reference: Ints,
-               images: list[Floats32], grid: Floats32
+               images: Sequence[GreyImage], grid: Floats32
                ) -> tuple[Floats32, Floats32, Floats32]:
     """Return normalised patches (t, p), steepest descent (t, p, 6), inverse Hessians (t, 6, 6)."""
     count, pixels = len(reference), len(grid)
@@ -94,10 +98,10 @@ def _templates(tracks: Tracks, reference: Ints,
         rows = np.flatnonzero((reference == k) & np.isfinite(tracks.xy[k, :, 0]))
         if len(rows) == 0:
             continue  # all of them are tracks that the structure does not use
-        centre = tracks.xy[k, rows][:, None] + grid
-        template[rows] = _sample(images[k], centre)
+        centre, image = tracks.xy[k, rows][:, None] + grid, _smooth(images[k])
+        template[rows] = _sample(image, centre)
         for axis, kernel in enumerate(((1, 0), (0, 1))):
-            slope = cv2.Sobel(images[k], cv2.CV_32F, *kernel, ksize=3, scale=1 / 8)
+            slope = cv2.Sobel(image, cv2.CV_32F, *kernel, ksize=3, scale=1 / 8)
             gradient[rows, :, axis] = _sample(slope, centre)
     contrast = np.maximum(template.std(axis=1, keepdims=True), 1e-3)
     template = (template - template.mean(axis=1, keepdims=True)) / contrast

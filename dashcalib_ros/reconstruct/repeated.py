@@ -120,7 +120,7 @@ def _alike(scene: Scene, other: Scene, rows: Ints, starts: Ints, times: Floats) 
         ends = rows[[start, start + SPAN]]
         own = scene.tracks.xy[ends]
         there = np.array([_places_at(other, times[row]) for row in ends])
-        own, there = (each[:, np.isfinite(each).all(axis=(0, 2))] for each in (own, there))
+        own, there = (each[:, np.isfinite(each[:, :, 0].sum(axis=0))] for each in (own, there))
         own = own[:, ::max(1, own.shape[1] // MOST_TRACKS)]
         if not own.shape[1] or not there.shape[1]:
             continue

@@ -23,7 +23,7 @@ from dashcalib_ros.judge.agreement import outdated, turns_of_another_camera
 from dashcalib_ros.judge.conclude import CONTRADICTS
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.ros.memory import mapped_copy
+from dashcalib_ros.workers.memory import mapped_copy
 
 # s between two checks whether enough turns are built: scenes are finished without a push
 LOOK_S = 0.25

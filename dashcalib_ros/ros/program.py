@@ -16,9 +16,9 @@ from rclpy.node import Node
 from dashcalib_ros.errors import ConfigError, DashcalibError
 from dashcalib_ros.ros.calibrator_node import CalibratorNode
 from dashcalib_ros.ros.check_node import CheckNode
-from dashcalib_ros.ros.memory import reuse_image_buffers
 from dashcalib_ros.ros.node import CameraNode, SetupError
 from dashcalib_ros.standard_streams import write_stderr
+from dashcalib_ros.workers.memory import reuse_image_buffers
 
 FAILED = 2
 # s; the wait after a failed callback doubles from the first to the second while all fail

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol, cast
 
 from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.workers.memory import return_free_memory
 from dashcalib_ros.workers.worker import THREAD_VARIABLES, Progress, WorkerDiedError
 
 # not `-m`: it would import from the current folder first, and a random.py may lie there
@@ -304,6 +305,7 @@ def main() -> None:
         while True:
             # no variable keeps a call's arguments in memory until the next call
             send(answers, _answer(receive(requests), report))
+            return_free_memory()
 
 
 def _answer(request: Parts, report: Progress) -> Parts:

@@ -14,6 +14,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import DashcalibError, WorkerError
 from dashcalib_ros.reconstruct.scene import Draft, Scene, TurnPicture, picture_of
+from dashcalib_ros.workers.memory import return_free_memory
 from dashcalib_ros.workers.worker import Progress, Worker, WorkerDiedError
 
 # if a worker dies on the same work this often, seconds apart, the work is the cause
@@ -286,7 +287,7 @@ class ScenePool:
     def _work(self, worker: Worker) -> None:
         # a function of its own: its variables must not keep a turn's images while it waits
         while self._work_once(worker):
-            pass
+            return_free_memory()
 
     def _work_once(self, worker: Worker) -> bool:
         """Wait for a call or a job, and have the worker do it; return False when closed."""

@@ -11,7 +11,8 @@ ROOT = Path(__file__).parents[2]
 CODE = """
 import os, sys
 import numpy as np
-from dashcalib_ros.ros.memory import mapped_copy, reuse_image_buffers
+from dashcalib_ros.workers.memory import (
+    mapped_copy, return_free_memory, reuse_image_buffers)
 reuse_image_buffers()
 keep = mapped_copy if sys.argv[1] == 'apart' else np.copy
 
@@ -25,6 +26,8 @@ for n in range(100):
     images.append(keep(np.ones(1_000_000, np.uint8)))
     between.append(bytearray(100_000))  # keeps the heap from shrinking
 del images
+if sys.argv[1] == 'returned':
+    return_free_memory()
 print(resident_mb() - before - 10)
 """
 
@@ -32,10 +35,10 @@ print(resident_mb() - before - 10)
 @pytest.mark.skipif(not sys.platform.startswith('linux'), reason='reads /proc')
 def test_kept_images_go_back_to_the_system_when_they_are_freed():
     kept = {}
-    for choice in ('apart', 'in the heap'):
+    for choice in ('apart', 'returned', 'in the heap'):
         done = subprocess.run([sys.executable, '-c', CODE, choice], cwd=ROOT, text=True,
                               capture_output=True, check=True, timeout=60)
         kept[choice] = float(done.stdout)
-    assert kept['apart'] < 10
+    assert kept['apart'] < 10 and kept['returned'] < 20
     if kept['in the heap'] < 60:
         pytest.skip('this C library gives memory back by itself')
