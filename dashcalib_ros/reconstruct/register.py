@@ -102,7 +102,7 @@ def _templates(tracks: Tracks, reference: Ints,
         template[rows] = _sample(image, centre)
         for axis, kernel in enumerate(((1, 0), (0, 1))):
             slope = cv2.Sobel(image, cv2.CV_32F, *kernel, ksize=3, scale=1 / 8)
-            gradient[rows, :, axis] = _sample(slope, centre)
+            gradient[rows, :, axis] = _sample(np.asarray(slope, np.float32), centre)
     contrast = np.maximum(template.std(axis=1, keepdims=True), 1e-3)
     template = (template - template.mean(axis=1, keepdims=True)) / contrast
     gradient /= contrast[:, :, None]
