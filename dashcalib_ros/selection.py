@@ -177,6 +177,7 @@ class SceneSelection:
     def make_room(self) -> None:
         """Wait, unless live, until few turns wait in memory; raises what a worker raised."""
         if not self._live:
+            # one beside those that the workers have: the detection goes on, and none of them idles
             self._pool.wait(lambda: len(self._pool.unbuilt()) <= self.config.threads + 1)
 
     def wanted(self, tell: Progress, final: bool) -> list[Scene]:

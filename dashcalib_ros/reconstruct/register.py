@@ -73,7 +73,8 @@ def _reference_rows(used: Mask, depth: Floats) -> Ints:
 
 
 def _smooth(image: GreyImage) -> Floats32:
-    # again where it is needed: those of a whole turn would take half of a child's memory
+    # made twice, for a reference and for what is aligned: kept, those of a whole turn would take a
+    # third of a child's memory
     return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8), np.float32)
 
 

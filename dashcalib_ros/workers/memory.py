@@ -3,7 +3,8 @@
 glibc maps large blocks separately and returns them as soon as they are freed. Every image then
 costs the system new pages, three times over (received, converted, grey): a third of the node's
 processor time. Kept in the heap they are reused; but then those that wait in a turn for seconds
-lie among small blocks, and are never returned. So these are copied out of it.
+lie among small blocks, and are never returned by themselves. So the node copies these out of it,
+and every process returns free pages after each turn.
 """
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def reuse_image_buffers() -> None:
 def return_free_memory() -> None:
     """Give the pages that are free within glibc's heaps back to the system.
 
-    A turn's images lie among small blocks; without this, they stay with the process.
+    Without this, a turn's images stay with the process after they are freed.
     """
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
