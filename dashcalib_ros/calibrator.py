@@ -1,7 +1,4 @@
-"""The complete calibration: detect turns, reconstruct each, solve for one camera, judge it.
-
-The stages are in stages.py; the Calibrator decides only what runs when.
-"""
+"""The complete calibration: detect turns, reconstruct each, solve for one camera, judge it."""
 from __future__ import annotations
 
 import time
@@ -9,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import TracebackType
 
-from dashcalib_ros import stages
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.camera import searched
 from dashcalib_ros.config import Config
@@ -18,10 +14,11 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.judge.agreement import earlier_of_another_camera, evidence_of
-from dashcalib_ros.judge.conclude import CONTRADICTS, Evidence, evidence_of_detection
-from dashcalib_ros.judge.witnesses import Asked
+from dashcalib_ros.judge.conclude import CONTRADICTS, Evidence, conclude, evidence_of_detection
+from dashcalib_ros.judge.witnesses import Asked, ask_sensors
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import Progress, SceneSelection
+from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 
 
@@ -131,11 +128,11 @@ class Calibrator:
         solution: Solution | None = None
         asked = Asked()
         if scenes:
-            if self._motion is None:
-                solution = self.scenes.run(stages.solve, scenes, config, progress=tell)
-            else:
-                asked = self.scenes.run(stages.solve_with_sensors, scenes, config, self._motion,
-                                        self.detection.start_s, progress=tell)
+            solution = self.scenes.run(solve, scenes, config, progress=tell)
+            if self._motion is not None:
+                tell('asking the motion sensors', 0.0)
+                asked = self.scenes.run(ask_sensors, solution, self._motion,
+                                        self.detection.start_s, config)
                 solution = asked.solution
             contradicted = earlier_of_another_camera(scenes, solution)
             self.scenes.leave_out(contradicted)
@@ -147,9 +144,9 @@ class Calibrator:
         evidence = replace(self._evidence(started), motion=self._motion,
                            asked=replace(asked, solution=None))
         if not self._live or solution is None:
-            return stages.judge(solution, evidence, config)
+            return conclude(solution, evidence, config)
         # it takes a second or two, and a live drive goes on meanwhile
-        found: Calibration = self.scenes.run(stages.judge, solution, evidence, config)
+        found: Calibration = self.scenes.run(conclude, solution, evidence, config)
         return found
 
     def _evidence(self, started: float) -> Evidence:

@@ -1,24 +1,18 @@
 """What the turns of a drive say of other cameras than their own: given ones, one in use."""
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from dashcalib_ros import stages
+from dashcalib_ros import judge
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.judge import (
-    Calibration,
-    Check,
-    Monitor,
-    Odometry,
-    Poses,
-    Reading,
-    watch,
-    with_lines,
-)
+from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.input.source import by
+from dashcalib_ros.judge import Calibration, Check, Monitor, Odometry, Poses, Reading
+from dashcalib_ros.judge.monitor import readings_of
 from dashcalib_ros.selection import Progress
 
 
@@ -41,11 +35,11 @@ class Questions:
         calibration: what the last calibrate() returned. progress: as for calibrate().
         """
         config = self._asked.scenes.config
-        found: Check = self._run(
-            stages.check, given, calibration.image_size, self._asked.solution,
-            calibration.verdict, config, progress=progress)
+        found: Check = self._run('the turns with the given camera', progress, judge.check, given,
+                                 calibration.image_size, self._asked.solution,
+                                 calibration.verdict, config)
         lines = self._asked.detection.lines()
-        return with_lines(found, given, lines, calibration.image_size, config)
+        return judge.with_lines(found, given, lines, calibration.image_size, config)
 
     def odometry(self, given: Camera, calibration: Calibration, poses: Poses,
                  progress: Progress | None = None) -> Odometry | None:
@@ -55,11 +49,18 @@ class Questions:
         check(). Returns None where the drive has no camera of its own. Raises InputError where
         given is for pictures of another size, or no turn has poses.
         """
-        if self._asked.solution is None:
+        solution, size = self._asked.solution, calibration.image_size
+        if solution is None:
             return None
-        found: Odometry = self._run(
-            stages.odometry, given, calibration.image_size, self._asked.solution, poses,
-            self._asked.scenes.config, progress=progress)
+        if given.image_size != size:
+            raise InputError(
+                f'the calibration is for {by(given.image_size)} pictures, and those of the drive '
+                f'have {by(size)}: poses tell nothing of it')
+        own, config = solution.camera, self._asked.scenes.config
+        cameras = {'given': given.resized(1 / Scale.of(size, config).px, own.image_size),
+                   'ours': own, 'guess': judge.trivial_guess(own.image_size)}
+        found: Odometry = self._run('the turns beside the poses', progress, judge.odometry,
+                                    solution.scenes, cameras, poses, config)
         return found
 
     def watch(self, camera: Camera, sigma: Mapping[str, float] | None = None,
@@ -75,23 +76,25 @@ class Questions:
         scenes, config = self._asked.scenes.all_scenes(), self._asked.scenes.config
         if camera.image_size != size:
             raise InputError(f'the camera in use is for pictures of another size: '
-                             f'{camera.image_size[0]}x{camera.image_size[1]}')
+                             f'{by(camera.image_size)}')
         small = camera.resized(1 / scale.px, scale.size(size))
         if self._watched != small:
             self._watched, self._read = small, {}
         new = [scene for turn, scene in scenes.items() if turn not in self._read]
         if new:
-            readings: tuple[Reading, ...] = self._run(stages.read, new, small, config,
-                                                      progress=progress)
+            readings: tuple[Reading, ...] = self._run(
+                'the turns with the camera in use', progress, readings_of, new, small, config)
             self._read |= {reading.turn: reading for reading in readings}
         # fx, fy, cx and cy are pixels
         scaled = None if sigma is None else {
             name: value / scale.px if name in small.names()[:4] else value
             for name, value in sigma.items()}
         # a stored turn that was driven again counts once
-        return watch((reading for turn, reading in sorted(self._read.items())
+        return judge.watch((reading for turn, reading in sorted(self._read.items())
                       if turn.of_this_drive or turn in scenes), small, scaled, config.monitor)
 
-    def _run(self, stage: Any, *arguments: Any, progress: Progress | None) -> Any:
-        return self._asked.scenes.run(stage, *arguments,
-                                      progress=progress or (lambda stage, done: None))
+    def _run(self, stage: str, progress: Progress | None, function: Callable[..., Any],
+             *arguments: Any) -> Any:
+        if progress is not None:
+            progress(stage, 0.0)
+        return self._asked.scenes.run(function, *arguments)

@@ -101,7 +101,7 @@ def die_at_first(flag):
     return 'second time'
 
 
-# stand-ins for stages.draft(turn, config, valid)
+# stand-ins for reconstruct.draft(turn, config, valid)
 
 def build_dies(turn, config, valid):
     with Path(turn.frames[0]).open('a') as log:
@@ -138,7 +138,7 @@ def draft(turn, config, valid):
     return Draft(tracks, Start(Profile(np.ones(1), np.ones(1), 1), Radial.centred((64, 48), 50.0)))
 
 
-# stand-ins for stages.finish(turn, config, begun)
+# stand-ins for reconstruct.finish(turn, config, begun)
 
 def finish(turn, config, begun):
     noted(turn, f'scene of {turn.center}')

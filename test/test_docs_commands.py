@@ -26,7 +26,6 @@ from made_drives import (
     write_video,
 )
 
-from dashcalib_ros import stages
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import main
@@ -218,7 +217,6 @@ def starts_and_stops(tmp_path):
 def test_the_python_runs(text, sandbox, monkeypatch):
     """On a drive that knows nothing: only what is calculated from turns is made by hand."""
     monkeypatch.setattr(Calibrator, 'calibrate', lambda self, *_, **__: made())
-    monkeypatch.setattr(stages, 'solve', lambda scenes, config, *_: None)
     exec(compile(text, '<document>', 'exec'), {'__name__': '__main__'})
 
 

@@ -12,7 +12,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / 'dashcalib_ros'
 # in the order in which data flows: a room imports from those above it
 ROOMS = ('arrays', 'camera', 'input', 'detect', 'reconstruct', 'solve', 'turn_store', 'judge',
-         'report', 'stages', 'workers', 'selection', 'calibrator', 'questions',
+         'report', 'workers', 'selection', 'calibrator', 'questions',
          'recorded', 'standard_streams', 'fleet', 'ros', 'demo', 'cli')
 EVERYWHERE = {'config', 'errors', 'arrays', 'limits', 'whole_files'}
 # what is not simply "all rooms above"
@@ -197,7 +197,7 @@ def test_colmap_is_loaded_by_the_child_only(module):
 
 
 def test_the_processes_that_reconstruct_turns_load_no_more_than_they_need():
-    assert loaded_by('import dashcalib_ros.stages', 'scipy', 'rosbags', 'rich') == set()
+    assert loaded_by('import dashcalib_ros.reconstruct.build', 'scipy', 'rosbags', 'rich') == set()
 
 
 def test_colmap_is_loaded_where_it_is_used():

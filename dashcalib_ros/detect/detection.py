@@ -1,6 +1,7 @@
 """Frames -> turns: the first stage, as a stream."""
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -152,6 +153,18 @@ class Detection:
             raise InputError(
                 f'{FIRST_FRAMES} images pass in {passed} ns: Frame.stamp_ns must rise, and count '
                 f'nanoseconds, not seconds, milliseconds or images')
+
+
+def detect(frames: Iterable[Frame], config: Config, mask: Mask | None = None) -> Detection:
+    """Find the turns of a drive. For a stream, call Detection.push() for each frame.
+
+    mask: (h, w), False where the ego vehicle is. Raises InputError when the images change size.
+    """
+    detection = Detection(config, mask)
+    for frame in frames:
+        detection.push(frame)
+    detection.finish()
+    return detection
 
 
 def _check_image(frame: Frame) -> None:

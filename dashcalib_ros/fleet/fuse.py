@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dashcalib_ros import stages
 from dashcalib_ros.config import Config, VerdictConfig
 from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId
@@ -19,11 +18,12 @@ from dashcalib_ros.input.scale import FULL_SIZE, Scale
 from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.judge.agreement import turns_of_another_camera
-from dashcalib_ros.judge.conclude import Evidence
+from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import lacks_knowledge_only
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.reconstruct.scene_file import Origin, SceneFile, StoredTurn
+from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 
 # solutions at the most; each leaves out the clips that contradict the one before
@@ -64,7 +64,7 @@ def fuse(clips: Sequence[Clip], config: Config) -> Fused:
     repeated: dict[TurnId, TurnId] = {}
     for further in reversed(range(ROUNDS)):
         scenes, repeated = _chosen(turns, left_out, config)
-        solution = stages.solve(scenes, config) if scenes else None
+        solution = solve(scenes, config) if scenes else None
         of_another = contradicting(solution, turns, _scale(clips, left_out).px, config.verdict)
         if not (of_another and further):
             break
@@ -166,7 +166,7 @@ def _judged(solution: Solution | None, clips: Sequence[Clip], stored: Sequence[S
         magnitudes=np.zeros((0, 2)), mask=None, scale=first.origin.scale if first else FULL_SIZE,
         timing={}, warnings=warnings, stored=tuple(stored),
         straights=StraightCollector().straights())  # none are gathered: the turns' paths tell
-    calibration = stages.judge(solution, evidence, config)
+    calibration = conclude(solution, evidence, config)
     if solution is None:
         return replace(calibration, verdict=Verdict('refused', (_nothing_found(clips),)))
     return calibration

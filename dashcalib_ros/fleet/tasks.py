@@ -18,8 +18,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import TypeVar
 
-from dashcalib_ros import stages
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect.detection import detect
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.fleet import solved
 from dashcalib_ros.fleet.fuse import Clip, fuse
@@ -30,6 +30,7 @@ from dashcalib_ros.fleet.storage import Folder, clip_files, is_url, local_copy, 
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.limits import read_file
+from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.reconstruct.scene_file import (
     FORMAT,
     LARGEST,
@@ -361,12 +362,12 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
     """
     source = open_frames(path, topic, fps)
     span = _Span(source)
-    detection = stages.detect(span, config)
+    detection = detect(span, config)
     best = detection.turns()[:max(config.turns.wanted, config.turns.at_most)]
     valid = detection.valid()
     turns = []
     for turn in sorted(best, key=lambda turn: turn.center):
-        scene = stages.reconstruct(turn, config, valid)
+        scene = reconstruct(turn, config, valid)
         detection.release(turn.center)
         if scene is not None:
             turns.append(StoredTurn(scene, turn.stamp_s, turn.prominence))

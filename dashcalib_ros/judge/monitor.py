@@ -98,6 +98,11 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
     return Reading(scene.turn, cost.at_noise(inflation), heading(found), misfit=misfit)
 
 
+def readings_of(scenes: Iterable[Scene], camera: Camera, config: Config) -> tuple[Reading, ...]:
+    """Return what each turn says of a camera in use; camera: of the scenes' pictures."""
+    return tuple(reading_of(scene, camera, config) for scene in scenes)
+
+
 @dataclass(frozen=True)
 class Change:
     """A change, and the first turn that shows it.

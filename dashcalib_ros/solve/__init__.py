@@ -1,1 +1,19 @@
-"""Scenes -> one shared camera, its covariance, and the information that each turn gives."""
+"""Scenes -> one shared camera with its covariance (paper, 3.2). COLMAP is loaded when called."""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from dashcalib_ros.config import Config
+from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.solve.solution import Solution
+
+
+def solve(scenes: Sequence[Scene], config: Config,
+          progress: Callable[[str, float], None] = lambda stage, done: None) -> Solution | None:
+    """Adjust all scenes with one camera (paper, 3.2); None where it explains none of them.
+
+    scenes: at least one, each as its turn was reconstructed. Those of earlier drives are not in
+    the solution, nor in its misfits, where this drive's turns contradict them.
+    """
+    from dashcalib_ros.solve import earlier, joint
+    return earlier.solve_with_earlier(scenes, lambda some: joint.solve(some, config, progress))

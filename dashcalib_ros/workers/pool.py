@@ -8,7 +8,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from dashcalib_ros import stages
+from dashcalib_ros import reconstruct
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
@@ -326,9 +326,9 @@ class ScenePool:
         """Run a job: the draft of a turn, or its scene."""
         try:
             if job.draft is None:
-                done = worker.call(stages.draft, job.turn, self._config, job.valid)
+                done = worker.call(reconstruct.draft, job.turn, self._config, job.valid)
             else:
-                done = worker.call(stages.finish, job.turn, self._config, job.draft)
+                done = worker.call(reconstruct.finish, job.turn, self._config, job.draft)
         except Exception as error:
             self._failed(worker, job.failed(), error)
             return
@@ -346,7 +346,7 @@ class ScenePool:
             self._try_again(job, error, report=False)
         elif isinstance(error, WorkerDiedError):
             try:
-                worker.call(stages.load)
+                worker.call(reconstruct.load)
             except Exception as reason:
                 # the turn is not the cause: workers die without it, too
                 self._try_again(job, WorkerError(

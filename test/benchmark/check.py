@@ -27,9 +27,10 @@ from measure import commit, complain, load, parser_with, save, table
 from solutions import RECORDED, Solved, solution_path, solved_drive
 from wide import WIDE
 
-from dashcalib_ros import Config, stages
+from dashcalib_ros import Config
 from dashcalib_ros.camera import MODELS, Camera
 from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.judge import check
 from dashcalib_ros.judge.difference import difference_of
 
 # of a normal distribution: 95 % lie above minus this
@@ -76,7 +77,7 @@ def ask(solved: Solved) -> dict[str, Any]:
     px = Scale.of(calibration.image_size, config).px
     for name, (camera, taken) in calibrations(truth).items():
         started = time.perf_counter()
-        found = stages.check(camera, calibration.image_size, solution, calibration.verdict, config)
+        found = check(camera, calibration.image_size, solution, calibration.verdict, config)
         row = {'answer': found.answer, 'reasons': list(found.reasons), 'rms_px': found.rms_px,
                'worst_px': found.worst_px, 'distance': found.distance, 'limit': found.limit,
                'loss': found.loss, 'seconds': round(time.perf_counter() - started, 2)}

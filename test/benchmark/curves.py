@@ -39,7 +39,8 @@ from measure import (
     summarised,
 )
 
-from dashcalib_ros import Config, open_frames, stages
+from dashcalib_ros import Config, open_frames
+from dashcalib_ros.detect.detection import detect
 from dashcalib_ros.input import Frame
 
 TURNS = Setting('curve over turns', DEMO, replace(STREET, turns=10))
@@ -54,7 +55,7 @@ def over_turns(frames: Iterable[Frame], counts: Sequence[int], seed: int,
                truth: Mapping[str, float]) -> dict[int, dict[str, Any]]:
     """Solve with so many turns each, best first; a turn's scene is built for the first only."""
     config = Config(seed=seed).replace({'turns.wanted': 1, 'turns.at_most': 1})
-    detection = stages.detect(frames, config)
+    detection = detect(frames, config)
     scenes, _ = reconstructed(detection, detection.turns(), config)
     return {count: summarised(solved(detection, scenes[:count], config)[0], truth)
             for count in sorted(counts)}

@@ -15,8 +15,11 @@ import numpy as np
 from attacks import Film, Grey, film_of
 from measure import parser_with
 
-from dashcalib_ros import Config, stages
+from dashcalib_ros import Config
 from dashcalib_ros.detect import Turn
+from dashcalib_ros.detect.detection import detect
+from dashcalib_ros.reconstruct import reconstruct
+from dashcalib_ros.solve import solve
 
 # gain of the grey levels, and their noise; streaks of rain
 DEGREES = ((1.0, 0.0, 0), *((gain, 2.0, 0) for gain in (0.2, 0.1, 0.05, 0.03, 0.02, 0.015)),
@@ -53,7 +56,7 @@ def line(film: Film, gain: float, noise: float, streaks: int) -> str:
     config, rng = Config(), np.random.default_rng(0)
     frames = [replace(frame, image=spoilt(frame.image, gain, noise, streaks, rng))
               for frame in film.frames]
-    detection = stages.detect(frames, config)
+    detection = detect(frames, config)
     centers = [turn.stamp_s for turn in detection.turns()]
     seen, scenes = 0, []
     turns = true_turns(film)
@@ -62,9 +65,9 @@ def line(film: Film, gain: float, noise: float, streaks: int) -> str:
         seen += any(abs(stamp_s - center) < HALF_S for center in centers)
         near = tuple(frame for frame in frames if abs(frame.stamp_ns / 1e9 - stamp_s) <= HALF_S)
         turn = Turn(k, near[0].index, near[-1].index, stamp_s, 0.1, near)
-        scenes.append(stages.reconstruct(turn, config, detection.valid()))
+        scenes.append(reconstruct(turn, config, detection.valid()))
     good = [scene for scene in scenes if scene is not None]
-    solution = stages.solve(good, config) if good else None
+    solution = solve(good, config) if good else None
     sigma = '' if solution is None else (
         f', sigma of fx {100 * solution.sigma[0] / solution.camera.fx:.2f} %')
     return (f'gain {gain}, noise {noise}, {streaks} streaks: of {len(turns)} turns {seen} found, '

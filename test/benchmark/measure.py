@@ -19,15 +19,16 @@ from typing import Any
 
 from mapping import is_fisheye, mapping_error, model_of
 
-from dashcalib_ros import Calibrator, Config, stages
+from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.judge.conclude import evidence_of_detection
+from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.solve import solve
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ScenePool
 
@@ -186,12 +187,12 @@ def solved(detection: Detection, scenes: Sequence[Scene], config: Config
     watch = Stopwatch('start')
     worker = ChildWorker()
     try:
-        solution = worker.call(stages.solve, scenes, config, progress=watch.enter)
+        solution = worker.call(solve, scenes, config, progress=watch.enter)
     finally:
         worker.close()
     watch.enter('end')
     evidence = evidence_of_detection(detection, scenes)
-    return stages.judge(solution, evidence, config), watch.seconds
+    return conclude(solution, evidence, config), watch.seconds
 
 
 def errors(estimate: Mapping[str, Any], truth: Mapping[str, Any],

@@ -25,10 +25,11 @@ from measure import complain, parser_with, table
 from scipy.spatial.transform import Rotation
 from solutions import Solved
 
-from dashcalib_ros import Config, stages
+from dashcalib_ros import Config
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge import Change, Reading, watch
+from dashcalib_ros.judge.monitor import readings_of
 from dashcalib_ros.reconstruct.scene import Scene
 
 CONFIG = Config()
@@ -127,7 +128,7 @@ def library_of(drive: Solved, cache: Path) -> Library:
     readings = pickle.loads(path.read_bytes()) if path.exists() else {}
     missing = [event for event in EVENTS if event not in readings]
     if missing:
-        readings |= {event: stages.read([seen_after(scene, camera, EVENTS[event])
+        readings |= {event: readings_of([seen_after(scene, camera, EVENTS[event])
                                          for scene in drive.solution.scenes], camera, CONFIG)
                      for event in missing}
         path.parent.mkdir(parents=True, exist_ok=True)

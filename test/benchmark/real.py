@@ -32,13 +32,15 @@ from measure import (
     table,
 )
 
-from dashcalib_ros import Config, open_frames, stages
+from dashcalib_ros import Config, open_frames
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.detect.detection import detect
 from dashcalib_ros.judge import Poses, read_poses
-from dashcalib_ros.judge.conclude import evidence_of_detection
+from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.judge.odometry import Odometry, angle_deg, odometry
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import load_camera
+from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.field import without_field
 from dashcalib_ros.solve.solution import Solution
 
@@ -70,13 +72,13 @@ DRIVES = (Recorded('kitti03', 'bag', 718.2, 1.8, poses='poses.txt'),
 def measured(drive: Recorded, data: Path, seed: int) -> dict[str, Any]:
     """Return all that is measured of a drive with a seed."""
     config = Config(seed=seed)
-    detection = stages.detect(open_frames(data / drive.name / drive.pictures, fps=drive.fps),
+    detection = detect(open_frames(data / drive.name / drive.pictures, fps=drive.fps),
                               config)
     px = detection.scale.px
     turns = detection.turns()[:config.turns.wanted]
     scenes, _ = reconstructed(detection, turns, config)
-    whole = stages.solve(scenes, config)
-    calibration = stages.judge(whole, evidence_of_detection(detection, scenes), config)
+    whole = solve(scenes, config)
+    calibration = conclude(whole, evidence_of_detection(detection, scenes), config)
     row: dict[str, Any] = {'verdict': calibration.verdict.level, 'turns': len(scenes),
                            'reasons': list(calibration.verdict.reasons)}
     if whole is None:
@@ -111,11 +113,11 @@ def alone(scenes: Sequence[Scene], whole: Solution, config: Config, px: float
     rows = []
     for scene in scenes:
         row: dict[str, Any] = {'turn': scene.turn.number}
-        found = stages.solve([scene], config)
+        found = solve([scene], config)
         row |= {} if found is None else {'before': px * found.camera.fx}
         if has_field(whole):
             assert whole.field is not None
-            found = stages.solve([without_field(scene, whole.field.field)], config)
+            found = solve([without_field(scene, whole.field.field)], config)
         row |= {} if found is None else {'after': px * found.camera.fx}
         rows.append(row)
     return rows
@@ -127,7 +129,7 @@ def subsets(scenes: Sequence[Scene], sharp: set[Any], config: Config, px: float
     rows = []
     for count in range(2, len(scenes) + 1):
         for some in itertools.combinations(scenes, count):
-            found = stages.solve(some, config)
+            found = solve(some, config)
             if found is not None and any(scene.turn in sharp for scene in found.scenes):
                 rows.append({'turns': [scene.turn.number for scene in some], 'count': count,
                              'sharp': sum(scene.turn in sharp for scene in found.scenes),

@@ -44,9 +44,9 @@ from measure import (
     table,
 )
 
-from dashcalib_ros import Config, open_frames, stages
+from dashcalib_ros import Config, open_frames
 from dashcalib_ros.detect import Turn
-from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.detect.detection import Detection, detect
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.scale import Scale
 
@@ -84,24 +84,24 @@ def trivial(task: Task) -> dict[str, Any]:
 
 def ours_on_turns(task: Task) -> dict[str, Any]:
     """dashcalib as it is."""
-    detection = stages.detect(task.frames, task.config)
+    detection = detect(task.frames, task.config)
     return _ours(task, detection, _best(task, detection))
 
 
 def ours_on_windows(task: Task) -> dict[str, Any]:
     """dashcalib's reconstruction without its turns."""
-    detection = stages.detect(task.frames, task.config)
+    detection = detect(task.frames, task.config)
     return _ours(task, detection, _windows(task, detection))
 
 
 def colmap_on_turns(task: Task) -> dict[str, Any]:
     """COLMAP on the turns that dashcalib used, together."""
-    return _colmap(task, _best(task, stages.detect(task.frames, task.config)))
+    return _colmap(task, _best(task, detect(task.frames, task.config)))
 
 
 def colmap_on_windows(task: Task) -> dict[str, Any]:
     """COLMAP on the random windows, together."""
-    return _colmap(task, _windows(task, stages.detect(task.frames, task.config)))
+    return _colmap(task, _windows(task, detect(task.frames, task.config)))
 
 
 def colmap_on_all(task: Task) -> dict[str, Any]:

@@ -9,10 +9,9 @@ import pytest
 from solving import CONFIG, scenes_of, solved
 from synthetic import LENS, SIZE
 
-from dashcalib_ros import stages
 from dashcalib_ros.camera import Brown, Fisheye
 from dashcalib_ros.camera.mapping import apart, as_model
-from dashcalib_ros.judge import Verdict
+from dashcalib_ros.judge import Verdict, check
 from dashcalib_ros.judge.difference import Difference, answers_of, difference_of, distance
 from dashcalib_ros.report import NamedCamera, compare
 from dashcalib_ros.solve.knowledge import PictureSigma
@@ -27,7 +26,7 @@ def solution():
 
 
 def ask(given, solution, verdict=ACCEPTED):
-    return stages.check(given, SIZE, solution, verdict, CONFIG)
+    return check(given, SIZE, solution, verdict, CONFIG)
 
 
 @pytest.mark.parametrize('shift', [0.0, 0.5, -0.5])

@@ -8,11 +8,11 @@ import pytest
 from solving import CONFIG
 from synthetic import LENS, rotation, synthetic_turn
 
-from dashcalib_ros import stages
 from dashcalib_ros.camera import Fisheye
 from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge import Reading, watch
+from dashcalib_ros.judge.monitor import readings_of
 from dashcalib_ros.reconstruct.heading import Heading, heading
 from dashcalib_ros.solve import fitting
 from dashcalib_ros.solve.quadratic import Quadratic
@@ -31,7 +31,7 @@ def scene_of(lens, yaw_deg, number):
 @pytest.fixture(scope='module')
 def readings():
     """What the camera in use makes of turns of three cameras, itself among them."""
-    return {name: stages.read([scene_of(lens, yaw, n) for n, yaw in enumerate(YAWS)], LENS, CONFIG)
+    return {name: readings_of([scene_of(lens, yaw, n) for n, yaw in enumerate(YAWS)], LENS, CONFIG)
             for name, lens in (('same', LENS), ('zoomed', ZOOMED), ('exchanged', EXCHANGED))}
 
 
@@ -145,7 +145,7 @@ def test_a_chain_that_breaks_where_images_are_lost_is_no_other_camera(monkeypatc
     broken = replace(scene, camera=LENS, structure=replace(
         scene.structure, registered=few, used=scene.structure.used & few[:, None]))
     monkeypatch.setattr(fitting, 'chain_scene', lambda *arguments: broken)
-    [reading] = stages.read([scene], LENS, CONFIG)
+    [reading] = readings_of([scene], LENS, CONFIG)
     assert reading.explained and reading.misfit < CONFIG.monitor.max_misfit
 
 

@@ -8,13 +8,12 @@ import pytest
 from solving import CONFIG, START, YAWS, scenes_of, z_of
 from synthetic import LENS, SyntheticTurn, synthetic_turn
 
-from dashcalib_ros import stages
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.agreement import earlier_of_another_camera
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve import focal
+from dashcalib_ros.solve import focal, solve
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +37,7 @@ def mixed(own: int, earlier: Camera) -> list[Scene]:
 
 
 def solved(scenes: list[Scene]):
-    solution = stages.solve(scenes, CONFIG)
+    solution = solve(scenes, CONFIG)
     assert solution is not None
     return solution
 

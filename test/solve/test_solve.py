@@ -9,7 +9,6 @@ import pytest
 from solving import CONFIG, NOTHING, START, adjusted, scenes_of, solved, z_of
 from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
-from dashcalib_ros import stages
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
@@ -32,6 +31,7 @@ from dashcalib_ros.reconstruct.scene import (
     truncated_cost,
 )
 from dashcalib_ros.solve import fitting, focal, joint, steps
+from dashcalib_ros.solve import solve as solve_stage
 from dashcalib_ros.solve.fitting import misfits
 from dashcalib_ros.solve.focal import summed
 from dashcalib_ros.solve.joint import solve
@@ -202,8 +202,8 @@ def test_a_scene_that_knows_nothing_is_dropped_and_told(no_profile):
     assert solution is None or judge(solution, hopeless.verdict).level != 'accepted'
     nothing = replace(scenes[1], tracks=replace(
         scenes[1].tracks, xy=np.full_like(scenes[1].tracks.xy, np.nan)))
-    assert stages.solve([nothing], CONFIG) is None
-    solution = stages.solve([scenes[0], nothing, scenes[2]], CONFIG)
+    assert solve_stage([nothing], CONFIG) is None
+    solution = solve_stage([scenes[0], nothing, scenes[2]], CONFIG)
     assert [scene.turn for scene in solution.scenes] == [at(0), at(2)]
     assert np.isfinite(solution.sigma).all()
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from waiting import LIMIT_S, background, is_running, wait_for
 
-from dashcalib_ros import stages
+from dashcalib_ros import reconstruct
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import WorkerError
@@ -59,7 +59,7 @@ def wait_until_built(pool: ScenePool) -> None:
 
 
 def use(monkeypatch, function: Callable[..., object]) -> None:
-    monkeypatch.setattr(stages, 'draft', function)
+    monkeypatch.setattr(reconstruct, 'draft', function)
 
 
 def test_turns_become_scenes_once(pool, monkeypatch):
@@ -78,7 +78,7 @@ def test_a_hopeless_turn_has_no_scene_and_verbose_tells_why(monkeypatch, capsys,
         raise error
 
     monkeypatch.setattr(build, 'draft_scene', fail)
-    assert stages.draft(turn(10), Config(), None) is None
+    assert reconstruct.draft(turn(10), Config(), None) is None
     # a child's stderr is the terminal with --verbose, and nowhere else
     told = capsys.readouterr().err
     assert 'turn at frame 10' in told and str(error) in told
@@ -219,7 +219,7 @@ def test_a_turn_is_built_in_two_halves(monkeypatch, tmp_path, live, done):
     """Side by side offline, so that the children end together; one by one live."""
     log, hold = tmp_path / 'log', tmp_path / 'hold'
     use(monkeypatch, child_tasks.build_slowly)
-    monkeypatch.setattr(stages, 'finish', child_tasks.finish)
+    monkeypatch.setattr(reconstruct, 'finish', child_tasks.finish)
     pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=9 if live else None)
     try:
         pool.submit(turn(5, hold), None)
@@ -240,7 +240,7 @@ def test_a_turn_is_built_in_two_halves(monkeypatch, tmp_path, live, done):
 
 def test_a_child_that_dies_in_the_second_half_loses_no_turn(pool, monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.draft)
-    monkeypatch.setattr(stages, 'finish', child_tasks.finish_dies_at_first)
+    monkeypatch.setattr(reconstruct, 'finish', child_tasks.finish_dies_at_first)
     for center in (10, 50, 90):
         pool.submit(filmed(center, 3, tmp_path / 'log'), None)
     wait_until_built(pool)
@@ -261,7 +261,7 @@ def test_what_failed_is_not_kept_for_a_turn_that_left(pool, monkeypatch, tmp_pat
 def test_a_lost_turn_is_tried_again_by_itself(pool, trouble, monkeypatch, tmp_path):
     """Killed at each start for a while and then left alone; nobody waits for it."""
     use(monkeypatch, child_tasks.build_dies)
-    monkeypatch.setattr(stages, 'load', child_tasks.die)
+    monkeypatch.setattr(reconstruct, 'load', child_tasks.die)
     pool.submit(turn(10, tmp_path / 'log'), None)
     wait_for(lambda: len(trouble) > ATTEMPTS)
     assert all('exit code 1' in line and 'turn at frame 10 is tried again' in line

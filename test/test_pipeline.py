@@ -1,4 +1,4 @@
-"""The four stages as public functions, and what it takes to add a camera model."""
+"""The four stages as functions, and what it takes to add a camera model."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from dashcalib_ros import Calibrator, Config, stages
+from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import (
     MODELS,
@@ -19,11 +19,13 @@ from dashcalib_ros.camera import (
 )
 from dashcalib_ros.camera.camera import ColmapModel
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
-from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.detect.detection import Detection, detect
 from dashcalib_ros.errors import ConfigError
-from dashcalib_ros.judge.conclude import evidence_of_detection
+from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.questions import Questions
+from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.report import calibration_yaml, load_camera, result_dict
+from dashcalib_ros.solve import solve
 
 # one term is all that this lens has
 LENS = Lens.of(640, 360, 70.0, -0.18, 0.0, offset=(5.0, -3.0))
@@ -72,13 +74,13 @@ def frames():
 
 @pytest.fixture(scope='module')
 def detection(frames):
-    return stages.detect(frames, QUICK)
+    return detect(frames, QUICK)
 
 
 def calibrated(detection, config):
-    scenes = [stages.reconstruct(turn, config, detection.valid()) for turn in detection.turns()]
-    solution = stages.solve([scene for scene in scenes if scene is not None], config)
-    return stages.judge(solution, evidence_of_detection(detection, scenes), config)
+    scenes = [reconstruct(turn, config, detection.valid()) for turn in detection.turns()]
+    solution = solve([scene for scene in scenes if scene is not None], config)
+    return conclude(solution, evidence_of_detection(detection, scenes), config)
 
 
 @pytest.fixture(scope='module')
@@ -115,7 +117,7 @@ def test_its_file_is_read_back(found, tmp_path):
 
 def test_a_model_that_nobody_knows_is_a_config_error(detection):
     with pytest.raises(ConfigError, match='radial, brown'):
-        stages.reconstruct(detection.turns()[0], QUICK.replace({'model': 'nonsense'}))
+        reconstruct(detection.turns()[0], QUICK.replace({'model': 'nonsense'}))
 
 
 def test_the_stages_give_what_the_calibrator_gives(frames, detection):
