@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import stat
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -184,44 +183,3 @@ def parse_json(text: str, what: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f'{what} is not valid JSON ({error}); write it anew') from error
-
-
-def join_within(chunks: Iterable[bytes], limit: int, what: str) -> bytes:
-    """Join the pieces of unpacked data; raises InputError when they pass the limit."""
-    pieces: list[bytes] = []
-    total = 0
-    for piece in chunks:
-        total += len(piece)
-        if total > limit:
-            raise InputError(f'{what} unpacks to more than {limit / 2**20:.0f} MB')
-        pieces.append(piece)
-    return b''.join(pieces)
-
-
-class UnpackedFile:
-    """The target of unpacking a file: write() raises InputError at a limit.
-
-    A file that becomes too large is no recording, and the disk must not become full.
-    """
-
-    def __init__(self, packed: Path, write: Callable[[bytes], Any], folder: Path | None) -> None:
-        """folder: on the disk that is written to; None where nothing is kept."""
-        self._packed, self._write, self._folder = packed, write, folder
-        self._limit = max(UNPACKED_LEAST, UNPACKED_RATIO * packed.stat().st_size)
-        self._total = self._looked = 0
-
-    def write(self, data: bytes) -> int:
-        """Take the next piece."""
-        self._total += len(data)
-        if self._total > self._limit:
-            raise InputError(
-                f'{self._packed} unpacks to more than {self._limit / 2**20:.0f} MB, which is no '
-                f'recording; if it is one, unpack it first (zstd -d)')
-        if self._folder is not None and self._total - self._looked >= UNPACKED_LEAST:
-            self._looked = self._total
-            if shutil.disk_usage(self._folder).free < FREE_BYTES:
-                raise InputError(
-                    f'no room to unpack {self._packed} in {self._folder}: set TMPDIR to a bigger '
-                    f'disk, or unpack it first (zstd -d)')
-        self._write(data)
-        return len(data)

@@ -7,28 +7,19 @@ its start to where it breaks (salvage).
 """
 from __future__ import annotations
 
-import errno
-import tempfile
 from collections import Counter
 from collections.abc import Collection, Generator, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path, PurePath
 from typing import Any
 
-import zstandard
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader as Ros2Reader
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.bag_read import (
-    Damage,
-    Record,
-    Ros1Reader,
-    Ros2Reader,
-    scan,
-    unpack_file,
-)
+from dashcalib_ros.input.bag_read import Damage, Record, scan, unpacked
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.source import (
     METADATA,
@@ -122,8 +113,8 @@ def check_unpacked(path: Path) -> None:
         files = list(open_bag(path).files)
         parse_yaml(read_text(path / METADATA, YAML_BYTES), str(path / METADATA))
     for file in files:
-        if file.suffix.lower() == '.zstd':
-            unpack_file(file, lambda _: None, None)
+        with unpacked(file, lambda _: None):
+            pass
 
 
 def _metadata(path: Path) -> tuple[tuple[Path, ...], tuple[Topic, ...]]:
@@ -148,7 +139,7 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
     problems: list[str] = []
     indexed = True
     for file in files:
-        with _unpacked(file, problems.append) as plain:
+        with unpacked(file, problems.append) as plain:
             found = _index_counts(plain)
             if found is None:
                 indexed = False
@@ -176,7 +167,7 @@ def _index_counts(path: Path) -> Counter[tuple[str, str]] | None:
 
 
 def _records(file: Path, topics: Collection[str], damage: Damage) -> Iterator[Record]:
-    with _unpacked(file, damage) as path:
+    with unpacked(file, damage) as path:
         last_ns = -1
         try:
             for record in _indexed_records(path, topics):
@@ -207,27 +198,6 @@ def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
 def _reader(path: Path) -> Ros1Reader | Ros2Reader:
     with path.open('rb') as file:
         return Ros1Reader(path) if file.read(7) == b'#ROSBAG' else Ros2Reader(path)
-
-
-@contextmanager
-def _unpacked(file: Path, damage: Damage) -> Iterator[Path]:
-    """Give the file; of a .zstd file, a temporary copy of what could be decompressed."""
-    if file.suffix.lower() != '.zstd':
-        yield file
-        return
-    with tempfile.TemporaryDirectory(prefix='dashcalib-') as folder:
-        plain = Path(folder, file.stem)
-        try:
-            with plain.open('wb') as output:
-                unpack_file(file, output.write, Path(folder))
-        except zstandard.ZstdError:
-            damage(f'{file.name} is damaged')
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            raise InputError(f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, '
-                             f'or unpack it first (zstd -d)') from error
-        yield plain
 
 
 def _names(files: tuple[Path, ...]) -> str:

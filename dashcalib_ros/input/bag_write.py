@@ -18,7 +18,6 @@ from rosbags.typesys import Stores, get_typestore
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.camera_info import SAME, RosCamera
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.input.bag_read import Ros2Reader
 from dashcalib_ros.input.bag_storage import check_unpacked, open_bag
 from dashcalib_ros.input.source import Frame
 
@@ -163,7 +162,7 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
         raise InputError(f'{source} is a ROS 1 bag: convert it first (rosbags-convert)')
     try:
         check_unpacked(path)
-        reader = Ros2Reader(path)
+        reader = Reader(path)
         reader.open()
     except Exception as error:  # a damaged file makes rosbags raise nearly anything
         raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
