@@ -284,7 +284,7 @@ def load_projection(path):
     (['--set', 'turns.half_width=.nan'], 'finite'),
     (['--set', 'turns.wanted'], 'KEY=VALUE'),
     (['--set', 'turns.wanted=[1'], 'not valid YAML'),
-    (['--set', 'turns.wanted=' + '[' * 40 + ']' * 40], 'more than 30 levels'),
+    (['--set', 'turns.wanted=' + '[' * 40 + ']' * 40], 'or 30 levels'),
     (['--set', 'seed=0x' + 'f' * 5000], 'more than 300 digits'),
     (['--set', 'seed=0x' + 'f' * 200], 'seed must be between'),
     (['--set', 'turns.wanted=!!int ""'], 'not valid YAML'),
