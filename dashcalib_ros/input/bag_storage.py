@@ -20,7 +20,7 @@ from rosbags.rosbag2 import Reader as Ros2Reader
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.bag_read import Damage, Record, scan, unpacked
-from dashcalib_ros.input.decode import BitDepth, decode
+from dashcalib_ros.input.decode import BitDepth, decode, message_size
 from dashcalib_ros.input.source import (
     METADATA,
     FrameSource,
@@ -104,17 +104,6 @@ def open_bag(path: Path) -> Bag:
         return Bag(files, promised, True, tuple(warnings))
     topics, indexed = _topics_of(files, path)
     return Bag(files, topics, indexed, tuple(warnings))
-
-
-def check_unpacked(path: Path) -> None:
-    """Raise InputError where rosbags would have to read or unpack more than limits allow."""
-    files = [path]
-    if path.is_dir():
-        files = list(open_bag(path).files)
-        parse_yaml(read_text(path / METADATA, YAML_BYTES), str(path / METADATA))
-    for file in files:
-        with unpacked(file, lambda _: None):
-            pass
 
 
 def _metadata(path: Path) -> tuple[tuple[Path, ...], tuple[Topic, ...]]:
@@ -312,7 +301,7 @@ def _sizes(bag: Bag, topics: list[Topic]) -> dict[str, str]:
             continue
         missing.discard(record.topic)
         try:
-            height, width = decode(record.message()).shape
+            width, height = message_size(record.message())
             sizes[record.topic] = f'{width}x{height}'
         except InputError:
             pass  # it is listed without a size

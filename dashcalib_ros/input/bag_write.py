@@ -4,7 +4,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,10 @@ from rosbags.typesys import Stores, get_typestore
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.camera_info import SAME, RosCamera
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.input.bag_storage import check_unpacked, open_bag
+from dashcalib_ros.input.bag_read import unpacked
+from dashcalib_ros.input.bag_storage import open_bag
+from dashcalib_ros.input.source import METADATA
+from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 REPAIR = "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
@@ -121,15 +124,10 @@ def _copy(reader: Reader, writer: Writer, image_topic: str, camera: RosCamera,
 
 def _messages(reader: Reader, connections: list[Connection], source: str | os.PathLike[str]
               ) -> Iterator[tuple[Connection, int, bytes]]:
-    messages = reader.messages(connections)
-    while True:
-        try:
-            item = next(messages)
-        except StopIteration:
-            return
-        except Exception as error:  # a damaged file makes rosbags raise nearly anything
-            raise InputError(f'{source} is damaged, no bag is made of it: {REPAIR}') from error
-        yield item
+    try:
+        yield from reader.messages(connections)
+    except Exception as error:  # a damaged file makes rosbags raise nearly anything
+        raise InputError(f'{source} is damaged, no bag is made of it: {REPAIR}') from error
 
 
 def _declared(writer: Writer, connection: Connection) -> Connection:
@@ -158,12 +156,12 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
                                  and any(path.glob('*.bag'))):
         raise InputError(f'{source} is a ROS 1 bag: convert it first (rosbags-convert)')
     try:
-        check_unpacked(path)
+        _check_limits(path)
         reader = Reader(path)
         reader.open()
     except Exception as error:  # a damaged file makes rosbags raise nearly anything
         raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
-    try:
+    with closing(reader):
         topic = camera_info_topic(image_topic)
         wrong = [each.msgtype for each in reader.connections
                  if each.topic == topic and each.msgtype != CAMERA_INFO]
@@ -171,8 +169,15 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
             raise InputError(f'{source} has {wrong[0]} on {topic}, where camera_info belongs: '
                              f'rename that topic')
         yield reader
-    finally:
-        reader.close()
+
+
+def _check_limits(path: Path) -> None:
+    """Raise InputError where rosbags would have to read or unpack more than limits allow."""
+    if path.is_dir():
+        parse_yaml(read_text(path / METADATA, YAML_BYTES), str(path / METADATA))
+    for file in open_bag(path).files:
+        with unpacked(file, lambda _: None):
+            pass
 
 
 def _camera_info(types: Any, c: RosCamera, header: Any) -> Any:
