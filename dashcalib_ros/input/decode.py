@@ -94,21 +94,18 @@ _LAYOUTS = {
 
 
 def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) -> Pixels:
-    """Decode an Image or a CompressedImage message, whichever it is; see the two below."""
-    if hasattr(message, 'encoding'):
-        return decode_image(message, depth, colour)
-    return decode_compressed(message, depth, colour)
+    """Decode a sensor_msgs/Image or CompressedImage: (height, width) uint8, a copy.
 
-
-def decode_image(message: Any, depth: BitDepth | None = None, colour: bool = False) -> Pixels:
-    """Decode a sensor_msgs/Image: (height, width) uint8, a copy.
-
-    message: has encoding, height, width, step, is_bigendian and data.
+    message: has encoding, height, width, step, is_bigendian and data; or format and data: a JPEG,
+    PNG, TIFF, WebP, BMP, PGM or PPM.
     depth: the stream's bit depth, for 16-bit encodings; without it, only this image counts.
     colour: (height, width, 3) BGR uint8, unless the image is grey.
 
-    Raises InputError for an unknown encoding, or a size that does not fit the data.
+    Raises InputError for an unknown encoding, a size that does not fit the data, depth images,
+    video streams, data that is cut off or damaged, and for more pixels than limits allow.
     """
+    if not hasattr(message, 'encoding'):
+        return decode_file(memoryview(message.data), depth, _name(message), colour)
     layout = _LAYOUTS.get(str(message.encoding).lower())
     if layout is None:
         raise InputError(f'encoding {message.encoding!r} is not supported: '
@@ -120,19 +117,6 @@ def decode_image(message: Any, depth: BitDepth | None = None, colour: bool = Fal
     else:
         image = np.array(pixels[..., layout.luma], order='C')
     return _to_8_bits(image, depth)
-
-
-def decode_compressed(message: Any, depth: BitDepth | None = None, colour: bool = False
-                      ) -> Pixels:
-    """Decode a sensor_msgs/CompressedImage: (height, width) uint8.
-
-    message: has format and data: a JPEG, PNG, TIFF, WebP, BMP, PGM or PPM.
-    depth, colour: as for decode_image.
-
-    Raises InputError for depth images, video streams, data that is cut off or damaged, and for
-    more pixels than limits allow.
-    """
-    return decode_file(memoryview(message.data), depth, _name(message), colour)
 
 
 def message_size(message: Any) -> tuple[int, int]:
@@ -162,7 +146,7 @@ def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
                 what: str = 'image', colour: bool = False) -> Pixels:
     """Decode the bytes of an image file: (height, width) uint8; an EXIF orientation is applied.
 
-    colour: as for decode_image. Raises InputError as decode_pixels does.
+    colour: as for decode. Raises InputError as decode_pixels does.
     """
     return _to_8_bits(decode_pixels(data, what, colour), depth)
 
@@ -170,7 +154,7 @@ def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
 def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = False) -> Pixels:
     """Decode the bytes of an image file: (height, width) of 8 or 16 bits.
 
-    colour: as for decode_image. what: the image's name in errors. Raises InputError when the bytes
+    colour: as for decode. what: the image's name in errors. Raises InputError when the bytes
     are cut off or no image, or have more pixels than limits allow.
     """
     _encoded_size(memoryview(data), what)  # check the size before memory is used
