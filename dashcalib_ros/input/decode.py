@@ -57,38 +57,31 @@ class _Layout:
     """How an encoding stores a pixel.
 
     channels, bits: of one pixel in a row of the message.
-    conversion: OpenCV's, with GRAY or BGR for its star. luma: the channel that is the grey value;
-    None: the conversion gives it.
+    conversion: OpenCV's, with GRAY or BGR for its star; '': the first channel is the grey value.
     planar: all pixels' brightness comes first, then their colours.
     """
 
     channels: int
     bits: int = 8
     conversion: str = ''
-    luma: int | None = 0
     planar: bool = False
 
 
 _LAYOUTS = {
-    'mono8': _Layout(1), '8uc1': _Layout(1),
-    'mono16': _Layout(1, 16), '16uc1': _Layout(1, 16),
-    'bgr8': _Layout(3, 8, 'BGR2*', None), '8uc3': _Layout(3, 8, 'BGR2*', None),
-    'rgb8': _Layout(3, 8, 'RGB2*', None),
-    'bgra8': _Layout(4, 8, 'BGRA2*', None), '8uc4': _Layout(4, 8, 'BGRA2*', None),
-    'rgba8': _Layout(4, 8, 'RGBA2*', None),
-    'bgr16': _Layout(3, 16, 'BGR2*', None), '16uc3': _Layout(3, 16, 'BGR2*', None),
-    'rgb16': _Layout(3, 16, 'RGB2*', None),
-    'bgra16': _Layout(4, 16, 'BGRA2*', None), '16uc4': _Layout(4, 16, 'BGRA2*', None),
-    'rgba16': _Layout(4, 16, 'RGBA2*', None),
-    # ROS: yuv422 is U Y V Y, yuv422_yuy2 is Y U Y V; every second byte is a pixel's brightness
-    'yuv422': _Layout(2, 8, 'YUV2*_UYVY', 1), 'uyvy': _Layout(2, 8, 'YUV2*_UYVY', 1),
+    'mono8': _Layout(1), 'mono16': _Layout(1, 16),
+    '8uc1': _Layout(1), '8uc3': _Layout(3, 8, 'BGR2*'), '8uc4': _Layout(4, 8, 'BGRA2*'),
+    '16uc1': _Layout(1, 16), '16uc3': _Layout(3, 16, 'BGR2*'), '16uc4': _Layout(4, 16, 'BGRA2*'),
+    **{f'{order}{bits}': _Layout(len(order), bits, f'{order.upper()}2*')
+       for bits in (8, 16) for order in ('bgr', 'rgb', 'bgra', 'rgba')},
+    # ROS: yuv422 is U Y V Y, yuv422_yuy2 is Y U Y V
+    **{name: _Layout(2, 8, 'YUV2*_UYVY') for name in ('yuv422', 'uyvy')},
     **{name: _Layout(2, 8, 'YUV2*_YUY2') for name in ('yuv422_yuy2', 'yuyv', 'yuy2')},
     **{name: _Layout(1, 8, f'YUV2*_{name.upper()}', planar=True)
        for name in ('nv12', 'nv21', 'i420')},
     'nv24': _Layout(1, planar=True),  # OpenCV does not know its colours
     # ROS and OpenCV name the colours of the first two rows so, from the corner on (OpenCV's older
     # names, BayerBG for rggb, start one pixel further down the diagonal)
-    **{f'bayer_{name}{bits}': _Layout(1, bits, f'Bayer{name.upper()}2*', None)
+    **{f'bayer_{name}{bits}': _Layout(1, bits, f'Bayer{name.upper()}2*')
        for bits in (8, 16) for name in ('rggb', 'bggr', 'gbrg', 'grbg')},
 }
 
@@ -112,10 +105,10 @@ def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) ->
                          f'publish mono8, bgr8, rgb8, yuv422 or a bayer encoding')
     colour = colour and bool(layout.conversion)
     pixels = _pixels(message, layout, colour)
-    if colour or layout.luma is None:
+    if layout.conversion and (colour or not layout.planar):
         image = _convert(pixels, layout.conversion.replace('*', 'BGR' if colour else 'GRAY'))
     else:
-        image = np.array(pixels[..., layout.luma], order='C')
+        image = np.array(pixels[..., 0], order='C')
     return _to_8_bits(image, depth)
 
 
