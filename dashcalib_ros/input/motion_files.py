@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -116,11 +117,10 @@ def _gpx(text: str, path: Path) -> SensorStream:
     if len(points) < 2:
         raise InputError(f'{path} has no track with times: export it with them')
     stamps = np.array([_epoch_s(point.time) for point in points])
-    metres = local_metres(*(np.array([np.nan if value is None else value for value in column])
-                            for column in zip(*((point.latitude, point.longitude,
-                                                 point.elevation) for point in points),
-                                              strict=True)))
-    return sensor_stream({'position': (stamps, metres)}, str(path), absolute=True)
+    # None becomes NaN
+    places = np.array([(point.latitude, point.longitude, point.elevation) for point in points],
+                      np.float64)
+    return sensor_stream({'position': (stamps, local_metres(*places.T))}, str(path), absolute=True)
 
 
 def _inside_video(path: Path) -> SensorStream:
@@ -260,9 +260,8 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None]) -> Senso
     if 'position' in arrays:
         stamps, rows = arrays['position']
         arrays['position'] = stamps, local_metres(*rows.T)
-    found_stream = sensor_stream(arrays, 'the bag', absolute=True)
-    return SensorStream(**found_stream.kinds, absolute=True,
-                        warnings=(*warnings, *found_stream.warnings))
+    stream = sensor_stream(arrays, 'the bag', absolute=True)
+    return replace(stream, warnings=(*warnings, *stream.warnings))
 
 
 def _of_message(message: Any, option: str) -> Iterator[tuple[str, tuple[float, ...]]]:
