@@ -13,7 +13,8 @@ import sqlite3
 import struct
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -26,6 +27,7 @@ import lz4.frame
 from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
+from rosbags import rosbag2
 from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import storage_mcap
 from rosbags.typesys import Stores, get_typestore
@@ -151,6 +153,57 @@ class Record:
 @lru_cache
 def _types(store: Stores) -> Typestore:
     return get_typestore(store)
+
+
+def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]], bool]:
+    """Return the numbers of messages by topic and type, and whether the file's index has them."""
+    counts = Counter[tuple[str, str]]()
+    with unpacked(file, damage) as path:
+        try:
+            with _reader(path) as reader:
+                for connection in reader.connections:
+                    counts[connection.topic, connection.msgtype] += connection.msgcount
+            return counts, True
+        except Exception:  # a damaged file makes rosbags raise nearly anything
+            return Counter((record.topic, record.msgtype) for record in scan(path, damage)), False
+
+
+def records(file: Path, topics: Collection[str], damage: Damage) -> Iterator[Record]:
+    """Yield a file's messages of these topics, where they can be read.
+
+    Raises InputError, OSError.
+    """
+    with unpacked(file, damage) as path:
+        last_ns = -1
+        try:
+            for record in _indexed_records(path, topics):
+                last_ns = record.receive_ns
+                yield record
+            return
+        except Exception:  # a damaged file makes rosbags raise nearly anything
+            pass
+        for record in scan(path, damage):
+            if record.topic in topics and record.receive_ns > last_ns:
+                yield record
+
+
+def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
+    with _reader(path) as reader:
+        wanted = [each for each in reader.connections if each.topic in topics]
+        missing = sum(connection.msgcount for connection in wanted)
+        if not wanted:
+            return
+        ros1 = isinstance(reader, rosbag1.Reader)
+        for connection, receive_ns, raw in reader.messages(wanted):
+            missing -= 1
+            yield Record(connection.topic, connection.msgtype, receive_ns, bytes(raw), ros1)
+        if missing > 0:
+            raise ValueError('the index does not lead to all messages')
+
+
+def _reader(path: Path) -> rosbag1.Reader | rosbag2.Reader:
+    with path.open('rb') as file:
+        return rosbag1.Reader(path) if file.read(7) == b'#ROSBAG' else rosbag2.Reader(path)
 
 
 def scan(path: Path, damage: Damage) -> Iterator[Record]:

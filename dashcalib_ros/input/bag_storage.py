@@ -15,11 +15,8 @@ from itertools import islice
 from pathlib import Path, PurePath
 from typing import Any
 
-from rosbags.rosbag1 import Reader as Ros1Reader
-from rosbags.rosbag2 import Reader as Ros2Reader
-
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.bag_read import Damage, Record, scan, unpacked
+from dashcalib_ros.input.bag_read import Damage, Record, message_counts, records
 from dashcalib_ros.input.decode import BitDepth, decode, message_size
 from dashcalib_ros.input.source import (
     METADATA,
@@ -71,7 +68,7 @@ class Bag:
     def records(self, topics: Collection[str], damage: Damage) -> Iterator[Record]:
         """Yield the messages of these topics, file by file; raises InputError, OSError."""
         for file in self.files:
-            yield from _records(file, topics, damage)
+            yield from records(file, topics, damage)
 
 
 def open_bag(path: Path) -> Bag:
@@ -128,13 +125,9 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
     problems: list[str] = []
     indexed = True
     for file in files:
-        with unpacked(file, problems.append) as plain:
-            found = _index_counts(plain)
-            if found is None:
-                indexed = False
-                found = Counter((record.topic, record.msgtype)
-                                for record in scan(plain, problems.append))
+        found, by_index = message_counts(file, problems.append)
         counts.update(found)
+        indexed &= by_index
     if problems and not counts:
         raise InputError(f'{bag} cannot be read ({problems[0]}): {CURE}')
     return _sorted(counts), indexed
@@ -142,51 +135,6 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
 
 def _sorted(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
     return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
-
-
-def _index_counts(path: Path) -> Counter[tuple[str, str]] | None:
-    counts = Counter[tuple[str, str]]()
-    try:
-        with _reader(path) as reader:
-            for connection in reader.connections:
-                counts[connection.topic, connection.msgtype] += connection.msgcount
-    except Exception:  # a damaged file makes rosbags raise nearly anything
-        return None
-    return counts
-
-
-def _records(file: Path, topics: Collection[str], damage: Damage) -> Iterator[Record]:
-    with unpacked(file, damage) as path:
-        last_ns = -1
-        try:
-            for record in _indexed_records(path, topics):
-                last_ns = record.receive_ns
-                yield record
-            return
-        except Exception:  # a damaged file makes rosbags raise nearly anything
-            pass
-        for record in scan(path, damage):
-            if record.topic in topics and record.receive_ns > last_ns:
-                yield record
-
-
-def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
-    with _reader(path) as reader:
-        wanted = [each for each in reader.connections if each.topic in topics]
-        missing = sum(connection.msgcount for connection in wanted)
-        if not wanted:
-            return
-        ros1 = isinstance(reader, Ros1Reader)
-        for connection, receive_ns, raw in reader.messages(wanted):
-            missing -= 1
-            yield Record(connection.topic, connection.msgtype, receive_ns, bytes(raw), ros1)
-        if missing > 0:
-            raise ValueError('the index does not lead to all messages')
-
-
-def _reader(path: Path) -> Ros1Reader | Ros2Reader:
-    with path.open('rb') as file:
-        return Ros1Reader(path) if file.read(7) == b'#ROSBAG' else Ros2Reader(path)
 
 
 def _names(files: tuple[Path, ...]) -> str:
