@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.source import (
     IMAGE_SUFFIXES,
     METADATA,
@@ -148,7 +148,7 @@ def _in_folder(folder: Path) -> _Group:
 def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> FrameSource:
     """Open all recordings of all groups as one drive; those that cannot be read are left out."""
     parts: list[FrameSource] = []
-    warnings = [f'{group.where}: left out {counted(group.others, "other file")}'
+    warnings = [f'{group.where}: left out {group.others} other file{"s" * (group.others > 1)}'
                 for group in groups if group.others]
     failures: list[str] = []
     for group in groups:
