@@ -1,4 +1,4 @@
-"""The table of input kinds; open_frames() finds what its paths are, and joins several.
+"""The kinds of inputs: open_frames() finds what its paths are, and joins several.
 
 Nothing here loads OpenCV or rosbags before a drive is opened: `--help` stays quick.
 """
@@ -204,13 +204,32 @@ def _listed(sources: Sequence[FrameSource]) -> str:
 def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
     try:
         if not place.is_dir():
-            _check_readable(place)
+            check_file(place)
+            if place.stat().st_size == 0:
+                raise InputError(f'{place} is empty: the recording or the copy failed; make it '
+                                 f'again')
+            with place.open('rb'):
+                pass  # what may not be read is told in our own words
         opener = _opener_of(place)
         if opener is None:
             raise InputError(_unknown(place))
         return opener(place, topic, fps)
     except OSError as error:
         raise InputError(os_error(place, error)) from error
+
+
+def _opener_of(path: Path) -> Callable[[Path, str | None, float | None], FrameSource] | None:
+    """Return what opens a kind of input (path, topic and rate, as open_frames() has them).
+
+    A folder with a bag in it is no folder of images.
+    """
+    if fits_bag(path):
+        from dashcalib_ros.input.bag_storage import BagSource
+        return BagSource
+    if _is_video(path):
+        from dashcalib_ros.input.video import VideoSource
+        return VideoSource
+    return FolderSource if path.is_dir() else None
 
 
 def fits_bag(path: Path) -> bool:
@@ -220,16 +239,6 @@ def fits_bag(path: Path) -> bool:
                    or (is_bag_file(entry.name) and not irregular_entry(entry))
                    for entry in path.iterdir())
     return is_bag_file(path.name)
-
-
-def _open_bag(path: Path, topic: str | None, fps: float | None) -> FrameSource:
-    from dashcalib_ros.input.bag_storage import BagSource
-    return BagSource(path, topic, fps)
-
-
-def _open_video(path: Path, topic: str | None, fps: float | None) -> FrameSource:
-    from dashcalib_ros.input.video import VideoSource
-    return VideoSource(path, topic, fps)
 
 
 def _is_video(path: Path) -> bool:
@@ -287,18 +296,6 @@ def _no_images(path: Path, names: list[str]) -> str:
             f'give the folder or the file that has them')
 
 
-Opener = Callable[[Path, str | None, float | None], FrameSource]
-#: the kinds of inputs: whether a path is one, and what opens it (path, topic and rate, as
-#: open_frames() has them; it loads its libraries). The first that fits is taken: a folder with a
-#: bag in it is no folder of images
-KINDS: tuple[tuple[Callable[[Path], bool], Opener], ...] = (
-    (fits_bag, _open_bag), (_is_video, _open_video), (Path.is_dir, FolderSource))
-
-
-def _opener_of(path: Path) -> Opener | None:
-    return next((opener for fits, opener in KINDS if fits(path)), None)
-
-
 def _check_recorded(text: str) -> None:
     """Raise InputError for a live stream: a drive is read from its beginning to its end."""
     if re.match(r'[a-z][a-z0-9+.-]+://', text, re.IGNORECASE):
@@ -311,15 +308,6 @@ def _check_recorded(text: str) -> None:
             f'{text} is a live camera: record it first (ffmpeg -f v4l2 -i {text} -t 900 '
             f'drive.mp4) and give that file, or run v4l2_camera and the node (ros2 run '
             f'dashcalib_ros calibrator)')
-
-
-def _check_readable(path: Path) -> None:
-    """Raise InputError or OSError for a file that no reader can open, with our own message."""
-    check_file(path)
-    if path.stat().st_size == 0:
-        raise InputError(f'{path} is empty: the recording or the copy failed; make it again')
-    with path.open('rb'):
-        pass
 
 
 def _unknown(path: Path) -> str:

@@ -170,7 +170,7 @@ def speeds_of(stream: SensorStream) -> Samples | None:
 
 
 class SensorBuffer:
-    """The newest samples of live sensors, for a node: add() them as they come, stream() to ask.
+    """The newest samples of a bag's or a node's sensors: add() them as they come, stream() to ask.
 
     Doubled and late samples are dropped when they are asked for. Memory is bounded: of each kind
     the newest are kept.
@@ -186,10 +186,13 @@ class SensorBuffer:
         kept = self._kept.setdefault(kind, deque(maxlen=self._length))
         kept.append((stamp_s, tuple(values)))
 
-    def stream(self) -> SensorStream:
-        """Return what there is."""
+    def arrays(self) -> dict[str, tuple[Floats, Floats]]:
+        """Return the stamps (n,) and values (n, d) of each kind."""
         # a thread may add meanwhile
         found = {kind: list(kept) for kind, kept in tuple(self._kept.items())}
-        return sensor_stream(
-            {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
-             for kind, rows in found.items() if rows}, 'the topic', absolute=True)
+        return {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
+                for kind, rows in found.items() if rows}
+
+    def stream(self) -> SensorStream:
+        """Return what there is."""
+        return sensor_stream(self.arrays(), 'the topic', absolute=True)

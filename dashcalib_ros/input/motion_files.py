@@ -15,6 +15,7 @@ from dashcalib_ros.input.inputs import VIDEO_SUFFIXES
 from dashcalib_ros.input.motion import (
     EPOCH_S,
     SAMPLES,
+    SensorBuffer,
     SensorStream,
     local_metres,
     sensor_stream,
@@ -216,7 +217,7 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None]) -> Senso
     none is used, and a warning lists them. Raises InputError for a chosen topic that there is not.
     """
     from dashcalib_ros.input.bag_storage import open_bag
-    raw: dict[str, list[tuple[float, tuple[float, ...]]]] = {}
+    samples = SensorBuffer(SAMPLES + 1)
     warnings: list[str] = []
     for path in paths:
         bag = open_bag(path)
@@ -249,11 +250,10 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None]) -> Senso
             except (InputError, AttributeError, TypeError, ValueError):
                 continue  # a damaged message is as one that is missing
             for kind, value in values:
-                raw.setdefault(kind, []).append((stamp_s, value))
-    if not raw and not warnings:
+                samples.add(kind, stamp_s, value)
+    arrays = samples.arrays()
+    if not arrays and not warnings:
         return None
-    arrays = {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
-              for kind, rows in raw.items()}
     if 'odom_rate' in arrays:
         arrays.setdefault('rate', arrays.pop('odom_rate'))
         arrays.pop('odom_rate', None)
