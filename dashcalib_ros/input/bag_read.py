@@ -105,7 +105,7 @@ def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
 
 def _unpack_file(packed: Path, plain: Path) -> None:
     limit = max(UNPACKED_LEAST, UNPACKED_RATIO * packed.stat().st_size)
-    with zstd.open(packed, 'rb') as source, plain.open('wb') as output:
+    with zstd.open(packed, 'rb') as source, plain.open('wb', PIECE) as output:
         while piece := source.read1(PIECE):
             if output.tell() + len(piece) > limit:
                 raise InputError(
