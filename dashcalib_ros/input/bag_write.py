@@ -77,8 +77,21 @@ def write_bag(source: str | os.PathLike[str], image_topic: str, camera: Camera,
     out: the new bag's folder; it appears only when all went well. rectified: as ros_camera()'s.
     Raises InputError, OutputError.
     """
+    topic, ros = camera_info_topic(image_topic), ros_camera(camera, rectified)
+    types = get_typestore(Stores.ROS2_JAZZY)
+    count = 0
     with _opened(source, image_topic) as reader, new_bag(Path(out)) as writer:
-        return _copy(reader, writer, image_topic, ros_camera(camera, rectified), source)
+        kept = [each for each in reader.connections if each.topic != topic]
+        copies = {each.id: _declared(writer, each) for each in kept}
+        infos = writer.add_connection(topic, CAMERA_INFO, typestore=types)
+        for connection, stamp_ns, raw in _messages(reader, kept, source):
+            writer.write(copies[connection.id], stamp_ns, raw)
+            if connection.topic == image_topic:
+                image: Any = types.deserialize_cdr(raw, connection.msgtype)
+                info = _camera_info(types.types, ros, image.header)
+                writer.write(infos, stamp_ns, types.serialize_cdr(info, CAMERA_INFO))
+                count += 1
+    return count
 
 
 @contextmanager
@@ -102,24 +115,6 @@ def new_bag(path: Path) -> Iterator[Writer]:
     except (OSError, WriterError) as error:
         raise OutputError(f'{path} cannot be written ({error}): check the permissions and the '
                           f'room on that disk') from error
-
-
-def _copy(reader: Reader, writer: Writer, image_topic: str, camera: RosCamera,
-          source: str | os.PathLike[str]) -> int:
-    topic = camera_info_topic(image_topic)
-    kept = [each for each in reader.connections if each.topic != topic]
-    copies = {each.id: _declared(writer, each) for each in kept}
-    types = get_typestore(Stores.ROS2_JAZZY)
-    infos = writer.add_connection(topic, CAMERA_INFO, typestore=types)
-    count = 0
-    for connection, stamp_ns, raw in _messages(reader, kept, source):
-        writer.write(copies[connection.id], stamp_ns, raw)
-        if connection.topic == image_topic:
-            header = types.deserialize_cdr(raw, connection.msgtype).header  # type: ignore[attr-defined]
-            info = _camera_info(types.types, camera, header)
-            writer.write(infos, stamp_ns, types.serialize_cdr(info, CAMERA_INFO))
-            count += 1
-    return count
 
 
 def _messages(reader: Reader, connections: list[Connection], source: str | os.PathLike[str]
