@@ -5,11 +5,10 @@ memory or time is spent on it.
 """
 from __future__ import annotations
 
+import itertools
 import json
-import re
-import shutil
 import stat
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +36,6 @@ YAML_DEPTH = 30
 CLIP_BYTES, CLIP_FILES = 2**38, 1_000_000
 # digits of a number in a text: a float has 17 digits and at most 308 zeros
 DIGITS = 300
-# text in YAML that may be a number; 1:20:30 is one, too
-NUMBER = re.compile(r'[-+.\d][-+.:\w]*')
 # times the size of a .zstd file, once unpacked: raw pictures have 2 to 10, rendered ones 50
 UNPACKED_RATIO = 200
 # bytes to which any .zstd file may be unpacked, however small it is
@@ -125,12 +122,16 @@ def parse_yaml(text: str, what: str) -> Any:
     """
     import yaml
 
-    loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # 20 times as fast where libyaml is
     if len(text) > YAML_BYTES:
         raise InputError(f'{what} has more than {YAML_BYTES / 2**20:.0f} MB of YAML')
     try:
-        _check_nesting(yaml.parse(text, Loader=loader), what)
-        return yaml.load(text, Loader=loader)
+        # 20 times as fast where libyaml is
+        loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)(text)
+        root = loader.get_single_node()
+        if root is None:
+            return None
+        _check_values(root, what)
+        return loader.construct_document(root)
     except InputError:
         raise
     except Exception as error:  # a wrong tag or number makes PyYAML raise nearly anything
@@ -140,42 +141,22 @@ def parse_yaml(text: str, what: str) -> Any:
         raise InputError(f'{what} is not valid YAML{where}') from error
 
 
-def _check_nesting(events: Iterable[Any], what: str) -> None:
-    """Raise InputError where a text has too many values or levels, aliases followed."""
-    # named: for each anchor, the number of its values and levels; stack: for each open list or
-    # map, its anchor and the number of its values and levels so far
-    named: dict[str, tuple[int, int]] = {}
-    stack: list[tuple[str | None, int, int]] = [(None, 0, 0)]
-    for event in events:
-        kind = type(event).__name__
-        anchor, values, levels = getattr(event, 'anchor', None), 1, 0
-        if kind in ('MappingStartEvent', 'SequenceStartEvent'):
-            stack.append((anchor, 1, 1))
-            if len(stack) > YAML_DEPTH:
-                raise InputError(f'{what} is no usable YAML: more than {YAML_DEPTH} levels')
-            continue
-        if kind in ('MappingEndEvent', 'SequenceEndEvent'):
-            anchor, values, levels = stack.pop()
-        elif kind == 'AliasEvent':
-            if anchor not in named:
-                raise InputError(f'{what} is no usable YAML: *{anchor} is inside itself')
-            (values, levels), anchor = named[str(anchor)], None
-        elif kind != 'ScalarEvent':
-            continue
-        elif len(event.value) > DIGITS and _is_number(event):
-            raise InputError(f'{what} is no usable YAML: a number has more than {DIGITS} digits')
-        if anchor:
-            named[anchor] = values, levels
-        name, more, deep = stack[-1]
-        stack[-1] = name, more + values, max(deep, levels + 1)
-        if stack[-1][1] > YAML_VALUES or len(stack) + levels > YAML_DEPTH:
+def _check_values(root: Any, what: str) -> None:
+    for count, (node, level) in enumerate(_nodes(root), 1):
+        if count > YAML_VALUES or level > YAML_DEPTH:
             raise InputError(f'{what} is no usable YAML: more than {YAML_VALUES} values or '
                              f'{YAML_DEPTH} levels, aliases followed')
+        if (node.id == 'scalar' and len(node.value) > DIGITS
+                and node.tag.endswith((':int', ':float'))):
+            raise InputError(f'{what} is no usable YAML: a number has more than {DIGITS} digits')
 
 
-def _is_number(scalar: Any) -> bool:
-    tagged = str(scalar.tag).endswith((':int', ':float'))
-    return tagged or (not scalar.style and NUMBER.fullmatch(scalar.value) is not None)
+def _nodes(root: Any, level: int = 1) -> Iterator[tuple[Any, int]]:
+    """Yield PyYAML's nodes and their levels; aliases are followed, also in circles."""
+    yield root, level
+    if root.id != 'scalar':
+        for node in itertools.chain(*root.value) if root.id == 'mapping' else root.value:
+            yield from _nodes(node, level + 1)
 
 
 def parse_json(text: str, what: str) -> Any:
@@ -184,44 +165,3 @@ def parse_json(text: str, what: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f'{what} is not valid JSON ({error}); write it anew') from error
-
-
-def join_within(chunks: Iterable[bytes], limit: int, what: str) -> bytes:
-    """Join the pieces of unpacked data; raises InputError when they pass the limit."""
-    pieces: list[bytes] = []
-    total = 0
-    for piece in chunks:
-        total += len(piece)
-        if total > limit:
-            raise InputError(f'{what} unpacks to more than {limit / 2**20:.0f} MB')
-        pieces.append(piece)
-    return b''.join(pieces)
-
-
-class UnpackedFile:
-    """The target of unpacking a file: write() raises InputError at a limit.
-
-    A file that becomes too large is no recording, and the disk must not become full.
-    """
-
-    def __init__(self, packed: Path, write: Callable[[bytes], Any], folder: Path | None) -> None:
-        """folder: on the disk that is written to; None where nothing is kept."""
-        self._packed, self._write, self._folder = packed, write, folder
-        self._limit = max(UNPACKED_LEAST, UNPACKED_RATIO * packed.stat().st_size)
-        self._total = self._looked = 0
-
-    def write(self, data: bytes) -> int:
-        """Take the next piece."""
-        self._total += len(data)
-        if self._total > self._limit:
-            raise InputError(
-                f'{self._packed} unpacks to more than {self._limit / 2**20:.0f} MB, which is no '
-                f'recording; if it is one, unpack it first (zstd -d)')
-        if self._folder is not None and self._total - self._looked >= UNPACKED_LEAST:
-            self._looked = self._total
-            if shutil.disk_usage(self._folder).free < FREE_BYTES:
-                raise InputError(
-                    f'no room to unpack {self._packed} in {self._folder}: set TMPDIR to a bigger '
-                    f'disk, or unpack it first (zstd -d)')
-        self._write(data)
-        return len(data)

@@ -13,10 +13,9 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.errors import InputError, counted, one_line
 from dashcalib_ros.limits import read_file
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.reconstruct.scene_file import (
@@ -173,11 +172,12 @@ class TurnStore:
     def _report(self, bad: list[str], others: list[Origin], origin: Origin) -> None:
         if bad:
             more = f' and {len(bad) - 3} more' if len(bad) > 3 else ''
-            self._warn(f'{_count(bad)} in {self._folder} left out: {", ".join(bad[:3])}{more}; '
-                       f'delete what is no stored turn')
+            self._warn(f'{counted(len(bad), "file")} in {self._folder} left out: '
+                       f'{", ".join(bad[:3])}{more}; delete what is no stored turn')
         if others:
-            self._warn(f'{_count(others)} in {self._folder} left out: of images {others[0]}, '
-                       f'these are {origin}; give each camera a folder of its own in turns.store')
+            self._warn(f'{counted(len(others), "file")} in {self._folder} left out: of images '
+                       f'{others[0]}, these are {origin}; give each camera a folder of its own in '
+                       f'turns.store')
 
     def _read(self, name: str) -> tuple[Origin, StoredTurn]:
         """Return a file's origin and turn; raises InputError if it is no stored turn."""
@@ -191,11 +191,13 @@ class TurnStore:
 
     def _about(self, name: str) -> tuple[Origin, float] | None:
         """Return a file's origin and prominence, None if it is no stored turn."""
-        try:
-            origin, turn = self._read(name)
-        except InputError:
-            return None
-        return origin, turn.prominence
+        if name not in self._known:
+            try:
+                origin, turn = self._read(name)
+                self._known[name] = origin, turn.prominence
+            except InputError:
+                self._known[name] = None
+        return self._known[name]
 
     def _write(self, turn: StoredTurn) -> str:
         assert self._origin is not None
@@ -210,9 +212,7 @@ class TurnStore:
         assert self._origin is not None
         ranked: list[tuple[float, str]] = []
         for name in self._listed():
-            if name not in self._known:
-                self._known[name] = self._about(name)
-            about = self._known[name]
+            about = self._about(name)
             if about is not None and about[0].fits(self._origin):
                 ranked.append((-about[1], name))
         ranked.sort()
@@ -239,7 +239,3 @@ class TurnStore:
         self._warn(f'turns cannot be stored in {self._folder} ({error.strerror or error}); '
                    + ('free some space' if full else 'set turns.store to a folder you may write '
                                                      'to'))
-
-
-def _count(files: list[Any]) -> str:
-    return '1 file is' if len(files) == 1 else f'{len(files)} files are'

@@ -8,14 +8,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from dashcalib_ros import limits
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.limits import (
     YAML_BYTES,
-    UnpackedFile,
     check_file,
     irregular_entry,
-    join_within,
     parse_json,
     parse_yaml,
     read_file,
@@ -105,27 +102,3 @@ def test_hostile_json_is_one_line(text):
     with pytest.raises(InputError, match='the text is not valid JSON') as caught:
         parse_json(text, 'the text')
     assert len(str(caught.value).splitlines()) == 1
-
-
-def test_what_is_unpacked_ends():
-    assert join_within([b'ab', b'c'], 3, 'it') == b'abc'
-    taken = []
-    with pytest.raises(InputError, match='it unpacks to more than 1 MB'):
-        join_within((taken.append(1) or bytes(2**19) for _ in range(1000)), 2**20, 'it')
-    assert len(taken) == 3
-
-
-def test_an_unpacked_file_has_a_budget_and_leaves_the_disk_room(tmp_path, monkeypatch):
-    packed = tmp_path / 'x.zstd'
-    packed.write_bytes(bytes(100))
-    monkeypatch.setattr(limits, 'UNPACKED_LEAST', 1000)
-    written = []
-    target = UnpackedFile(packed, written.append, tmp_path)
-    for _ in range(20):
-        target.write(bytes(1000))
-    with pytest.raises(InputError, match='which is no recording'):
-        target.write(b'1')  # 200 times 100 bytes are there
-    assert sum(map(len, written)) == 20_000
-    monkeypatch.setattr(limits, 'FREE_BYTES', 2**60)
-    with pytest.raises(InputError, match=r'no room to unpack .* set TMPDIR'):
-        UnpackedFile(packed, written.append, tmp_path).write(bytes(1000))

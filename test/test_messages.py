@@ -30,15 +30,17 @@ PARTS = {
         'they are not of one drive'},
     'input/motion_files.py': {'stamp_s and any of …'},
     'input/bag_write.py': {
-        'compressed must be jpeg, png or None, not …',
         "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"},
-    'input/bag_read.py': {'… does not start like a bag', '… has a broken chunk (…)',
-                          'a part of the bag', 'a packed part is cut off'},
+    'input/bag_read.py': {
+        '… does not start like a bag', '… has a broken chunk (…)', 'a packed part is cut off',
+        'a part of the bag unpacks to more than … MB',
+        '… unpacks to more than … MB, which is no recording; if it is one, unpack it first '
+        '(zstd -d)', 'the index does not lead to all messages'},
     'input/bag_storage.py': {
         '… images; how many are lost is not known', '… (…, … images…)',
         '… of … images; … are lost', '… of … images; none is lost',
         "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
-        'copy it again or record it again', 'the index does not lead to all messages'},
+        'copy it again or record it again'},
     'detect/turn.py': {'the turn at frame …'},
     'reconstruct/scene_file.py': {
         'it is too large when unpacked', 'it is too large', 'it has too many parts',

@@ -186,7 +186,7 @@ def test_another_camera_is_left_out_with_one_warning(make, other):
     hold(make(), stored(0), stored(1))
     store = make(other)
     assert store.turns == {}
-    assert len(store.said) == 1 and '2 files are' in store.said[0]
+    assert len(store.said) == 1 and '2 files in' in store.said[0]
     assert 'in turns.store' in store.said[0] and str(other) in store.said[0]
     # they are left alone, and do not take the others' places
     hold(store, stored(2))
@@ -329,7 +329,7 @@ def test_what_cannot_be_used_is_named(make):
     (store._folder / 'folder.npz').mkdir()
     found = make()
     assert len(found.turns) == 1 and len(found.said) == 1
-    assert found.said[0].startswith('3 files are') and all(
+    assert found.said[0].startswith('3 files in') and all(
         name in found.said[0] for name in ('pipe.npz', 'gone.npz', 'folder.npz'))
     hold(found, stored(1))
     assert {'pipe.npz', 'gone.npz', 'folder.npz'} < names(found)

@@ -2,19 +2,32 @@
 from __future__ import annotations
 
 import os
-from typing import Literal
+from pathlib import Path
 
 from dashcalib_ros.demo.drive import Drive
 
+TOPIC = '/camera/image_raw'
 
-def render_to_bag(drive: Drive, path: str | os.PathLike[str], processes: int = 2,
-                  topic: str = '/camera/image_raw',
-                  compressed: Literal['jpeg', 'png'] | None = None, quality: int = 90) -> None:
-    """Render a complete drive into a new ROS 2 bag.
 
-    path: the bag's folder, which must not exist yet. Raises OutputError or WorkerError.
+def render_to_bag(drive: Drive, path: str | os.PathLike[str]) -> None:
+    """Render a complete drive into a new ROS 2 bag, as mono8 Images.
+
+    path: the bag's folder, which must not exist yet; it appears only when all went well. Raises
+    OutputError or WorkerError.
     """
-    from dashcalib_ros.input.bag_write import BagWriter
-    with BagWriter(path, topic, compressed=compressed, quality=quality) as writer:
-        for frame in drive.frames(processes=processes):
-            writer.write(frame)
+    from rosbags.typesys import Stores, get_typestore
+
+    from dashcalib_ros.input.bag_write import new_bag
+    store = get_typestore(Stores.ROS2_JAZZY)
+    image, header, time = (store.types[name] for name in (
+        'sensor_msgs/msg/Image', 'std_msgs/msg/Header', 'builtin_interfaces/msg/Time'))
+    with new_bag(Path(path)) as writer:
+        topic = writer.add_connection(TOPIC, image.__msgtype__, typestore=store)
+        for frame in drive.frames(processes=2):
+            seconds, nanoseconds = divmod(frame.stamp_ns, 10**9)
+            width, height = frame.size
+            message = image(
+                header=header(stamp=time(sec=seconds, nanosec=nanoseconds), frame_id='camera'),
+                height=height, width=width, encoding='mono8', is_bigendian=0, step=width,
+                data=frame.image.reshape(-1))
+            writer.write(topic, frame.stamp_ns, store.serialize_cdr(message, topic.msgtype))

@@ -1,158 +1,119 @@
 """The messages of a bag's file: by its index, or from its start as far as it is whole.
 
-rosbags and mcap unpack chunks without a limit. Here each is unpacked within one: the two readers
-do so by the index. Damaged files are scanned without it: a scanner yields messages in the order in
-which they were written, and reports what it leaves out by calling `damage` with a short phrase.
+A damaged file is scanned without its index: a scanner yields messages in the order in which they
+were written, and reports what it leaves out by calling `damage` with a short phrase.
 """
 from __future__ import annotations
 
 import bz2
-import heapq
+import errno
+import os
+import shutil
 import sqlite3
 import struct
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from io import BytesIO
+from functools import lru_cache, partial
+from io import BufferedReader, BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 from urllib.parse import quote
 
 import lz4.frame
-import rosbags.rosbag1.reader
-import zstandard
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
-from rosbags.interfaces import Connection
-from rosbags.rosbag2.reader import DirectoryReader, Reader
-from rosbags.rosbag2.storage_mcap import ChunkInfo, McapReader
+from rosbags import rosbag2
+from rosbags.rosbag1 import reader as rosbag1
+from rosbags.rosbag2 import storage_mcap
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from dashcalib_ros.errors import InputError, one_line
-from dashcalib_ros.limits import CHUNK_BYTES, MESSAGE_BYTES, UnpackedFile, join_within
+from dashcalib_ros.limits import (
+    CHUNK_BYTES,
+    FREE_BYTES,
+    MESSAGE_BYTES,
+    UNPACKED_LEAST,
+    UNPACKED_RATIO,
+)
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 Damage = Callable[[str], None]
-# bytes; of one step
+# bytes of a file that are unpacked at once
 PIECE = 2**20
+UNPACKERS: dict[str, Callable[[], Any]] = {
+    'zstd': zstd.ZstdDecompressor, 'lz4': lz4.frame.LZ4FrameDecompressor,
+    'bz2': bz2.BZ2Decompressor}
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 
-def unpack_zstd(data: bytes, limit: int = CHUNK_BYTES) -> bytes:
-    """Return the unpacked data; raises InputError beyond the limit, ZstdError for damage."""
-    return join_within(zstandard.ZstdDecompressor().read_to_iter(data), limit, 'a part of the bag')
+def unpack(kind: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
+    """Return unpacked data, `limit` bytes and those of a chunk at the most.
 
-
-def unpack_lz4(data: bytes, limit: int = CHUNK_BYTES) -> bytes:
-    """Return the unpacked data; raises InputError beyond the limit, RuntimeError for damage."""
-    return join_within(_pieces(lz4.frame.LZ4FrameDecompressor(), data), limit, 'a part of the bag')
-
-
-def unpack_bz2(data: bytes, limit: int = CHUNK_BYTES) -> bytes:
-    """Return the unpacked data; raises InputError beyond the limit, OSError for damage."""
-    return join_within(_pieces(bz2.BZ2Decompressor(), data), limit, 'a part of the bag')
-
-
-def unpack_file(packed: Path, write: Callable[[bytes], Any], folder: Path | None) -> None:
-    """Unpack a .zstd file; folder: where it is written, None where it is not kept.
-
-    Raises InputError beyond limits, ZstdError for damage, OSError.
+    kind: as bags name it; '' or none: it is not packed. Raises InputError beyond the limit; for
+    damage what the libraries raise, and EOFError where it is cut off.
     """
-    target: Any = UnpackedFile(packed, write, folder)  # copy_stream() needs write() only
-    with packed.open('rb') as source:
-        zstandard.ZstdDecompressor().copy_stream(source, target)
+    if kind in ('', 'none'):
+        return data
+    limit = min(limit, CHUNK_BYTES)
+    unpacker = UNPACKERS[kind]()
+    plain: bytes = unpacker.decompress(data, limit + 1)
+    if len(plain) > limit:
+        raise InputError(f'a part of the bag unpacks to more than {limit / 2**20:.0f} MB')
+    if not unpacker.eof:
+        raise EOFError('a packed part is cut off')
+    return plain
 
 
-def _pieces(unpacker: Any, data: bytes) -> Iterator[bytes]:
-    while True:
-        piece = unpacker.decompress(data, PIECE)
-        yield piece
-        data = b''
-        if unpacker.eof:
-            return
-        if not piece and unpacker.needs_input:
-            raise EOFError('a packed part is cut off')
+# rosbags unpacks chunks by these tables, without a limit
+storage_mcap.DECOMPRESSORS.update({kind: partial(unpack, kind) for kind in ('zstd', 'lz4')})
+rosbag1.decompressors.update({kind: partial(unpack, kind) for kind in ('bz2', 'lz4')})
 
 
-UNPACK_MCAP: dict[str, Callable[[bytes], bytes]] = {'zstd': unpack_zstd, 'lz4': unpack_lz4}
-UNPACK_BAG: dict[str, Callable[[bytes], bytes]] = {
-    'none': bytes, 'bz2': unpack_bz2, 'lz4': unpack_lz4}
+@contextmanager
+def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
+    """Give the file; of a .zstd file, a temporary copy of what could be unpacked.
 
-
-def chunk_records(chunk: Chunk) -> list[McapRecord]:
-    """Return what is in a chunk of an MCAP file.
-
-    Raises InputError beyond the limit; for damage what mcap, zstandard and lz4 raise.
+    Raises InputError where that is too much for a recording or for the disk; OSError.
     """
-    unpack = UNPACK_MCAP.get(chunk.compression, bytes)
-    plain = replace(chunk, compression='', data=unpack(chunk.data))
-    return breakup_chunk(plain, validate_crc=True)
+    if file.suffix.lower() != '.zstd':
+        yield file
+        return
+    with tempfile.TemporaryDirectory(prefix='dashcalib-') as folder:
+        plain = Path(folder, file.stem)
+        try:
+            _unpack_file(file, plain)
+        except (zstd.ZstdError, EOFError):
+            damage(f'{file.name} is damaged')
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise InputError(f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, '
+                             f'or unpack it first (zstd -d)') from error
+        yield plain
 
 
-class Ros1Reader(rosbags.rosbag1.reader.Reader):
-    """Reads a ROS 1 bag by its index."""
-
-    def read_chunk(self) -> rosbags.rosbag1.reader.Chunk:
-        """Return a chunk's place, and what unpacks it."""
-        chunk = super().read_chunk()
-        names = {function: name for name, function in rosbags.rosbag1.reader.decompressors.items()}
-        return chunk._replace(decompressor=UNPACK_BAG[names[chunk.decompressor]])
-
-
-class _McapFile(McapReader):
-
-    def meta_scan(self) -> None:
-        """Read a file without an index. Its chunks are tried first: rosbags unpacks them all."""
-        assert self.bio
-        self.bio.seek(0)
-        size = Path(str(self.path)).stat().st_size
-        for record in StreamReader(self.bio, emit_chunks=True, record_size_limit=size).records:
-            if isinstance(record, Chunk):
-                chunk_records(record)
-        self.bio.seek(self.data_start)
-        super().meta_scan()
-
-    def messages(self, connections: Collection[Connection], start: int | None = None,
-                 stop: int | None = None) -> Generator[tuple[Connection, int, bytes], None, None]:
-        """Yield topic, time of reception in ns and bytes of messages, by time.
-
-        start, stop: as rosbags has them; nothing here gives them.
-        """
-        if not self.chunks or start is not None or stop is not None:
-            yield from super().messages(connections, start, stop)
-            return
-        wanted = {each.id: each for each in connections}
-        chunks = [self._chunk_messages(chunk, wanted) for chunk in self.chunks
-                  if any(chunk.channel_count.get(each, 0) for each in wanted)]
-        for time_ns, _, message in heapq.merge(*chunks, key=lambda each: each[:2]):
-            if message is not None:
-                yield wanted[message.channel_id], time_ns, message.data
-
-    def _chunk_messages(self, info: ChunkInfo, wanted: Mapping[int, Connection]
-                        ) -> Iterator[tuple[int, int, Message | None]]:
-        """Yield a chunk's messages by time; first its start, so that it is not unpacked yet."""
-        yield info.message_start_time, 0, None
-        assert self.bio
-        self.bio.seek(info.chunk_start_offset + 9)  # behind its kind and its length
-        chunk = Chunk.read(ReadDataStream(self.bio))
-        messages = [each for each in chunk_records(chunk)
-                    if isinstance(each, Message) and each.channel_id in wanted
-                    and info.message_start_time <= each.log_time <= info.message_end_time]
-        for message in sorted(messages, key=lambda each: each.log_time):
-            yield message.log_time, info.chunk_start_offset, message
-
-
-class _Folder(DirectoryReader):
-    STORAGE_PLUGINS: Mapping[str, Any] = {**DirectoryReader.STORAGE_PLUGINS, 'mcap': _McapFile}
-
-
-class Ros2Reader(Reader):
-    """Reads a ROS 2 bag, a folder or a file, by its index."""
-
-    STORAGE_PLUGINS: Mapping[str, Any] = {
-        **Reader.STORAGE_PLUGINS, 'dir': _Folder, '.mcap': _McapFile}
+def _unpack_file(packed: Path, plain: Path) -> None:
+    limit = max(UNPACKED_LEAST, UNPACKED_RATIO * packed.stat().st_size)
+    with zstd.open(packed, 'rb') as source, plain.open('wb', PIECE) as output:
+        while piece := source.read1(PIECE):
+            if output.tell() + len(piece) > limit:
+                raise InputError(
+                    f'{packed} unpacks to more than {limit / 2**20:.0f} MB, which is no '
+                    f'recording; if it is one, unpack it first (zstd -d)')
+            if shutil.disk_usage(plain.parent).free < FREE_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            output.write(piece)
 
 
 @dataclass(frozen=True)
@@ -181,7 +142,7 @@ class Record:
                 return _types(Stores.ROS1_NOETIC).deserialize_ros1(self.raw, self.msgtype)
             raw = self.raw
             if raw[:4] == _ZSTD_MAGIC:  # a CDR message never starts so
-                raw = unpack_zstd(raw, MESSAGE_BYTES)
+                raw = unpack('zstd', raw, MESSAGE_BYTES)
             return _types(Stores.ROS2_JAZZY).deserialize_cdr(raw, self.msgtype)
         except InputError as error:
             raise InputError(f'a message on {self.topic}: {error}') from error
@@ -189,15 +150,60 @@ class Record:
             raise InputError(f'a damaged message on {self.topic}: record it again') from error
 
 
-def ros2_type(name: str) -> str:
-    """Return a message type as ROS 2 writes it: sensor_msgs/Image -> sensor_msgs/msg/Image."""
-    package, slash, kind = name.partition('/')
-    return f'{package}/msg/{kind}' if slash and '/' not in kind else name
-
-
 @lru_cache
 def _types(store: Stores) -> Typestore:
     return get_typestore(store)
+
+
+def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]], bool]:
+    """Return the numbers of messages by topic and type, and whether the file's index has them."""
+    counts = Counter[tuple[str, str]]()
+    with unpacked(file, damage) as path:
+        try:
+            with _reader(path) as reader:
+                for connection in reader.connections:
+                    counts[connection.topic, connection.msgtype] += connection.msgcount
+            return counts, True
+        except Exception:  # a damaged file makes rosbags raise nearly anything
+            return Counter((record.topic, record.msgtype) for record in scan(path, damage)), False
+
+
+def records(file: Path, topics: Collection[str], damage: Damage) -> Iterator[Record]:
+    """Yield a file's messages of these topics, where they can be read.
+
+    Raises InputError, OSError.
+    """
+    with unpacked(file, damage) as path:
+        last_ns = -1
+        try:
+            for record in _indexed_records(path, topics):
+                last_ns = record.receive_ns
+                yield record
+            return
+        except Exception:  # a damaged file makes rosbags raise nearly anything
+            pass
+        for record in scan(path, damage):
+            if record.topic in topics and record.receive_ns > last_ns:
+                yield record
+
+
+def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
+    with _reader(path) as reader:
+        wanted = [each for each in reader.connections if each.topic in topics]
+        missing = sum(connection.msgcount for connection in wanted)
+        if not wanted:
+            return
+        ros1 = isinstance(reader, rosbag1.Reader)
+        for connection, receive_ns, raw in reader.messages(wanted):
+            missing -= 1
+            yield Record(connection.topic, connection.msgtype, receive_ns, bytes(raw), ros1)
+        if missing > 0:
+            raise ValueError('the index does not lead to all messages')
+
+
+def _reader(path: Path) -> rosbag1.Reader | rosbag2.Reader:
+    with path.open('rb') as file:
+        return rosbag1.Reader(path) if file.read(7) == b'#ROSBAG' else rosbag2.Reader(path)
 
 
 def scan(path: Path, damage: Damage) -> Iterator[Record]:
@@ -223,7 +229,7 @@ def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
         reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
         for record in _mcap_records(reader, path.name, damage):
             if isinstance(record, Schema):
-                schemas[record.id] = ros2_type(record.name)
+                schemas[record.id] = normalize_msgtype(record.name)
             elif isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Message) and record.channel_id in channels:
@@ -247,8 +253,9 @@ def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[M
             yield record
             continue
         try:
-            inner = chunk_records(record)
-        except Exception as error:  # also zstandard's and lz4's own errors
+            plain = unpack(record.compression, record.data)
+            inner = breakup_chunk(replace(record, compression='', data=plain), validate_crc=True)
+        except Exception as error:  # also the unpackers' own errors
             damage(f'{name} has a broken chunk ({one_line(error)})')
             continue
         yield from inner
@@ -279,50 +286,32 @@ def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
 
 def scan_bag(path: Path, damage: Damage) -> Iterator[Record]:
     """Yield the messages of a ROS 1 bag."""
-    connections: dict[int, tuple[str, str]] = {}
     with path.open('rb') as file:
         file.readline()
         try:
-            yield from _bag_messages(file, connections)
-        except (InputError, EOFError, struct.error, KeyError, ValueError, OSError, RuntimeError,
-                MemoryError) as error:
+            yield from _bag_messages(file, {})
+        except Exception as error:  # rosbags' errors, and those of what unpacks
             damage(f'{path.name} is cut off ({one_line(error)})')
 
 
-def _bag_messages(file: BinaryIO, connections: dict[int, tuple[str, str]]) -> Iterator[Record]:
-    while head := file.read(4):
-        fields = _bag_fields(_exactly(file, *struct.unpack('<I', head)))
-        size, = struct.unpack('<I', _exactly(file, 4))
-        kind = fields['op'][0]
+def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]]
+                  ) -> Iterator[Record]:
+    while file.peek(1):
+        head = rosbag1.Header.read(file)
+        kind = head.get_uint8('op')
+        if kind == rosbag1.RecordType.CONNECTION:
+            about = rosbag1.Header.read(file)
+            connections[head.get_uint32('conn')] = (
+                head.get_string('topic'), normalize_msgtype(about.get_string('type')))
+            continue
+        size = rosbag1.read_uint32(file)
         data = file.read(size)
-        if kind == 5:
+        if kind == rosbag1.RecordType.CHUNK:
             # a chunk that is cut off may have complete messages at its start
-            unpack = UNPACK_BAG[fields['compression'].decode()]
-            yield from _bag_messages(BytesIO(unpack(data)), connections)
+            plain = BytesIO(unpack(head.get_string('compression'), data))
+            yield from _bag_messages(BufferedReader(plain), connections)
         if len(data) < size:
             raise EOFError(f'{size - len(data)} bytes are missing')
-        if kind == 7:
-            number, = struct.unpack('<I', fields['conn'])
-            connections[number] = (fields['topic'].decode(),
-                                   ros2_type(_bag_fields(data)['type'].decode()))
-        elif kind == 2:
-            number, seconds, nanoseconds = struct.unpack('<III', fields['conn'] + fields['time'])
-            yield Record(*connections[number], seconds * 10**9 + nanoseconds, data, ros1=True)
-
-
-def _bag_fields(data: bytes) -> dict[str, bytes]:
-    fields: dict[str, bytes] = {}
-    position = 0
-    while position < len(data):
-        size, = struct.unpack_from('<I', data, position)
-        name, _, value = data[position + 4:position + 4 + size].partition(b'=')
-        fields[name.decode()] = value
-        position += 4 + size
-    return fields
-
-
-def _exactly(file: BinaryIO, size: int) -> bytes:
-    data = file.read(size)
-    if len(data) < size:
-        raise EOFError(f'{size - len(data)} bytes are missing')
-    return data
+        if kind == rosbag1.RecordType.MSGDATA:
+            yield Record(*connections[head.get_uint32('conn')], head.get_time('time'), data,
+                         ros1=True)

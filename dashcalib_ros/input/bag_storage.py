@@ -7,29 +7,17 @@ its start to where it breaks (salvage).
 """
 from __future__ import annotations
 
-import errno
-import tempfile
 from collections import Counter
 from collections.abc import Collection, Generator, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path, PurePath
 from typing import Any
 
-import zstandard
-
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.bag_read import (
-    Damage,
-    Record,
-    Ros1Reader,
-    Ros2Reader,
-    scan,
-    unpack_file,
-)
-from dashcalib_ros.input.decode import BitDepth, decode
+from dashcalib_ros.input.bag_read import Damage, Record, message_counts, records
+from dashcalib_ros.input.decode import BitDepth, decode, message_size
 from dashcalib_ros.input.source import (
     METADATA,
     FrameSource,
@@ -80,7 +68,7 @@ class Bag:
     def records(self, topics: Collection[str], damage: Damage) -> Iterator[Record]:
         """Yield the messages of these topics, file by file; raises InputError, OSError."""
         for file in self.files:
-            yield from _records(file, topics, damage)
+            yield from records(file, topics, damage)
 
 
 def open_bag(path: Path) -> Bag:
@@ -115,17 +103,6 @@ def open_bag(path: Path) -> Bag:
     return Bag(files, topics, indexed, tuple(warnings))
 
 
-def check_unpacked(path: Path) -> None:
-    """Raise InputError where rosbags would have to read or unpack more than limits allow."""
-    files = [path]
-    if path.is_dir():
-        files = list(open_bag(path).files)
-        parse_yaml(read_text(path / METADATA, YAML_BYTES), str(path / METADATA))
-    for file in files:
-        if file.suffix.lower() == '.zstd':
-            unpack_file(file, lambda _: None, None)
-
-
 def _metadata(path: Path) -> tuple[tuple[Path, ...], tuple[Topic, ...]]:
     """Return the files and topics that metadata.yaml lists, or nothing if it cannot be used."""
     try:
@@ -148,13 +125,9 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
     problems: list[str] = []
     indexed = True
     for file in files:
-        with _unpacked(file, problems.append) as plain:
-            found = _index_counts(plain)
-            if found is None:
-                indexed = False
-                found = Counter((record.topic, record.msgtype)
-                                for record in scan(plain, problems.append))
+        found, by_index = message_counts(file, problems.append)
         counts.update(found)
+        indexed &= by_index
     if problems and not counts:
         raise InputError(f'{bag} cannot be read ({problems[0]}): {CURE}')
     return _sorted(counts), indexed
@@ -162,72 +135,6 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
 
 def _sorted(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
     return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
-
-
-def _index_counts(path: Path) -> Counter[tuple[str, str]] | None:
-    counts = Counter[tuple[str, str]]()
-    try:
-        with _reader(path) as reader:
-            for connection in reader.connections:
-                counts[connection.topic, connection.msgtype] += connection.msgcount
-    except Exception:  # a damaged file makes rosbags raise nearly anything
-        return None
-    return counts
-
-
-def _records(file: Path, topics: Collection[str], damage: Damage) -> Iterator[Record]:
-    with _unpacked(file, damage) as path:
-        last_ns = -1
-        try:
-            for record in _indexed_records(path, topics):
-                last_ns = record.receive_ns
-                yield record
-            return
-        except Exception:  # a damaged file makes rosbags raise nearly anything
-            pass
-        for record in scan(path, damage):
-            if record.topic in topics and record.receive_ns > last_ns:
-                yield record
-
-
-def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
-    with _reader(path) as reader:
-        wanted = [each for each in reader.connections if each.topic in topics]
-        missing = sum(connection.msgcount for connection in wanted)
-        if not wanted:
-            return
-        ros1 = isinstance(reader, Ros1Reader)
-        for connection, receive_ns, raw in reader.messages(wanted):
-            missing -= 1
-            yield Record(connection.topic, connection.msgtype, receive_ns, bytes(raw), ros1)
-        if missing > 0:
-            raise ValueError('the index does not lead to all messages')
-
-
-def _reader(path: Path) -> Ros1Reader | Ros2Reader:
-    with path.open('rb') as file:
-        return Ros1Reader(path) if file.read(7) == b'#ROSBAG' else Ros2Reader(path)
-
-
-@contextmanager
-def _unpacked(file: Path, damage: Damage) -> Iterator[Path]:
-    """Give the file; of a .zstd file, a temporary copy of what could be decompressed."""
-    if file.suffix.lower() != '.zstd':
-        yield file
-        return
-    with tempfile.TemporaryDirectory(prefix='dashcalib-') as folder:
-        plain = Path(folder, file.stem)
-        try:
-            with plain.open('wb') as output:
-                unpack_file(file, output.write, Path(folder))
-        except zstandard.ZstdError:
-            damage(f'{file.name} is damaged')
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            raise InputError(f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, '
-                             f'or unpack it first (zstd -d)') from error
-        yield plain
 
 
 def _names(files: tuple[Path, ...]) -> str:
@@ -342,7 +249,7 @@ def _sizes(bag: Bag, topics: list[Topic]) -> dict[str, str]:
             continue
         missing.discard(record.topic)
         try:
-            height, width = decode(record.message()).shape
+            width, height = message_size(record.message())
             sizes[record.topic] = f'{width}x{height}'
         except InputError:
             pass  # it is listed without a size

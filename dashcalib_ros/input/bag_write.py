@@ -1,15 +1,13 @@
-"""Bags are written: frames as a bag, and a copy of a bag with a camera_info for each image."""
+"""A copy of a bag with a camera_info for each image, and the camera_info that a bag has."""
 from __future__ import annotations
 
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal
+from typing import Any
 
-import cv2
 import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
@@ -18,11 +16,11 @@ from rosbags.typesys import Stores, get_typestore
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.camera_info import SAME, RosCamera
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.input.bag_read import Ros2Reader
-from dashcalib_ros.input.bag_storage import check_unpacked, open_bag
-from dashcalib_ros.input.source import Frame
+from dashcalib_ros.input.bag_read import unpacked
+from dashcalib_ros.input.bag_storage import open_bag
+from dashcalib_ros.input.source import METADATA
+from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 
-_FORMATS = {'jpeg': '.jpg', 'png': '.png'}
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 REPAIR = "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
 
@@ -79,16 +77,30 @@ def write_bag(source: str | os.PathLike[str], image_topic: str, camera: Camera,
     out: the new bag's folder; it appears only when all went well. rectified: as ros_camera()'s.
     Raises InputError, OutputError.
     """
-    with _opened(source, image_topic) as reader, _new_bag(Path(out).absolute()) as writer:
-        return _copy(reader, writer, image_topic, ros_camera(camera, rectified), source)
+    topic, ros = camera_info_topic(image_topic), ros_camera(camera, rectified)
+    types = get_typestore(Stores.ROS2_JAZZY)
+    count = 0
+    with _opened(source, image_topic) as reader, new_bag(Path(out)) as writer:
+        kept = [each for each in reader.connections if each.topic != topic]
+        copies = {each.id: _declared(writer, each) for each in kept}
+        infos = writer.add_connection(topic, CAMERA_INFO, typestore=types)
+        for connection, stamp_ns, raw in _messages(reader, kept, source):
+            writer.write(copies[connection.id], stamp_ns, raw)
+            if connection.topic == image_topic:
+                image: Any = types.deserialize_cdr(raw, connection.msgtype)
+                info = _camera_info(types.types, ros, image.header)
+                writer.write(infos, stamp_ns, types.serialize_cdr(info, CAMERA_INFO))
+                count += 1
+    return count
 
 
 @contextmanager
-def _new_bag(path: Path) -> Iterator[Writer]:
+def new_bag(path: Path) -> Iterator[Writer]:
     """Give the writer of an MCAP bag, a folder that appears when all went well.
 
     Raises OutputError when it exists or cannot be written.
     """
+    path = path.absolute()
     if path.exists():
         raise OutputError(f'{path} exists: choose another place for the bag or remove it')
     try:
@@ -105,35 +117,12 @@ def _new_bag(path: Path) -> Iterator[Writer]:
                           f'room on that disk') from error
 
 
-def _copy(reader: Reader, writer: Writer, image_topic: str, camera: RosCamera,
-          source: str | os.PathLike[str]) -> int:
-    topic = camera_info_topic(image_topic)
-    kept = [each for each in reader.connections if each.topic != topic]
-    copies = {each.id: _declared(writer, each) for each in kept}
-    types = get_typestore(Stores.ROS2_JAZZY)
-    infos = writer.add_connection(topic, CAMERA_INFO, typestore=types)
-    count = 0
-    for connection, stamp_ns, raw in _messages(reader, kept, source):
-        writer.write(copies[connection.id], stamp_ns, raw)
-        if connection.topic == image_topic:
-            header = types.deserialize_cdr(raw, connection.msgtype).header  # type: ignore[attr-defined]
-            info = _camera_info(types.types, camera, header)
-            writer.write(infos, stamp_ns, types.serialize_cdr(info, CAMERA_INFO))
-            count += 1
-    return count
-
-
 def _messages(reader: Reader, connections: list[Connection], source: str | os.PathLike[str]
               ) -> Iterator[tuple[Connection, int, bytes]]:
-    messages = reader.messages(connections)
-    while True:
-        try:
-            item = next(messages)
-        except StopIteration:
-            return
-        except Exception as error:  # a damaged file makes rosbags raise nearly anything
-            raise InputError(f'{source} is damaged, no bag is made of it: {REPAIR}') from error
-        yield item
+    try:
+        yield from reader.messages(connections)
+    except Exception as error:  # a damaged file makes rosbags raise nearly anything
+        raise InputError(f'{source} is damaged, no bag is made of it: {REPAIR}') from error
 
 
 def _declared(writer: Writer, connection: Connection) -> Connection:
@@ -162,12 +151,12 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
                                  and any(path.glob('*.bag'))):
         raise InputError(f'{source} is a ROS 1 bag: convert it first (rosbags-convert)')
     try:
-        check_unpacked(path)
-        reader = Ros2Reader(path)
+        _check_limits(path)
+        reader = Reader(path)
         reader.open()
     except Exception as error:  # a damaged file makes rosbags raise nearly anything
         raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
-    try:
+    with closing(reader):
         topic = camera_info_topic(image_topic)
         wrong = [each.msgtype for each in reader.connections
                  if each.topic == topic and each.msgtype != CAMERA_INFO]
@@ -175,8 +164,15 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
             raise InputError(f'{source} has {wrong[0]} on {topic}, where camera_info belongs: '
                              f'rename that topic')
         yield reader
-    finally:
-        reader.close()
+
+
+def _check_limits(path: Path) -> None:
+    """Raise InputError where rosbags would have to read or unpack more than limits allow."""
+    if path.is_dir():
+        parse_yaml(read_text(path / METADATA, YAML_BYTES), str(path / METADATA))
+    for file in open_bag(path).files:
+        with unpacked(file, lambda _: None):
+            pass
 
 
 def _camera_info(types: Any, c: RosCamera, header: Any) -> Any:
@@ -187,66 +183,3 @@ def _camera_info(types: Any, c: RosCamera, header: Any) -> Any:
         binning_x=0, binning_y=0,
         roi=types['sensor_msgs/msg/RegionOfInterest'](
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False))
-
-
-class BagWriter:
-    """Writes frames into a new ROS 2 bag (a folder with an MCAP file); use it in a with statement.
-
-    path: of the bag's folder; it must not exist yet, and it appears only when all went well.
-    topic: taken as it is: for compressed images ROS expects it to end in /compressed.
-    frame_id: of every header; the stamps are the frames'.
-    compressed: None for mono8 Images, 'jpeg' or 'png' for CompressedImages.
-    quality: of the JPEG, 1 to 100.
-
-    Raises OutputError when the bag exists or cannot be written.
-    """
-
-    def __init__(self, path: str | os.PathLike[str], topic: str, frame_id: str = 'camera',
-                 compressed: Literal['jpeg', 'png'] | None = None, quality: int = 90) -> None:
-        if compressed is not None and compressed not in _FORMATS:
-            raise OutputError(f'compressed must be jpeg, png or None, not {compressed!r}')
-        self._path = Path(path).absolute()
-        self._topic = topic
-        self._frame_id = frame_id
-        self._compressed = compressed
-        self._quality = quality
-        self._types = get_typestore(Stores.ROS2_JAZZY)
-
-    def __enter__(self) -> BagWriter:
-        kind = 'sensor_msgs/msg/' + ('CompressedImage' if self._compressed else 'Image')
-        with ExitStack() as stack:
-            self._writer = stack.enter_context(_new_bag(self._path))
-            self._connection: Connection = self._writer.add_connection(
-                self._topic, kind, typestore=self._types)
-            self._stack = stack.pop_all()
-        return self
-
-    def write(self, frame: Frame) -> None:
-        """Append one frame, stamped frame.stamp_ns."""
-        kinds = self._types.types
-        seconds, nanoseconds = divmod(frame.stamp_ns, 10**9)
-        header = kinds['std_msgs/msg/Header'](
-            stamp=kinds['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds),
-            frame_id=self._frame_id)
-        if self._compressed:
-            message = kinds['sensor_msgs/msg/CompressedImage'](
-                header=header, format=f'mono8; {self._compressed} compressed mono8',
-                data=self._encode(frame))
-        else:
-            width, height = frame.size
-            message = kinds['sensor_msgs/msg/Image'](
-                header=header, height=height, width=width, encoding='mono8', is_bigendian=0,
-                step=width, data=np.ascontiguousarray(frame.image).reshape(-1))
-        raw = self._types.serialize_cdr(message, self._connection.msgtype)
-        self._writer.write(self._connection, frame.stamp_ns, raw)
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        self._stack.__exit__(kind, error, trace)
-
-    def _encode(self, frame: Frame) -> np.ndarray[tuple[int], np.dtype[np.uint8]]:
-        assert self._compressed
-        _, data = cv2.imencode(_FORMATS[self._compressed], frame.image,
-                               [cv2.IMWRITE_JPEG_QUALITY, self._quality]
-                               if self._compressed == 'jpeg' else [])
-        return np.asarray(data, np.uint8).reshape(-1)

@@ -57,82 +57,59 @@ class _Layout:
     """How an encoding stores a pixel.
 
     channels, bits: of one pixel in a row of the message.
-    conversion: OpenCV's, with GRAY or BGR for its star. luma: the channel that is the grey value;
-    None: the conversion gives it.
+    conversion: OpenCV's, with GRAY or BGR for its star; '': the first channel is the grey value.
     planar: all pixels' brightness comes first, then their colours.
     """
 
     channels: int
     bits: int = 8
     conversion: str = ''
-    luma: int | None = 0
     planar: bool = False
 
 
 _LAYOUTS = {
-    'mono8': _Layout(1), '8uc1': _Layout(1),
-    'mono16': _Layout(1, 16), '16uc1': _Layout(1, 16),
-    'bgr8': _Layout(3, 8, 'BGR2*', None), '8uc3': _Layout(3, 8, 'BGR2*', None),
-    'rgb8': _Layout(3, 8, 'RGB2*', None),
-    'bgra8': _Layout(4, 8, 'BGRA2*', None), '8uc4': _Layout(4, 8, 'BGRA2*', None),
-    'rgba8': _Layout(4, 8, 'RGBA2*', None),
-    'bgr16': _Layout(3, 16, 'BGR2*', None), '16uc3': _Layout(3, 16, 'BGR2*', None),
-    'rgb16': _Layout(3, 16, 'RGB2*', None),
-    'bgra16': _Layout(4, 16, 'BGRA2*', None), '16uc4': _Layout(4, 16, 'BGRA2*', None),
-    'rgba16': _Layout(4, 16, 'RGBA2*', None),
-    # ROS: yuv422 is U Y V Y, yuv422_yuy2 is Y U Y V; every second byte is a pixel's brightness
-    'yuv422': _Layout(2, 8, 'YUV2*_UYVY', 1), 'uyvy': _Layout(2, 8, 'YUV2*_UYVY', 1),
+    'mono8': _Layout(1), 'mono16': _Layout(1, 16),
+    '8uc1': _Layout(1), '8uc3': _Layout(3, 8, 'BGR2*'), '8uc4': _Layout(4, 8, 'BGRA2*'),
+    '16uc1': _Layout(1, 16), '16uc3': _Layout(3, 16, 'BGR2*'), '16uc4': _Layout(4, 16, 'BGRA2*'),
+    **{f'{order}{bits}': _Layout(len(order), bits, f'{order.upper()}2*')
+       for bits in (8, 16) for order in ('bgr', 'rgb', 'bgra', 'rgba')},
+    # ROS: yuv422 is U Y V Y, yuv422_yuy2 is Y U Y V
+    **{name: _Layout(2, 8, 'YUV2*_UYVY') for name in ('yuv422', 'uyvy')},
     **{name: _Layout(2, 8, 'YUV2*_YUY2') for name in ('yuv422_yuy2', 'yuyv', 'yuy2')},
     **{name: _Layout(1, 8, f'YUV2*_{name.upper()}', planar=True)
        for name in ('nv12', 'nv21', 'i420')},
     'nv24': _Layout(1, planar=True),  # OpenCV does not know its colours
     # ROS and OpenCV name the colours of the first two rows so, from the corner on (OpenCV's older
     # names, BayerBG for rggb, start one pixel further down the diagonal)
-    **{f'bayer_{name}{bits}': _Layout(1, bits, f'Bayer{name.upper()}2*', None)
+    **{f'bayer_{name}{bits}': _Layout(1, bits, f'Bayer{name.upper()}2*')
        for bits in (8, 16) for name in ('rggb', 'bggr', 'gbrg', 'grbg')},
 }
 
 
 def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) -> Pixels:
-    """Decode an Image or a CompressedImage message, whichever it is; see the two below."""
-    if hasattr(message, 'encoding'):
-        return decode_image(message, depth, colour)
-    return decode_compressed(message, depth, colour)
+    """Decode a sensor_msgs/Image or CompressedImage: (height, width) uint8, a copy.
 
-
-def decode_image(message: Any, depth: BitDepth | None = None, colour: bool = False) -> Pixels:
-    """Decode a sensor_msgs/Image: (height, width) uint8, a copy.
-
-    message: has encoding, height, width, step, is_bigendian and data.
+    message: has encoding, height, width, step, is_bigendian and data; or format and data: a JPEG,
+    PNG, TIFF, WebP, BMP, PGM or PPM.
     depth: the stream's bit depth, for 16-bit encodings; without it, only this image counts.
     colour: (height, width, 3) BGR uint8, unless the image is grey.
 
-    Raises InputError for an unknown encoding, or a size that does not fit the data.
+    Raises InputError for an unknown encoding, a size that does not fit the data, depth images,
+    video streams, data that is cut off or damaged, and for more pixels than limits allow.
     """
+    if not hasattr(message, 'encoding'):
+        return decode_file(memoryview(message.data), depth, _name(message), colour)
     layout = _LAYOUTS.get(str(message.encoding).lower())
     if layout is None:
         raise InputError(f'encoding {message.encoding!r} is not supported: '
                          f'publish mono8, bgr8, rgb8, yuv422 or a bayer encoding')
     colour = colour and bool(layout.conversion)
     pixels = _pixels(message, layout, colour)
-    if colour or layout.luma is None:
+    if layout.conversion and (colour or not layout.planar):
         image = _convert(pixels, layout.conversion.replace('*', 'BGR' if colour else 'GRAY'))
     else:
-        image = np.array(pixels[..., layout.luma], order='C')
+        image = np.array(pixels[..., 0], order='C')
     return _to_8_bits(image, depth)
-
-
-def decode_compressed(message: Any, depth: BitDepth | None = None, colour: bool = False
-                      ) -> Pixels:
-    """Decode a sensor_msgs/CompressedImage: (height, width) uint8.
-
-    message: has format and data: a JPEG, PNG, TIFF, WebP, BMP, PGM or PPM.
-    depth, colour: as for decode_image.
-
-    Raises InputError for depth images, video streams, data that is cut off or damaged, and for
-    more pixels than limits allow.
-    """
-    return decode_file(memoryview(message.data), depth, _name(message), colour)
 
 
 def message_size(message: Any) -> tuple[int, int]:
@@ -162,7 +139,7 @@ def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
                 what: str = 'image', colour: bool = False) -> Pixels:
     """Decode the bytes of an image file: (height, width) uint8; an EXIF orientation is applied.
 
-    colour: as for decode_image. Raises InputError as decode_pixels does.
+    colour: as for decode. Raises InputError as decode_pixels does.
     """
     return _to_8_bits(decode_pixels(data, what, colour), depth)
 
@@ -170,7 +147,7 @@ def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
 def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = False) -> Pixels:
     """Decode the bytes of an image file: (height, width) of 8 or 16 bits.
 
-    colour: as for decode_image. what: the image's name in errors. Raises InputError when the bytes
+    colour: as for decode. what: the image's name in errors. Raises InputError when the bytes
     are cut off or no image, or have more pixels than limits allow.
     """
     _encoded_size(memoryview(data), what)  # check the size before memory is used

@@ -1,4 +1,4 @@
-"""The table of input kinds; open_frames() finds what its paths are, and joins several.
+"""The kinds of inputs: open_frames() finds what its paths are, and joins several.
 
 Nothing here loads OpenCV or rosbags before a drive is opened: `--help` stays quick.
 """
@@ -90,11 +90,11 @@ def _check_numbers(fps: float | None, start_s: float, duration_s: float | None) 
 
 @dataclass(frozen=True)
 class _Group:
-    """The recordings that one argument names, by name. where: the argument."""
+    """The recordings that an argument names, by name; others: how many files are none."""
 
     where: str
-    paths: tuple[Path, ...]
-    warnings: tuple[str, ...] = ()
+    paths: list[Path]
+    others: int = 0
 
 
 def _expanded(text: str) -> _Group:
@@ -107,13 +107,13 @@ def _expanded(text: str) -> _Group:
     except OSError as error:
         raise InputError(os_error(path, error)) from error
     if path.exists() or not glob.has_magic(text):
-        return _Group(text, (path,))
+        return _Group(text, [path])
     found = sorted(named_like(text), key=lambda each: by_name(str(each)))
-    known = tuple(each for each in found if _opener_of(each) is not None)
+    known = [each for each in found if _opener_of(each) is not None]
     if not known:
         raise InputError(_unknown(found[0]) if found else
                          f'no file is named like {text}: check the pattern')
-    return _Group(text, known, _left_out(text, len(found) - len(known)))
+    return _Group(text, known, len(found) - len(known))
 
 
 def named_like(pattern: str) -> Iterator[Path]:
@@ -134,25 +134,22 @@ def _is_hidden(part: str) -> bool:
 def _in_folder(folder: Path) -> _Group:
     """Return a bag or a folder of images itself, or else the videos and bags that are in it."""
     if fits_bag(folder):
-        return _Group(str(folder), (folder,))
+        return _Group(str(folder), [folder])
     entries = sorted(folder.iterdir(), key=lambda each: by_name(each.name))
-    found = tuple(each for each in entries if not each.name.startswith('.')
-                  and (_is_video(each) or (each.is_dir() and fits_bag(each))))
+    found = [each for each in entries if not each.name.startswith('.')
+             and (_is_video(each) or (each.is_dir() and fits_bag(each)))]
     images = sum(each.suffix.lower() in IMAGE_SUFFIXES for each in entries)
     # cameras leave thumbnails beside their videos
     if not found or images > len(found):
-        return _Group(str(folder), (folder,))
-    return _Group(str(folder), found, _left_out(str(folder), images))
-
-
-def _left_out(where: str, count: int) -> tuple[str, ...]:
-    return (f'{where}: left out {count} other file{"s" * (count > 1)}',) if count else ()
+        return _Group(str(folder), [folder])
+    return _Group(str(folder), found, images)
 
 
 def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> FrameSource:
     """Open all recordings of all groups as one drive; those that cannot be read are left out."""
     parts: list[FrameSource] = []
-    warnings = [line for group in groups for line in group.warnings]
+    warnings = [f'{group.where}: left out {group.others} other file{"s" * (group.others > 1)}'
+                for group in groups if group.others]
     failures: list[str] = []
     for group in groups:
         opened = []
@@ -207,13 +204,32 @@ def _listed(sources: Sequence[FrameSource]) -> str:
 def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
     try:
         if not place.is_dir():
-            _check_readable(place)
+            check_file(place)
+            if place.stat().st_size == 0:
+                raise InputError(f'{place} is empty: the recording or the copy failed; make it '
+                                 f'again')
+            with place.open('rb'):
+                pass  # what may not be read is told in our own words
         opener = _opener_of(place)
         if opener is None:
             raise InputError(_unknown(place))
         return opener(place, topic, fps)
     except OSError as error:
         raise InputError(os_error(place, error)) from error
+
+
+def _opener_of(path: Path) -> Callable[[Path, str | None, float | None], FrameSource] | None:
+    """Return what opens a kind of input (path, topic and rate, as open_frames() has them).
+
+    A folder with a bag in it is no folder of images.
+    """
+    if fits_bag(path):
+        from dashcalib_ros.input.bag_storage import BagSource
+        return BagSource
+    if _is_video(path):
+        from dashcalib_ros.input.video import VideoSource
+        return VideoSource
+    return FolderSource if path.is_dir() else None
 
 
 def fits_bag(path: Path) -> bool:
@@ -223,16 +239,6 @@ def fits_bag(path: Path) -> bool:
                    or (is_bag_file(entry.name) and not irregular_entry(entry))
                    for entry in path.iterdir())
     return is_bag_file(path.name)
-
-
-def _open_bag(path: Path, topic: str | None, fps: float | None) -> FrameSource:
-    from dashcalib_ros.input.bag_storage import BagSource
-    return BagSource(path, topic, fps)
-
-
-def _open_video(path: Path, topic: str | None, fps: float | None) -> FrameSource:
-    from dashcalib_ros.input.video import VideoSource
-    return VideoSource(path, topic, fps)
 
 
 def _is_video(path: Path) -> bool:
@@ -290,18 +296,6 @@ def _no_images(path: Path, names: list[str]) -> str:
             f'give the folder or the file that has them')
 
 
-Opener = Callable[[Path, str | None, float | None], FrameSource]
-#: the kinds of inputs: whether a path is one, and what opens it (path, topic and rate, as
-#: open_frames() has them; it loads its libraries). The first that fits is taken: a folder with a
-#: bag in it is no folder of images
-KINDS: tuple[tuple[Callable[[Path], bool], Opener], ...] = (
-    (fits_bag, _open_bag), (_is_video, _open_video), (Path.is_dir, FolderSource))
-
-
-def _opener_of(path: Path) -> Opener | None:
-    return next((opener for fits, opener in KINDS if fits(path)), None)
-
-
 def _check_recorded(text: str) -> None:
     """Raise InputError for a live stream: a drive is read from its beginning to its end."""
     if re.match(r'[a-z][a-z0-9+.-]+://', text, re.IGNORECASE):
@@ -314,15 +308,6 @@ def _check_recorded(text: str) -> None:
             f'{text} is a live camera: record it first (ffmpeg -f v4l2 -i {text} -t 900 '
             f'drive.mp4) and give that file, or run v4l2_camera and the node (ros2 run '
             f'dashcalib_ros calibrator)')
-
-
-def _check_readable(path: Path) -> None:
-    """Raise InputError or OSError for a file that no reader can open, with our own message."""
-    check_file(path)
-    if path.stat().st_size == 0:
-        raise InputError(f'{path} is empty: the recording or the copy failed; make it again')
-    with path.open('rb'):
-        pass
 
 
 def _unknown(path: Path) -> str:
@@ -385,15 +370,6 @@ class JoinedSource(FrameSource):
         reading.warnings += _together(told)
 
 
-@dataclass(frozen=True)
-class _Joint:
-    """How a source follows the one before. shift_ns: what is added to its stamps."""
-
-    shift_ns: int
-    gap: bool = False
-    perhaps_gap: bool = False
-
-
 class _Place:
     """Where the next source begins in the drive: index of its first image, and its time in ns.
 
@@ -409,51 +385,49 @@ class _Place:
 
     def pictures(self, part: FrameSource, reading: Reading) -> Generator[Picture, None, None]:
         """Yield a source's pictures with the drive's index and stamps."""
-        left = 0 if part.recorded else self._left_ns()
-        if part.length_ns is not None and part.length_ns <= left:
+        left_ns = 0
+        if not part.recorded:  # then it follows directly
+            self._first_ns = self._next_ns if self._first_ns is None else self._first_ns
+            left_ns = max(0, self._start_ns - (self._next_ns - self._first_ns))
+        if part.length_ns is not None and part.length_ns <= left_ns:
             reading.images = part.count or 0
             self._next_ns += part.length_ns
             return
         before: int | None = None
-        with closing(part._pictures(reading, left)) as pictures:
+        with closing(part._pictures(reading, left_ns)) as pictures:
             for picture in pictures:
                 if before is None:
-                    joint = self._joint(part, picture.stamp_ns)
+                    shift_ns, gap, perhaps = self._joint(part, picture.stamp_ns)
                     before = picture.stamp_ns - STEP_NS
-                stamp_ns = picture.stamp_ns + joint.shift_ns
-                if self._first_ns is None:
-                    self._first_ns = stamp_ns
+                stamp_ns = picture.stamp_ns + shift_ns
+                self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
                 self._last_ns = stamp_ns
                 self._next_ns = stamp_ns + picture.stamp_ns - before
                 before = picture.stamp_ns
                 # what a bag has before the start is left out here; it is not decoded yet
                 if stamp_ns - self._first_ns >= self._start_ns:
                     yield replace(picture, index=self.index + picture.index, stamp_ns=stamp_ns,
-                                  file=part.name, after_gap=joint.gap,
-                                  perhaps_after_gap=joint.perhaps_gap)
-                    joint = _Joint(joint.shift_ns)
+                                  file=part.name, after_gap=gap, perhaps_after_gap=perhaps)
+                    gap = perhaps = False
         if before is None:
             self._next_ns += part.length_ns or 0  # all of it was before the excerpt
         self._recorded = part.recorded
 
-    def _left_ns(self) -> int:
-        """Return how much of the next source is before the excerpt, if it follows directly."""
-        if self._first_ns is None:
-            self._first_ns = self._next_ns
-        return max(0, self._start_ns - (self._next_ns - self._first_ns))
+    def _joint(self, part: FrameSource, stamp_ns: int) -> tuple[int, bool, bool]:
+        """Return how a source follows the one before. stamp_ns: its first one.
 
-    def _joint(self, part: FrameSource, stamp_ns: int) -> _Joint:
-        """Return how a source follows the one before. stamp_ns: its first one."""
+        That is: what is added to its stamps, whether there is a gap, whether there may be one.
+        """
         if not part.recorded:
-            return _Joint(self._next_ns, perhaps_gap=self.index > 0)
+            return self._next_ns, False, self.index > 0
         if self.index == 0:
-            return _Joint(0)
+            return 0, False, False
         if not self._recorded:
-            return _Joint(self._next_ns - stamp_ns, perhaps_gap=True)
-        step = stamp_ns - self._last_ns
-        if step > 0:
-            return _Joint(0, gap=step > CONTINUES_NS)
-        return _Joint(self._next_ns - stamp_ns, gap=True)
+            return self._next_ns - stamp_ns, False, True
+        step_ns = stamp_ns - self._last_ns
+        if step_ns > 0:
+            return 0, step_ns > CONTINUES_NS, False
+        return self._next_ns - stamp_ns, True, False
 
 
 def _together(told: Sequence[tuple[str, Sequence[str]]]) -> tuple[str, ...]:

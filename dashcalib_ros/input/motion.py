@@ -41,10 +41,6 @@ class Samples:
     stamps_s: Floats
     values: Floats
 
-    def shifted(self, later_s: float) -> Samples:
-        """Return the samples with later stamps."""
-        return Samples(self.stamps_s + later_s, self.values)
-
 
 @dataclass(frozen=True)
 class SensorStream:
@@ -68,17 +64,17 @@ class SensorStream:
         """Return whether there is nothing to use."""
         return self.rate is None and self.speed is None and self.position is None
 
+    @property
+    def kinds(self) -> Mapping[str, Samples]:
+        """Return the streams that there are, by their names."""
+        found = {kind: getattr(self, kind) for kind in NAMES}
+        return {kind: samples for kind, samples in found.items() if samples is not None}
+
     def shifted(self, later_s: float) -> SensorStream:
         """Return the same with later stamps."""
-        moved = {name: None if samples is None else samples.shifted(later_s)
-                 for name, samples in self.kinds.items()}
+        moved = {kind: Samples(samples.stamps_s + later_s, samples.values)
+                 for kind, samples in self.kinds.items()}
         return SensorStream(**moved, warnings=self.warnings, absolute=self.absolute)
-
-    @property
-    def kinds(self) -> Mapping[str, Samples | None]:
-        """Return the streams by their names."""
-        return {'rate': self.rate, 'speed': self.speed, 'position': self.position,
-                'heading': self.heading}
 
     def since(self, start_s: float) -> SensorStream:
         """Return the same, with stamps from a drive's first image on. start_s: its stamp.
@@ -89,8 +85,7 @@ class SensorStream:
             return replace(self, absolute=False)
         if start_s > EPOCH_S:
             return replace(self.shifted(-start_s), absolute=False)
-        first = min(float(samples.stamps_s[0]) for samples in self.kinds.values()
-                    if samples is not None)
+        first = min(float(samples.stamps_s[0]) for samples in self.kinds.values())
         return replace(self.shifted(start_s - first), absolute=False, warnings=(
             *self.warnings, 'the pictures have no time of day: the first sample of the motion '
                             'sensors is taken to be of the first image'))
@@ -175,7 +170,7 @@ def speeds_of(stream: SensorStream) -> Samples | None:
 
 
 class SensorBuffer:
-    """The newest samples of live sensors, for a node: add() them as they come, stream() to ask.
+    """The newest samples of a bag's or a node's sensors: add() them as they come, stream() to ask.
 
     Doubled and late samples are dropped when they are asked for. Memory is bounded: of each kind
     the newest are kept.
@@ -191,10 +186,13 @@ class SensorBuffer:
         kept = self._kept.setdefault(kind, deque(maxlen=self._length))
         kept.append((stamp_s, tuple(values)))
 
-    def stream(self) -> SensorStream:
-        """Return what there is."""
+    def arrays(self) -> dict[str, tuple[Floats, Floats]]:
+        """Return the stamps (n,) and values (n, d) of each kind."""
         # a thread may add meanwhile
         found = {kind: list(kept) for kind, kept in tuple(self._kept.items())}
-        return sensor_stream(
-            {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
-             for kind, rows in found.items() if rows}, 'the topic', absolute=True)
+        return {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
+                for kind, rows in found.items() if rows}
+
+    def stream(self) -> SensorStream:
+        """Return what there is."""
+        return sensor_stream(self.arrays(), 'the topic', absolute=True)

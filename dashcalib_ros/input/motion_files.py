@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from dashcalib_ros.input.inputs import VIDEO_SUFFIXES
 from dashcalib_ros.input.motion import (
     EPOCH_S,
     SAMPLES,
+    SensorBuffer,
     SensorStream,
     local_metres,
     sensor_stream,
@@ -116,11 +118,10 @@ def _gpx(text: str, path: Path) -> SensorStream:
     if len(points) < 2:
         raise InputError(f'{path} has no track with times: export it with them')
     stamps = np.array([_epoch_s(point.time) for point in points])
-    metres = local_metres(*(np.array([np.nan if value is None else value for value in column])
-                            for column in zip(*((point.latitude, point.longitude,
-                                                 point.elevation) for point in points),
-                                              strict=True)))
-    return sensor_stream({'position': (stamps, metres)}, str(path), absolute=True)
+    # None becomes NaN
+    places = np.array([(point.latitude, point.longitude, point.elevation) for point in points],
+                      np.float64)
+    return sensor_stream({'position': (stamps, local_metres(*places.T))}, str(path), absolute=True)
 
 
 def _inside_video(path: Path) -> SensorStream:
@@ -216,7 +217,7 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None]) -> Senso
     none is used, and a warning lists them. Raises InputError for a chosen topic that there is not.
     """
     from dashcalib_ros.input.bag_storage import open_bag
-    raw: dict[str, list[tuple[float, tuple[float, ...]]]] = {}
+    samples = SensorBuffer(SAMPLES + 1)
     warnings: list[str] = []
     for path in paths:
         bag = open_bag(path)
@@ -249,20 +250,18 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None]) -> Senso
             except (InputError, AttributeError, TypeError, ValueError):
                 continue  # a damaged message is as one that is missing
             for kind, value in values:
-                raw.setdefault(kind, []).append((stamp_s, value))
-    if not raw and not warnings:
+                samples.add(kind, stamp_s, value)
+    arrays = samples.arrays()
+    if not arrays and not warnings:
         return None
-    arrays = {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
-              for kind, rows in raw.items()}
     if 'odom_rate' in arrays:
         arrays.setdefault('rate', arrays.pop('odom_rate'))
         arrays.pop('odom_rate', None)
     if 'position' in arrays:
         stamps, rows = arrays['position']
         arrays['position'] = stamps, local_metres(*rows.T)
-    found_stream = sensor_stream(arrays, 'the bag', absolute=True)
-    return SensorStream(**found_stream.kinds, absolute=True,
-                        warnings=(*warnings, *found_stream.warnings))
+    stream = sensor_stream(arrays, 'the bag', absolute=True)
+    return replace(stream, warnings=(*warnings, *stream.warnings))
 
 
 def _of_message(message: Any, option: str) -> Iterator[tuple[str, tuple[float, ...]]]:

@@ -61,7 +61,10 @@ class Scale:
 
     def mask(self, valid: Mask) -> Mask:
         """Return the mask (h, w) of resized pictures: valid where all of the input's are."""
-        small = shrink_mask(valid, self.shrink)
+        by = self.shrink
+        height, width = (side // by for side in valid.shape)
+        blocks = valid[:height * by, :width * by].reshape(height, by, width, by)
+        small = np.asarray(blocks.all(axis=(1, 3)), bool)
         return small.repeat(self.enlarge, axis=0).repeat(self.enlarge, axis=1)
 
     def __str__(self) -> str:
@@ -101,10 +104,3 @@ def shrink_image(image: GreyImage, factor: int) -> GreyImage:
     small = cv2.resize(image[:height * factor, :width * factor], (width, height),
                        interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8)
-
-
-def shrink_mask(valid: Mask, factor: int) -> Mask:
-    """Return the mask for an image shrunk alike: valid where all of a block is."""
-    height, width = (side // factor for side in valid.shape)
-    blocks = valid[:height * factor, :width * factor].reshape(height, factor, width, factor)
-    return np.asarray(blocks.all(axis=(1, 3)), bool)

@@ -109,7 +109,6 @@ class Reading:
 
     warnings: list[str] = field(default_factory=list)
     images: int = 0
-    decoded: int = 0
     undecodable: int = 0
     first_failure: str = ''
 
@@ -232,10 +231,9 @@ class FrameSource(ABC):
                         f'{picture.file or self.name}: image {frame.index} is {by(frame.size)}, '
                         f'those before are {by(size)}: a calibration holds for one size; '
                         f'split the drive there')
-                reading.decoded += 1
                 after_gap = perhaps = False
                 yield frame
-        if not reading.decoded:
+        if size is None:
             raise InputError(self._no_image(reading))
 
     def _excerpted(self, reading: Reading) -> Generator[Picture, None, None]:

@@ -4,15 +4,16 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import made_drives
 import numpy as np
 import pytest
+from made_drives import drive, picture, same
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial, ros_camera
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.input import Frame
-from dashcalib_ros.input.bag_write import BagWriter, camera_info_topic, check_bag, write_bag
+from dashcalib_ros.input.bag_write import camera_info_topic, check_bag, write_bag
 from dashcalib_ros.input.inputs import open_frames
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
@@ -90,13 +91,21 @@ def test_other_models_and_their_rectified_view(bag, tmp_path, lens, rectified):
 
 
 def test_compressed_images_and_the_other_reader(tmp_path):
-    source, out = tmp_path / 'drive', tmp_path / 'out'
-    with BagWriter(source, '/image_raw/compressed', compressed='jpeg') as writer:
-        for n in range(3):
-            writer.write(Frame(n, START + n, np.full((48, 64), n, np.uint8)))
+    frames = drive(3)
+    source = made_drives.write_bag(tmp_path / 'drive', [
+        ('/image_raw/compressed', frame.stamp_ns, picture(frame)) for frame in frames])
+    out = tmp_path / 'out'
     assert write_bag(source, '/image_raw/compressed', CAMERA, out) == 3
     assert len(messages(out, '/camera_info')) == 3
-    assert [frame.stamp_ns for frame in open_frames(out)] == [START, START + 1, START + 2]
+    same(list(open_frames(out)), frames)
+
+
+def test_what_cannot_be_written_is_one_line(bag, tmp_path):
+    (tmp_path / 'file').touch()
+    with pytest.raises(OutputError, match='cannot be written'):
+        write_bag(bag, '/cam/image_raw', CAMERA, tmp_path / 'file' / 'bag')
+    with pytest.raises(OutputError, match='exists'):
+        write_bag(bag, '/cam/image_raw', CAMERA, bag)
 
 
 @pytest.mark.parametrize(('topic', 'expected'), [

@@ -10,9 +10,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.decode import (
     BitDepth,
     decode,
-    decode_compressed,
     decode_file,
-    decode_image,
 )
 
 WIDTH, HEIGHT = 8, 6
@@ -40,7 +38,7 @@ def colour(*channels, dtype=np.uint8):
 @pytest.mark.parametrize('encoding', ['mono8', '8UC1'])
 @pytest.mark.parametrize('padding', [0, 5])
 def test_grey_is_taken_as_it_is(encoding, padding):
-    image = decode_image(message(encoding, GREY, padding=padding))
+    image = decode(message(encoding, GREY, padding=padding))
     assert image.dtype == np.uint8
     assert image.flags.c_contiguous
     np.testing.assert_array_equal(image, GREY)
@@ -52,7 +50,7 @@ def test_grey_is_taken_as_it_is(encoding, padding):
     ('rgba8', (RED, GREEN, BLUE, 9))])
 @pytest.mark.parametrize('padding', [0, 3])
 def test_colours_are_weighted_in_their_order(encoding, channels, padding):
-    image = decode_image(message(encoding, colour(*channels), padding=padding))
+    image = decode(message(encoding, colour(*channels), padding=padding))
     np.testing.assert_array_equal(image, np.full((HEIGHT, WIDTH), LUMA))
 
 
@@ -62,7 +60,7 @@ def test_colours_are_weighted_in_their_order(encoding, channels, padding):
 @pytest.mark.parametrize('big', [False, True])
 def test_deep_colours(encoding, channels, big):
     deep = colour(*channels, dtype=np.uint16) * 256
-    image = decode_image(message(encoding, deep, big), BitDepth())
+    image = decode(message(encoding, deep, big), BitDepth())
     np.testing.assert_array_equal(image, np.full((HEIGHT, WIDTH), LUMA))
 
 
@@ -72,14 +70,14 @@ def test_deep_colours(encoding, channels, big):
 def test_yuv_gives_its_brightness(encoding, luma, padding):
     pixels = np.full((HEIGHT, WIDTH, 2), 77, np.uint8)
     pixels[..., luma] = GREY
-    np.testing.assert_array_equal(decode_image(message(encoding, pixels, padding=padding)), GREY)
+    np.testing.assert_array_equal(decode(message(encoding, pixels, padding=padding)), GREY)
 
 
 @pytest.mark.parametrize('encoding, chroma_rows', [
     ('nv12', HEIGHT // 2), ('nv21', HEIGHT // 2), ('nv24', HEIGHT * 2), ('i420', HEIGHT // 2)])
 def test_planar_yuv_gives_its_first_plane(encoding, chroma_rows):
     planes = np.vstack([GREY, np.full((chroma_rows, WIDTH), 77, np.uint8)])
-    np.testing.assert_array_equal(decode_image(message(encoding, planes, height=HEIGHT)), GREY)
+    np.testing.assert_array_equal(decode(message(encoding, planes, height=HEIGHT)), GREY)
 
 
 def mosaic(pattern, dtype=np.uint8):
@@ -92,7 +90,7 @@ def mosaic(pattern, dtype=np.uint8):
 
 @pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
 def test_bayer_patterns_are_named_as_ros_does(pattern):
-    image = decode_image(message(f'bayer_{pattern}8', mosaic(pattern)))
+    image = decode(message(f'bayer_{pattern}8', mosaic(pattern)))
     assert image.shape == (HEIGHT, WIDTH)
     np.testing.assert_array_equal(image, np.full((HEIGHT, WIDTH), LUMA))
 
@@ -101,7 +99,7 @@ def test_bayer_patterns_are_named_as_ros_does(pattern):
 @pytest.mark.parametrize('big', [False, True])
 def test_deep_bayer(pattern, big):
     deep = message(f'bayer_{pattern}16', mosaic(pattern, np.uint16) * 256, big)
-    np.testing.assert_array_equal(decode_image(deep, BitDepth()),
+    np.testing.assert_array_equal(decode(deep, BitDepth()),
                                   np.full((HEIGHT, WIDTH), LUMA))
 
 
@@ -110,7 +108,7 @@ def test_deep_bayer(pattern, big):
 @pytest.mark.parametrize('bits', [10, 12, 14, 16])
 def test_sixteen_bits_hold_fewer(encoding, big, bits):
     deep = GREY.astype(np.uint16) << (bits - 8)
-    image = decode_image(message(encoding, deep, big, padding=2), BitDepth())
+    image = decode(message(encoding, deep, big, padding=2), BitDepth())
     np.testing.assert_array_equal(image, GREY)
 
 
@@ -126,7 +124,7 @@ def test_bit_depth_grows_with_the_evidence_and_never_shrinks():
 
 def test_the_image_shares_nothing_with_the_message():
     source = message('mono8', GREY)
-    image = decode_image(source)
+    image = decode(source)
     source.data[0] = 99
     assert image[0, 0] == GREY[0, 0]
     image[0, 1] = 123
@@ -137,7 +135,7 @@ def test_the_image_shares_nothing_with_the_message():
                                   lambda raw: np.frombuffer(raw, np.uint8)])
 def test_any_buffer_will_do(data):
     np.testing.assert_array_equal(
-        decode_image(message('mono8', GREY, data=data(GREY.tobytes()))), GREY)
+        decode(message('mono8', GREY, data=data(GREY.tobytes()))), GREY)
 
 
 @pytest.mark.parametrize('changes', [
@@ -145,13 +143,13 @@ def test_any_buffer_will_do(data):
     {'width': WIDTH + 1}, {'data': b''}, {'height': HEIGHT - 1}, {'encoding': 'bgr8'}])
 def test_a_size_that_does_not_fit_is_an_error(changes):
     with pytest.raises(InputError, match='camera driver'):
-        decode_image(message(**{'encoding': 'mono8', 'pixels': GREY, **changes}))
+        decode(message(**{'encoding': 'mono8', 'pixels': GREY, **changes}))
 
 
 @pytest.mark.parametrize('encoding', ['32FC1', 'rgb565', ''])
 def test_unknown_encodings_are_an_error_with_a_cure(encoding):
     with pytest.raises(InputError, match='not supported: publish mono8'):
-        decode_image(message(encoding, GREY))
+        decode(message(encoding, GREY))
 
 
 def compressed(extension, pixels, name, *options):
@@ -166,14 +164,14 @@ def test_png_is_exact(name):
 
 
 def test_compressed_colour_becomes_grey():
-    image = decode_compressed(
+    image = decode(
         compressed('.png', colour(BLUE, GREEN, RED), 'bgr8; png compressed bgr8'))
     assert abs(int(image[0, 0]) - LUMA) <= 1
     assert image.shape == (HEIGHT, WIDTH)
 
 
 def test_jpeg_is_close():
-    image = decode_compressed(compressed('.jpg', GREY, 'jpeg', cv2.IMWRITE_JPEG_QUALITY, 100))
+    image = decode(compressed('.jpg', GREY, 'jpeg', cv2.IMWRITE_JPEG_QUALITY, 100))
     assert np.abs(image.astype(int) - GREY).max() <= 3
 
 
@@ -185,13 +183,13 @@ def test_deep_png_keeps_its_lower_bits():
 @pytest.mark.parametrize('name', ['16UC1; compressedDepth', '32FC1; compressedDepth png', 'h264'])
 def test_formats_that_are_no_pictures(name):
     with pytest.raises(InputError, match=name):
-        decode_compressed(compressed('.png', GREY, name))
+        decode(compressed('.png', GREY, name))
 
 
 @pytest.mark.parametrize('data', [b'', b'junk', bytes(1000)])
 def test_junk_is_an_error(data):
     with pytest.raises(InputError, match='jpeg or png'):
-        decode_compressed(compressed_message(format='jpeg', data=data))
+        decode(compressed_message(format='jpeg', data=data))
 
 
 @pytest.mark.parametrize('extension', ['.jpg', '.png', '.bmp', '.tif', '.webp', '.pgm'])
@@ -215,32 +213,32 @@ def test_float_pictures_are_refused():
 def test_what_has_no_colours_stays_grey(encoding):
     pixels = np.full((HEIGHT, WIDTH), 4000 if encoding == 'mono16' else 40)
     dtype = np.uint16 if encoding == 'mono16' else np.uint8
-    assert decode_image(message(encoding, pixels.astype(dtype)), colour=True).ndim == 2
+    assert decode(message(encoding, pixels.astype(dtype)), colour=True).ndim == 2
 
 
 @pytest.mark.parametrize('encoding, channels', [
     ('bgr8', (BLUE, GREEN, RED)), ('rgb8', (RED, GREEN, BLUE)), ('bgra8', (BLUE, GREEN, RED, 9)),
     ('rgba8', (RED, GREEN, BLUE, 9))])
 def test_colours_are_kept_in_opencv_s_order(encoding, channels):
-    image = decode_image(message(encoding, colour(*channels), padding=3), colour=True)
+    image = decode(message(encoding, colour(*channels), padding=3), colour=True)
     np.testing.assert_array_equal(image[..., :3], colour(BLUE, GREEN, RED))
     assert image.shape[2] == 3
 
 
 def test_colours_of_16_bits_planes_and_mosaics_are_found():
-    deep = decode_image(message('rgb16', colour(4000, 2000, 1000, dtype=np.uint16)), colour=True)
+    deep = decode(message('rgb16', colour(4000, 2000, 1000, dtype=np.uint16)), colour=True)
     np.testing.assert_array_equal(deep[0, 0], [62, 125, 250])
     shown = colour(BLUE, GREEN, RED)
     yuv = cv2.cvtColor(shown, cv2.COLOR_BGR2YUV_I420)
     planes = message('i420', yuv, height=HEIGHT)
-    assert np.abs(decode_image(planes, colour=True).astype(int) - shown).max() < 4
+    assert np.abs(decode(planes, colour=True).astype(int) - shown).max() < 4
     two = np.stack([np.tile(yuv[HEIGHT:].reshape(2, -1)[:, :1].T.repeat(HEIGHT, 0), WIDTH // 2),
                     yuv[:HEIGHT]], -1)
-    assert np.abs(decode_image(message('uyvy', two), colour=True).astype(int) - shown).max() < 4
+    assert np.abs(decode(message('uyvy', two), colour=True).astype(int) - shown).max() < 4
     mosaic = np.zeros((HEIGHT, WIDTH), np.uint8)
     mosaic[::2, ::2], mosaic[1::2, 1::2] = RED, BLUE
     mosaic[::2, 1::2] = mosaic[1::2, ::2] = GREEN
-    found = decode_image(message('bayer_rggb8', mosaic), colour=True)
+    found = decode(message('bayer_rggb8', mosaic), colour=True)
     np.testing.assert_array_equal(found[HEIGHT // 2, WIDTH // 2], [BLUE, GREEN, RED])
 
 

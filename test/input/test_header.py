@@ -13,7 +13,7 @@ from fakes import compressed_message, image_message
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import decode as decoding
-from dashcalib_ros.input.decode import decode_compressed, decode_file, encoded_size, message_size
+from dashcalib_ros.input.decode import decode, decode_file, encoded_size, message_size
 from dashcalib_ros.limits import PIXELS
 
 SUFFIXES = ['.jpg', '.png', '.webp', '.bmp', '.tif', '.pgm', '.ppm']
@@ -113,7 +113,7 @@ def test_what_would_take_too_much_memory_is_never_decoded(suffix, monkeypatch):
     monkeypatch.setattr(decoding.cv2, 'imdecode', decoded)
     data = huge(suffix)
     message = compressed_message(format='', data=data)
-    for read in (decode_compressed, message_size, lambda each: decode_file(each.data)):
+    for read in (decode, message_size, lambda each: decode_file(each.data)):
         with pytest.raises(InputError, match='more than 50 million pixels are not taken'):
             read(message)
 

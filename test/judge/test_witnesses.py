@@ -219,7 +219,8 @@ def with_town(drive, scale, seed=3, **given):
     bias = turns.rate.values.mean(axis=0)
     return SensorStream(rate=Samples(
         np.r_[turns.rate.stamps_s, rate.stamps_s + later],
-        np.concatenate([turns.rate.values, rate.values + bias])), position=position.shifted(later))
+        np.concatenate([turns.rate.values, rate.values + bias])),
+        position=Samples(position.stamps_s + later, position.values))
 
 
 @pytest.mark.parametrize('scale', [1.0, 1.02])

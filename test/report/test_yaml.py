@@ -304,7 +304,7 @@ def test_another_tool_s_fisheye_loads(tmp_path, name):
     ('image_width: 640', f'image_width: {"9" * 200}', '65535 at the most'),
     ('data: [500, 0, 320', f'data: [{"5" * 400}, 0, 320', 'more than 300 digits'),
     ('data: [500, 0, 320', f'data: [0x{"f" * 290}, 0, 320', 'finite numbers'),
-    ('camera_matrix:', f'laughs: {"[" * 5000}\ncamera_matrix:', 'more than 30 levels'),
+    ('camera_matrix:', f'laughs: {"[" * 40}{"]" * 40}\ncamera_matrix:', 'or 30 levels'),
     ('camera_matrix:', f'large: [{"1, " * 2**20}]\ncamera_matrix:', 'more than 1 MB'),
 ])
 def test_broken_files_are_refused_with_what_is_wrong(tmp_path, old, new, complaint):
