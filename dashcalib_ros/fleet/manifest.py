@@ -7,7 +7,7 @@ import json
 import math
 import posixpath
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
@@ -61,7 +61,7 @@ def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
     pattern = _pattern(group_by)
     suffix = next((each for each in KNOWN_SUFFIXES if place.lower().endswith(each)), '')
     if suffix and not storage.is_folder(place):
-        folder = storage.parent(place)
+        folder = posixpath.dirname(place)
         rows = [_row(number, values, folder) for number, values in _table(place, suffix)]
     else:
         rows = [Row(number, found, found) for number, found in enumerate(_found(place), 1)]
@@ -81,7 +81,7 @@ def _pattern(group_by: str | None) -> re.Pattern[str] | None:
 
 def _found(place: str) -> list[str]:
     """Return what lies in a folder, or what a glob finds."""
-    if any(sign in place for sign in '*?['):
+    if storage.is_pattern(place):
         return storage.listed(place)
     if not storage.is_folder(place):
         if storage.stamp(place) is None:
@@ -225,15 +225,3 @@ def _grouped(row: Row, pattern: re.Pattern[str] | None) -> Row:
     camera = named.get('camera') or (found.group(1) if pattern.groups else found.group(0))
     return replace(row, camera=row.camera or camera or '',
                    make=row.make or named.get('make') or '')
-
-
-def by_camera(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the rows of each camera, cameras sorted by name, rows as they stand.
-
-    A clip whose camera is unknown is one of its own, and its name is the clip's. Rows that name
-    neither are under ''.
-    """
-    found: dict[str, list[Row]] = {}
-    for row in rows:
-        found.setdefault(row.camera or row.name, []).append(row)
-    return dict(sorted(found.items()))
