@@ -132,8 +132,8 @@ def _write_tables(cameras: Sequence[Camera], out: str) -> tuple[str, ...]:
     camera_rows = [camera.row for camera in cameras if camera.name]
     clip_rows = sorted((row for camera in cameras for row in camera.clips),
                        key=lambda row: int(row['row']))
-    files = [*tables.write_table(out, tables.CAMERAS, camera_rows, tables.CAMERA_COLUMNS),
-             *tables.write_table(out, tables.CLIPS, clip_rows, tables.CLIP_COLUMNS)]
+    files = [*tables.write_table(out, 'cameras', camera_rows, tables.CAMERA_COLUMNS),
+             *tables.write_table(out, 'clips', clip_rows, tables.CLIP_COLUMNS)]
     write(joined(out, overview.NAME), overview.overview_html(camera_rows, clip_rows).encode(
         'utf-8', 'replace'))
     return (*files, overview.NAME)

@@ -20,7 +20,6 @@ from dashcalib_ros.fleet.lens_prior import OfMake, Unit
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.storage import is_url, joined, read, remove, write
 from dashcalib_ros.fleet.tables import camera_folder, camera_row
-from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report import write_results
 from dashcalib_ros.report.files import ACCEPTED, WEAK
 
@@ -59,7 +58,6 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
             loaded[clip] = replace(found, content=content)
         text = solved.encoded(fuse(camera, make, loaded, config))
         result = solved.decoded(text, name)
-        _publish(result.calibration, camera, out)
         write(joined(out, name), text)
     return Own(name, result.calibration.verdict.level, result.shares, solved.unit_of(result),
                data is not None)
@@ -82,31 +80,26 @@ def solved_file(camera: str, make: str, clips: Sequence[tuple[str, str, str]], c
 
 def publish_camera(name: str, found: OfMake | None, clips: Sequence[Mapping[str, Any]], out: str
                    ) -> dict[str, Any]:
-    """Write a camera's files with the prior of its make; return its row of the table.
+    """Write calibration.yaml, result.json and report.html of a camera; return its row.
 
-    name: the file of its own result. clips: the rows of its clips.
+    name: the file of its own result. found: what its make tells of it. clips: the rows of its
+    clips.
     """
     data = read(joined(out, name))
     if data is None:
         raise InputError(f'{name} has gone while the fleet was solved; start again')
     result = solved.decoded(data, name)
     final = solved.final_of(result, found)
-    _publish(final.calibration, result.camera, out)
-    return camera_row(result, final, clips)
-
-
-def _publish(calibration: Calibration, camera: str, out: str) -> None:
-    """Write calibration.yaml, result.json and report.html of a camera."""
-    place = joined(out, camera_folder(camera))
-    yaml_name = re.sub(r'[^A-Za-z0-9_]+', '_', camera).strip('_') or 'camera'
+    yaml_name = re.sub(r'[^A-Za-z0-9_]+', '_', result.camera).strip('_') or 'camera'
     yaml_name = 'camera_narrow_stereo' if yaml_name == 'narrow_stereo' else yaml_name
-    if not is_url(place):
-        write_results(calibration, place, yaml_name)
-        return
-    with tempfile.TemporaryDirectory(prefix='dashcalib-') as scratch:
-        written = {path.name: path.read_bytes()
-                   for path in write_results(calibration, scratch, yaml_name).files}
-    for file, data in written.items():
-        write(joined(place, file), data)
-    for file in {ACCEPTED, WEAK} - written.keys():
-        remove(joined(place, file))
+    place = joined(out, camera_folder(result.camera))
+    if is_url(place):
+        with tempfile.TemporaryDirectory(prefix='dashcalib-') as scratch:
+            files = write_results(final.calibration, scratch, yaml_name).files
+            for path in files:
+                write(joined(place, path.name), path.read_bytes())
+        for file in {ACCEPTED, WEAK} - {path.name for path in files}:
+            remove(joined(place, file))
+    else:
+        write_results(final.calibration, place, yaml_name)
+    return camera_row(result, final, clips)

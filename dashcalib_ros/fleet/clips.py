@@ -7,7 +7,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -29,8 +28,6 @@ from dashcalib_ros.reconstruct.scene_file import (
     encoded,
 )
 
-# names of gathered turns: nothing from inside a file becomes a path
-GATHERED = re.compile(rf'gathered/[0-9a-f]{{2}}/[0-9a-f]+(-[0-9a-f]+)?\{SUFFIX}')
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.')
 LATER_NAMES = ('threads', 'rectified', 'turns.store')
@@ -107,11 +104,9 @@ def _earlier(name: str, out: str, now: str) -> ClipResult | None:
         result = ClipResult(**{**values, 'warnings': tuple(values['warnings']), 'again': True})
     except (ValueError, KeyError, TypeError):
         return None
-    if now != result.stamp and (now or not result.file):
-        return None
-    if result.file and not (GATHERED.fullmatch(result.file) and stamp(joined(out, result.file))):
-        return None
-    return result
+    holds = now == result.stamp or (result.file and not now)
+    there = not result.file or stamp(joined(out, result.file))
+    return result if holds and there else None
 
 
 def _noted(name: str, result: ClipResult) -> ClipResult:
@@ -129,20 +124,19 @@ def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
         raise InputError('there is no such file; check the path')
     with local_copy(row.place) as path:
         try:
-            if path.suffix == SUFFIX:
-                # with whatever settings; known by itself, for what it says of itself may be false
-                data = read_file(path, LARGEST)
-                content = hashlib.sha256(data).hexdigest()[:32]
-                name = gathered_file(content)
-                found = _given(data, path)
-                write(joined(out, name), data)
-            else:
-                content = content_hash(path)
-                name = gathered_file(f'{content}-{settings_hash(config, row.fps, row.topic)}')
-                kept = gathered(out, name)
-                found = kept or gather(path, content, row.fps, row.topic, config)
-                if kept is None:
-                    write(joined(out, name), encoded(found))
+            content = content_hash(path)
+            # turns that were gathered elsewhere have whatever settings
+            given = path.suffix == SUFFIX
+            of = content if given else f'{content}-{settings_hash(config, row.fps, row.topic)}'
+            name = f'gathered/{of[:2]}/{of}{SUFFIX}'
+            found = gathered(out, name)
+            if found is None:
+                found = _given(path) if given else gather(path, content, row.fps, row.topic,
+                                                          config)
+                if content_hash(path) != content:
+                    raise InputError(f'{path} changed while it was read: start again when it is '
+                                     f'complete')
+                write(joined(out, name), encoded(found))
         except InputError as error:
             # the tables must not depend on where the clip, or its copy, lies
             raise InputError(str(error).replace(str(path), row.clip)) from error
@@ -150,11 +144,6 @@ def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
     return ClipResult('', now, name, content, width, height, found.frames, found.seconds,
                       found.found, len(found.turns),
                       found.turns[0].stamp_s if found.turns else None, found.warnings)
-
-
-def gathered_file(hashes: str) -> str:
-    """Return the name of a clip's file of gathered turns."""
-    return f'gathered/{hashes[:2]}/{hashes}{SUFFIX}'
 
 
 def gathered(out: str, name: str) -> SceneFile | None:
@@ -166,10 +155,10 @@ def gathered(out: str, name: str) -> SceneFile | None:
         return None
 
 
-def _given(data: bytes, path: Path) -> SceneFile:
+def _given(path: Path) -> SceneFile:
     """Return turns that were gathered elsewhere; raises InputError."""
     try:
-        return decoded(data)
+        return decoded(read_file(path, LARGEST))
     except ValueError as error:
         raise InputError(f'{path.name} is no file of gathered turns ({one_line(error)}); gather '
                          f'its clip anew') from error
@@ -207,8 +196,7 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
            ) -> SceneFile:
     """Return a clip's turns and their scenes.
 
-    content: the clip's content_hash(). Raises InputError for what cannot be read, or changes
-    meanwhile.
+    content: the clip's content_hash(). Raises InputError for what cannot be read.
     """
     source = open_frames(path, topic, fps)
     detection = stages.detect(source, config)
@@ -220,8 +208,6 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
         detection.release(turn.center)
         if scene is not None:
             turns.append(StoredTurn(scene, turn.stamp_s, turn.prominence))
-    if content_hash(path) != content:
-        raise InputError(f'{path} changed while it was read: start again when it is complete')
     assert detection.size is not None
     # the same content gives the same, wherever it lies
     warnings = tuple(line.replace(str(path), 'the clip')

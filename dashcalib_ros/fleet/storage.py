@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import importlib
 import os
 import posixpath
 import re
@@ -15,6 +14,8 @@ import stat as stat_module
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -205,18 +206,12 @@ def _system(url: str) -> tuple[Any, str]:
 
 def needs(library: str, what: str) -> ModuleType:
     """Import a library of the extra; raises ConfigError that says how to install it."""
-    found = has(library)
-    if found is None:
+    if not has(library):
         raise ConfigError(f"{what} need {library}: install it with pip install "
                           f"'dashcalib_ros[fleet]'")
-    return found
+    return import_module(library)
 
 
-def has(library: str) -> ModuleType | None:
-    """Import a library of the extra, if it is installed."""
-    try:
-        return importlib.import_module(library)
-    except ModuleNotFoundError as error:
-        if error.name != library.partition('.')[0]:
-            raise
-        return None
+def has(library: str) -> bool:
+    """Return whether a library of the extra is installed."""
+    return find_spec(library) is not None

@@ -23,7 +23,6 @@ from dashcalib_ros.judge.calibration import ANGLES
 from dashcalib_ros.reconstruct.scene_file import DATES_S
 from dashcalib_ros.report.result import plain_values
 
-CAMERAS, CLIPS = 'cameras', 'clips'
 PARAMETERS = tuple(dict.fromkeys(name for model in calibrated_models() for name in model.names()))
 MOUNT = (*ANGLES, 'height_m')
 YEAR_S = 365.25 * 86400
