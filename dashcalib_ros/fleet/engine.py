@@ -11,7 +11,7 @@ import resource
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from queue import SimpleQueue
@@ -79,16 +79,15 @@ class Engine(ABC):
             while self._waiting and len(self._running) < places:
                 task = self._waiting.popleft()
                 self._running[self._start(task)] = task
-            for handle in self._ready():
+            for handle, found in self._ended():
                 task = self._running.pop(handle)
-                found = self._found(handle)
                 if isinstance(found, WorkerDiedError):
                     self._deaths[task.key] += 1
                     found = (DiedError(self._attempts, one_line(found))
                              if self._deaths[task.key] >= self._attempts else None)
                 if found is None:
                     self.submit(task, first=True)
-                elif isinstance(found, Exception):
+                elif isinstance(found, BaseException):
                     yield task.key, _known(found)
                 else:
                     result, cpu_s, peak_mb = found
@@ -105,22 +104,23 @@ class Engine(ABC):
         """Start a task; return its handle."""
 
     @abstractmethod
-    def _ready(self) -> Iterable[Any]:
-        """Return the handles of tasks that have ended; wait a little where there are none."""
+    def _ended(self) -> list[tuple[Any, Any]]:
+        """Return the handles of tasks that have ended; wait a little where there are none.
 
-    @abstractmethod
-    def _found(self, handle: Any) -> Any:
-        """Return what measured() returned or raised; None where that was no fault of the task."""
+        Beside each: what measured() returned or raised, None where that was no fault of the task.
+        """
 
     @abstractmethod
     def close(self) -> None:
         """End the workers."""
 
 
-def _known(error: Exception) -> DashcalibError:
+def _known(error: BaseException) -> DashcalibError:
     """Return a task's error; one that nobody expected must not end the tasks of others."""
     if isinstance(error, DashcalibError):
         return error
+    if not isinstance(error, Exception):
+        raise error  # such as Ctrl-C
     return WorkerError(f'{type(error).__name__}: {one_line(error)}; this is a defect of '
                        f'dashcalib: report it with the clip')
 
@@ -157,14 +157,9 @@ class LocalEngine(Engine):
         finally:
             self._idle.put(worker)
 
-    def _ready(self) -> Iterable[Any]:
-        return wait(self._running, return_when=FIRST_COMPLETED).done
-
-    def _found(self, handle: Any) -> Any:
-        try:
-            return handle.result()
-        except Exception as error:
-            return error
+    def _ended(self) -> list[tuple[Any, Any]]:
+        done = wait(self._running, return_when=FIRST_COMPLETED).done
+        return [(future, future.exception() or future.result()) for future in done]
 
     def close(self) -> None:
         """End the workers; calls that run end with an error."""
@@ -214,9 +209,9 @@ class RayEngine(Engine):
     def _start(self, task: Task) -> Any:
         return self._remote.remote(task.function, *task.arguments)
 
-    def _ready(self) -> Iterable[Any]:
+    def _ended(self) -> list[tuple[Any, Any]]:
         ready, _ = self._ray.wait(list(self._running), timeout=LOOK_S)
-        return list(ready)
+        return [(handle, self._found(handle)) for handle in ready]
 
     def _found(self, handle: Any) -> Any:
         errors = self._ray.exceptions

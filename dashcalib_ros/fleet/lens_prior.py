@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -90,23 +91,16 @@ class OfMake:
 
 def priors(units: Sequence[Unit], config: FleetConfig) -> dict[str, OfMake]:
     """Return each unit's prior, from the other units of its make."""
-    makes: dict[tuple[str, ...], list[Unit]] = {}
-    for unit in sorted(units, key=lambda unit: unit.name):
-        makes.setdefault(unit.make, []).append(unit)
     found: dict[str, OfMake] = {}
-    for of_make in makes.values():
-        found.update(_priors_of_make(of_make, config))
-    return found
-
-
-def _priors_of_make(units: Sequence[Unit], config: FleetConfig) -> dict[str, OfMake]:
-    found: dict[str, OfMake] = {}
-    folds = min(len(units), FOLDS)
-    for fold in range(folds):
-        others = [unit for n, unit in enumerate(units) if n % folds != fold]
-        prior = lens_prior(others, config)
-        for unit in units[fold::folds]:
-            found[unit.name] = _verdict(unit, prior, len(others), config)
+    ordered = sorted(units, key=lambda unit: (unit.make, unit.name))
+    for _, group in groupby(ordered, key=lambda unit: unit.make):
+        of_make = list(group)
+        folds = min(len(of_make), FOLDS)
+        for fold in range(folds):
+            others = [unit for n, unit in enumerate(of_make) if n % folds != fold]
+            prior = lens_prior(others, config)
+            for unit in of_make[fold::folds]:
+                found[unit.name] = _of_make(unit, prior, len(others), config)
     return found
 
 
@@ -120,7 +114,7 @@ def focal_length(curvature: Floats) -> Floats:
     return np.asarray(1 / np.sqrt(-2 * np.asarray(curvature)))
 
 
-def _verdict(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> OfMake:
+def _of_make(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> OfMake:
     if prior is None:
         return OfMake(None, f'of its make there are {others} other usable cameras, '
                              f'{config.least_units} that agree are needed')
