@@ -127,7 +127,7 @@ class _Progress:
 
     def effort_json(self, engine: Engine) -> bytes:
         """Return what the run took, for people who plan larger ones."""
-        gather_s = engine.cpu_s.get('clip', 0.0)
+        gather_s = engine.cpu_s['gather_clip']
         return (json.dumps({
             'wall_s': time.monotonic() - self.started, 'clips_read': self.read,
             'video_s': self.video_s, 'gather_cpu_s': gather_s,

@@ -5,18 +5,37 @@ cameras, and each camera published with it. Whatever is done has a file, and is 
 """
 from __future__ import annotations
 
+import re
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib import metadata
 from typing import Any
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import ConfigError, one_line
-from dashcalib_ros.fleet import lens_prior, overview, tables
-from dashcalib_ros.fleet.cameras import Own, publish_camera, solve_camera
-from dashcalib_ros.fleet.clips import ClipResult, gather_clip, set_aside
+from dashcalib_ros.errors import ConfigError, InputError, one_line
+from dashcalib_ros.fleet import lens_prior, overview, solved, tables
+from dashcalib_ros.fleet.clips import ClipResult, gather_clip, gathered, hash_of, set_aside
 from dashcalib_ros.fleet.engine import DiedError, Engine, Task
+from dashcalib_ros.fleet.fuse import fuse
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.storage import joined, write
+from dashcalib_ros.fleet.storage import is_url, joined, read, remove, write
+from dashcalib_ros.report import write_results
+from dashcalib_ros.report.files import ACCEPTED, WEAK
+
+
+@dataclass(frozen=True)
+class Own:
+    """What the fleet needs of a camera's own result. file: has the result.
+
+    shares: by clip. unit: what the camera tells of its make. again: this was known before.
+    """
+
+    file: str
+    verdict: str
+    shares: Mapping[str, solved.ClipShare]
+    unit: lens_prior.Unit | None
+    again: bool
 
 
 @dataclass
@@ -80,33 +99,30 @@ def batch(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
 
 def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
                       tell: Told) -> None:
-    by_name = {each.name: each for each in cameras}
-    by_row = {str(row.number): (each, row) for each in cameras for row in each.rows}
-    for key, (_, row) in by_row.items():
-        engine.submit(Task(('clip', key), gather_clip, (row, out, config)))
-    for (kind, key), outcome in engine.outcomes():
-        if kind == 'clip':
-            camera, row = by_row[key]
-            if isinstance(outcome, DiedError):
-                outcome = set_aside(row, out, config, outcome.attempts)
-            elif isinstance(outcome, Exception):
-                outcome = ClipResult(one_line(outcome, 300))
-            camera.results[row.number] = outcome
-            tell(camera, outcome)
-            if len(camera.results) == len(camera.rows):
-                camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered, {})
-                if camera.name:
-                    engine.submit(Task(('camera', camera.name), solve_camera, (
-                        camera.name, camera.make, camera.gathered, out, config)), first=True)
+    for camera in cameras:
+        for row in camera.rows:
+            engine.submit(Task(gather_clip, (row, out, config), (camera, row)))
+    for (camera, row), outcome in engine.outcomes():
+        if row is None:
+            if isinstance(outcome, Exception):
+                _failed(camera, outcome)
+            else:
+                camera.own, camera.verdict = outcome, outcome.verdict
+                camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered,
+                                                outcome.shares)
+            tell(camera, None)
             continue
-        camera = by_name[key]
-        if isinstance(outcome, Exception):
-            _failed(camera, outcome)
-        else:
-            camera.own, camera.verdict = outcome, outcome.verdict
-            camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered,
-                                            outcome.shares)
-        tell(camera, None)
+        if isinstance(outcome, DiedError):
+            outcome = set_aside(row, out, config)
+        elif isinstance(outcome, Exception):
+            outcome = ClipResult(one_line(outcome, 300))
+        camera.results[row.number] = outcome
+        tell(camera, outcome)
+        if len(camera.results) == len(camera.rows):
+            camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered, {})
+            if camera.name:
+                engine.submit(Task(solve_camera, (camera.name, camera.make, camera.gathered, out,
+                                                  config), (camera, None)), first=True)
 
 
 def _failed(camera: Camera, error: Exception) -> None:
@@ -116,16 +132,15 @@ def _failed(camera: Camera, error: Exception) -> None:
 
 def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.OfMake], out: str,
              engine: Engine) -> None:
-    by_name = {each.name: each for each in cameras}
     for camera in cameras:
         if camera.own is not None:
-            engine.submit(Task(('publish', camera.name), publish_camera, (
-                camera.own.file, found.get(camera.name), camera.clips, out)))
-    for (_, name), outcome in engine.outcomes():
+            engine.submit(Task(publish_camera, (camera.own.file, found.get(camera.name),
+                                                camera.clips, out), camera))
+    for camera, outcome in engine.outcomes():
         if isinstance(outcome, Exception):
-            _failed(by_name[name], outcome)
+            _failed(camera, outcome)
         else:
-            by_name[name].row, by_name[name].verdict = outcome, outcome['verdict']
+            camera.row, camera.verdict = outcome, outcome['verdict']
 
 
 def _write_tables(cameras: Sequence[Camera], out: str) -> tuple[str, ...]:
@@ -153,3 +168,70 @@ def problems(cameras: Sequence[Camera]) -> Iterator[tuple[Row, str]]:
         for row, result in camera.gathered:
             if not result.file:
                 yield row, result.problem
+
+
+def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]], out: str,
+                 config: Config) -> Own:
+    """Solve a camera from its gathered clips, unless that was done."""
+    # a clip that the manifest names twice counts once
+    used = {row.name: (result.file, f'{result.content}{row.topic or ""}')
+            for row, result in reversed(clips) if result.file}
+    name = solved_file(camera, make, [(clip, *used[clip]) for clip in sorted(used)], config)
+    data = read(joined(out, name))
+    result = None if data is None else solved.decoded(data, name)
+    if result is None:
+        loaded = {}
+        for clip, (file, content) in used.items():
+            found = gathered(out, file)
+            if found is None:
+                raise InputError(f'{file} has gone or changed while the fleet was solved; remove '
+                                 f'it and start again')
+            # what was read has this content, whatever it says
+            loaded[clip] = replace(found, content=content)
+        text = solved.encoded(fuse(camera, make, loaded, config))
+        result = solved.decoded(text, name)
+        write(joined(out, name), text)
+    return Own(name, result.calibration.verdict.level, result.shares, solved.unit_of(result),
+               data is not None)
+
+
+def solved_file(camera: str, make: str, clips: Sequence[tuple[str, str, str]], config: Config
+                ) -> str:
+    """Return the name of a camera's own result. clips: name, file and content of each.
+
+    Other clips, other settings and another version of this package have another one.
+    """
+    settings = {key: value for key, value in config.flat().items() if key != 'threads'}
+    try:
+        version = metadata.version('dashcalib_ros')
+    except metadata.PackageNotFoundError:
+        version = ''
+    key = hash_of([solved.FORMAT, version, camera, make, clips, settings])
+    return f'solved/{key[:2]}/{key}.json'
+
+
+def publish_camera(name: str, found: lens_prior.OfMake | None, clips: Sequence[Mapping[str, Any]],
+                   out: str) -> dict[str, Any]:
+    """Write calibration.yaml, result.json and report.html of a camera; return its row.
+
+    name: the file of its own result. found: what its make tells of it. clips: the rows of its
+    clips.
+    """
+    data = read(joined(out, name))
+    if data is None:
+        raise InputError(f'{name} has gone while the fleet was solved; start again')
+    result = solved.decoded(data, name)
+    final = solved.final_of(result, found)
+    yaml_name = re.sub(r'[^A-Za-z0-9_]+', '_', result.camera).strip('_') or 'camera'
+    yaml_name = 'camera_narrow_stereo' if yaml_name == 'narrow_stereo' else yaml_name
+    place = joined(out, tables.camera_folder(result.camera))
+    if is_url(place):
+        with tempfile.TemporaryDirectory(prefix='dashcalib-') as scratch:
+            files = write_results(final.calibration, scratch, yaml_name).files
+            for path in files:
+                write(joined(place, path.name), path.read_bytes())
+        for file in {ACCEPTED, WEAK} - {path.name for path in files}:
+            remove(joined(place, file))
+    else:
+        write_results(final.calibration, place, yaml_name)
+    return tables.camera_row(result, final, clips)

@@ -76,11 +76,11 @@ def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
         return ClipResult(f'cannot be read here: {one_line(error)}')
 
 
-def set_aside(row: Row, out: str, config: Config, attempts: int) -> ClipResult:
+def set_aside(row: Row, out: str, config: Config) -> ClipResult:
     """Note that a clip is not tried again, as it killed its worker so many times."""
     return _noted(clip_file(row, out, config), ClipResult(
-        f'killed its worker {attempts} times: it is set aside; is it damaged, or is there too '
-        f'little memory?', stamp(row.place) or ''))
+        f'killed its worker {config.fleet.attempts} times: it is set aside; is it damaged, or is '
+        f'there too little memory?', stamp(row.place) or ''))
 
 
 def clip_file(row: Row, out: str, config: Config) -> str:

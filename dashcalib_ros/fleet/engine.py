@@ -10,7 +10,7 @@ import os
 import resource
 import time
 from abc import ABC, abstractmethod
-from collections import Counter, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -34,43 +34,42 @@ LOOK_S = 1.0
 COUNT_S = 5.0
 
 
-@dataclass(frozen=True)
+@dataclass
 class Task:
-    """A module-level function and its arguments. key: its kind, and whose outcome it is."""
+    """A module-level function and its arguments.
 
-    key: tuple[str, str]
+    about: whose outcome it is, for the caller. deaths: how often it ended its worker.
+    """
+
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
+    about: Any
+    deaths: int = 0
 
 
 class DiedError(WorkerError):
-    """A task ended its worker each time. attempts: how often."""
-
-    def __init__(self, attempts: int, reason: str) -> None:
-        super().__init__(f'killed its worker {attempts} times: {reason}')
-        self.attempts = attempts
+    """A task ended its worker each time."""
 
 
 class Engine(ABC):
     """Runs tasks; outcomes come in any order.
 
-    cpu_s: of the tasks so far, by their kind. peak_mb: of memory, of one worker at the most.
+    cpu_s: of the tasks so far, by their function. peak_mb: of memory, of one worker at the most.
     """
 
     def __init__(self, attempts: int) -> None:
-        self.cpu_s: dict[str, float] = {}
+        self.cpu_s: defaultdict[str, float] = defaultdict(float)
         self.peak_mb = 0.0
         self._attempts = attempts
         self._waiting: deque[Task] = deque()
         self._running: dict[Any, Task] = {}
-        self._deaths: Counter[tuple[str, str]] = Counter()
 
     def submit(self, task: Task, first: bool = False) -> None:
         """Take a task; first: before all that wait."""
         (self._waiting.appendleft if first else self._waiting.append)(task)
 
-    def outcomes(self) -> Iterator[tuple[tuple[str, str], Any]]:
-        """Yield (key, outcome), until no task is left; tasks may be submitted meanwhile.
+    def outcomes(self) -> Iterator[tuple[Any, Any]]:
+        """Yield (about, outcome), until no task is left; tasks may be submitted meanwhile.
 
         An outcome is what the function returned, or the DashcalibError that it raised.
         """
@@ -82,18 +81,18 @@ class Engine(ABC):
             for handle, found in self._ended():
                 task = self._running.pop(handle)
                 if isinstance(found, WorkerDiedError):
-                    self._deaths[task.key] += 1
-                    found = (DiedError(self._attempts, one_line(found))
-                             if self._deaths[task.key] >= self._attempts else None)
+                    task.deaths += 1
+                    found = None if task.deaths < self._attempts else DiedError(
+                        f'killed its worker {task.deaths} times: {one_line(found)}')
                 if found is None:
                     self.submit(task, first=True)
                 elif isinstance(found, BaseException):
-                    yield task.key, _known(found)
+                    yield task.about, _known(found)
                 else:
                     result, cpu_s, peak_mb = found
-                    self.cpu_s[task.key[0]] = self.cpu_s.get(task.key[0], 0.0) + cpu_s
+                    self.cpu_s[task.function.__name__] += cpu_s
                     self.peak_mb = max(self.peak_mb, peak_mb)
-                    yield task.key, result
+                    yield task.about, result
 
     @abstractmethod
     def _places(self) -> int:
@@ -191,7 +190,7 @@ class RayEngine(Engine):
         self._remote = self._ray.remote(num_cpus=1, max_retries=0, memory=memory_mb * 2**20)(
             _in_one_thread)
 
-    def outcomes(self) -> Iterator[tuple[tuple[str, str], Any]]:
+    def outcomes(self) -> Iterator[tuple[Any, Any]]:
         """Yield the outcomes; see Engine. Raises WorkerError when Ray itself has ended."""
         try:
             yield from super().outcomes()
