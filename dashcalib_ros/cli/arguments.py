@@ -238,12 +238,12 @@ def _add_batch(commands: Any) -> None:
                              '(?P<camera>...) and (?P<make>...)')
     where = parser.add_mutually_exclusive_group()
     where.add_argument('--workers', type=_count, metavar='N',
-                       help='processes (default: one a core); 1 needs no Ray; the result is the '
-                            'same with any')
+                       help='processes (default: one a core, while memory lasts); the result is '
+                            'the same with any')
     where.add_argument('--address', metavar='A', help="a Ray cluster's; auto: the one here")
     where.add_argument('--shard', metavar='I/N',
-                       help='do the I-th of N parts, with one process and without Ray; a run '
-                            'without --shard then makes the tables')
+                       help='do the I-th of N parts, with one process; a run without --shard then '
+                            'makes the tables')
     _add_shared(parser, '--config', '--set', '--model', '--seed', '--quiet')
 
 

@@ -3,7 +3,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rich.text import Text
@@ -13,69 +15,76 @@ from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import counted
-from dashcalib_ros.fleet.batch import Camera, Fleet, problems, shard_of
+from dashcalib_ros.fleet.batch import Camera, cameras_of, problems, shard_of
 from dashcalib_ros.fleet.batch import batch as calibrate_fleet
-from dashcalib_ros.fleet.engine import Engine, OneWorker, RayEngine
-from dashcalib_ros.fleet.manifest import Row, by_camera, read_manifest
-from dashcalib_ros.fleet.storage import Folder
-from dashcalib_ros.fleet.tasks import ClipResult, Effort
+from dashcalib_ros.fleet.clips import ClipResult
+from dashcalib_ros.fleet.engine import Engine, LocalEngine, RayEngine
+from dashcalib_ros.fleet.manifest import Row, read_manifest
+from dashcalib_ros.fleet.storage import joined, remove, write
 from dashcalib_ros.standard_streams import folded, write_stderr
+from dashcalib_ros.workers.child import ChildWorker
 
 # problems that are shown; the table has all
 SHOWN = 10
-EFFORT = 'effort.json'
+LEVELS = ('accepted', 'weak', 'refused')
 
 
 def batch(args: argparse.Namespace) -> int:
     """Calibrate every camera of the manifest; return the exit code."""
     config = read_config(args)
-    shard = None if args.shard is None else shard_of(args.shard)
-    rows = read_manifest(args.manifest, args.group_by)
-    cameras = list(by_camera(rows).values())
-    mine = cameras if shard is None else cameras[shard[0] - 1::shard[1]]
+    shard = shard_of(args.shard or '1/1')
+    cameras = cameras_of(read_manifest(args.manifest, args.group_by), shard)
     # before hours of work, and not after them
-    Folder(args.out).write('.writable', b'')
-    Folder(args.out).remove('.writable')
-    progress = _Progress(sum(len(each) for each in mine), Screen(args.quiet), Stages(args.quiet))
+    probe = joined(args.out, '.writable')
+    write(probe, b'')
+    remove(probe)
+    progress = _Progress(sum(len(each.rows) for each in cameras), Screen(args.quiet),
+                         Stages(args.quiet))
     if not args.quiet:  # before workers start, which takes a while
         write_stderr(folded(
-            f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(mine), "camera")}; '
+            f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(cameras), "camera")}; '
             f'Ctrl-C keeps what is done in {args.out}, and the same command goes on'))
     engine = _engine(args, config)
     try:
         with progress.stages:
-            fleet = calibrate_fleet(rows, args.out, config, engine, shard, progress.tell)
+            files = calibrate_fleet(cameras, args.out, config, engine, args.shard is None,
+                                    progress.tell)
     except KeyboardInterrupt:
         warn([f'{progress.done} of {counted(progress.clips, "clip")} done, and kept in '
               f'{args.out}: the same command goes on'])
         raise
     finally:
         engine.close()
-    name = EFFORT if shard is None else f'effort-{shard[0]}-of-{shard[1]}.json'
-    Folder(args.out).write(name, progress.effort_json())
-    _summarise(fleet, args.out, progress.screen)
-    return ACCEPTED if fleet.all_well else NOT_ENOUGH
+    name = '' if args.shard is None else f'-{shard[0]}-of-{shard[1]}'
+    write(joined(args.out, f'effort{name}.json'), progress.effort_json(engine))
+    if files:
+        progress.screen.show(Text(f'written to {args.out}: ' + ', '.join(files)))
+    return _summarise(cameras, progress.screen)
 
 
 def _engine(args: argparse.Namespace, config: Config) -> Engine:
-    if args.address is None and (args.workers == 1 or args.shard is not None):
-        return OneWorker(config.fleet.attempts)
-    return RayEngine(config.fleet.attempts, config.fleet.memory_mb, args.workers, args.address)
+    settings = config.fleet
+    if args.address is not None:
+        return RayEngine(settings.attempts, settings.memory_mb, args.address)
+    # one a core, while memory lasts
+    memory_mb = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2**20
+    most = max(1, min(os.cpu_count() or 1, memory_mb // settings.memory_mb))
+    count = 1 if args.shard is not None else args.workers or most
+    return LocalEngine(settings.attempts, [ChildWorker() for _ in range(count)])
 
 
-def _summarise(fleet: Fleet, out: str, screen: Screen) -> None:
-    found = list(problems(fleet))
+def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
+    """Show what came of the cameras; return the exit code."""
+    found = list(problems(cameras))
     lines = [_problem(row, why) for row, why in found[:SHOWN]]
     if len(found) > SHOWN:
         lines.append(f'{len(found) - SHOWN} more clips could not be read: see the table of clips')
     warn(lines)
-    verdicts = [camera.verdict for camera in fleet.cameras if camera.name]
-    counts = ', '.join(f'{verdicts.count(level)} {level}'
-                       for level in ('accepted', 'weak', 'refused'))
-    if fleet.files:
-        screen.show(Text(f'written to {out}: ' + ', '.join(fleet.files)))
+    verdicts = [camera.verdict for camera in cameras if camera.name]
+    counts = ', '.join(f'{verdicts.count(level)} {level}' for level in LEVELS)
     screen.show(Text(f'{counted(len(verdicts), "camera")}: {counts}; '
                      f'{counted(len(found), "clip")} could not be read'))
+    return NOT_ENOUGH if found or 'refused' in verdicts else ACCEPTED
 
 
 def _problem(row: Row, why: str) -> str:
@@ -85,7 +94,7 @@ def _problem(row: Row, why: str) -> str:
 
 @dataclass
 class _Progress:
-    """Shows rate and time left, and each camera as it is solved; adds up what tasks took."""
+    """Shows rate and time left, and each camera as it is solved."""
 
     clips: int
     screen: Screen
@@ -94,20 +103,15 @@ class _Progress:
     done: int = 0
     read: int = 0
     video_s: float = 0.0
-    cpu_s: dict[str, float] = field(default_factory=lambda: {'gather': 0.0, 'solve': 0.0})
-    peak_mb: float = 0.0
 
-    def tell(self, camera: Camera, clip: ClipResult | None, effort: Effort | None) -> None:
+    def tell(self, camera: Camera, clip: ClipResult | None) -> None:
         """Take the news of a clip, or of a camera that is solved."""
-        if effort is not None:
-            self.cpu_s['solve' if clip is None else 'gather'] += effort.cpu_s
-            self.peak_mb = max(self.peak_mb, effort.peak_mb)
         if clip is None:
-            if effort is None or not effort.again:
+            if camera.own is None or not camera.own.again:
                 self.screen.show(Text(f'{camera.name}: {camera.verdict}'))
             return
         self.done += 1
-        if effort is not None and not effort.again:
+        if not clip.again:
             self.read += 1
             self.video_s += clip.seconds
         self._show()
@@ -121,13 +125,14 @@ class _Progress:
                 f'{_duration(left)} left')
         self.stages.show('clips', self.done / max(self.clips, 1), note)
 
-    def effort_json(self) -> bytes:
+    def effort_json(self, engine: Engine) -> bytes:
         """Return what the run took, for people who plan larger ones."""
+        gather_s = engine.cpu_s['gather_clip']
         return (json.dumps({
             'wall_s': time.monotonic() - self.started, 'clips_read': self.read,
-            'video_s': self.video_s, 'gather_cpu_s': self.cpu_s['gather'],
-            'solve_cpu_s': self.cpu_s['solve'], 'peak_mb_of_a_worker': self.peak_mb},
-            indent=2) + '\n').encode()
+            'video_s': self.video_s, 'gather_cpu_s': gather_s,
+            'solve_cpu_s': sum(engine.cpu_s.values()) - gather_s,
+            'peak_mb_of_a_worker': engine.peak_mb}, indent=2) + '\n').encode()
 
 
 def _duration(seconds: float) -> str:

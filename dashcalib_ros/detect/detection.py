@@ -56,6 +56,11 @@ class Detection:
         return self._first_ns / 1e9
 
     @property
+    def seconds(self) -> float:
+        """Return how long the drive lasts so far, from the first image to the last, s."""
+        return (self._last_ns - self._first_ns) / 1e9
+
+    @property
     def magnitude(self) -> float:
         """Return the newest filtered turning magnitude, of the image width."""
         return self._turns.magnitude
@@ -142,11 +147,11 @@ class Detection:
         """Check once that time passes between the first images, in the right unit."""
         if self.frames == 0:
             self._first_ns = self._last_ns = frame.stamp_ns
+        before, self._last_ns = self._last_ns, frame.stamp_ns
         if self.frames > FIRST_FRAMES:
             return
         # a clock may be set back once, but then it goes on
-        self._rises += frame.stamp_ns > self._last_ns
-        self._last_ns = frame.stamp_ns
+        self._rises += frame.stamp_ns > before
         passed = frame.stamp_ns - self._first_ns
         too_short = 0 <= passed < FIRST_FRAMES * SHORTEST_NS
         if self.frames == FIRST_FRAMES and (too_short or self._rises < FIRST_FRAMES // 2):

@@ -5,197 +5,153 @@ cameras, and each camera published with it. Whatever is done has a file, and is 
 """
 from __future__ import annotations
 
+import re
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib import metadata
 from typing import Any
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import ConfigError, one_line
-from dashcalib_ros.fleet import lens_prior, overview, tables
-from dashcalib_ros.fleet.engine import Died, Engine, Task
-from dashcalib_ros.fleet.fuse import ClipShare
-from dashcalib_ros.fleet.manifest import Row, by_camera
-from dashcalib_ros.fleet.solved import Final, unit_of
-from dashcalib_ros.fleet.storage import Folder
-from dashcalib_ros.fleet.tasks import (
-    ClipResult,
-    Effort,
-    gather_clip,
-    publish_camera,
-    set_aside,
-    solve_camera,
-)
+from dashcalib_ros.errors import ConfigError, InputError, one_line
+from dashcalib_ros.fleet import lens_prior, overview, solved, tables
+from dashcalib_ros.fleet.clips import ClipResult, gather_clip, gathered, hash_of, set_aside
+from dashcalib_ros.fleet.engine import DiedError, Engine, Task
+from dashcalib_ros.fleet.fuse import fuse
+from dashcalib_ros.fleet.manifest import Row
+from dashcalib_ros.fleet.storage import is_url, joined, read, remove, write
+from dashcalib_ros.report import write_results
+from dashcalib_ros.report.files import ACCEPTED, WEAK
 
-Told = Callable[['Camera', ClipResult | None, Effort | None], None]
+
+@dataclass(frozen=True)
+class Own:
+    """What the fleet needs of a camera's own result. file: has the result.
+
+    shares: by clip. unit: what the camera tells of its make. again: this was known before.
+    """
+
+    file: str
+    verdict: str
+    shares: Mapping[str, solved.ClipShare]
+    unit: lens_prior.Unit | None
+    again: bool
 
 
 @dataclass
 class Camera:
     """A camera on its way; one without a name has the rows that name no clip.
 
-    rows, results: its clips, and what became of them, by row number.
-    solved: the file of its own result; shares: of its clips; unit: what it tells of its make.
-    failure: why there is no result. final: the published one.
+    results: what became of its clips, by the number of their row. own: its own result, None where
+    there is none. clips: its rows of the table of clips, once it is solved. row: its own row.
     """
 
     name: str
     make: str
     rows: Sequence[Row]
     results: dict[int, ClipResult] = field(default_factory=dict)
-    solved: str = ''
-    shares: Mapping[str, ClipShare] = field(default_factory=dict)
-    unit: lens_prior.Unit | None = None
-    verdict: str = ''
-    failure: str = ''
-    final: Final | None = None
+    own: Own | None = None
+    verdict: str = 'refused'
+    clips: Sequence[Mapping[str, Any]] = ()
+    row: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def complete(self) -> bool:
-        """Return whether all its clips were tried."""
-        return len(self.results) == len(self.rows)
+    def gathered(self) -> list[tuple[Row, ClipResult]]:
+        """Return its clips with what became of them."""
+        return [(row, self.results[row.number]) for row in self.rows]
 
 
-@dataclass(frozen=True)
-class Fleet:
-    """What a batch made: its cameras, and the files that tell of all; none of a shard."""
-
-    cameras: Sequence[Camera]
-    files: tuple[str, ...] = ()
-
-    @property
-    def all_well(self) -> bool:
-        """Return whether every clip was read and no camera refused."""
-        return all(each.verdict != 'refused' and all(
-            result.file for result in each.results.values()) for each in self.cameras)
+# called for each clip, and, without one, for each camera that is solved
+Told = Callable[[Camera, ClipResult | None], None]
 
 
-def batch(rows: Sequence[Row], out: str, config: Config, engine: Engine,
-          shard: tuple[int, int] | None = None, tell: Told = lambda *news: None) -> Fleet:
-    """Calibrate all cameras of a manifest; return them in the order of their names.
+def cameras_of(rows: Sequence[Row], shard: tuple[int, int] = (1, 1)) -> list[Camera]:
+    """Return the cameras of a manifest, by name. shard: (i, n), the i-th of n parts.
 
-    out: the folder for everything. shard: (i, n) does the i-th of n parts, with all clips of its
-    cameras, and makes no tables: a run without a shard does. tell: called for each clip, and for
-    each camera that is solved. Raises OutputError where the tables cannot be written.
+    A clip whose camera is unknown is one of its own, and its name is the clip's. Rows that name
+    neither are under ''.
     """
-    cameras = [_camera(name, of_camera) for name, of_camera in by_camera(rows).items()]
-    if shard is not None:
-        cameras = cameras[shard[0] - 1::shard[1]]
-    _gather_and_solve(cameras, out, config, engine, tell)
-    if shard is not None:
-        return Fleet(cameras)
-    found = lens_prior.priors([each.unit for each in cameras if each.unit], config.fleet)
-    _publish(cameras, found, out, config, engine)
-    return Fleet(cameras, _write_tables(cameras, Folder(out)))
-
-
-def _camera(name: str, rows: Sequence[Row]) -> Camera:
-    makes = {row.make for row in rows if row.make}
-    # a camera of two makes has none that can be trusted
-    camera = Camera(name, makes.pop() if len(makes) == 1 else '', rows)
+    found: dict[str, list[Row]] = {}
     for row in rows:
-        if row.problem:
-            camera.results[row.number] = ClipResult(row.clip, problem=row.problem, kept=False)
-    return camera
+        found.setdefault(row.camera or row.name, []).append(row)
+    cameras = []
+    for name in sorted(found)[shard[0] - 1::shard[1]]:
+        makes = {row.make for row in found[name] if row.make}
+        # a camera of two makes has none that can be trusted
+        cameras.append(Camera(name, makes.pop() if len(makes) == 1 else '', found[name]))
+    return cameras
+
+
+def batch(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
+          whole: bool = True, tell: Told = lambda camera, clip: None) -> tuple[str, ...]:
+    """Calibrate cameras; return the files that tell of all.
+
+    out: the folder for everything. whole: they are all of the manifest; of a part there is no
+    prior and no table. Raises OutputError where the tables cannot be written.
+    """
+    _gather_and_solve(cameras, out, config, engine, tell)
+    if not whole:
+        return ()
+    units = [each.own.unit for each in cameras if each.own and each.own.unit]
+    _publish(cameras, lens_prior.priors(units, config.fleet), out, engine)
+    return _write_tables(cameras, out)
 
 
 def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
                       tell: Told) -> None:
-    by_name = {each.name: each for each in cameras}
-    by_row = {row.number: (each, row) for each in cameras for row in each.rows}
     for camera in cameras:
-        for result in camera.results.values():
-            tell(camera, result, None)
         for row in camera.rows:
-            if not row.problem:
-                engine.submit(Task(('clip', str(row.number)), gather_clip, (row, out, config)))
-        if camera.complete and camera.name:
-            engine.submit(_solving(camera, out, config))
-    for (kind, key), outcome in engine.outcomes():
-        if kind == 'clip':
-            camera, row = by_row[int(key)]
-            result, effort = _clip_result(row, outcome, out, config)
-            camera.results[row.number] = result
-            tell(camera, result, effort)
-            if camera.complete:
-                engine.submit(_solving(camera, out, config), first=True)
-        else:
-            camera = by_name[key]
-            tell(camera, None, _note_solved(camera, outcome))
+            engine.submit(Task(gather_clip, (row, out, config), (camera, row)))
+    for (camera, row), outcome in engine.outcomes():
+        if row is None:
+            if isinstance(outcome, Exception):
+                _failed(camera, outcome)
+            else:
+                camera.own, camera.verdict = outcome, outcome.verdict
+                camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered,
+                                                outcome.shares)
+            tell(camera, None)
+            continue
+        if isinstance(outcome, DiedError):
+            outcome = set_aside(row, out, config)
+        elif isinstance(outcome, Exception):
+            outcome = ClipResult(one_line(outcome, 300))
+        camera.results[row.number] = outcome
+        tell(camera, outcome)
+        if len(camera.results) == len(camera.rows):
+            camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered, {})
+            if camera.name:
+                engine.submit(Task(solve_camera, (camera.name, camera.make, camera.gathered, out,
+                                                  config), (camera, None)), first=True)
 
 
-def _solving(camera: Camera, out: str, config: Config) -> Task:
-    clips = tuple((row, camera.results[row.number]) for row in camera.rows)
-    return Task(('camera', camera.name), solve_camera,
-                (camera.name, camera.make, clips, out, config))
+def _failed(camera: Camera, error: Exception) -> None:
+    camera.own, camera.verdict = None, 'refused'
+    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, one_line(error, 300))
 
 
-def _clip_result(row: Row, outcome: Any, out: str, config: Config
-                 ) -> tuple[ClipResult, Effort | None]:
-    if isinstance(outcome, Died):
-        return set_aside(row, out, config, outcome.attempts), None
-    if isinstance(outcome, Exception):
-        return ClipResult(row.clip, problem=one_line(outcome, 300), kept=False), None
-    result, effort = outcome
-    return result, effort
-
-
-def _note_solved(camera: Camera, outcome: Any) -> Effort | None:
-    """Keep of a solved camera what its make and the tables need."""
-    if isinstance(outcome, (Died, Exception)):
-        camera.verdict = 'refused'
-        camera.failure = (f'killed its worker {outcome.attempts} times: {outcome.reason}'
-                          if isinstance(outcome, Died) else one_line(outcome, 300))
-        return None
-    name, solved, effort = outcome
-    camera.solved, camera.shares, camera.unit = name, solved.shares, unit_of(solved)
-    camera.verdict = solved.calibration.verdict.level
-    return effort if isinstance(effort, Effort) else None
-
-
-def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.Verdict], out: str,
-             config: Config, engine: Engine) -> None:
-    by_name = {each.name: each for each in cameras}
+def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.OfMake], out: str,
+             engine: Engine) -> None:
     for camera in cameras:
-        if camera.solved:
-            engine.submit(Task(('publish', camera.name), publish_camera, (
-                camera.solved, found.get(camera.name), out, config)))
-    for (_, name), outcome in engine.outcomes():
-        if isinstance(outcome, Final):
-            by_name[name].final = outcome
-            by_name[name].verdict = outcome.calibration.verdict.level
+        if camera.own is not None:
+            engine.submit(Task(publish_camera, (camera.own.file, found.get(camera.name),
+                                                camera.clips, out), camera))
+    for camera, outcome in engine.outcomes():
+        if isinstance(outcome, Exception):
+            _failed(camera, outcome)
         else:
-            _note_solved(by_name[name], outcome)
+            camera.row, camera.verdict = outcome, outcome['verdict']
 
 
-def _write_tables(cameras: Sequence[Camera], folder: Folder) -> tuple[str, ...]:
-    camera_rows, clip_rows = [], []
-    for camera in cameras:
-        shares = _shares(camera)
-        own = [tables.clip_row(row, camera.name, camera.make, camera.results[row.number],
-                               shares.get(row.number)) for row in camera.rows]
-        clip_rows += own
-        if camera.name:
-            camera_rows.append(tables.camera_row(camera.name, camera.make, camera.final,
-                                                 camera.failure, own))
-    clip_rows.sort(key=lambda row: int(row['row']))
-    files = [*tables.write_table(folder, tables.CAMERAS, camera_rows, tables.CAMERA_COLUMNS),
-             *tables.write_table(folder, tables.CLIPS, clip_rows, tables.CLIP_COLUMNS)]
-    folder.write(overview.NAME, overview.overview_html(camera_rows, clip_rows).encode(
+def _write_tables(cameras: Sequence[Camera], out: str) -> tuple[str, ...]:
+    camera_rows = [camera.row for camera in cameras if camera.name]
+    clip_rows = sorted((row for camera in cameras for row in camera.clips),
+                       key=lambda row: int(row['row']))
+    files = [*tables.write_table(out, 'cameras', camera_rows, tables.CAMERA_COLUMNS),
+             *tables.write_table(out, 'clips', clip_rows, tables.CLIP_COLUMNS)]
+    write(joined(out, overview.NAME), overview.overview_html(camera_rows, clip_rows).encode(
         'utf-8', 'replace'))
     return (*files, overview.NAME)
-
-
-def _shares(camera: Camera) -> dict[int, ClipShare]:
-    """Return what each row's clip gave; a clip that is named twice counts once."""
-    first: dict[str, int] = {}
-    found = {}
-    for row in camera.rows:
-        before = first.setdefault(row.name, row.number)
-        if before != row.number:
-            found[row.number] = ClipShare(left_out=f'is the clip of row {before} again')
-        elif row.name in camera.shares:
-            found[row.number] = camera.shares[row.name]
-    return found
 
 
 def shard_of(text: str) -> tuple[int, int]:
@@ -206,9 +162,76 @@ def shard_of(text: str) -> tuple[int, int]:
     return int(i), int(n)
 
 
-def problems(fleet: Fleet) -> Iterator[tuple[Row, str]]:
+def problems(cameras: Sequence[Camera]) -> Iterator[tuple[Row, str]]:
     """Yield the clips that could not be read, and why."""
-    for camera in fleet.cameras:
-        for row in camera.rows:
-            if not camera.results[row.number].file:
-                yield row, camera.results[row.number].problem
+    for camera in cameras:
+        for row, result in camera.gathered:
+            if not result.file:
+                yield row, result.problem
+
+
+def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]], out: str,
+                 config: Config) -> Own:
+    """Solve a camera from its gathered clips, unless that was done."""
+    # a clip that the manifest names twice counts once
+    used = {row.name: (result.file, f'{result.content}{row.topic or ""}')
+            for row, result in reversed(clips) if result.file}
+    name = solved_file(camera, make, [(clip, *used[clip]) for clip in sorted(used)], config)
+    data = read(joined(out, name))
+    result = None if data is None else solved.decoded(data, name)
+    if result is None:
+        loaded = {}
+        for clip, (file, content) in used.items():
+            found = gathered(out, file)
+            if found is None:
+                raise InputError(f'{file} has gone or changed while the fleet was solved; remove '
+                                 f'it and start again')
+            # what was read has this content, whatever it says
+            loaded[clip] = replace(found, content=content)
+        text = solved.encoded(fuse(camera, make, loaded, config))
+        result = solved.decoded(text, name)
+        write(joined(out, name), text)
+    return Own(name, result.calibration.verdict.level, result.shares, solved.unit_of(result),
+               data is not None)
+
+
+def solved_file(camera: str, make: str, clips: Sequence[tuple[str, str, str]], config: Config
+                ) -> str:
+    """Return the name of a camera's own result. clips: name, file and content of each.
+
+    Other clips, other settings and another version of this package have another one.
+    """
+    settings = {key: value for key, value in config.flat().items() if key != 'threads'}
+    try:
+        version = metadata.version('dashcalib_ros')
+    except metadata.PackageNotFoundError:
+        version = ''
+    key = hash_of([solved.FORMAT, version, camera, make, clips, settings])
+    return f'solved/{key[:2]}/{key}.json'
+
+
+def publish_camera(name: str, found: lens_prior.OfMake | None, clips: Sequence[Mapping[str, Any]],
+                   out: str) -> dict[str, Any]:
+    """Write calibration.yaml, result.json and report.html of a camera; return its row.
+
+    name: the file of its own result. found: what its make tells of it. clips: the rows of its
+    clips.
+    """
+    data = read(joined(out, name))
+    if data is None:
+        raise InputError(f'{name} has gone while the fleet was solved; start again')
+    result = solved.decoded(data, name)
+    final = solved.final_of(result, found)
+    yaml_name = re.sub(r'[^A-Za-z0-9_]+', '_', result.camera).strip('_') or 'camera'
+    yaml_name = 'camera_narrow_stereo' if yaml_name == 'narrow_stereo' else yaml_name
+    place = joined(out, tables.camera_folder(result.camera))
+    if is_url(place):
+        with tempfile.TemporaryDirectory(prefix='dashcalib-') as scratch:
+            files = write_results(final.calibration, scratch, yaml_name).files
+            for path in files:
+                write(joined(place, path.name), path.read_bytes())
+        for file in {ACCEPTED, WEAK} - {path.name for path in files}:
+            remove(joined(place, file))
+    else:
+        write_results(final.calibration, place, yaml_name)
+    return tables.camera_row(result, final, clips)

@@ -1,26 +1,30 @@
-"""Where tasks run: in one child process, or on Ray's workers, here or on a cluster.
+"""Where tasks run: in child processes of this machine, or on the workers of a Ray cluster.
 
 A task that ends its worker (COLMAP aborts, the system is out of memory) is tried again, up to
-`attempts` times; then its outcome is Died, and the others go on.
+`attempts` times; then its outcome is a DiedError, and the others go on.
 """
 from __future__ import annotations
 
 import math
 import os
-import sys
+import resource
 import time
 from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from dashcalib_ros.errors import DashcalibError, WorkerError, one_line
 from dashcalib_ros.fleet.storage import needs
-from dashcalib_ros.fleet.tasks import one_thread
-from dashcalib_ros.workers.child import ChildWorker
-from dashcalib_ros.workers.worker import THREAD_VARIABLES, Worker, WorkerDiedError
+from dashcalib_ros.workers.worker import (
+    THREAD_VARIABLES,
+    InlineWorker,
+    Worker,
+    WorkerDiedError,
+)
 
 # tasks that are handed to Ray for each of its processors: enough that none waits
 AHEAD = 3
@@ -30,47 +34,79 @@ LOOK_S = 1.0
 COUNT_S = 5.0
 
 
-@dataclass(frozen=True)
+@dataclass
 class Task:
-    """A module-level function and its arguments. key: tells whose outcome it is."""
+    """A module-level function and its arguments.
 
-    key: tuple[str, str]
+    about: whose outcome it is, for the caller. deaths: how often it ended its worker.
+    """
+
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
+    about: Any
+    deaths: int = 0
 
 
-@dataclass(frozen=True)
-class Died:
-    """A task that ended its worker each time. attempts: how often. reason: the last one."""
-
-    attempts: int
-    reason: str
-
-
-def _known(error: Exception) -> DashcalibError:
-    """Return a task's error; one that nobody expected must not end the tasks of others."""
-    if isinstance(error, DashcalibError):
-        return error
-    return WorkerError(f'{type(error).__name__}: {one_line(error)}; this is a defect of '
-                       f'dashcalib: report it with the clip')
+class DiedError(WorkerError):
+    """A task ended its worker each time."""
 
 
 class Engine(ABC):
-    """Runs tasks; outcomes come in any order."""
+    """Runs tasks; outcomes come in any order.
+
+    cpu_s: of the tasks so far, by their function. peak_mb: of memory, of one worker at the most.
+    """
 
     def __init__(self, attempts: int) -> None:
-        self._waiting: deque[Task] = deque()
+        self.cpu_s: defaultdict[str, float] = defaultdict(float)
+        self.peak_mb = 0.0
         self._attempts = attempts
+        self._waiting: deque[Task] = deque()
+        self._running: dict[Any, Task] = {}
 
     def submit(self, task: Task, first: bool = False) -> None:
         """Take a task; first: before all that wait."""
         (self._waiting.appendleft if first else self._waiting.append)(task)
 
-    @abstractmethod
-    def outcomes(self) -> Iterator[tuple[tuple[str, str], Any]]:
-        """Yield (key, result), until no task is left; tasks may be submitted meanwhile.
+    def outcomes(self) -> Iterator[tuple[Any, Any]]:
+        """Yield (about, outcome), until no task is left; tasks may be submitted meanwhile.
 
-        A result is what the function returned, the DashcalibError that it raised, or Died.
+        An outcome is what the function returned, or the DashcalibError that it raised.
+        """
+        while self._waiting or self._running:
+            places = self._places()
+            while self._waiting and len(self._running) < places:
+                task = self._waiting.popleft()
+                self._running[self._start(task)] = task
+            for handle, found in self._ended():
+                task = self._running.pop(handle)
+                if isinstance(found, WorkerDiedError):
+                    task.deaths += 1
+                    found = None if task.deaths < self._attempts else DiedError(
+                        f'killed its worker {task.deaths} times: {one_line(found)}')
+                if found is None:
+                    self.submit(task, first=True)
+                elif isinstance(found, BaseException):
+                    yield task.about, _known(found)
+                else:
+                    result, cpu_s, peak_mb = found
+                    self.cpu_s[task.function.__name__] += cpu_s
+                    self.peak_mb = max(self.peak_mb, peak_mb)
+                    yield task.about, result
+
+    @abstractmethod
+    def _places(self) -> int:
+        """Return how many tasks may be started at a time."""
+
+    @abstractmethod
+    def _start(self, task: Task) -> Any:
+        """Start a task; return its handle."""
+
+    @abstractmethod
+    def _ended(self) -> list[tuple[Any, Any]]:
+        """Return the handles of tasks that have ended; wait a little where there are none.
+
+        Beside each: what measured() returned or raised, None where that was no fault of the task.
         """
 
     @abstractmethod
@@ -78,118 +114,118 @@ class Engine(ABC):
         """End the workers."""
 
 
-class OneWorker(Engine):
-    """One worker, one task after the other; see Engine."""
+def _known(error: BaseException) -> DashcalibError:
+    """Return a task's error; one that nobody expected must not end the tasks of others."""
+    if isinstance(error, DashcalibError):
+        return error
+    if not isinstance(error, Exception):
+        raise error  # such as Ctrl-C
+    return WorkerError(f'{type(error).__name__}: {one_line(error)}; this is a defect of '
+                       f'dashcalib: report it with the clip')
 
-    def __init__(self, attempts: int, worker: Worker | None = None) -> None:
-        """worker: a child process where None is given."""
+
+def measured(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float, float]:
+    """Return a task's result, the processor time that it took, s, and its process's memory, MB."""
+    before = time.process_time()
+    result = function(*arguments)
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return result, time.process_time() - before, peak_mb
+
+
+class LocalEngine(Engine):
+    """Workers of this machine, such as child processes; see Engine."""
+
+    def __init__(self, attempts: int, workers: Sequence[Worker]) -> None:
         super().__init__(attempts)
-        self._worker = worker or ChildWorker()
+        self._workers = tuple(workers)
+        self._threads = ThreadPoolExecutor(len(self._workers))
+        self._idle: SimpleQueue[Worker] = SimpleQueue()
+        for worker in self._workers:
+            self._idle.put(worker)
 
-    def outcomes(self) -> Iterator[tuple[tuple[str, str], Any]]:
-        """Yield the outcomes; see Engine."""
-        while self._waiting:
-            task = self._waiting.popleft()
-            yield task.key, self._outcome(task)
+    def _places(self) -> int:
+        return len(self._workers)
 
-    def _outcome(self, task: Task) -> Any:
-        reason = ''
-        for _ in range(self._attempts):
-            try:
-                return self._worker.call(task.function, *task.arguments)
-            except WorkerDiedError as error:
-                reason = one_line(error)
-            except Exception as error:
-                return _known(error)
-        return Died(self._attempts, reason)
+    def _start(self, task: Task) -> Future[Any]:
+        return self._threads.submit(self._call, task)
+
+    def _call(self, task: Task) -> Any:
+        worker = self._idle.get()
+        try:
+            return worker.call(measured, task.function, *task.arguments)
+        finally:
+            self._idle.put(worker)
+
+    def _ended(self) -> list[tuple[Any, Any]]:
+        done = wait(self._running, return_when=FIRST_COMPLETED).done
+        return [(future, future.exception() or future.result()) for future in done]
 
     def close(self) -> None:
-        """End the worker."""
-        self._worker.close()
+        """End the workers; calls that run end with an error."""
+        for worker in self._workers:
+            worker.close()
+        self._threads.shutdown()
 
 
 class RayEngine(Engine):
-    """Ray's workers, one thread and one task each; see Engine.
+    """A cluster's workers, one thread and one task each; see Engine.
 
     A task whose node was lost is tried again without being counted: that is no fault of its own.
     """
 
-    def __init__(self, attempts: int, memory_mb: int, workers: int | None = None,
-                 address: str | None = None) -> None:
-        """workers: processes of this machine, by default one a core. address: of a cluster.
-
-        Raises ConfigError without Ray, WorkerError where it does not start.
-        """
+    def __init__(self, attempts: int, memory_mb: int, address: str) -> None:
+        """Raise ConfigError without Ray, WorkerError where the cluster cannot be reached."""
         super().__init__(attempts)
-        self._ray = needs('ray', 'several workers (--workers 1 does without)')
-        self._running: dict[Any, Task] = {}
-        self._died: dict[tuple[str, str], int] = {}
+        self._ray = needs('ray', 'clusters (--address)')
         self._lost_nodes = 0
-        self._places, self._counted_at = 0, -math.inf
-        environment = {name: '1' for name in THREAD_VARIABLES}
-        if not address:
-            # as a child process finds it; another machine has other paths
-            environment['PYTHONPATH'] = os.pathsep.join(path or str(Path.cwd())
-                                                        for path in sys.path)
+        self._most, self._counted_at = 0, -math.inf
         os.environ.setdefault('RAY_USAGE_STATS_ENABLED', '0')
-        options: dict[str, Any] = {'address': address} if address else {
-            'num_cpus': workers or os.cpu_count(), 'include_dashboard': False}
+        variables = {'env_vars': dict.fromkeys(THREAD_VARIABLES, '1')}
         try:
-            self._ours = not self._ray.is_initialized()
-            if self._ours:
-                self._ray.init(log_to_driver=False, logging_level='ERROR', configure_logging=True,
-                               runtime_env={'env_vars': environment}, **options)
+            self._ray.init(address, log_to_driver=False, logging_level='ERROR',
+                           configure_logging=True, runtime_env=variables)
         except Exception as error:  # of many kinds, none of them ours
-            where = f'at {address}' if address else 'on this machine'
-            raise WorkerError(f'Ray does not start {where} ({one_line(error)}); check the '
-                              f'address, or use --workers 1') from error
+            raise WorkerError(f'there is no Ray cluster at {address} ({one_line(error)}); check '
+                              f'the address, or leave --address away') from error
         self._remote = self._ray.remote(num_cpus=1, max_retries=0, memory=memory_mb * 2**20)(
-            one_thread)
+            _in_one_thread)
 
-    def outcomes(self) -> Iterator[tuple[tuple[str, str], Any]]:
+    def outcomes(self) -> Iterator[tuple[Any, Any]]:
         """Yield the outcomes; see Engine. Raises WorkerError when Ray itself has ended."""
-        while self._waiting or self._running:
-            try:
-                self._hand_over()
-                ready, _ = self._ray.wait(list(self._running), timeout=LOOK_S)
-                done = [(task, self._outcome(reference, task)) for reference in ready
-                        for task in [self._running.pop(reference)]]
-            except Exception as error:  # of many kinds, none of them ours
-                raise WorkerError(f'Ray has ended ({one_line(error)}); start the command again: '
-                                  f'what is done stays') from error
-            for task, outcome in done:
-                if outcome is None:
-                    self.submit(task, first=True)
-                else:
-                    yield task.key, outcome[0]
+        try:
+            yield from super().outcomes()
+        except Exception as error:  # of many kinds, none of them ours
+            raise WorkerError(f'Ray has ended ({one_line(error)}); start the command again: '
+                              f'what is done stays') from error
 
-    def _hand_over(self) -> None:
+    def _places(self) -> int:
         if time.monotonic() - self._counted_at > COUNT_S:
             # nodes come and go
             cores = int(self._ray.cluster_resources().get('CPU', 1))
-            self._places, self._counted_at = AHEAD * max(1, cores), time.monotonic()
-        while self._waiting and len(self._running) < self._places:
-            task = self._waiting.popleft()
-            self._running[self._remote.remote(task.function, *task.arguments)] = task
+            self._most, self._counted_at = AHEAD * max(1, cores), time.monotonic()
+        return self._most
 
-    def _outcome(self, reference: Any, task: Task) -> tuple[Any] | None:
-        """Return a task's outcome, None where it is to be tried again."""
+    def _start(self, task: Task) -> Any:
+        return self._remote.remote(task.function, *task.arguments)
+
+    def _ended(self) -> list[tuple[Any, Any]]:
+        ready, _ = self._ray.wait(list(self._running), timeout=LOOK_S)
+        return [(handle, self._found(handle)) for handle in ready]
+
+    def _found(self, handle: Any) -> Any:
         errors = self._ray.exceptions
         try:
-            return (self._ray.get(reference),)
+            return self._ray.get(handle)
         except errors.RayTaskError as error:
-            return (_known(error.cause or error),)
+            return error.cause or error
         except errors.LocalRayletDiedError:
             raise
         except (errors.NodeDiedError, errors.ObjectLostError, errors.RaySystemError):
             return None
         except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
-            if self._node_was_lost():
-                return None
-            count = self._died[task.key] = self._died.get(task.key, 0) + 1
-            return (Died(count, one_line(error)),) if count >= self._attempts else None
+            return None if self._node_was_lost() else WorkerDiedError(one_line(error))
         except errors.RayError as error:
-            return (WorkerError(one_line(error)),)
+            return WorkerError(one_line(error))
 
     def _node_was_lost(self) -> bool:
         """Return whether a node of the cluster died since the last look."""
@@ -199,6 +235,13 @@ class RayEngine(Engine):
         return more
 
     def close(self) -> None:
-        """End the workers that were started here."""
-        if self._ours:
-            self._ray.shutdown()
+        """Leave the cluster."""
+        self._ray.shutdown()
+
+
+def _in_one_thread(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float, float]:
+    """Measure a task in this process, which must have one thread for numpy; raises WorkerError."""
+    import cv2
+    cv2.setNumThreads(1)
+    found: tuple[Any, float, float] = InlineWorker().call(measured, function, *arguments)
+    return found

@@ -1,7 +1,7 @@
-"""The second stage of a fleet: all clips of one camera -> one calibration.
+"""All clips of one camera -> its own result.
 
-ClipShare says what each clip gave. A clip that shows another camera (another device, a zoom,
-another mode of the sensor) is named and left out; it is never averaged.
+A clip that shows another camera (another device, a zoom, another mode of the sensor) is named and
+left out; it is never averaged.
 """
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ import numpy as np
 from dashcalib_ros.config import Config, VerdictConfig
 from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.input.scale import FULL_SIZE, Scale
+from dashcalib_ros.errors import counted
+from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved
 from dashcalib_ros.input.source import by
-from dashcalib_ros.judge import Calibration, Verdict
+from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.agreement import turns_of_another_camera
 from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import lacks_knowledge_only
@@ -24,110 +25,110 @@ from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.reconstruct.scene_file import Origin, SceneFile, StoredTurn
 from dashcalib_ros.solve import solve
+from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 
 # solutions at the most; each leaves out the clips that contradict the one before
 ROUNDS = 3
+# a clip whose own fx is farther off that of most, in sigmas and in shares of it, is of another
+# camera; on one real drive gentle bends differ by 3 % from the sharp turn
+OTHER_FOCAL, OTHER_FOCAL_SHARE = 4.0, 0.05
+
+Clips = Mapping[str, SceneFile]
 
 
 @dataclass(frozen=True)
-class Clip:
-    """A clip of the camera. gathered: its content is that of what was read, whatever it says."""
+class ClipTurn:
+    """A turn of one of the clips. stored: with an identity that is unique in the camera."""
 
-    name: str
-    gathered: SceneFile
-
-
-@dataclass(frozen=True)
-class Fused:
-    """A camera's calibration from its own clips.
-
-    shares: by clip. solution: None where no turn could be used; scale: of its pictures. sound:
-    nothing but a lack of knowledge speaks against it: a prior of its make may help.
-    """
-
-    calibration: Calibration
-    shares: Mapping[str, ClipShare]
-    solution: Solution | None
-    scale: Scale
-    sound: bool
+    clip: str
+    stored: StoredTurn
 
 
-def fuse(clips: Sequence[Clip], config: Config) -> Fused:
-    """Calibrate one camera from all its clips; the order of the clips does not count."""
-    clips = sorted(clips, key=lambda clip: (clip.name, clip.gathered.content))
+def fuse(camera: str, make: str, clips: Clips, config: Config) -> Solved:
+    """Calibrate one camera from all its clips, by name; their order does not count."""
+    clips = dict(sorted(clips.items()))
     left_out = _same_content(clips)
-    left_out.update(_other_sizes([clip for clip in clips if clip.name not in left_out]))
-    turns = _numbered([clip for clip in clips if clip.name not in left_out])
+    left_out.update(_other_origins(_without(clips, left_out)))
+    kept = _without(clips, left_out)
+    # all clips that are kept are alike
+    origin = next((clip.origin for clip in kept.values()), Origin((0, 0)))
+    turns = _numbered(kept)
     solution: Solution | None = None
-    scenes: list[Scene] = []
-    repeated: dict[TurnId, TurnId] = {}
     for further in reversed(range(ROUNDS)):
         scenes, repeated = _chosen(turns, left_out, config)
         solution = solve(scenes, config) if scenes else None
-        of_another = contradicting(solution, turns, _scale(clips, left_out).px, config.verdict)
+        own = shares_of(solution, turns, origin.scale.px)
+        of_another = contradicting(solution, turns, own, config.verdict)
         if not (of_another and further):
             break
         left_out.update(of_another)
-    kept = [clip for clip in clips if clip.name not in left_out]
-    calibration = _judged(solution, kept, [turns[scene.turn].stored for scene in scenes],
-                          left_out, config)
-    scale = _scale(clips, left_out)
-    shares = shares_of(solution, turns, scale.px)
-    for turn, other in sorted(repeated.items()):
-        shares.setdefault(turns[turn].clip, ClipShare(
-            left_out=f'shows the same pictures as {turns[other].clip}'))
+    kept = _without(clips, left_out)
+    evidence = _evidence(kept, origin, [turns[scene.turn].stored for scene in scenes], left_out)
+    calibration = replace(conclude(solution, evidence, config), input_name=camera)
+    if solution is None:
+        calibration = replace(calibration,
+                              verdict=Verdict('refused', (_nothing_found(kept),)))
+    shares = dict.fromkeys(clips, ClipShare())
+    shares.update({turns[turn].clip: ClipShare(
+        left_out=f'shows the same pictures as {turns[other].clip}')
+        for turn, other in sorted(repeated.items(), reverse=True)})
+    shares.update(own)
     shares.update({name: ClipShare(left_out=why) for name, why in left_out.items()})
-    return Fused(calibration, {clip.name: shares.get(clip.name, ClipShare()) for clip in clips},
-                 solution, scale,
-                 solution is not None and lacks_knowledge_only(solution, config.verdict))
+    return Solved(camera, make, calibration, _estimate(solution, origin, config), shares)
 
 
-def _scale(clips: Sequence[Clip], left_out: Mapping[str, str]) -> Scale:
-    """Return how the pictures of the clips that are left were resized: all alike."""
-    return next((clip.gathered.origin.scale for clip in clips if clip.name not in left_out),
-                FULL_SIZE)
+def _without(clips: Clips, left_out: Mapping[str, str]) -> Clips:
+    return {name: clip for name, clip in clips.items() if name not in left_out}
 
 
-def _same_content(clips: Sequence[Clip]) -> dict[str, str]:
+def _estimate(solution: Solution | None, origin: Origin, config: Config) -> Estimate | None:
+    """Return the camera in px of the input, also where it is refused; None without a solution."""
+    if solution is None:
+        return None
+    px = origin.scale.px
+    units = np.where(np.arange(len(solution.sigma)) < 4, px, 1.0)
+    units = np.outer(units, units)
+    return Estimate(
+        solution.camera.resized(px, origin.image_size), solution.covariance * units,
+        (solution.covariance - solution.known.covariance_between_turns) * units,
+        PictureSigma(solution.picture.rms * px, solution.picture.worst * px),
+        solution.reprojection_error_px * px, lacks_knowledge_only(solution, config.verdict))
+
+
+def _same_content(clips: Clips) -> dict[str, str]:
     """Return the clips with the same content as another, which count once."""
     first: dict[str, str] = {}
-    found = {}
-    for clip in clips:
-        other = first.setdefault(clip.gathered.content, clip.name)
-        if other != clip.name:
-            found[clip.name] = f'has the same content as {other}'
-    return found
+    return {name: f'has the same content as {first[clip.content]}'
+            for name, clip in clips.items()
+            if first.setdefault(clip.content, name) != name}
 
 
-def _other_sizes(clips: Sequence[Clip]) -> dict[str, str]:
+def _other_origins(clips: Clips) -> dict[str, str]:
     """Return the clips with another image size than most: a calibration holds for one.
 
     Pictures that were resized differently, with other settings, are of another size, too.
     """
     def weight(origin: Origin) -> tuple[int, int, int, str]:
-        turns = [len(clip.gathered.turns) for clip in clips if clip.gathered.origin == origin]
+        turns = [len(clip.turns) for clip in clips.values() if clip.origin == origin]
         # clips count before turns: one clip with many does not decide
         return sum(map(bool, turns)), sum(turns), len(turns), str(origin)
 
-    origins = {clip.gathered.origin for clip in clips}
-    if len(origins) < 2:
-        return {}
-    main = max(origins, key=weight)
-    return {clip.name: f'is {by(clip.gathered.origin.image_size)}, most of this camera are '
-                       f'{by(main.image_size)}'
-            if clip.gathered.origin.image_size != main.image_size else
+    main = max({clip.origin for clip in clips.values()}, key=weight, default=Origin((0, 0)))
+    return {name: f'is {by(clip.origin.image_size)}, most of this camera are '
+                  f'{by(main.image_size)}'
+            if clip.origin.image_size != main.image_size else
             'was gathered with other settings of max_width or min_width than most'
-            for clip in clips if clip.gathered.origin != main}
+            for name, clip in clips.items() if clip.origin != main}
 
 
-def _numbered(clips: Sequence[Clip]) -> dict[TurnId, ClipTurn]:
+def _numbered(clips: Clips) -> dict[TurnId, ClipTurn]:
     """Return every reconstructed turn, under an identity that is unique in the camera."""
     found: dict[TurnId, ClipTurn] = {}
-    for clip in clips:
-        for turn in clip.gathered.turns:
+    for name, clip in clips.items():
+        for turn in clip.turns:
             key = TurnId.stored(len(found))
-            found[key] = ClipTurn(clip.name, replace(turn, scene=replace(turn.scene, turn=key)))
+            found[key] = ClipTurn(name, replace(turn, scene=replace(turn.scene, turn=key)))
     return found
 
 
@@ -155,29 +156,24 @@ def _chosen(turns: Mapping[TurnId, ClipTurn], left_out: Mapping[str, str], confi
         repeated.update(more)
 
 
-def _judged(solution: Solution | None, clips: Sequence[Clip], stored: Sequence[StoredTurn],
-            left_out: Mapping[str, str], config: Config) -> Calibration:
-    warnings = tuple(f'the clip {name} was left out: it {why}'
-                     for name, why in sorted(left_out.items()))
-    first = clips[0].gathered if clips else None
-    evidence = Evidence(
-        image_size=first.origin.image_size if first else (0, 0),
-        frames=sum(clip.gathered.frames for clip in clips), turns=(), built={},
-        magnitudes=np.zeros((0, 2)), mask=None, scale=first.origin.scale if first else FULL_SIZE,
-        timing={}, warnings=warnings, stored=tuple(stored),
+def _evidence(clips: Clips, origin: Origin, stored: Sequence[StoredTurn],
+              left_out: Mapping[str, str]) -> Evidence:
+    """Return what the judge needs beside the solution: of clips, only their turns are left."""
+    return Evidence(
+        image_size=origin.image_size, scale=origin.scale,
+        frames=sum(clip.frames for clip in clips.values()), stored=tuple(stored),
+        warnings=tuple(f'the clip {name} was left out: it {why}'
+                       for name, why in sorted(left_out.items())),
+        turns=(), built={}, magnitudes=np.zeros((0, 2)), mask=None, timing={},
         straights=StraightCollector().straights())  # none are gathered: the turns' paths tell
-    calibration = conclude(solution, evidence, config)
-    if solution is None:
-        return replace(calibration, verdict=Verdict('refused', (_nothing_found(clips),)))
-    return calibration
 
 
-def _nothing_found(clips: Sequence[Clip]) -> str:
+def _nothing_found(clips: Clips) -> str:
     if not clips:
         return 'none of its clips could be read'
-    turns = sum(clip.gathered.found for clip in clips)
-    scenes = sum(len(clip.gathered.turns) for clip in clips)
-    what = f'{len(clips)} clip{"s" * (len(clips) > 1)}'
+    turns = sum(clip.found for clip in clips.values())
+    scenes = sum(len(clip.turns) for clip in clips.values())
+    what = counted(len(clips), 'clip')
     if not turns:
         return f'no turn was found in {what}: more clips with turns are needed'
     if not scenes:
@@ -185,35 +181,8 @@ def _nothing_found(clips: Sequence[Clip]) -> str:
     return f'no common camera explains the {scenes} turns of {what}'
 
 
-# a clip whose own fx is farther off that of most, in sigmas and in shares of it, is of another
-# camera; on one real drive gentle bends differ by 3 % from the sharp turn
-OTHER_FOCAL, OTHER_FOCAL_SHARE = 4.0, 0.05
-
-
-@dataclass(frozen=True)
-class ClipShare:
-    """What a clip gave to its camera's calibration.
-
-    used: turns in the adjustment. left_out: why none is, '' otherwise. fx, fx_sigma: what its
-    turns alone say, in px of the input, linearised at the camera's solution; None where unknown.
-    """
-
-    used: int = 0
-    left_out: str = ''
-    fx: float | None = None
-    fx_sigma: float | None = None
-
-
-@dataclass(frozen=True)
-class ClipTurn:
-    """A turn of one of the clips. stored: with an identity that is unique in the camera."""
-
-    clip: str
-    stored: StoredTurn
-
-
-def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn], px: float,
-                  config: VerdictConfig) -> dict[str, str]:
+def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn],
+                  shares: Mapping[str, ClipShare], config: VerdictConfig) -> dict[str, str]:
     """Return the clips, less than half of all, that are of another camera, and why.
 
     Two things tell: the cost of a clip's turns, and what fx they alone would have.
@@ -227,7 +196,7 @@ def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn], p
              for clip, count in sorted(against.items()) if 2 * count >= used[clip]
              for worst in [max(solution.misfits[key] for key in of_another
                                if turns[key].clip == clip)]}
-    found.update(_other_focal(shares_of(solution, turns, px)))
+    found.update(_other_focal(shares))
     # where half of them differ, nobody knows which are right: the verdict is weak, and says so
     return found if 2 * len(found) < len(used) else {}
 

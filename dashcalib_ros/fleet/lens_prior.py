@@ -17,11 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import FleetConfig
+from dashcalib_ros.input.source import by
 
 # steps of EM, and how often units are thrown out and taken back
 STEPS, ROUNDS = 200, 10
@@ -78,7 +81,7 @@ class LensPrior:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class OfMake:
     """A unit's prior; None with the reason, which may be that it is in another mode."""
 
     prior: LensPrior | None
@@ -86,25 +89,18 @@ class Verdict:
     other_mode: bool = False
 
 
-def priors(units: Sequence[Unit], config: FleetConfig) -> dict[str, Verdict]:
+def priors(units: Sequence[Unit], config: FleetConfig) -> dict[str, OfMake]:
     """Return each unit's prior, from the other units of its make."""
-    makes: dict[tuple[str, ...], list[Unit]] = {}
-    for unit in sorted(units, key=lambda unit: unit.name):
-        makes.setdefault(unit.make, []).append(unit)
-    found: dict[str, Verdict] = {}
-    for of_make in makes.values():
-        found.update(_priors_of_make(of_make, config))
-    return found
-
-
-def _priors_of_make(units: Sequence[Unit], config: FleetConfig) -> dict[str, Verdict]:
-    found: dict[str, Verdict] = {}
-    folds = min(len(units), FOLDS)
-    for fold in range(folds):
-        others = [unit for n, unit in enumerate(units) if n % folds != fold]
-        prior = lens_prior(others, config)
-        for unit in units[fold::folds]:
-            found[unit.name] = _verdict(unit, prior, len(others), config)
+    found: dict[str, OfMake] = {}
+    ordered = sorted(units, key=lambda unit: (unit.make, unit.name))
+    for _, group in groupby(ordered, key=lambda unit: unit.make):
+        of_make = list(group)
+        folds = min(len(of_make), FOLDS)
+        for fold in range(folds):
+            others = [unit for n, unit in enumerate(of_make) if n % folds != fold]
+            prior = lens_prior(others, config)
+            for unit in of_make[fold::folds]:
+                found[unit.name] = _of_make(unit, prior, len(others), config)
     return found
 
 
@@ -118,18 +114,18 @@ def focal_length(curvature: Floats) -> Floats:
     return np.asarray(1 / np.sqrt(-2 * np.asarray(curvature)))
 
 
-def _verdict(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> Verdict:
+def _of_make(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> OfMake:
     if prior is None:
-        return Verdict(None, f'of its make there are {others} other usable cameras, '
+        return OfMake(None, f'of its make there are {others} other usable cameras, '
                              f'{config.least_units} that agree are needed')
     if off_by(unit, prior) > config.other_mode:
         percent = 100 * (focal_length(unit.lens[0]) / focal_length(prior.mean[0]) - 1)
-        return Verdict(None, f'its fx is {percent:+.1f} % off that of its make, or its distortion '
+        return OfMake(None, f'its fx is {percent:+.1f} % off that of its make, or its distortion '
                              f'is another: another mode of the sensor, or another device', True)
     if odds_of_mode(unit, prior) < LEAST_ODDS:
-        return Verdict(None, 'its own turns know too little to tell whether its sensor is in the '
+        return OfMake(None, 'its own turns know too little to tell whether its sensor is in the '
                              'mode of its make')
-    return Verdict(prior)
+    return OfMake(prior)
 
 
 def odds_of_mode(unit: Unit, prior: LensPrior) -> float:
@@ -216,3 +212,53 @@ def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:
         if change < SETTLED:
             break
     return LensPrior(mean, between + of_mean, count, excess)
+
+
+def unit_of(name: str, make: str, camera: Camera, covariance: Floats, one_turn: bool) -> Unit:
+    """Return what a camera, with its covariance (n, n), tells of its make."""
+    values, slopes = _in_curvatures(camera)
+    which = _lens_places(len(values))
+    spread = (covariance * np.outer(slopes, slopes))[np.ix_(which, which)]
+    return Unit(name, (make, by(camera.image_size), camera.model), values[which], spread, one_turn)
+
+
+def conditioned(camera: Camera, covariance: Floats, prior: LensPrior) -> tuple[Camera, Floats]:
+    """Return the camera and its covariance (n, n) after the prior.
+
+    Estimate and prior are normal distributions, the estimate linearised at the unit's own
+    solution: one step of conditioning.
+    """
+    values, slopes = _in_curvatures(camera)
+    spread = covariance * np.outer(slopes, slopes)
+    which = _lens_places(len(values))
+    gain = spread[:, which] @ np.linalg.inv(spread[np.ix_(which, which)] + prior.covariance)
+    values = values + gain @ (prior.mean - values[which])
+    keep = np.eye(len(values))
+    keep[:, which] -= gain
+    # Joseph's form stays positive
+    spread = keep @ spread @ keep.T + gain @ prior.covariance @ gain.T
+    params = values * _scales(camera)
+    params[:2] = focal_length(values[:2]) * camera.image_size[0]
+    moved = camera.with_params(params)
+    _, back = _in_curvatures(moved)
+    return moved, spread / np.outer(back, back)
+
+
+def _in_curvatures(camera: Camera) -> tuple[Floats, Floats]:
+    """Return (n,) the curvatures, cx/w, cy/w and the coefficients, and (n,) their derivatives.
+
+    Each is that by the camera's own parameter.
+    """
+    values, slopes = camera.params / _scales(camera), 1 / _scales(camera)
+    values[:2] = curvature(values[:2])
+    slopes[:2] = camera.image_size[0]**2 / camera.params[:2]**3
+    return values, slopes
+
+
+def _scales(camera: Camera) -> Floats:
+    return np.where(np.arange(len(camera.params)) < 4, float(camera.image_size[0]), 1.0)
+
+
+def _lens_places(count: int) -> list[int]:
+    """Return the places of what units of a model share: the focal length, the distortion."""
+    return [0, *range(4, count)]

@@ -4,10 +4,10 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 import posixpath
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
@@ -23,7 +23,6 @@ from dashcalib_ros.reconstruct.scene_file import SUFFIX as GATHERED
 # bytes of a manifest: ten million rows
 LARGEST = 2**31
 COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time')
-KNOWN_SUFFIXES = ('.csv', '.jsonl', '.ndjson', '.parquet')
 
 
 @dataclass(frozen=True)
@@ -58,30 +57,31 @@ def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
     its first group, or all that it matches; its group `make`, too. Raises InputError where the
     manifest cannot be read at all; what is wrong with a row stands in the row.
     """
-    pattern = _pattern(group_by)
-    suffix = next((each for each in KNOWN_SUFFIXES if place.lower().endswith(each)), '')
-    if suffix and not storage.is_folder(place):
-        folder = storage.parent(place)
-        rows = [_row(number, values, folder) for number, values in _table(place, suffix)]
-    else:
-        rows = [Row(number, found, found) for number, found in enumerate(_found(place), 1)]
-    if not rows:
-        raise InputError(f'{place} names no clip; give a CSV with a column clip, a folder or a '
-                         f'glob')
-    return [_grouped(row, pattern) for row in rows]
-
-
-def _pattern(group_by: str | None) -> re.Pattern[str] | None:
     try:
-        return None if group_by is None else re.compile(group_by)
+        pattern = None if group_by is None else re.compile(group_by)
     except re.error as error:
         raise ConfigError(f'--group-by {shortened(group_by or "")} is no regular expression '
                           f'({error})') from error
+    reader = next((each for suffix, each in READERS.items() if place.lower().endswith(suffix)),
+                  None)
+    if reader is None or storage.is_folder(place):
+        rows = [Row(number, found, found) for number, found in enumerate(_found(place), 1)]
+    else:
+        data = storage.read(place, LARGEST)
+        if data is None:
+            raise InputError(f'there is no manifest {place}; check the path')
+        folder = posixpath.dirname(place)
+        rows = [_row(number, values, folder)
+                for number, values in enumerate(reader(place, data), 1)]
+    if not rows:
+        raise InputError(f'{place} names no clip; give a CSV with a column clip, a folder or a '
+                         f'glob')
+    return rows if pattern is None else [_grouped(row, pattern) for row in rows]
 
 
 def _found(place: str) -> list[str]:
     """Return what lies in a folder, or what a glob finds."""
-    if any(sign in place for sign in '*?['):
+    if storage.is_pattern(place):
         return storage.listed(place)
     if not storage.is_folder(place):
         if storage.stamp(place) is None:
@@ -100,53 +100,43 @@ def _may_be_a_clip(name: str) -> bool:
     return suffix in (*VIDEO_SUFFIXES, GATHERED) or is_bag_file(name) or storage.is_folder(name)
 
 
-def _table(place: str, suffix: str) -> Iterator[tuple[int, Mapping[str, Any] | str]]:
-    """Yield each row's number and its values, or why there are none."""
-    data = storage.read(place, LARGEST)
-    if data is None:
-        raise InputError(f'there is no manifest {place}; check the path')
-    if suffix == '.parquet':
-        yield from _parquet(place, data)
-        return
-    try:
-        text = data.decode('utf-8-sig')
-    except UnicodeDecodeError as error:
-        line = data[:error.start].count(b'\n') + 1
-        raise InputError(f'{place} is not UTF-8 (line {line}); save it as UTF-8') from error
-    yield from (_csv if suffix == '.csv' else _json_lines)(place, text)
+# of a row, or why there are none
+Values = Mapping[str, Any] | str
 
 
-def _csv(place: str, text: str) -> Iterator[tuple[int, Mapping[str, Any] | str]]:
-    reader = csv.reader(io.StringIO(text.replace('\0', ''), newline=''))
+def _csv(place: str, data: bytes) -> Iterator[Values]:
+    reader = csv.reader(io.StringIO(_text_of(place, data).replace('\0', ''), newline=''))
     try:
         head = [name.strip().lower() for name in next(reader, [])]
         if 'clip' not in head:
             raise InputError(f'{place} has no column clip; its first line must name the columns: '
                              f'{", ".join(COLUMNS)}')
-        number = 0
         for values in reader:
-            if not any(value.strip() for value in values):
-                continue
-            number += 1
-            if len(values) > len(head):
-                yield number, f'has {len(values)} values for {len(head)} columns'
-            else:
-                yield number, dict(zip(head, values, strict=False))
+            if any(map(str.strip, values)):
+                yield (dict(zip(head, values, strict=False)) if len(values) <= len(head) else
+                       f'has {len(values)} values for {len(head)} columns')
     except csv.Error as error:
         raise InputError(f'{place} is no CSV (line {reader.line_num}: {error})') from error
 
 
-def _json_lines(place: str, text: str) -> Iterator[tuple[int, Mapping[str, Any] | str]]:
-    for number, line in enumerate(filter(str.strip, text.split('\n')), 1):
+def _json_lines(place: str, data: bytes) -> Iterator[Values]:
+    for line in filter(str.strip, _text_of(place, data).split('\n')):
         try:
             values = json.loads(line)
+            yield values if isinstance(values, dict) else 'is no JSON object'
         except (ValueError, RecursionError) as error:
-            yield number, f'is no JSON ({one_line(error, 80)})'
-            continue
-        yield number, values if isinstance(values, dict) else 'is no JSON object'
+            yield f'is no JSON ({one_line(error, 80)})'
 
 
-def _parquet(place: str, data: bytes) -> Iterator[tuple[int, Mapping[str, Any]]]:
+def _text_of(place: str, data: bytes) -> str:
+    try:
+        return data.decode('utf-8-sig')
+    except UnicodeDecodeError as error:
+        line = data[:error.start].count(b'\n') + 1
+        raise InputError(f'{place} is not UTF-8 (line {line}); save it as UTF-8') from error
+
+
+def _parquet(place: str, data: bytes) -> Iterator[Values]:
     needs('pyarrow', 'Parquet manifests')
     import pyarrow as arrow
     from pyarrow import parquet
@@ -156,47 +146,36 @@ def _parquet(place: str, data: bytes) -> Iterator[tuple[int, Mapping[str, Any]]]
         raise InputError(f'{place} is no Parquet file ({one_line(error)})') from error
     if 'clip' not in table.column_names:
         raise InputError(f'{place} has no column clip; the columns may be {", ".join(COLUMNS)}')
-    kept = table.select([name for name in COLUMNS if name in table.column_names])
-    yield from enumerate(kept.to_pylist(), 1)
+    yield from table.select([name for name in COLUMNS if name in table.column_names]).to_pylist()
 
 
-def _row(number: int, values: Mapping[str, Any] | str, folder: str) -> Row:
+READERS: dict[str, Callable[[str, bytes], Iterator[Values]]] = {
+    '.csv': _csv, '.jsonl': _json_lines, '.ndjson': _json_lines, '.parquet': _parquet}
+
+
+def _row(number: int, values: Values, folder: str) -> Row:
     if isinstance(values, str):
         return Row(number, '', '', problem=values)
-    clip, camera, make, topic = (_text(values, name)
-                                 for name in ('clip', 'camera', 'make', 'topic'))
+    clip, camera, make, fps, topic, time = (
+        '' if values.get(name) is None else str(values[name]).strip() for name in COLUMNS)
     if not clip:
         return Row(number, '', '', camera, make, problem='names no clip')
     row = Row(number, clip, storage.joined(folder, clip), camera, make, topic=topic or None)
     try:
-        return replace(row, fps=_rate(values), time_s=_time(values))
+        return replace(row, fps=_rate(fps) if fps else None, time_s=_time(time) if time else None)
     except ValueError as error:
         return replace(row, problem=str(error))
 
 
-def _text(values: Mapping[str, Any], name: str) -> str:
-    value = values.get(name)
-    return '' if value is None else str(value).strip()
+def _rate(text: str) -> float:
+    with suppress(ValueError):
+        if 0 < float(text) <= 1000:
+            return float(text)
+    raise ValueError(f'fps must be above 0 and at most 1000, not {shortened(text, 40)}')
 
 
-def _rate(values: Mapping[str, Any]) -> float | None:
-    text = _text(values, 'fps')
-    if not text:
-        return None
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = math.nan
-    if not 0 < rate <= 1000:
-        raise ValueError(f'fps must be above 0 and at most 1000, not {shortened(text, 40)}')
-    return rate
-
-
-def _time(values: Mapping[str, Any]) -> float | None:
+def _time(text: str) -> float:
     """Return s since 1970 from a number or an ISO date; a date without a zone is UTC."""
-    text = _text(values, 'time')
-    if not text:
-        return None
     try:
         seconds = float(text)
     except ValueError:
@@ -205,17 +184,15 @@ def _time(values: Mapping[str, Any]) -> float | None:
         except ValueError:
             raise ValueError(f'time must be like 2026-01-31T12:00:00, or s since 1970, not '
                              f'{shortened(text, 40)}') from None
-        if date.tzinfo is None:
-            date = date.replace(tzinfo=timezone.utc)
-        seconds = date.timestamp()
+        seconds = (date if date.tzinfo else date.replace(tzinfo=timezone.utc)).timestamp()
     if not abs(seconds) <= LAST_S:
         raise ValueError('time must be a date before 2261')
     return seconds
 
 
-def _grouped(row: Row, pattern: re.Pattern[str] | None) -> Row:
+def _grouped(row: Row, pattern: re.Pattern[str]) -> Row:
     """Return the row with the camera, and the make, that its clip's name tells."""
-    if pattern is None or not row.clip:
+    if not row.clip:
         return row
     found = pattern.search(row.clip)
     if found is None:
@@ -225,15 +202,3 @@ def _grouped(row: Row, pattern: re.Pattern[str] | None) -> Row:
     camera = named.get('camera') or (found.group(1) if pattern.groups else found.group(0))
     return replace(row, camera=row.camera or camera or '',
                    make=row.make or named.get('make') or '')
-
-
-def by_camera(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the rows of each camera, cameras sorted by name, rows as they stand.
-
-    A clip whose camera is unknown is one of its own, and its name is the clip's. Rows that name
-    neither are under ''.
-    """
-    found: dict[str, list[Row]] = {}
-    for row in rows:
-        found.setdefault(row.camera or row.name, []).append(row)
-    return dict(sorted(found.items()))

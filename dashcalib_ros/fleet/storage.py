@@ -6,16 +6,16 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import importlib
 import os
 import posixpath
 import re
 import shutil
 import stat as stat_module
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -26,6 +26,11 @@ from dashcalib_ros.limits import CLIP_BYTES, CLIP_FILES, check_file, read_file
 from dashcalib_ros.whole_files import write_whole
 
 URL = re.compile(r'[a-z][a-z0-9+.-]+://')
+FULL = (errno.ENOSPC, errno.EDQUOT)
+# bytes of one of our own files
+LARGEST = 2**28
+# by which an object store tells that a file changed
+CHANGES = ('size', 'ETag', 'etag', 'mtime', 'created', 'LastModified', 'generation')
 
 
 def is_url(place: str) -> bool:
@@ -35,35 +40,25 @@ def is_url(place: str) -> bool:
 
 def joined(folder: str, name: str) -> str:
     """Return a name relative to a folder; a name that is a URL or absolute stands for itself."""
-    if is_url(name) or Path(name).is_absolute():
-        return name
-    return posixpath.join(folder, name) if is_url(folder) else str(Path(folder) / name)
+    return name if is_url(name) else posixpath.join(folder, name)
 
 
-def parent(place: str) -> str:
-    """Return the folder that a file is in."""
-    return posixpath.dirname(place) if is_url(place) else str(Path(place).parent)
+def is_pattern(place: str) -> bool:
+    """Return whether a place is a glob."""
+    return any(sign in place for sign in '*?[')
 
 
-def listed(pattern: str) -> list[str]:
+def listed(place: str) -> list[str]:
     """Return the files and folders that a folder has, or that a glob finds, sorted."""
-    if is_url(pattern):
-        system, path = _system(pattern)
-        scheme = pattern.partition('://')[0]
-        try:
-            found = (system.glob(path) if _is_glob(path) else system.ls(path, detail=False))
-        except Exception as error:  # each kind of store has errors of its own
-            raise InputError(f'cannot list {pattern} ({one_line(error)}); check the address and '
-                             f'your access to it') from error
+    if is_url(place):
+        system, path = _system(place)
+        scheme = place.partition('://')[0]
+        with _store_errors(f'list {place}'):
+            found = system.glob(path) if is_pattern(path) else system.ls(path, detail=False)
         return sorted(f'{scheme}://{name}' for name in found)
-    if _is_glob(pattern):
-        return sorted(map(str, named_like(pattern)))
-    return sorted(str(entry) for entry in Path(pattern).iterdir()
-                  if not entry.name.startswith('.'))
-
-
-def _is_glob(pattern: str) -> bool:
-    return any(sign in pattern for sign in '*?[')
+    if is_pattern(place):
+        return sorted(map(str, named_like(place)))
+    return sorted(str(entry) for entry in Path(place).iterdir() if not entry.name.startswith('.'))
 
 
 def is_folder(place: str) -> bool:
@@ -99,35 +94,31 @@ def clip_files(path: Path) -> list[tuple[Path, os.stat_result]]:
 def stamp(place: str) -> str | None:
     """Return a text that changes with a file, or with any file of a folder; None without one."""
     if is_url(place):
-        system, path = _system(place)
+        stamps = _stored_stamps(place)
+    else:
         try:
-            about = system.info(path)
-            entries = {'.': about} if about.get('type') != 'directory' else {
-                name.removeprefix(path): each
-                for name, each in system.find(path, maxdepth=2, detail=True).items()}
-        except FileNotFoundError:
+            # the time of change is also that of a file put in its place, whose others are older
+            stamps = [f'{os.path.relpath(file, place)}: {about.st_size} {about.st_mtime_ns} '
+                      f'{about.st_ctime_ns}' for file, about in clip_files(Path(place))]
+        except InputError as error:
+            return str(error)  # until it is something else
+        except (OSError, ValueError):
             return None
-        except Exception as error:
-            raise InputError(f'cannot read {place} ({one_line(error)})') from error
-        return _joined_stamps((name, ' '.join(
-            f'{each[key]}' for key in ('size', 'ETag', 'etag', 'mtime', 'created', 'LastModified',
-                                       'generation') if each.get(key) is not None))
-            for name, each in sorted(entries.items()))
-    here = Path(place)
-    try:
-        files = clip_files(here)
-    except InputError as error:
-        return str(error)  # until it is something else
-    except (OSError, ValueError):
-        return None
-    # the time of change is also that of a file put in its place, whose other times are older
-    return _joined_stamps((os.path.relpath(file, here), f'{about.st_size} {about.st_mtime_ns} '
-                           f'{about.st_ctime_ns}') for file, about in files)
+    text = '\n'.join(stamps)
+    return hashlib.sha256(os.fsencode(text)).hexdigest()[:32] if stamps else None
 
 
-def _joined_stamps(stamps: Iterable[tuple[str, str]]) -> str:
-    text = '\n'.join(f'{name}: {each}' for name, each in stamps)
-    return hashlib.sha256(os.fsencode(text)).hexdigest()[:32]
+def _stored_stamps(url: str) -> list[str]:
+    """Return what tells that a file of a store changed, or each of a folder; [] without one."""
+    system, path = _system(url)
+    entries: dict[str, Any] = {}
+    with _store_errors(f'read {url}'), suppress(FileNotFoundError):
+        about = system.info(path)
+        entries = {'.': about} if about.get('type') != 'directory' else {
+            name.removeprefix(path): each
+            for name, each in system.find(path, maxdepth=2, detail=True).items()}
+    return [f'{name}: ' + ' '.join(f'{each[key]}' for key in CHANGES if each.get(key) is not None)
+            for name, each in sorted(entries.items())]
 
 
 @contextmanager
@@ -143,80 +134,62 @@ def local_copy(place: str) -> Iterator[Path]:
     scratch = Path(tempfile.mkdtemp(prefix='dashcalib-'))
     try:
         copy = scratch / posixpath.basename(path.rstrip('/'))
-        try:
+        with _store_errors(f'copy {place}'):
             system.get(path, str(copy), recursive=system.isdir(path))
-        except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            raise InputError(f'cannot copy {place} ({one_line(error)})') from error
-        except Exception as error:
-            raise InputError(f'cannot copy {place} ({one_line(error)})') from error
         yield copy
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def read(place: str, limit: int) -> bytes | None:
+def read(place: str, limit: int = LARGEST) -> bytes | None:
     """Return a file's bytes, None where there is none; raises InputError beyond the limit."""
-    try:
-        if is_url(place):
-            system, path = _system(place)
-            data = bytes(system.cat_file(path, start=0, end=limit + 1))
-        else:
-            return read_file(Path(place), limit) if Path(place).exists() else None
-    except FileNotFoundError:
-        return None
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f'cannot read {place} ({one_line(error)})') from error
-    if len(data) > limit:
+    if not is_url(place):
+        return read_file(Path(place), limit) if Path(place).exists() else None
+    system, path = _system(place)
+    data = None
+    with _store_errors(f'read {place}'), suppress(FileNotFoundError):
+        data = bytes(system.cat_file(path, start=0, end=limit + 1))
+    if data is not None and len(data) > limit:
         raise InputError(f'{place} is larger than {limit / 2**20:.0f} MB: is it the right file?')
     return data
 
 
-@dataclass(frozen=True)
-class Folder:
-    """An output folder: its files appear whole or not at all. place: a path or a URL."""
-
-    place: str
-
-    def read(self, name: str, limit: int = 2**28) -> bytes | None:
-        """Return a file's bytes, None where there is none; raises InputError."""
-        return read(joined(self.place, name), limit)
-
-    def exists(self, name: str) -> bool:
-        """Return whether there is such a file."""
-        if is_url(self.place):
-            system, path = _system(joined(self.place, name))
-            return bool(system.exists(path))
-        return (Path(self.place) / name).is_file()
-
-    def write(self, name: str, data: bytes) -> None:
-        """Write a file: others see all of it or nothing. Raises OutputError."""
-        place = joined(self.place, name)
-        try:
-            if is_url(place):
-                system, path = _system(place)
-                system.pipe_file(path, data)  # object stores show complete objects only
-            else:
-                Path(place).parent.mkdir(parents=True, exist_ok=True)
-                write_whole(Path(place), data)
-        except OSError as error:
-            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-            raise OutputError(
-                f'cannot write {place}: {error.strerror or one_line(error)}; '
-                + ('free some space, and start again: what is done stays' if full
-                   else 'choose an output folder you may write to')) from error
-
-    def remove(self, name: str) -> None:
-        """Remove a file, if there is one."""
-        if is_url(self.place):
-            system, path = _system(joined(self.place, name))
-            with suppress(FileNotFoundError):
-                system.rm_file(path)
+def write(place: str, data: bytes) -> None:
+    """Write a file: others see all of it or nothing. Raises OutputError."""
+    try:
+        if is_url(place):
+            system, path = _system(place)
+            system.pipe_file(path, data)  # object stores show complete objects only
         else:
-            (Path(self.place) / name).unlink(missing_ok=True)
+            Path(place).parent.mkdir(parents=True, exist_ok=True)
+            write_whole(Path(place), data)
+    except OSError as error:
+        cure = ('free some space, and start again: what is done stays' if error.errno in FULL
+                else 'choose an output folder you may write to')
+        raise OutputError(f'cannot write {place}: {error.strerror or one_line(error)}; '
+                          f'{cure}') from error
+
+
+def remove(place: str) -> None:
+    """Remove a file, if there is one."""
+    with suppress(FileNotFoundError):
+        if is_url(place):
+            system, path = _system(place)
+            system.rm_file(path)
+        else:
+            Path(place).unlink()
+
+
+@contextmanager
+def _store_errors(what: str) -> Iterator[None]:
+    """Raise InputError for what stores raise, each errors of its own; OSError for a full disk."""
+    try:
+        yield
+    except Exception as error:
+        if getattr(error, 'errno', None) in FULL:
+            raise
+        raise InputError(f'cannot {what} ({one_line(error)}); check the address and your access '
+                         f'to it') from error
 
 
 def _system(url: str) -> tuple[Any, str]:
@@ -233,18 +206,12 @@ def _system(url: str) -> tuple[Any, str]:
 
 def needs(library: str, what: str) -> ModuleType:
     """Import a library of the extra; raises ConfigError that says how to install it."""
-    found = has(library)
-    if found is None:
+    if not has(library):
         raise ConfigError(f"{what} need {library}: install it with pip install "
                           f"'dashcalib_ros[fleet]'")
-    return found
+    return import_module(library)
 
 
-def has(library: str) -> ModuleType | None:
-    """Import a library of the extra, if it is installed."""
-    try:
-        return importlib.import_module(library)
-    except ModuleNotFoundError as error:
-        if error.name != library.partition('.')[0]:
-            raise
-        return None
+def has(library: str) -> bool:
+    """Return whether a library of the extra is installed."""
+    return find_spec(library) is not None

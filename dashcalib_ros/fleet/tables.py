@@ -7,113 +7,137 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from dashcalib_ros.camera import calibrated_models
-from dashcalib_ros.fleet.fuse import ClipShare
+from dashcalib_ros.fleet.clips import ClipResult, hash_of
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.solved import Final
-from dashcalib_ros.fleet.storage import Folder, has
-from dashcalib_ros.fleet.tasks import ClipResult, camera_folder
-from dashcalib_ros.judge.calibration import ANGLES, Mount
+from dashcalib_ros.fleet.solved import ClipShare, Final, Solved
+from dashcalib_ros.fleet.storage import has, joined, write
+from dashcalib_ros.judge.calibration import ANGLES
 from dashcalib_ros.reconstruct.scene_file import DATES_S
 from dashcalib_ros.report.result import plain_values
 
-CAMERAS, CLIPS = 'cameras', 'clips'
 PARAMETERS = tuple(dict.fromkeys(name for model in calibrated_models() for name in model.names()))
+MOUNT = (*ANGLES, 'height_m')
 YEAR_S = 365.25 * 86400
 # clips at different times from which a drift is told
 LEAST_CLIPS = 3
+# the end of a camera's folder whose name is not the camera's
+HASHED = re.compile(r'-[0-9a-f]{32}$')
+
+# each column's type
+CAMERA_COLUMNS = {
+    **dict.fromkeys(('camera', 'make', 'verdict', 'verdict_alone', 'model'), 'text'),
+    **dict.fromkeys(('width', 'height'), 'number'),
+    **dict.fromkeys(PARAMETERS, 'real'),
+    **{f'sigma_{name}': 'real' for name in PARAMETERS},
+    **{f'sigma_{name}_alone': 'real' for name in PARAMETERS},
+    **dict.fromkeys(('sigma_px', 'sigma_px_worst', 'readout_ms', 'reprojection_error_px'), 'real'),
+    'mount_verdict': 'text',
+    **{f'{of}mount_{name}': 'real' for name in MOUNT for of in ('', 'sigma_')},
+    **dict.fromkeys(('clips', 'clips_used', 'clips_left_out', 'clips_unreadable', 'turns',
+                     'turns_used'), 'number'),
+    'seconds': 'real', 'prior_units': 'number', 'prior_share': 'real', 'prior_note': 'text',
+    'other_mode': 'flag', 'drift_percent_per_year': 'real', 'drift_sigma': 'real',
+    'reasons': 'texts', 'warnings': 'texts', 'folder': 'text'}
+CLIP_COLUMNS = {
+    'row': 'number', **dict.fromkeys(('clip', 'camera', 'make', 'status', 'reason'), 'text'),
+    'width': 'number', 'height': 'number', 'frames': 'number', 'seconds': 'real',
+    **dict.fromkeys(('turns', 'scenes', 'turns_used'), 'number'),
+    **dict.fromkeys(('fx', 'fx_sigma', 'time'), 'real'), 'content': 'text', 'file': 'text',
+    'warnings': 'texts'}
 
 
-def camera_row(camera: str, make: str, final: Final | None, failure: str,
-               clips: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a camera's row. final: None where it failed; clips: the rows of its clips."""
-    c = None if final is None else final.calibration
+def camera_row(solved: Solved, final: Final, clips: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the row of a camera. clips: the rows of its clips."""
+    c, estimate = final.calibration, solved.estimate
+    row = {
+        **failed_row(solved.camera, solved.make, clips), 'verdict': c.verdict.level,
+        'verdict_alone': solved.calibration.verdict.level,
+        'width': c.image_size[0] or None, 'height': c.image_size[1] or None,
+        'reprojection_error_px': c.reprojection_error_px, 'prior_units': final.prior_units,
+        'prior_share': final.prior_share, 'prior_note': final.prior_note,
+        'other_mode': final.other_mode, 'reasons': list(c.verdict.reasons),
+        'warnings': list(c.warnings)}
+    if estimate is not None:
+        row.update({f'sigma_{name}_alone': sigma for name, sigma in estimate.sigma.items()})
+    if c.camera is not None and c.sigma is not None:
+        row.update({'model': c.camera.model, **c.camera.named})
+        row.update({f'sigma_{name}': sigma for name, sigma in c.sigma.items()})
+    if c.sigma_px is not None:
+        row.update({'sigma_px': c.sigma_px.rms, 'sigma_px_worst': c.sigma_px.worst})
+    if c.rolling_shutter is not None:
+        row['readout_ms'] = c.rolling_shutter.readout_ms
+    if c.mount is not None:
+        row['mount_verdict'] = c.mount.verdict
+        row.update({f'mount_{name}': getattr(c.mount, name) for name in MOUNT})
+        row.update({f'sigma_mount_{name}': c.mount.sigma[name] for name in MOUNT})
+    return row
+
+
+def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]], reason: str = ''
+               ) -> dict[str, Any]:
+    """Return the row of a camera without a result: what its clips tell, and why there is none."""
     drift, drift_sigma = _drift(clips)
-    named = {} if c is None or c.camera is None else c.camera.named
-    sigma = {} if c is None or c.sigma is None else c.sigma
-    alone = {} if final is None or final.sigma_alone is None else final.sigma_alone
-    shutter = None if c is None else c.rolling_shutter
-    picture = None if c is None else c.sigma_px
+    count = Counter(row['status'] for row in clips)
     return {
-        'camera': camera, 'make': make or None,
-        'verdict': 'refused' if c is None else c.verdict.level,
-        'verdict_alone': 'refused' if final is None else final.verdict_alone,
-        'model': None if c is None or c.camera is None else c.camera.model,
-        'width': None if c is None or not c.image_size[0] else c.image_size[0],
-        'height': None if c is None or not c.image_size[1] else c.image_size[1],
-        **{name: named.get(name) for name in PARAMETERS},
-        **{f'sigma_{name}': sigma.get(name) for name in PARAMETERS},
-        **{f'sigma_{name}_alone': alone.get(name) for name in PARAMETERS},
-        'sigma_px': None if picture is None else picture.rms,
-        'sigma_px_worst': None if picture is None else picture.worst,
-        'readout_ms': None if shutter is None else shutter.readout_ms,
-        'reprojection_error_px': None if c is None else c.reprojection_error_px,
-        **_mount(None if c is None else c.mount),
-        'clips': len(clips), **{f'clips_{name}': _count(clips, status) for name, status in (
-            ('used', 'used'), ('left_out', 'left out'), ('unreadable', 'unreadable'))},
-        'turns': sum(row['turns'] for row in clips),
+        **dict.fromkeys(CAMERA_COLUMNS), 'camera': camera, 'make': make or None,
+        'verdict': 'refused', 'verdict_alone': 'refused', 'clips': len(clips),
+        'clips_used': count['used'], 'clips_left_out': count['left out'],
+        'clips_unreadable': count['unreadable'], 'turns': sum(row['turns'] for row in clips),
         'turns_used': sum(row['turns_used'] for row in clips),
-        'seconds': float(sum(row['seconds'] for row in clips)),
-        'prior_units': 0 if final is None else final.prior_units,
-        'prior_share': 0.0 if final is None else final.prior_share,
-        'prior_note': '' if final is None else final.prior_note,
-        'other_mode': False if final is None else final.other_mode,
-        'drift_percent_per_year': drift, 'drift_sigma': drift_sigma,
-        'reasons': [failure] if c is None else list(c.verdict.reasons),
-        'warnings': [] if c is None else list(c.warnings), 'folder': camera_folder(camera)}
+        'seconds': float(sum(row['seconds'] for row in clips)), 'prior_units': 0,
+        'prior_share': 0.0, 'prior_note': '', 'other_mode': False,
+        'drift_percent_per_year': drift, 'drift_sigma': drift_sigma, 'reasons': [reason],
+        'warnings': [], 'folder': camera_folder(camera)}
 
 
-def _mount(mount: Mount | None) -> dict[str, Any]:
-    """Return how the camera sits on the car, by columns; None where that is not known."""
-    return {'mount_verdict': None if mount is None else mount.verdict, **{
-        name: value for key in (*ANGLES, 'height_m') for name, value in (
-            (f'mount_{key}', None if mount is None else getattr(mount, key)),
-            (f'sigma_mount_{key}', None if mount is None else mount.sigma[key]))}}
+def camera_folder(camera: str) -> str:
+    """Return the folder of a camera's files; different names never share one."""
+    plain = re.sub(r'[^A-Za-z0-9._-]+', '_', camera).strip('._')[:80]
+    if plain == camera and not HASHED.search(camera):
+        return f'cameras/{camera}'
+    return f'cameras/{plain}-{hash_of([camera])}'
 
 
-def clip_row(row: Row, camera: str, make: str, result: ClipResult, share: ClipShare | None
-             ) -> dict[str, Any]:
-    """Return a clip's row."""
-    size = result.image_size or (None, None)
-    used = share.used if share else 0
-    return {
-        'row': row.number, 'clip': row.clip, 'camera': camera, 'make': make or None,
-        **dict(zip(('status', 'reason'), _status(result, share), strict=True)),
-        'width': size[0], 'height': size[1], 'frames': result.frames, 'seconds': result.seconds,
-        'turns': result.turns, 'scenes': result.scenes, 'turns_used': used,
-        'fx': share.fx if share else None, 'fx_sigma': share.fx_sigma if share else None,
-        'time': _date(row, result),
-        'content': result.content or None, 'file': result.file or None,
-        'warnings': list(result.warnings)}
+def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
+              shares: Mapping[str, ClipShare]) -> list[dict[str, Any]]:
+    """Return the rows of a camera's clips. shares: by name; a clip named twice counts once."""
+    first: dict[str, int] = {}
+    found = []
+    for row, result in clips:
+        share = shares.get(row.name, ClipShare())
+        if result.file and first.setdefault(row.name, row.number) != row.number:
+            share = ClipShare(left_out=f'is the clip of row {first[row.name]} again')
+        status, reason = _status(result, share)
+        # videos count from 0, which is no date
+        time = next((time for time in (row.time_s, result.time)
+                     if time is not None and time > DATES_S), None)
+        found.append({
+            **vars(result), 'row': row.number, 'clip': row.clip, 'camera': camera,
+            'make': make or None, 'status': status, 'reason': reason, 'turns_used': share.used,
+            'fx': share.fx, 'fx_sigma': share.fx_sigma, 'time': time})
+    return found
 
 
-def _date(row: Row, result: ClipResult) -> float | None:
-    """Return when the clip was recorded; videos count from 0, which is no date."""
-    times = [time_s for time_s in (row.time_s, result.time_s) if time_s is not None]
-    return next((time_s for time_s in times if time_s > DATES_S), None)
-
-
-def _status(result: ClipResult, share: ClipShare | None) -> tuple[str, str]:
+def _status(result: ClipResult, share: ClipShare) -> tuple[str, str]:
     if not result.file:
         return 'unreadable', result.problem
-    if share is not None and share.left_out:
+    if share.left_out:
         return 'left out', share.left_out
-    if share is not None and share.used:
+    if share.used:
         return 'used', ''
     if not result.turns:
         return 'no turn', 'the car does not turn, or does not move'
     if not result.scenes:
         return 'no scene', f'none of its {result.turns} turns could be reconstructed'
     return 'not needed', 'other turns of the camera are used'
-
-
-def _count(clips: Sequence[Mapping[str, Any]], status: str) -> int:
-    return sum(row['status'] == status for row in clips)
 
 
 def _drift(clips: Sequence[Mapping[str, Any]]) -> tuple[float | None, float | None]:
@@ -136,56 +160,39 @@ def _drift(clips: Sequence[Mapping[str, Any]]) -> tuple[float | None, float | No
     return percent * slope, percent * float(np.sqrt(variance * max(scatter, 1.0)))
 
 
-def write_table(folder: Folder, name: str, rows: Sequence[Mapping[str, Any]],
-                schema: Mapping[str, str]) -> tuple[str, str]:
-    """Write a table, and as CSV, too; return the files' names. schema: each column's type."""
+def write_table(out: str, name: str, rows: Sequence[Mapping[str, Any]],
+                columns: Mapping[str, str]) -> tuple[str, ...]:
+    """Write a table into a folder, also as CSV; return the files' names. columns: their types."""
+    plain = [{key: _plain(row[key]) for key in columns} for row in rows]
     text = io.StringIO()
-    csv.writer(text, lineterminator='\n').writerows([schema, *(
-        ['; '.join(value) if isinstance(value, (list, tuple)) else value
-         for value in (_plain(row[key]) for key in schema)] for row in rows)])
-    folder.write(f'{name}.csv', text.getvalue().encode('utf-8', 'replace'))
-    return _write_typed(folder, name, rows, schema), f'{name}.csv'
+    csv.writer(text, lineterminator='\n').writerows([columns, *(
+        ['; '.join(value) if isinstance(value, list) else value for value in row.values()]
+        for row in plain)])
+    typed = {f'{name}.parquet': _parquet(plain, columns)} if has('pyarrow') else {
+        f'{name}.jsonl': ''.join(json.dumps(row, ensure_ascii=False) + '\n' for row in plain
+                                 ).encode()}
+    files = {**typed, f'{name}.csv': text.getvalue().encode()}
+    for file, data in files.items():
+        write(joined(out, file), data)
+    return tuple(files)
 
 
-def _write_typed(folder: Folder, name: str, rows: Sequence[Mapping[str, Any]],
-                 schema: Mapping[str, str]) -> str:
-    if has('pyarrow') is None:
-        text = ''.join(json.dumps(plain_values(row), ensure_ascii=False, allow_nan=False) + '\n'
-                       for row in rows)
-        folder.write(f'{name}.jsonl', text.encode('utf-8', 'replace'))
-        return f'{name}.jsonl'
+def _parquet(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> bytes:
     import pyarrow as arrow
     from pyarrow import parquet
     types = {'text': arrow.string(), 'real': arrow.float64(), 'number': arrow.int64(),
              'flag': arrow.bool_(), 'texts': arrow.list_(arrow.string())}
-    columns = {key: arrow.array([_plain(row[key]) for row in rows], types[kind])
-               for key, kind in schema.items()}
+    table = arrow.table({key: arrow.array([row[key] for row in rows], types[kind])
+                         for key, kind in columns.items()})
     data = io.BytesIO()
-    parquet.write_table(arrow.table(columns), data, compression='zstd')
-    folder.write(f'{name}.parquet', data.getvalue())
-    return f'{name}.parquet'
+    parquet.write_table(table, data, compression='zstd')
+    return data.getvalue()
 
 
 def _plain(value: Any) -> Any:
-    """Return a value that Parquet can hold: names of files may be no Unicode."""
+    """Return a value that all tables can hold: names of files may be no Unicode."""
     if isinstance(value, str):
         return value.encode('utf-8', 'replace').decode()
     if isinstance(value, (list, tuple)):
         return [_plain(each) for each in value]
-    return value if not isinstance(value, float) or np.isfinite(value) else None
-
-
-_WORDS = ('camera', 'make', 'verdict', 'verdict_alone', 'mount_verdict', 'model', 'prior_note',
-          'folder', 'clip', 'status', 'reason', 'content', 'file')
-_NUMBERS = ('width', 'height', 'clips', 'clips_used', 'clips_left_out', 'clips_unreadable',
-            'turns', 'turns_used', 'prior_units', 'row', 'frames', 'scenes')
-
-
-def _types(columns: Sequence[str]) -> dict[str, str]:
-    kinds = {**dict.fromkeys(_WORDS, 'text'), **dict.fromkeys(_NUMBERS, 'number'),
-             'other_mode': 'flag', 'reasons': 'texts', 'warnings': 'texts'}
-    return {name: kinds.get(name, 'real') for name in columns}
-
-
-CLIP_COLUMNS = _types(tuple(clip_row(Row(0, '', ''), '', '', ClipResult(''), None)))
-CAMERA_COLUMNS = _types(tuple(camera_row('', '', None, '', ())))
+    return plain_values(value)

@@ -29,7 +29,7 @@ from measure import commit, load, parser_with, save, table
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.fleet import lens_prior, solved
-from dashcalib_ros.fleet.fuse import Clip, fuse
+from dashcalib_ros.fleet.fuse import fuse
 
 # every result of the fleet, whoever made it
 TABLES = ('cameras.parquet', 'clips.parquet', 'overview.html')
@@ -160,17 +160,17 @@ def prior(work: Path, cache: Path, videos: int, seeds: Sequence[int]) -> list[di
     config = Config().replace({'intrinsics.profile_tracks': 60})
     found = []
     for seed in seeds:
-        units = [(lens, zoom, solved.solved_of(f'u{n:02}', 'model', fuse(
-            [Clip('bend', clip)], config))) for n, (lens, zoom, clip) in enumerate(bends(seed))]
+        units = [(lens, zoom, fuse(f'u{n:02}', 'model', {'bend': clip}, config))
+                 for n, (lens, zoom, clip) in enumerate(bends(seed))]
         known = [unit for _, _, result in units if (unit := solved.unit_of(result))]
         priors = lens_prior.priors(known, config.fleet)
         rows = []
         for lens, zoom, result in units:
             final = solved.final_of(result, priors.get(result.camera))
             row = {'zoom': zoom, 'prior': bool(final.prior_units), 'thrown': final.other_mode}
-            if result.estimate is not None and final.sigma_alone is not None:
+            if result.estimate is not None:
                 row['alone'] = result.estimate.camera.fx / lens.fx - 1
-                row['sigma_alone'] = final.sigma_alone['fx'] / lens.fx
+                row['sigma_alone'] = result.estimate.sigma['fx'] / lens.fx
             if final.prior_units and final.calibration.camera and final.calibration.sigma:
                 row['with'] = final.calibration.camera.fx / lens.fx - 1
                 row['sigma'] = final.calibration.sigma['fx'] / lens.fx

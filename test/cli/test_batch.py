@@ -56,8 +56,11 @@ def test_an_output_that_cannot_be_written(tmp_path, capsys):
     assert code == 2 and 'choose an output folder' in err
 
 
-def test_several_workers_without_ray(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(('options', 'expected'), [
+    (('--workers', '2'), 3), ((), 3), (('--address', 'auto'), 2)])
+def test_only_a_cluster_needs_ray(tmp_path, capsys, monkeypatch, options, expected):
     monkeypatch.setattr('dashcalib_ros.fleet.storage.has', lambda name: None)
     (tmp_path / 'm.csv').write_text('clip\na.avi\n')
-    code, _, err = run(capsys, tmp_path / 'm.csv', '--out', tmp_path / 'out', '--workers', '2')
-    assert code == 2 and "pip install 'dashcalib_ros[fleet]'" in err and '--workers 1' in err
+    code, _, err = run(capsys, tmp_path / 'm.csv', '--out', tmp_path / 'out', *options)
+    assert code == expected
+    assert ("pip install 'dashcalib_ros[fleet]'" in err) == (expected == 2)

@@ -12,10 +12,11 @@ from fleet_made import CONFIG, YAWS, Here, clip_of, lens_of, written
 from made_drives import drive, images, smooth, write_bag, write_video
 
 from dashcalib_ros.errors import ConfigError, OutputError
-from dashcalib_ros.fleet.batch import batch, problems, shard_of
-from dashcalib_ros.fleet.engine import Died, OneWorker, Task
+from dashcalib_ros.fleet.batch import batch, cameras_of, problems, shard_of
+from dashcalib_ros.fleet.engine import LocalEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
-from dashcalib_ros.fleet.tasks import camera_folder
+from dashcalib_ros.fleet.tables import camera_folder
+from dashcalib_ros.workers.worker import WorkerDiedError
 
 FEW = {'tracks': 60, 'keyframes': 7}
 FILES = ('cameras.parquet', 'cameras.csv', 'clips.parquet', 'clips.csv', 'overview.html')
@@ -42,10 +43,11 @@ class Counting(Here):
         self.done: list[str] = []
 
     def call(self, function, *arguments, progress=None):
-        result = super().call(function, *arguments)
-        if function.__name__ != 'publish_camera' and not result[-1].again:
-            self.done.append(function.__name__)
-        return result
+        found = super().call(function, *arguments)
+        task = arguments[0].__name__
+        if task != 'publish_camera' and not found[0].again:
+            self.done.append(task)
+        return found
 
 
 @pytest.fixture(scope='module')
@@ -69,9 +71,15 @@ def manifest(tmp_path_factory):
     return folder / 'm.csv'
 
 
+def calibrate(rows, out, worker=None, shard=None, **options):
+    """Return the cameras, and the files that tell of all."""
+    cameras = cameras_of(rows, shard or (1, 1))
+    engine = LocalEngine(3, [worker or Here()])
+    return cameras, batch(cameras, str(out), SETTINGS, engine, shard is None, **options)
+
+
 def run(manifest, out, worker=None, shard=None):
-    rows = read_manifest(str(manifest))
-    return batch(rows, str(out), SETTINGS, OneWorker(3, worker or Here()), shard)
+    return calibrate(read_manifest(str(manifest)), out, worker, shard)
 
 
 @pytest.fixture(scope='module')
@@ -86,7 +94,7 @@ def rows_of(path):
 
 
 def test_the_tables_tell_everything(reference):
-    out, fleet = reference
+    out, (found, _) = reference
     cameras = {row['camera']: row for row in rows_of(out / 'cameras.parquet')}
     clips = rows_of(out / 'clips.parquet')
     assert list(cameras) == [f'cam {n}' for n in range(6)]
@@ -114,8 +122,7 @@ def test_the_tables_tell_everything(reference):
         assert (folder / 'calibration.weak.yaml').exists()
     page = (out / 'overview.html').read_text()
     assert '6 cameras, 10 clips' in page and camera_folder('cam 1').split('/')[1] in page
-    assert not fleet.all_well
-    assert {row.clip for row, _ in problems(fleet)} == {'empty.mp4', 'gone.mp4'}
+    assert {row.clip for row, _ in problems(found)} == {'empty.mp4', 'gone.mp4'}
 
 
 def same(one, other):
@@ -144,7 +151,7 @@ def test_killed_at_any_time_it_does_only_what_is_missing(manifest, reference, tm
 
 def test_shards_and_a_merge_give_the_same_tables(manifest, reference, tmp_path):
     parts = [run(manifest, tmp_path, shard=(n, 3)) for n in (3, 1, 2)]
-    assert [len(part.cameras) for part in parts] == [2, 2, 2] and not parts[0].files
+    assert [len(cameras) for cameras, _ in parts] == [2, 2, 2] and not parts[0][1]
     worker = Counting()
     run(manifest, tmp_path, worker)
     assert worker.done == ['gather_clip'] and same(tmp_path, reference[0])
@@ -165,25 +172,25 @@ def test_next_months_clips_need_no_old_video(manifest, tmp_path):
     video = write_video(tmp_path / 'still.avi', smooth(), fps=10.0)
     row = Row(1, 'still.avi', str(video), 'cam')
     for _ in range(2):
-        fleet = batch([row], str(tmp_path / 'out'), SETTINGS, OneWorker(3, Here()))
-        assert not list(problems(fleet))
+        cameras, _ = calibrate([row], tmp_path / 'out')
+        assert not list(problems(cameras))
         video.unlink(missing_ok=True)
     # but another clip under its name is read
     video.write_bytes(b'')
-    fleet = batch([row], str(tmp_path / 'out'), SETTINGS, OneWorker(3, Here()))
-    assert 'empty' in next(problems(fleet))[1]
+    cameras, _ = calibrate([row], tmp_path / 'out')
+    assert 'empty' in next(problems(cameras))[1]
 
 
 def test_a_clip_that_kills_its_worker_is_set_aside(manifest, tmp_path):
-    class Deadly(OneWorker):
-        def _outcome(self, task: Task):
-            if task.key == ('clip', '2'):
-                return Died(3, 'the worker died')
-            return super()._outcome(task)
+    class Deadly(Here):
+        def call(self, function, *arguments, progress=None):
+            if getattr(arguments[1], 'number', None) == 2:
+                raise WorkerDiedError('the worker died')
+            return super().call(function, *arguments)
 
-    for engine in (Deadly(3, Here()), OneWorker(3, Here())):
-        fleet = batch(read_manifest(str(manifest)), str(tmp_path), SETTINGS, engine)
-        found = {row.number: why for row, why in problems(fleet)}
+    for worker in (Deadly(), Here()):
+        cameras, _ = run(manifest, tmp_path, worker)
+        found = {row.number: why for row, why in problems(cameras)}
         # the second time it is not even tried
         assert 'killed its worker 3 times' in found[2] and set(found) == {2, 8, 9}
     assert {row['camera']: row['verdict'] for row in rows_of(tmp_path / 'cameras.parquet')}[
@@ -200,8 +207,7 @@ def test_a_full_disk_is_told_of_each_clip_and_of_the_tables(manifest, tmp_path, 
     rows = read_manifest(str(manifest))
     told = []
     with pytest.raises(OutputError, match='free some space'):
-        batch(rows, str(tmp_path), SETTINGS, OneWorker(3, Here()),
-              tell=lambda camera, clip, effort: told.append(clip and clip.problem))
+        calibrate(rows, tmp_path, tell=lambda camera, clip: told.append(clip and clip.problem))
     assert sum('No space left' in (text or '') for text in told) >= 7
     monkeypatch.undo()
     assert not [path for path in tmp_path.rglob('*') if path.is_file()]
@@ -213,19 +219,17 @@ def test_ten_thousand_unreadable_clips(tmp_path):
     rows.append(Row(10_000, 'bad.avi', str(tmp_path / 'bad.avi')))
     for row in rows[:-1]:
         assert row.camera == ''
-    engine = OneWorker(3, Here())
     few = [Row(row.number, row.clip, row.place, 'cam') for row in rows]
-    fleet = batch(few, str(tmp_path / 'out'), SETTINGS, engine)
-    assert len(list(problems(fleet))) == 10_001
-    assert fleet.cameras[0].verdict == 'refused' and not fleet.all_well
+    cameras, _ = calibrate(few, tmp_path / 'out')
+    assert len(list(problems(cameras))) == 10_001
+    assert cameras[0].verdict == 'refused'
 
 
 def test_without_pyarrow_the_tables_are_json_lines(manifest, tmp_path, monkeypatch):
     monkeypatch.setattr('dashcalib_ros.fleet.tables.has', lambda name: None)
     row = Row(1, 'gone.mp4', str(tmp_path / 'gone.mp4'))
-    fleet = batch([row], str(tmp_path), SETTINGS, OneWorker(3, Here()))
-    assert fleet.files == ('cameras.jsonl', 'cameras.csv', 'clips.jsonl', 'clips.csv',
-                           'overview.html')
+    _, files = calibrate([row], tmp_path)
+    assert files == ('cameras.jsonl', 'cameras.csv', 'clips.jsonl', 'clips.csv', 'overview.html')
     line, = (tmp_path / 'clips.jsonl').read_text().splitlines()
     assert json.loads(line)['status'] == 'unreadable'
 
@@ -261,8 +265,8 @@ def test_a_hostile_clip_costs_its_row_only(tmp_path):
     bad += ['zero.npz', 'fifo.avi']
     rows = [Row(n, name, str(clips / name), 'cam')
             for n, name in enumerate(['0.npz', *bad, '1.npz'], 1)]
-    fleet = batch(rows, str(tmp_path / 'out'), SETTINGS, OneWorker(3, Here()))
-    assert [row.clip for row, _ in problems(fleet)] == bad
+    cameras, _ = calibrate(rows, tmp_path / 'out')
+    assert [row.clip for row, _ in problems(cameras)] == bad
     camera, = rows_of(tmp_path / 'out' / 'cameras.parquet')
     assert (camera['clips_used'], camera['clips_unreadable']) == (2, len(bad))
     assert not list(tmp_path.rglob('*escaped*'))
@@ -274,8 +278,8 @@ def test_another_topic_of_a_bag_is_another_clip(tmp_path):
     for camera in ('cam', ''):
         rows = [Row(n, 'bag', str(bag), camera, topic=topic)
                 for n, topic in enumerate(('/left', '/right', '/right'), 1)]
-        fleet = batch(rows, str(tmp_path / 'out'), SETTINGS, OneWorker(3, Here()))
-        assert len(fleet.cameras) == (1 if camera else 2) and not list(problems(fleet))
+        cameras, _ = calibrate(rows, tmp_path / 'out')
+        assert len(cameras) == (1 if camera else 2) and not list(problems(cameras))
         left, right, again = rows_of(tmp_path / 'out' / 'clips.parquet')
         assert [row['frames'] for row in (left, right)] == [12, 8]
         assert left['status'] == right['status'] == 'no turn'

@@ -1,6 +1,8 @@
 """Engines: every task has one outcome, whatever becomes of the workers."""
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,7 +10,8 @@ import fleet_tasks
 import pytest
 
 from dashcalib_ros.errors import ConfigError, InputError, WorkerError
-from dashcalib_ros.fleet.engine import Died, OneWorker, RayEngine, Task
+from dashcalib_ros.fleet.engine import DiedError, LocalEngine, RayEngine, Task
+from dashcalib_ros.workers.child import ChildWorker
 
 
 def outcomes_of(engine, tmp_path):
@@ -18,15 +21,15 @@ def outcomes_of(engine, tmp_path):
              'once': (fleet_tasks.die_until, (str(tmp_path / 'once'), 1)),
              'always': (fleet_tasks.die_until, (str(tmp_path / 'always'), 99))}
     for name, (function, arguments) in tasks.items():
-        engine.submit(Task(('first', name), function, arguments))
+        engine.submit(Task(function, arguments, name))
     found = {}
     try:
-        for (kind, name), outcome in engine.outcomes():
+        for name, outcome in engine.outcomes():
             assert name not in found
             found[name] = outcome
             if name == 'a':
                 # a task may follow from an outcome
-                engine.submit(Task((kind, 'later'), fleet_tasks.double, (21,)), first=True)
+                engine.submit(Task(fleet_tasks.double, (21,), 'later'), first=True)
     finally:
         engine.close()
     return found
@@ -37,18 +40,28 @@ def check(found, tmp_path):
     assert isinstance(found['b'], InputError) and str(found['b']) == 'no clip'
     assert isinstance(found['c'], WorkerError) and 'ZeroDivisionError' in str(found['c'])
     assert found['once'] == 2
-    assert isinstance(found['always'], Died) and found['always'].attempts == 3
-    assert found['always'].reason
+    assert isinstance(found['always'], DiedError)
+    assert 'killed its worker 3 times: ' in str(found['always'])
     assert Path(tmp_path / 'always').read_text() == '3'
 
 
-def test_one_worker(tmp_path):
-    check(outcomes_of(OneWorker(3), tmp_path), tmp_path)
+@pytest.mark.parametrize('count', [1, 3])
+def test_child_processes(tmp_path, count):
+    engine = LocalEngine(3, [ChildWorker() for _ in range(count)])
+    check(outcomes_of(engine, tmp_path), tmp_path)
+    assert engine.cpu_s['double'] > 0 and engine.peak_mb > 10
 
 
-def test_ray(tmp_path):
-    pytest.importorskip('ray')
-    check(outcomes_of(RayEngine(3, 100, workers=2), tmp_path), tmp_path)
+def test_ray(tmp_path, monkeypatch):
+    cluster_utils = pytest.importorskip('ray.cluster_utils')
+    # as an installed package is there for the cluster's workers
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(sys.path))
+    cluster = cluster_utils.Cluster(initialize_head=True, head_node_args={
+        'num_cpus': 2, 'include_dashboard': False})
+    try:
+        check(outcomes_of(RayEngine(3, 100, cluster.address), tmp_path), tmp_path)
+    finally:
+        cluster.shutdown()
 
 
 def test_ray_that_has_ended_is_one_line(monkeypatch):
@@ -60,18 +73,26 @@ def test_ray_that_has_ended_is_one_line(monkeypatch):
 
     remote = SimpleNamespace(remote=lambda *arguments: 'reference')
     for name, value in {
-            'is_initialized': lambda: True, 'remote': lambda **options: lambda function: remote,
+            'init': lambda *where, **options: None,
+            'remote': lambda **options: lambda function: remote,
             'cluster_resources': dict, 'wait': lambda found, timeout: (found, []),
             'get': dead}.items():
         monkeypatch.setattr(ray, name, value)
-    engine = RayEngine(3, 100, workers=1)
-    engine.submit(Task(('clip', '1'), fleet_tasks.double, (1,)))
+    engine = RayEngine(3, 100, 'auto')
+    engine.submit(Task(fleet_tasks.double, (1,), 'a'))
     with pytest.raises(WorkerError, match='start the command again') as caught:
         list(engine.outcomes())
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_several_workers_say_which_extra_they_need(monkeypatch):
+def test_a_cluster_says_which_extra_it_needs(monkeypatch):
     monkeypatch.setattr('dashcalib_ros.fleet.storage.has', lambda name: None)
-    with pytest.raises(ConfigError, match=r'several workers .* need ray: .*\[fleet\]'):
-        RayEngine(3, 100, workers=2)
+    with pytest.raises(ConfigError, match=r'clusters .* need ray: .*\[fleet\]'):
+        RayEngine(3, 100, 'auto')
+
+
+def test_no_cluster_is_one_line():
+    pytest.importorskip('ray')
+    with pytest.raises(WorkerError, match='no Ray cluster at auto') as caught:
+        RayEngine(3, 100, 'auto')
+    assert len(str(caught.value).splitlines()) == 1

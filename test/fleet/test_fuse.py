@@ -9,21 +9,21 @@ from fleet_made import CONFIG, YAWS, clip_of, lens_of
 from synthetic import LENS
 
 from dashcalib_ros.fleet import solved
-from dashcalib_ros.fleet.fuse import Clip, fuse
+from dashcalib_ros.fleet.fuse import fuse
 from dashcalib_ros.reconstruct.scene_file import Origin
 
 FEW = {'tracks': 80, 'keyframes': 8}
-CLIPS = [Clip(f'{n}.mp4', clip_of(yaws=YAWS[n:n + 1], world=n, **FEW)) for n in range(4)]
+CLIPS = {f'{n}.mp4': clip_of(yaws=YAWS[n:n + 1], world=n, **FEW) for n in range(4)}
 
 
 @pytest.fixture(scope='module')
 def fused():
     """Four good clips, one twice, one zoomed, one of another size, one without turns."""
     smaller = replace(clip_of(yaws=(), world=70), origin=Origin((640, 480)))
-    odd = [Clip('again.mp4', CLIPS[0].gathered), Clip('small.mp4', smaller),
-           Clip('straight.mp4', clip_of(yaws=(), world=60)),
-           Clip('zoomed.mp4', clip_of(lens_of(1.2), YAWS[4:5], world=40, **FEW))]
-    return fuse([*odd, *CLIPS[::-1]], CONFIG)
+    odd = {'again.mp4': CLIPS['0.mp4'], 'small.mp4': smaller,
+           'straight.mp4': clip_of(yaws=(), world=60),
+           'zoomed.mp4': clip_of(lens_of(1.2), YAWS[4:5], world=40, **FEW)}
+    return fuse('cam', 'acme', odd | CLIPS, CONFIG)
 
 
 def test_what_contradicts_is_named_and_left_out(fused):
@@ -37,42 +37,47 @@ def test_what_contradicts_is_named_and_left_out(fused):
     assert all(name in warnings for name in ('again.mp4', 'small.mp4', 'zoomed.mp4'))
 
 
+def first_two():
+    return dict(list(CLIPS.items())[:2])
+
+
 def test_one_clip_with_many_turns_does_not_decide_the_size():
     many = clip_of(yaws=YAWS, world=50, tracks=60, keyframes=7)
-    other = Clip('many.npz', replace(many, origin=Origin((640, 450))))
-    shares = fuse([other, *CLIPS[:2]], CONFIG).shares
+    clips = {'many.npz': replace(many, origin=Origin((640, 450))), **first_two()}
+    shares = fuse('cam', 'acme', clips, CONFIG).shares
     assert '640x450, most of this camera are 800x450' in shares['many.npz'].left_out
 
 
 def test_the_others_give_one_camera(fused):
     found = fused.calibration
-    assert found.verdict.level == 'accepted' and found.turns_used == 4 and fused.sound
+    assert found.verdict.level == 'accepted' and found.turns_used == 4 and fused.estimate.sound
     assert abs(found.camera.fx - LENS.fx) < 2 * found.sigma['fx'] < 10
     for share in list(fused.shares.values())[:4]:
         assert abs(share.fx - LENS.fx) < 4 * share.fx_sigma if share.used else share.fx is None
 
 
-def test_the_order_of_the_clips_does_not_count(fused):
-    alone, turned = (fuse(clips, CONFIG) for clips in (CLIPS[:2], CLIPS[1::-1]))
-    texts = [solved.encoded(solved.solved_of('cam', 'acme', each)) for each in (alone, turned)]
+def test_the_order_of_the_clips_does_not_count():
+    turned = dict(reversed(first_two().items()))
+    texts = [solved.encoded(fuse('cam', 'acme', clips, CONFIG))
+             for clips in (first_two(), turned)]
     assert texts[0] == texts[1]
 
 
 def test_a_solved_camera_comes_back_from_its_file(fused):
-    text = solved.encoded(solved.solved_of('cam', 'acme', fused))
+    text = solved.encoded(fused)
     found = solved.decoded(text, 'file')
     assert solved.encoded(found) == text
     assert found.calibration.camera == fused.calibration.camera
     assert found.calibration.mount == fused.calibration.mount
     assert found.calibration.sigma == pytest.approx(dict(fused.calibration.sigma))
-    np.testing.assert_array_equal(found.estimate.covariance, fused.solution.covariance)
+    np.testing.assert_array_equal(found.estimate.covariance, fused.estimate.covariance)
 
 
 @pytest.mark.parametrize(('clips', 'reason'), [
-    ([], 'none of its clips could be read'),
-    ([Clip('a', clip_of(yaws=(), world=1)), Clip('b', clip_of(yaws=(), world=2))],
+    ({}, 'none of its clips could be read'),
+    ({'a': clip_of(yaws=(), world=1), 'b': clip_of(yaws=(), world=2)},
      'no turn was found in 2 clips')])
 def test_nothing_to_solve_is_refused_with_the_reason(clips, reason):
-    found = fuse(clips, CONFIG)
-    assert found.solution is None and found.calibration.verdict.level == 'refused'
+    found = fuse('cam', 'acme', clips, CONFIG)
+    assert found.estimate is None and found.calibration.verdict.level == 'refused'
     assert reason in found.calibration.verdict.reasons[0]

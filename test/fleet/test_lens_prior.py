@@ -8,19 +8,18 @@ import pytest
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import FleetConfig
-from dashcalib_ros.fleet.fuse import ClipShare
 from dashcalib_ros.fleet.lens_prior import (
     LensPrior,
+    OfMake,
     Unit,
-    Verdict,
+    conditioned,
     curvature,
     focal_length,
     lens_prior,
     priors,
 )
-from dashcalib_ros.fleet.solved import Estimate, Solved, conditioned, final_of, unit_of
-from dashcalib_ros.judge import Calibration
-from dashcalib_ros.judge import Verdict as OwnVerdict
+from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved, final_of, unit_of
+from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.solve.knowledge import PictureSigma
 
 CONFIG = FleetConfig()
@@ -143,7 +142,7 @@ def solved_unit(level='weak', make='acme', sigma=15.0, sound=True):
     covariance = np.diag([sigma, sigma, 2.0, 2.0, 0.01, 0.02])**2
     covariance[0, 1] = covariance[1, 0] = 0.99 * sigma**2
     calibration = Calibration(
-        OwnVerdict(level, () if level == 'accepted' else ('too little yaw',)), (800, 450),
+        Verdict(level, () if level == 'accepted' else ('too little yaw',)), (800, 450),
         None if level == 'refused' else camera, None, (), 100, 0.2, {}, {}, _config())
     return Solved('cam', make, calibration,
                   Estimate(camera, 4 * covariance, covariance, PictureSigma(9.0, 20.0), 0.2,
@@ -162,21 +161,22 @@ PRIOR = LensPrior(np.array([curvature(520 / 800), -0.28, 0.09]),
 
 @pytest.mark.parametrize('level', ['weak', 'refused'])
 def test_a_prior_decides_and_the_verdict_says_so(level):
-    final = final_of(solved_unit(level), Verdict(PRIOR))
+    final = final_of(solved_unit(level), OfMake(PRIOR))
     found = final.calibration
-    assert found.verdict.level == 'weak' and final.verdict_alone == level
+    assert found.verdict.level == 'weak'
     assert 'the prior of the make acme, from 20 other cameras, decided' in found.verdict.reasons[0]
     assert found.verdict.reasons[1] == 'alone: too little yaw'
     assert 0.5 < final.prior_share < 1 and final.prior_units == 20
     assert 520 < found.camera.fx < 530 and found.camera.cx == 400.0
     # fy goes with fx, as the unit's own turns say
     assert abs(found.camera.fy - found.camera.fx) < 4
-    assert found.sigma['fx'] < 6 < final.sigma_alone['fx'] and found.sigma_px.rms < 9
-    assert found.details['prior']['fx_alone'] == 540.0
+    alone = found.details['prior']
+    assert found.sigma['fx'] < 6 < alone['sigma_alone']['fx'] and found.sigma_px.rms < 9
+    assert alone['fx_alone'] == 540.0
 
 
 def test_an_accepted_camera_stays_accepted_and_hardly_moves():
-    final = final_of(solved_unit('accepted', sigma=1.0), Verdict(PRIOR))
+    final = final_of(solved_unit('accepted', sigma=1.0), OfMake(PRIOR))
     assert final.calibration.verdict.level == 'accepted' and final.prior_share < 0.1
     assert abs(final.calibration.camera.fx - 540) < 1
 
@@ -184,7 +184,7 @@ def test_an_accepted_camera_stays_accepted_and_hardly_moves():
 def test_where_there_is_no_prior_it_says_why():
     assert unit_of(solved_unit(make='')) is None and unit_of(solved_unit(sound=False)) is None
     assert final_of(solved_unit(make=''), None).prior_note == 'its make is not known'
-    thrown = final_of(solved_unit(), Verdict(None, 'its fx is off: another mode', True))
+    thrown = final_of(solved_unit(), OfMake(None, 'its fx is off: another mode', True))
     assert thrown.other_mode and 'another mode' in thrown.calibration.warnings[0]
     assert thrown.calibration.camera.fx == 540.0
 

@@ -6,7 +6,8 @@ import json
 import pytest
 
 from dashcalib_ros.errors import ConfigError, InputError
-from dashcalib_ros.fleet.manifest import by_camera, read_manifest
+from dashcalib_ros.fleet.batch import cameras_of
+from dashcalib_ros.fleet.manifest import read_manifest
 
 
 def rows_of(tmp_path, text, name='m.csv', **options):
@@ -25,7 +26,7 @@ def test_a_csv_names_clips_relative_to_itself(tmp_path):
     assert one.time_s == 1769860800.0 and not one.problem
     assert (two.number, two.place, two.camera, two.fps) == (2, '/abs/2.mp4', '', None)
     assert three.place == 's3://bucket/3.mp4'
-    assert {name: len(rows) for name, rows in by_camera([one, two, three]).items()} == {
+    assert {each.name: len(each.rows) for each in cameras_of([one, two, three])} == {
         'cam': 2, '/abs/2.mp4': 1}
 
 

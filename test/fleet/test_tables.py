@@ -10,25 +10,25 @@ from browser import BROWSER, found_by_the_browser
 from page_reader import Page
 
 from dashcalib_ros.fleet import tables
-from dashcalib_ros.fleet.fuse import ClipShare
+from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.overview import overview_html
-from dashcalib_ros.fleet.storage import Folder
-from dashcalib_ros.fleet.tables import CAMERA_COLUMNS, CLIP_COLUMNS, camera_row, clip_row
-from dashcalib_ros.fleet.tasks import ClipResult
+from dashcalib_ros.fleet.solved import ClipShare
+from dashcalib_ros.fleet.tables import CAMERA_COLUMNS, CLIP_COLUMNS, clip_rows, failed_row
 
 START_S = 1.7e9
 
 
 def rows_at(times_s, focal, sigma=2.0):
-    return [clip_row(Row(n, f'{n}.mp4', f'/{n}.mp4', 'cam', time_s=time_s), 'cam', 'acme',
-                     ClipResult(f'{n}.mp4', 'x.npz', turns=1, scenes=1, seconds=10.0),
-                     ClipShare(1, '', fx, sigma))
-            for n, (time_s, fx) in enumerate(zip(times_s, focal, strict=True))]
+    result = ClipResult(file='x.npz', turns=1, scenes=1, seconds=10.0)
+    clips = [(Row(n, f'{n}.mp4', f'/{n}.mp4', 'cam', time_s=time_s), result)
+             for n, time_s in enumerate(times_s)]
+    return clip_rows('cam', 'acme', clips, {
+        f'{n}.mp4': ClipShare(1, '', fx, sigma) for n, fx in enumerate(focal)})
 
 
 def drift_of(rows):
-    row = camera_row('cam', 'acme', None, 'failed', rows)
+    row = failed_row('cam', 'acme', rows)
     return row['drift_percent_per_year'], row['drift_sigma']
 
 
@@ -47,12 +47,21 @@ def test_without_dates_there_is_no_drift(times):
     assert drift_of(rows_at(times, [1000.0] * len(times))) == (None, None)
 
 
+def test_a_row_that_cannot_be_read_does_not_take_the_place_of_another():
+    bad, good, again = (Row(n, 'a.mp4', '/a.mp4', 'cam') for n in (1, 2, 3))
+    read = ClipResult(file='x.npz', turns=1, scenes=1)
+    rows = clip_rows('cam', '', [(bad, ClipResult('fps')), (good, read), (again, read)],
+                     {'a.mp4': ClipShare(1)})
+    assert [row['status'] for row in rows] == ['unreadable', 'used', 'left out']
+    assert 'row 2 again' in rows[2]['reason']
+
+
 def test_texts_that_are_no_unicode_and_numbers_that_are_none(tmp_path, monkeypatch):
     parquet = pytest.importorskip('pyarrow.parquet')
     odd = 'b\udcff<script>.mp4'
-    clips = [clip_row(Row(1, odd, odd), odd, '', ClipResult(odd, problem='is <b>bad</b>'), None)]
-    cameras = [{**camera_row(odd, '', None, 'why', clips), 'drift_sigma': float('nan')}]
-    folder = Folder(str(tmp_path))
+    clips = clip_rows(odd, '', [(Row(1, odd, odd), ClipResult('is <b>bad</b>'))], {})
+    cameras = [{**failed_row(odd, '', clips, 'why'), 'drift_sigma': float('nan')}]
+    folder = str(tmp_path)
     tables.write_table(folder, 'clips', clips, CLIP_COLUMNS)
     tables.write_table(folder, 'cameras', cameras, CAMERA_COLUMNS)
     row, = parquet.read_table(tmp_path / 'cameras.parquet').to_pylist()
@@ -73,7 +82,7 @@ def drawn_fleet():
     """Return the overview of three cameras that were calibrated and one that was not."""
     times = START_S + np.arange(5) * tables.YEAR_S / 2
     clips = rows_at(times, 1000 * (1 + 0.05 * np.arange(5)), sigma=1.0)
-    failed = camera_row('cam', 'acme', None, 'failed', clips)
+    failed = failed_row('cam', 'acme', clips, 'failed')
     cameras = [{**failed, 'camera': name, 'make': make, 'verdict': verdict, 'fx': fx,
                 'width': 1280, 'sigma_fx': 5.0, 'turns_used': turns}
                for turns, (name, make, verdict, fx) in enumerate((

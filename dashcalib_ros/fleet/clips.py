@@ -1,0 +1,218 @@
+"""A clip -> the scenes of its turns, and what became of it. Done is what has a file.
+
+Each task is a function of its arguments and of files; it may run anywhere, and twice.
+"""
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from dashcalib_ros.config import Config
+from dashcalib_ros.detect.detection import detect
+from dashcalib_ros.errors import DashcalibError, InputError, one_line
+from dashcalib_ros.fleet.manifest import Row
+from dashcalib_ros.fleet.storage import clip_files, joined, local_copy, read, stamp, write
+from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.limits import read_file
+from dashcalib_ros.reconstruct import reconstruct
+from dashcalib_ros.reconstruct.scene_file import (
+    FORMAT,
+    LARGEST,
+    SUFFIX,
+    Origin,
+    SceneFile,
+    StoredTurn,
+    decoded,
+    encoded,
+)
+
+# settings by which a clip's scenes do not change
+LATER = ('intrinsics.', 'verdict.', 'fleet.')
+LATER_NAMES = ('threads', 'rectified', 'turns.store')
+# bytes of a file that are hashed at a time
+BLOCK = 2**20
+
+
+@dataclass(frozen=True)
+class ClipResult:
+    """What became of a clip, with columns of the table of clips.
+
+    problem: why there are no gathered turns, '' if there are: in file. stamp: as storage.stamp()
+    before the clip was read; '' for what is tried again the next time. time: of the first turn, s;
+    only a date if the clip has dates. again: this was known before.
+    """
+
+    problem: str = ''
+    stamp: str = ''
+    file: str | None = None
+    content: str | None = None
+    width: int | None = None
+    height: int | None = None
+    frames: int = 0
+    seconds: float = 0.0
+    turns: int = 0
+    scenes: int = 0
+    time: float | None = None
+    warnings: tuple[str, ...] = ()
+    again: bool = False
+
+
+def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
+    """Read a clip, unless that was done; never raises what a clip can cause."""
+    if row.problem:
+        return ClipResult(row.problem, again=True)
+    name, now = clip_file(row, out, config), ''
+    try:
+        # before it is read: what changes later is read again
+        now = stamp(row.place) or ''
+        return _earlier(name, out, now) or _noted(name, _gathered(row, out, config, now))
+    except InputError as error:
+        return _noted(name, ClipResult(one_line(error, 300), now))
+    except DashcalibError as error:  # not the clip's own fault
+        return ClipResult(one_line(error, 300))
+    except OSError as error:
+        return ClipResult(f'cannot be read here: {one_line(error)}')
+
+
+def set_aside(row: Row, out: str, config: Config) -> ClipResult:
+    """Note that a clip is not tried again, as it killed its worker so many times."""
+    return _noted(clip_file(row, out, config), ClipResult(
+        f'killed its worker {config.fleet.attempts} times: it is set aside; is it damaged, or is '
+        f'there too little memory?', stamp(row.place) or ''))
+
+
+def clip_file(row: Row, out: str, config: Config) -> str:
+    """Return the place of the file that tells what became of a clip."""
+    key = hash_of([row.place, settings_hash(config, row.fps, row.topic)])
+    return joined(out, f'clips/{key[:2]}/{key}.json')
+
+
+def hash_of(values: object) -> str:
+    """Return a hash of values that JSON has, 32 digits."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _earlier(name: str, out: str, now: str) -> ClipResult | None:
+    """Return what became of the clip before, if that still holds.
+
+    A clip that changed since is read again. One that is gone is not needed any more.
+    """
+    try:
+        values = json.loads(read(name) or b'')
+        result = ClipResult(**{**values, 'warnings': tuple(values['warnings']), 'again': True})
+    except (ValueError, KeyError, TypeError):
+        return None
+    holds = now == result.stamp or (result.file and not now)
+    there = not result.file or stamp(joined(out, result.file))
+    return result if holds and there else None
+
+
+def _noted(name: str, result: ClipResult) -> ClipResult:
+    if result.stamp:
+        try:
+            write(name, json.dumps(asdict(result), sort_keys=True).encode())
+        except DashcalibError as error:
+            return ClipResult(one_line(error, 300))
+    return result
+
+
+def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
+    """Write a clip's turns to their file. Raises DashcalibError, OSError."""
+    if not now:
+        raise InputError('there is no such file; check the path')
+    with local_copy(row.place) as path:
+        try:
+            content = content_hash(path)
+            # turns that were gathered elsewhere have whatever settings
+            given = path.suffix == SUFFIX
+            of = content if given else f'{content}-{settings_hash(config, row.fps, row.topic)}'
+            name = f'gathered/{of[:2]}/{of}{SUFFIX}'
+            found = gathered(out, name)
+            if found is None:
+                found = _given(path) if given else gather(path, content, row.fps, row.topic,
+                                                          config)
+                if content_hash(path) != content:
+                    raise InputError(f'{path} changed while it was read: start again when it is '
+                                     f'complete')
+                write(joined(out, name), encoded(found))
+        except InputError as error:
+            # the tables must not depend on where the clip, or its copy, lies
+            raise InputError(str(error).replace(str(path), row.clip)) from error
+    width, height = found.origin.image_size
+    return ClipResult('', now, name, content, width, height, found.frames, found.seconds,
+                      found.found, len(found.turns),
+                      found.turns[0].stamp_s if found.turns else None, found.warnings)
+
+
+def gathered(out: str, name: str) -> SceneFile | None:
+    """Return turns that were gathered before; None where there are none, or they are damaged."""
+    data = read(joined(out, name))
+    try:
+        return None if data is None else decoded(data)
+    except ValueError:
+        return None
+
+
+def _given(path: Path) -> SceneFile:
+    """Return turns that were gathered elsewhere; raises InputError."""
+    try:
+        return decoded(read_file(path, LARGEST))
+    except ValueError as error:
+        raise InputError(f'{path.name} is no file of gathered turns ({one_line(error)}); gather '
+                         f'its clip anew') from error
+
+
+def settings_hash(config: Config, fps: float | None, topic: str | None) -> str:
+    """Return a hash of all that a clip's scenes depend on beside its content."""
+    used = {name: value for name, value in config.flat().items()
+            if not name.startswith(LATER) and name not in LATER_NAMES}
+    return hash_of([FORMAT, used, fps, topic])[:16]
+
+
+def content_hash(path: Path) -> str:
+    """Return a hash of a file's bytes, or of all files that a folder's clip may be made of.
+
+    Raises InputError.
+    """
+    found = hashlib.sha256()
+    try:
+        for file, about in clip_files(path):
+            if file != path:
+                found.update(os.fsencode(file.relative_to(path)) + b'\0')
+                found.update(about.st_size.to_bytes(8, 'big'))
+            left = about.st_size  # files of /proc say 0, and reading some would wait for ever
+            with file.open('rb') as stream:
+                while left > 0 and (block := stream.read(min(BLOCK, left))):
+                    found.update(block)
+                    left -= len(block)
+    except OSError as error:
+        raise InputError(f'cannot read {path} ({error.strerror or error})') from error
+    return found.hexdigest()[:32]
+
+
+def gather(path: Path, content: str, fps: float | None, topic: str | None, config: Config
+           ) -> SceneFile:
+    """Return a clip's turns and their scenes.
+
+    content: the clip's content_hash(). Raises InputError for what cannot be read.
+    """
+    source = open_frames(path, topic, fps)
+    detection = detect(source, config)
+    best = detection.turns()[:max(config.turns.wanted, config.turns.at_most)]
+    valid = detection.valid()
+    turns = []
+    for turn in sorted(best, key=lambda turn: turn.center):
+        scene = reconstruct(turn, config, valid)
+        detection.release(turn.center)
+        if scene is not None:
+            turns.append(StoredTurn(scene, turn.stamp_s, turn.prominence))
+    assert detection.size is not None
+    # the same content gives the same, wherever it lies
+    warnings = tuple(line.replace(str(path), 'the clip')
+                     for line in (*source.warnings, *detection.warnings()))
+    return SceneFile(Origin(detection.size, detection.scale), tuple(turns), len(best), content,
+                     settings_hash(config, fps, topic), detection.frames, detection.seconds,
+                     warnings)
