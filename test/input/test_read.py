@@ -283,6 +283,21 @@ def test_a_broken_chunk_costs_only_itself(tmp_path):
     assert 'broken chunk' in source.warnings[0]
 
 
+def test_a_broken_first_chunk_costs_only_itself(tmp_path):
+    """It has the names of the topics, which the end of the file repeats."""
+    frames = drive(60)
+    file = write_mcap(tmp_path / 'drive.mcap', frames, chunk_size=20_000)
+    data = bytearray(file.read_bytes())
+    data[1000:1050] = bytes(50)
+    file.write_bytes(data)
+    source = open_frames(file)
+    found = list(source)
+    assert [frame.stamp_ns for frame in found] == [
+        frame.stamp_ns for frame in frames[60 - len(found):]]
+    assert 50 <= len(found) <= 55
+    assert f'read {len(found)} of 60 images; {60 - len(found)} are lost' in source.warnings[0]
+
+
 def test_a_split_bag_with_a_missing_and_a_broken_file(tmp_path):
     frames = drive(30)
     bag = split_bag(tmp_path, frames)
