@@ -392,6 +392,7 @@ class _Place:
         if part.length_ns is not None and part.length_ns <= left_ns:
             reading.images = part.count or 0
             self._next_ns += part.length_ns
+            self._recorded = False
             return
         before: int | None = None
         with closing(part._pictures(reading, left_ns)) as pictures:
