@@ -19,14 +19,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from io import BufferedReader, BytesIO
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 import lz4.frame
 from mcap.exceptions import McapError
+from mcap.reader import FOOTER_SIZE
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from rosbags import rosbag2
 from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import storage_mcap
@@ -226,8 +228,9 @@ def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
     channels: dict[int, Channel] = {}
     with path.open('rb') as file:
         limit = path.stat().st_size
+        repeated = _repeated(file, limit)
         reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
-        for record in _mcap_records(reader, path.name, damage):
+        for record in chain(repeated, _mcap_records(reader, path.name, damage)):
             if isinstance(record, Schema):
                 schemas[record.id] = normalize_msgtype(record.name)
             elif isinstance(record, Channel):
@@ -236,6 +239,23 @@ def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
                 channel = channels[record.channel_id]
                 yield Record(channel.topic, schemas.get(channel.schema_id, ''), record.log_time,
                              record.data, ros1=channel.message_encoding == 'ros1')
+
+
+def _repeated(file: BinaryIO, limit: int) -> list[McapRecord]:
+    """Return the topics and types that an MCAP file repeats at its end, nothing if it is cut off.
+
+    Else the first chunk, which has them too, would cost all others when it is broken.
+    """
+    try:
+        file.seek(-FOOTER_SIZE - MAGIC_SIZE, os.SEEK_END)
+        footer: Any = next(StreamReader(file, skip_magic=True, record_size_limit=limit).records)
+        file.seek(footer.summary_start)
+        reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=limit)
+        return [record for record in reader.records if isinstance(record, (Schema, Channel))]
+    except Exception:  # there are no limits to what a damaged file makes of these numbers
+        return []
+    finally:
+        file.seek(0)
 
 
 def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[McapRecord]:

@@ -24,6 +24,7 @@ from dashcalib_ros.input.source import (
     Picture,
     Reading,
     by_name,
+    first_of,
     is_bag_file,
 )
 from dashcalib_ros.input.stamps import StampGate
@@ -82,9 +83,8 @@ def open_bag(path: Path) -> Bag:
     present = tuple(path / name for name in names if name not in skipped)
     warnings = []
     if skipped:
-        listing = ', '.join(f'{name} is {what}' for name, what in list(skipped.items())[:3])
-        warnings = [f'{len(skipped)} entries of {path} were skipped: {listing}'
-                    f'{" ..." if len(skipped) > 3 else ""}']
+        listing = first_of([f'{name} is {what}' for name, what in skipped.items()])
+        warnings = [f'{len(skipped)} entries of {path} were skipped: {listing}']
     listed, promised = _metadata(path / METADATA)
     files = tuple(file for file in listed if file in present)
     if files:
@@ -92,7 +92,8 @@ def open_bag(path: Path) -> Bag:
                      for file in listed if file not in present and file.name not in skipped]
     elif present:
         files = present
-        warnings += [f'{path} has no usable metadata.yaml: reading {_names(files)} in this order']
+        warnings += [f'{path} has no usable metadata.yaml: reading '
+                     f'{first_of([file.name for file in files])} in this order']
     if not files:
         why = f' ({"; ".join(warnings)})' if warnings else ''
         raise InputError(f'{path} has no .mcap, .db3 or .bag file{why}: '
@@ -135,11 +136,6 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
 
 def _sorted(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
     return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
-
-
-def _names(files: tuple[Path, ...]) -> str:
-    names = [file.name for file in files]
-    return ', '.join(names[:3]) + (' ...' if len(names) > 3 else '')
 
 
 class BagSource(FrameSource):

@@ -25,6 +25,7 @@ from dashcalib_ros.input.source import (
     Reading,
     by,
     by_name,
+    first_of,
     is_bag_file,
     os_error,
 )
@@ -292,8 +293,7 @@ def _no_images(path: Path, names: list[str]) -> str:
     if not names:
         return f'{path} is empty: give a folder of images, a bag or a video'
     return (f'{path} has no images (png, jpg, bmp, tif, pgm, ppm, webp) and is no bag: '
-            f'it has {", ".join(sorted(names)[:3])}{" ..." if len(names) > 3 else ""}; '
-            f'give the folder or the file that has them')
+            f'it has {first_of(sorted(names))}; give the folder or the file that has them')
 
 
 def _check_recorded(text: str) -> None:
@@ -392,6 +392,7 @@ class _Place:
         if part.length_ns is not None and part.length_ns <= left_ns:
             reading.images = part.count or 0
             self._next_ns += part.length_ns
+            self._recorded = False
             return
         before: int | None = None
         with closing(part._pictures(reading, left_ns)) as pictures:

@@ -4,7 +4,7 @@ from __future__ import annotations
 import copy
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from numbers import Real
@@ -33,6 +33,11 @@ def by_name(name: str) -> tuple[list[tuple[int, str]], str]:
 def by(size: tuple[int, int]) -> str:
     """Return (width, height) as messages have it."""
     return f'{size[0]}x{size[1]}'
+
+
+def first_of(texts: Sequence[str], most: int = 3) -> str:
+    """Return the first texts for a message, and dots where there are more."""
+    return ', '.join(texts[:most]) + (' ...' if len(texts) > most else '')
 
 
 def is_bag_file(name: str) -> bool:

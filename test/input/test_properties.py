@@ -3,14 +3,26 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
+import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.decode import BitDepth, decode, encoded_size, message_size
+from dashcalib_ros.input.decode import (
+    BitDepth,
+    decode,
+    decode_file,
+    encoded_size,
+    message_size,
+)
+from dashcalib_ros.input.motion import NAMES, sensor_stream
+from dashcalib_ros.input.motion_files import read_motion
 from dashcalib_ros.input.source import LAST_NS, Frame, by_name, is_bag_file
 from dashcalib_ros.input.stamps import StampGate
+from dashcalib_ros.limits import parse_yaml
 
 QUICK = settings(derandomize=True, deadline=None, max_examples=150, database=None)
 STARTS = (b'', b'\xff\xd8', b'\xff\xd8\xff\xc0\0\x11\x08', b'\x89PNG\r\n\x1a\n', b'BM', b'II*\0',
@@ -25,6 +37,29 @@ STAMPS = st.integers(0, 2**40) | st.integers(-2**31 * 10**9, 2**31 * 10**9) | st
 def test_the_size_of_any_bytes(data: bytes) -> None:
     size = encoded_size(memoryview(data))
     assert size is None or (len(size) == 2 and min(size) >= 0)
+
+
+@QUICK
+@given(st.sampled_from(['.jpg', '.png', '.webp', '.bmp', '.tif', '.pgm', '.ppm']),
+       st.integers(1, 70), st.integers(1, 70), st.booleans(),
+       st.lists(st.tuples(st.integers(0, 40) | st.integers(0, 5000), st.integers(0, 255)),
+                max_size=3))
+def test_no_picture_is_larger_than_it_says(kind: str, width: int, height: int, grey: bool,
+                                           damage: list[tuple[int, int]]) -> None:
+    grey = (grey or kind == '.pgm') and kind != '.ppm'
+    noise = np.random.default_rng(width).integers(
+        0, 256, (height, width) if grey else (height, width, 3), np.uint8)
+    data = bytearray(cv2.imencode(kind, noise)[1].tobytes())
+    for place, value in damage:
+        data[place % len(data)] = value
+    size = encoded_size(memoryview(data))
+    assert damage or size == (width, height)
+    try:
+        shown = decode_file(bytes(data)).shape
+    except InputError as error:
+        assert damage and '\n' not in str(error)
+        return
+    assert size is not None and shown[1] <= size[0] and shown[0] <= size[1]
 
 
 @QUICK
@@ -64,6 +99,22 @@ def test_stamps_of_a_recording_increase(stamps: list[tuple[int, int]]) -> None:
 
 
 @QUICK
+@given(st.lists(st.tuples(STAMPS, STAMPS), max_size=40))
+def test_every_image_of_a_recording_is_used_or_counted(stamps: list[tuple[int, int]]) -> None:
+    gate = StampGate()
+    used = sum(gate.take(*each) is not None for each in stamps)
+    assert used + gate.repeated == len(stamps) and gate.zero == 0
+
+
+@QUICK
+@given(st.lists(st.integers(1, 2**62), unique=True).map(sorted))
+def test_stamps_that_increase_stay_as_they_are(stamps: list[int]) -> None:
+    gate = StampGate()
+    assert [gate.take(stamp, 5) for stamp in stamps] == stamps
+    assert gate.warnings() == []
+
+
+@QUICK
 @given(st.lists(st.tuples(STAMPS, STAMPS), max_size=40), st.floats(0.1, 100))
 def test_a_live_gate_gives_the_stamps_it_was_given(stamps: list[tuple[int, int]],
                                                    rate: float) -> None:
@@ -88,3 +139,63 @@ def test_names_of_any_kind_have_an_order(names: list[str]) -> None:
     assert sorted(sorted(names, key=by_name, reverse=True), key=by_name) == sorted(
         names, key=by_name)
     assert not any(is_bag_file(f'{name}.png') for name in names)
+
+
+NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=32)
+
+
+@QUICK
+@given(st.sampled_from(sorted(NAMES)), st.lists(st.tuples(NUMBERS, NUMBERS), max_size=30))
+def test_samples_of_any_sensor(kind: str, rows: list[tuple[float, float]]) -> None:
+    stamps = np.array([stamp for stamp, _ in rows], float)
+    values = np.array([[value] * 3 for _, value in rows], float).reshape(-1, 3)
+    stream = sensor_stream({kind: (stamps, values)}, 'a test')
+    samples = stream.kinds.get(kind)
+    assert (samples is None) == (len(stream.warnings) == 1)
+    if samples is not None:
+        assert (np.diff(samples.stamps_s) > 0).all() and np.isfinite(samples.values).all()
+        assert set(zip(samples.stamps_s, samples.values[:, 0], strict=True)) <= set(rows)
+        assert len(samples.stamps_s) >= 0.8 * len(rows)
+
+
+@QUICK
+@given(st.text(max_size=60) | st.lists(
+    st.sampled_from(['stamp_s', 'gyro_x', 'gyro_y', 'gyro_z', 'speed', 'latitude', 'longitude',
+                     'altitude', '0.1', '1e9', 'nan', '', ' 7', 'x', ',', ',', '\n', '\n']),
+    max_size=40).map(lambda cells: 'stamp_s,speed,' + ','.join(cells)))
+def test_a_csv_of_any_text(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.getbasetemp() / 'any.csv'
+    path.write_text(text, 'utf-8', 'replace')
+    try:
+        stream = read_motion(path)
+        assert not stream.empty or stream.warnings
+    except InputError as error:
+        assert len(str(error).splitlines()) == 1
+
+
+PLAIN = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False),
+                  st.text(max_size=9))
+NESTED = st.recursive(PLAIN, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(
+    st.text(max_size=4), inner, max_size=4), max_leaves=20)
+
+
+@QUICK
+@given(NESTED, st.lists(st.tuples(st.integers(0, 200), st.sampled_from('[]{}:-&*!#\n 1a')),
+                        max_size=3))
+def test_yaml_is_what_it_was_or_an_error(content: object, damage: list[tuple[int, str]]) -> None:
+    text = yaml.safe_dump([content, content])
+    for place, sign in damage:
+        place %= len(text)
+        text = text[:place] + sign + text[place + 1:]
+    try:
+        expected = yaml.load(text, getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+    except Exception:
+        with pytest.raises(InputError):
+            parse_yaml(text, 'it')
+        return
+    try:
+        found = parse_yaml(text, 'it')
+    except InputError as error:
+        assert damage and 'no usable YAML' in str(error)
+        return
+    assert found == expected
