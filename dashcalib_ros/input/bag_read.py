@@ -77,9 +77,32 @@ def unpack(kind: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
     return plain
 
 
-# rosbags unpacks chunks by these tables, without a limit
-storage_mcap.DECOMPRESSORS.update({kind: partial(unpack, kind) for kind in ('zstd', 'lz4')})
-rosbag1.decompressors.update({kind: partial(unpack, kind) for kind in ('bz2', 'lz4')})
+class _WithinLimit:
+    """Lets rosbags unpack within our limit, which it has not, while a reader of ours is open.
+
+    It finds its unpackers in two tables. What else uses rosbags in this process keeps its own
+    as soon as the last reader is closed, in whatever order they are.
+    """
+
+    def __init__(self) -> None:
+        self._readers = 0
+        self._tables: tuple[tuple[dict[str, Any], dict[str, Any]], ...] = (
+            (storage_mcap.DECOMPRESSORS, dict(storage_mcap.DECOMPRESSORS)),
+            (rosbag1.decompressors, dict(rosbag1.decompressors)))
+
+    def __enter__(self) -> None:
+        self._readers += 1
+        for table, own in self._tables:
+            table.update({kind: partial(unpack, kind) for kind in own if kind in UNPACKERS})
+
+    def __exit__(self, *error: object) -> None:
+        self._readers -= 1
+        if not self._readers:
+            for table, own in self._tables:
+                table.update(own)
+
+
+_WITHIN_LIMIT = _WithinLimit()
 
 
 @contextmanager
@@ -162,7 +185,7 @@ def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]]
     counts = Counter[tuple[str, str]]()
     with unpacked(file, damage) as path:
         try:
-            with _reader(path) as reader:
+            with _WITHIN_LIMIT, _reader(path) as reader:
                 for connection in reader.connections:
                     counts[connection.topic, connection.msgtype] += connection.msgcount
             return counts, True
@@ -190,7 +213,7 @@ def records(file: Path, topics: Collection[str], damage: Damage) -> Iterator[Rec
 
 
 def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
-    with _reader(path) as reader:
+    with _WITHIN_LIMIT, _reader(path) as reader:
         wanted = [each for each in reader.connections if each.topic in topics]
         missing = sum(connection.msgcount for connection in wanted)
         if not wanted:
