@@ -4,16 +4,16 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Any, Protocol
+from typing import Any
 
 from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.detect.estimator import TrackedPoints
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import DashcalibError, InputError, counted, one_line
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
@@ -64,39 +64,6 @@ class Watched:
 
 
 @dataclass(frozen=True)
-class NewTurn:
-    """A turn that was reconstructed. number: its place among the turns so far, from 1.
-
-    of_this_drive: False for a stored turn of an earlier drive. total_deg: yaw of all turns so far.
-    """
-
-    number: int
-    yaw_deg: float
-    total_deg: float
-    of_this_drive: bool
-
-    def text(self, wanted: int, checking: bool) -> str:
-        """Return 'turn 2 of 5: 89°, 179° in all'; checking: it checks a published calibration."""
-        number = f'turn {self.number}' + (f' of {wanted}' if self.number <= wanted else '')
-        source = '' if self.of_this_drive else ' (of an earlier drive)'
-        purpose = ' for the next check of the calibration' if checking else ''
-        return f'{number}{purpose}{source}: {self.yaw_deg:.0f}°, {self.total_deg:.0f}° in all'
-
-
-@dataclass(frozen=True)
-class Started:
-    """A calibration begins."""
-
-    status: Status
-
-    def __str__(self) -> str:
-        found, built = self.status.turns, self.status.built
-        if not built:
-            return f'calibrating, as soon as {counted(found, "turn")} found so far can be used…'
-        return f'calibrating with {counted(built, "turn")}, {self.status.yaw_deg:.0f}° of yaw…'
-
-
-@dataclass(frozen=True)
 class Trouble:
     """A problem: its kind, for counting, and one line for the log."""
 
@@ -104,43 +71,17 @@ class Trouble:
     text: str
 
 
-News = Status | NewTurn | Started | Trouble | Result | Watched
-
-
-@dataclass(frozen=True)
-class View:
-    """What is seen in the newest frame: for pictures that people look at.
-
-    valid: (h, w) of the frame, or of the frame resized; None: no ego vehicle is known.
-    """
-
-    points: TrackedPoints
-    valid: Mask | None
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A decoded image with its message's header, and what was tracked and masked in it."""
-
-    header: Any
-    image: GreyImage
-    view: View
-
-
-class Viewer(Protocol):
-    """Who shows images to people; wanted() is called for each, show() where it returned True."""
-
-    def wanted(self) -> bool:
-        """Return whether the next image is to be shown."""
-
-    def show(self, picture: Picture) -> None:
-        """Take an image; must not wait."""
+# a text is for the log
+News = Status | str | Trouble | Result | Watched
+# takes an image with its message's header, and what was found so far; it must not wait
+Show = Callable[[Any, GreyImage, Detection], None]
 
 
 class Inbox:
     """What the background thread is to do next: commands first, then images, each in order.
 
-    put() and put_image() never wait: when too many images wait, the oldest is dropped.
+    put() and put_image() never wait: when too many images wait, the oldest is dropped. dropped:
+    how many were, because detection does not keep up.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -205,14 +146,16 @@ class Learner:
 
     goal: calibrations start by themselves when so many turns are built, and again when others are
     among the best; None: only by request. bank: the number of the present bank of turns; results
-    of an older one are out of date.
+    of an older one are out of date. activity: what the background thread does now. inbox: what
+    it is to do. sensors: what the car's own sensors say; it may be added to.
     """
 
     def __init__(self, config: Config, queue_size: int, tell: Callable[[News], None],
-                 viewer: Viewer, mask: Mask | None = None) -> None:
+                 show: Show, mask: Mask | None = None) -> None:
         """tell: called with all news, in any thread; it must neither wait nor raise.
 
-        mask: (h, w), False where the images are not to be used.
+        show: called with each image in the background thread. mask: (h, w), False where the images
+        are not to be used.
         """
         self.goal: int | None = config.turns.wanted
         self.bank = 0
@@ -222,11 +165,11 @@ class Learner:
         self._watched: NamedCamera | None = None
         self._checked: NamedCamera | None = None
         self._tell = tell
-        self._viewer = viewer
+        self._show = show
         self._mask = mask
-        self._inbox = Inbox(queue_size)
-        self._sensors = SensorBuffer()
-        self._activity = Activity()
+        self.inbox = Inbox(queue_size)
+        self.sensors = SensorBuffer()
+        self.activity = Activity()
         self._closed = False
         # from here on of the background thread only
         self._now = self._bank(0, use_stored=True)
@@ -236,31 +179,18 @@ class Learner:
         self._thread = threading.Thread(target=self._run, name='learn', daemon=True)
         self._thread.start()
 
-    @property
-    def dropped(self) -> int:
-        """Return how many images were dropped because detection did not keep up."""
-        return self._inbox.dropped
-
-    def activity(self) -> Activity:
-        """Return what the background thread does now."""
-        return self._activity
-
     def offer(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int],
               frame_id: str = '') -> None:
         """Take an image message; size and frame_id are what its header says."""
-        self._inbox.put_image(lambda: self._push(index, stamp_ns, message, size, frame_id))
-
-    def sense(self, kind: str, stamp_s: float, values: Sequence[float]) -> None:
-        """Take a sample of the car's own sensors; kind: one of SensorStream's."""
-        self._sensors.add(kind, stamp_s, values)
+        self.inbox.put_image(lambda: self._push(index, stamp_ns, message, size, frame_id))
 
     def request(self) -> str:
         """Calibrate now, with the present turns; return why not, '' if it is started."""
-        if self._activity.calibrating:
+        if self.activity.calibrating:
             return 'a calibration is running already'
-        if not self._activity.status.turns:
+        if not self.activity.status.turns:
             return 'no turn was found so far: drive some'
-        self._inbox.put(self._request)
+        self.inbox.put(self._request)
         return ''
 
     def want(self, turns: int) -> None:
@@ -291,16 +221,16 @@ class Learner:
         """
         new = self._bank(self.bank + 1, use_stored=keep_stored)
         self.bank, self._more = new.number, 0
-        self._inbox.put(lambda: self._begin(new, keep_stored), instead_of_images=True)
+        self.inbox.put(lambda: self._begin(new, keep_stored), instead_of_images=True)
 
     def forget_stored(self, but: Set[TurnId]) -> None:
         """Drop the turns of earlier drives but these: the camera has changed since."""
-        self._inbox.put(lambda: self._now.calibrator.scenes.forget_stored(but))
+        self.inbox.put(lambda: self._now.calibrator.scenes.forget_stored(but))
 
     def close(self) -> None:
         """End the thread and every child process."""
         self._closed = True
-        self._inbox.put(lambda: None)
+        self.inbox.put(lambda: None)
         self._now.calibrator.close()
         self._thread.join(timeout=10)
 
@@ -321,7 +251,7 @@ class Learner:
 
         The calibrator calls this while it waits for a child.
         """
-        action = self._inbox.get(wait_s)
+        action = self.inbox.get(wait_s)
         if action is None or self._closed:
             return False
         try:
@@ -339,7 +269,7 @@ class Learner:
 
     def _begin(self, new: _Bank, keep_stored: bool) -> None:
         old, self._now = self._now, new
-        self._activity = replace(self._activity, status=NOTHING)
+        self.activity = replace(self.activity, status=NOTHING)
         old.calibrator.close()
         if not keep_stored:
             old.calibrator.scenes.clear_store()
@@ -355,8 +285,7 @@ class Learner:
             image = mapped_copy(whole(message, size, bank.depth))
             status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
             bank.start_s = stamp_ns / 1e9 if bank.start_s is None else bank.start_s
-            if self._viewer.wanted():
-                self._viewer.show(Picture(message.header, image, _view(bank.calibrator)))
+            self._show(message.header, image, bank.calibrator.detection)
         except InputError as error:
             self._tell(Trouble('undecodable', str(error)))
         except Exception as error:
@@ -407,25 +336,26 @@ class Learner:
         self._tell(Watched(camera, found))
 
     def _note(self, bank: _Bank, status: Status) -> None:
-        self._activity = replace(self._activity, status=status)
-        for turn in new_turns(bank.told, status):
-            self._tell(turn)
+        self.activity = replace(self.activity, status=status)
+        for line in new_turns(bank.told, status, self._config.turns.wanted,
+                              self._watched is not None):
+            self._tell(line)
         bank.told |= set(status.ready)
 
     def _due(self, bank: _Bank) -> bool:
         if self._checked is not self._tried_with:
             self._tried_with, bank.tried = self._checked, frozenset()
-        ready, goal = self._activity.status.ready, self.goal
+        ready, goal = self.activity.status.ready, self.goal
         news = goal is not None and len(ready) >= goal and not bank.tried.issuperset(ready)
         return (bank.number == self.bank and (bank.requested or news)
                 and time.monotonic() >= bank.not_before)
 
     def _calibrate(self, bank: _Bank) -> None:
         bank.requested, given = False, self._checked
-        self._activity = replace(self._activity, calibrating=True)
-        self._tell(Started(self._activity.status))
+        self.activity = replace(self.activity, calibrating=True)
+        self._tell(beginning(self.activity.status))
         try:
-            stream = self._sensors.stream()
+            stream = self.sensors.stream()
             if bank.start_s is not None and (stream.warnings or not stream.empty):
                 # both have the same clock, whichever it is
                 bank.calibrator.sense(replace(stream.shifted(-bank.start_s), absolute=False))
@@ -439,13 +369,13 @@ class Learner:
             self._failed(bank, error)
             return
         finally:
-            self._activity = replace(self._activity, calibrating=False, stage='')
+            self.activity = replace(self.activity, calibrating=False, stage='')
         bank.tried, bank.failures = frozenset(calibration.misfits), 0
         complete = calibration.turns_used >= self._config.turns.wanted
         self._tell(Result(calibration, complete, bank.number, given, check))
 
     def _progress(self, stage: str, share: float) -> None:
-        self._activity = replace(self._activity, stage=stage)
+        self.activity = replace(self.activity, stage=stage)
 
     def _failed(self, bank: _Bank, error: Exception) -> None:
         if bank is not self._now or self._closed:
@@ -468,23 +398,31 @@ def whole(message: Any, size: tuple[int, int], depth: BitDepth | None = None) ->
     return image
 
 
-def _view(calibrator: Calibrator) -> View:
-    found = calibrator.detection
-    return View(found.points(), found.valid())
-
-
-def new_turns(told: Set[TurnId], now: Status) -> list[NewTurn]:
-    """Return the turns that are ready now and were not told.
+def new_turns(told: Set[TurnId], now: Status, wanted: int, checking: bool) -> list[str]:
+    """Return 'turn 2 of 5: 89°, 179° in all' for each turn that is ready now and was not told.
 
     The total is that of the turns so far; a turn that replaces another has the last number.
+    checking: the turns check a calibration in use.
     """
     fresh = [place for place, turn in enumerate(now.ready) if turn not in told]
-    old = sum(now.yaws_deg) - sum(now.yaws_deg[place] for place in fresh)
-    found = []
+    total = sum(now.yaws_deg) - sum(now.yaws_deg[place] for place in fresh)
+    purpose = ' for the next check of the calibration' if checking else ''
+    lines = []
     for count, place in enumerate(fresh, len(now.ready) - len(fresh) + 1):
-        old += now.yaws_deg[place]
-        found.append(NewTurn(count, now.yaws_deg[place], old, now.ready[place].of_this_drive))
-    return found
+        yaw = now.yaws_deg[place]
+        total += yaw
+        number = f'turn {count} of {wanted}' if count <= wanted else f'turn {count}'
+        source = '' if now.ready[place].of_this_drive else ' (of an earlier drive)'
+        lines.append(f'{number}{purpose}{source}: {yaw:.0f}°, {total:.0f}° in all')
+    return lines
+
+
+def beginning(status: Status) -> str:
+    """Return the line about a calibration that begins."""
+    if not status.built:
+        return (f'calibrating, as soon as {counted(status.turns, "turn")} found so far can be '
+                f'used…')
+    return f'calibrating with {counted(status.built, "turn")}, {status.yaw_deg:.0f}° of yaw…'
 
 
 def _named(error: Exception) -> str:

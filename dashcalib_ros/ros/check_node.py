@@ -13,14 +13,12 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.judge import Check, with_faults
 from dashcalib_ros.report import NamedCamera, answer_dict
 from dashcalib_ros.report.camera_file import camera_of_message
-from dashcalib_ros.ros.background import Activity, Result, Watched
-from dashcalib_ros.ros.diagnostics import OK, WARN, Health
+from dashcalib_ros.ros.background import Result, Watched
+from dashcalib_ros.ros.diagnostics import OK, WARN, Health, log_line
 from dashcalib_ros.ros.images import Source, SourceWatch
-from dashcalib_ros.ros.node import LATCHED, CameraNode
-from dashcalib_ros.ros.parameters import make_publisher, make_subscription
+from dashcalib_ros.ros.node import CameraNode
+from dashcalib_ros.ros.parameters import OVERRIDES, latched
 
-# hears reliable and best-effort drivers alike; one that is lost is followed by the next image's
-FROM_DRIVER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 NOT_YET = Check('cannot tell', ('the turns wanted are not there yet',))
 UNTOUCHED = 'check_only: the calibration is the driver\'s, and stays as it is'
 
@@ -38,8 +36,12 @@ class CheckNode(CameraNode):
         self._found = NOT_YET
         # why there is no camera, or it is not of the images
         self._problem = f'no camera_info on {self._given_topic} yet'
-        self._answers = make_publisher(self, String, '~/check', LATCHED)
-        make_subscription(self, CameraInfo, 'camera_info', self._on_info, FROM_DRIVER)
+        self._answers = self._publisher(String, '~/check', latched())
+        # hears reliable and best-effort drivers alike; one that is lost is followed by the next
+        self.create_subscription(
+            CameraInfo, 'camera_info', self._on_info,
+            QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT),
+            qos_overriding_options=OVERRIDES)
 
     def _trusted(self) -> NamedCamera | None:
         """Return the driver's camera, None if it is for other images."""
@@ -80,16 +82,11 @@ class CheckNode(CameraNode):
         self._publish()
         if not result.complete and found.answer == before:
             return
-        answer, topic = self._answer(), self._given_topic
-        reasons = '; '.join(answer.reasons)
-        # rclpy takes one severity for each line of code
-        if answer.answer == 'wrong':
-            self._log.warning(f'the calibration on {topic} is wrong: {reasons}')
-        elif answer.answer == 'right':
-            self._log.info(f'the calibration on {topic} is right: {reasons}')
-        else:
-            self._log.info(f'the turns cannot tell whether the calibration on {topic} is right: '
-                           f'{reasons}')
+        answer = self._answer()
+        said = f'the calibration on {self._given_topic} is'
+        log_line(self._log, answer.answer == 'wrong', (
+            f'the turns cannot tell whether {said} right' if answer.answer == 'cannot tell' else
+            f'{said} {answer.answer}') + f': {"; ".join(answer.reasons)}')
         if result.complete and found.answer != 'cannot tell':
             # the next answer must be independent: it uses new turns only
             self._learner.restart()
@@ -115,7 +112,7 @@ class CheckNode(CameraNode):
         """Return what keeps the calibration from being checked."""
         return [self._problem] if self._problem else []
 
-    def _health(self, activity: Activity, turns: str) -> Health:
+    def _health(self, turns: str) -> Health:
         found = self._answer()
         if found.answer == 'wrong':
             level, message = WARN, f'the calibration is wrong: {found.reasons[0]}'
@@ -123,7 +120,8 @@ class CheckNode(CameraNode):
             level, message = OK, f'the calibration is right; {turns} for the next check'
         else:
             level, message = OK, f'checking the calibration, {turns}: {found.reasons[0]}'
-        return Health('checking', level, message, check=found.answer, check_reasons=found.reasons)
+        return Health('checking', level, message, self._trusted(), {
+            'check': found.answer, 'check reasons': '; '.join(found.reasons)})
 
     def _answer(self) -> Check:
         """Return what the turns say of it, and what no turn is needed for."""
