@@ -144,10 +144,14 @@ class _Bank:
 class Learner:
     """Learns in the background. All methods are for the node's thread; none of them waits.
 
+    The node may set these at any time. config: turns.wanted counts, from the next calibration on.
     goal: calibrations start by themselves when so many turns are built, and again when others are
-    among the best; None: only by request. bank: the number of the present bank of turns; results
-    of an older one are out of date. activity: what the background thread does now. inbox: what
-    it is to do. sensors: what the car's own sensors say; it may be added to.
+    among the best; None: only by request. watched: a camera that each new turn is compared with,
+    to find changes. checked: one that each calibration is compared with, at once where it is new.
+
+    bank: the number of the present bank of turns; results of an older one are out of date.
+    activity: what the background thread does now. inbox: what it is to do. sensors: what the car's
+    own sensors say; it may be added to.
     """
 
     def __init__(self, config: Config, queue_size: int, tell: Callable[[News], None],
@@ -157,13 +161,13 @@ class Learner:
         show: called with each image in the background thread. mask: (h, w), False where the images
         are not to be used.
         """
+        self.config = config
         self.goal: int | None = config.turns.wanted
+        self.watched: NamedCamera | None = None
+        self.checked: NamedCamera | None = None
         self.bank = 0
-        self._config = config
         # turns of this drive that are used beyond those wanted
         self._more = 0
-        self._watched: NamedCamera | None = None
-        self._checked: NamedCamera | None = None
         self._tell = tell
         self._show = show
         self._mask = mask
@@ -193,25 +197,13 @@ class Learner:
         self.inbox.put(self._request)
         return ''
 
-    def want(self, turns: int) -> None:
-        """Use so many turns from the next calibration on."""
-        self._config = self._config.replace({'turns.wanted': turns})
-
     def extend(self) -> bool:
         """Use one turn of this drive more with this bank; False where no more are kept."""
-        turns = self._config.turns
+        turns = self.config.turns
         if turns.wanted + self._more >= turns.capacity:
             return False
         self._more += 1
         return True
-
-    def compare(self, watched: NamedCamera | None, checked: NamedCamera | None = None) -> None:
-        """Compare turns with cameras from now on; both may be called again with the same ones.
-
-        watched: each new turn is compared with it, to find changes. checked: each calibration is
-        compared with it; the present turns at once.
-        """
-        self._watched, self._checked = watched, checked
 
     def restart(self, keep_stored: bool = False) -> None:
         """Forget all turns and begin with an empty bank; a running calibration is cancelled.
@@ -262,7 +254,7 @@ class Learner:
 
     def _bank(self, number: int, use_stored: bool) -> _Bank:
         calibrator = Calibrator(
-            self._config, mask=self._mask, live=True, use_stored=use_stored,
+            self.config, mask=self._mask, live=True, use_stored=use_stored,
             warn=lambda text: self._tell(Trouble('store', text)),
             on_trouble=lambda text: self._tell(Trouble('workers', text)), on_wait=self._serve)
         return _Bank(number, calibrator, Questions(calibrator))
@@ -297,14 +289,14 @@ class Learner:
     def _look(self, bank: _Bank) -> None:
         """See which turns are built now."""
         try:
-            bank.calibrator.scenes.want(self._config.turns.wanted, self._more)
+            bank.calibrator.scenes.want(self.config.turns.wanted, self._more)
             status = bank.calibrator.status()
         except Exception as error:
             self._tell(Trouble('failed', f'the turns could not be counted: {_named(error)}'))
             return
         self._note(bank, status)
-        if self._watching is not self._watched:
-            self._watching, self._monitor, bank.read = self._watched, None, frozenset()
+        if self._watching is not self.watched:
+            self._watching, self._monitor, bank.read = self.watched, None, frozenset()
         turns = frozenset(status.reconstructed)
         if self._watching is not None and not turns <= bank.read:
             self._read(bank, self._watching, turns)
@@ -337,21 +329,21 @@ class Learner:
 
     def _note(self, bank: _Bank, status: Status) -> None:
         self.activity = replace(self.activity, status=status)
-        for line in new_turns(bank.told, status, self._config.turns.wanted,
-                              self._watched is not None):
+        for line in new_turns(bank.told, status, self.config.turns.wanted,
+                              self.watched is not None):
             self._tell(line)
         bank.told |= set(status.ready)
 
     def _due(self, bank: _Bank) -> bool:
-        if self._checked is not self._tried_with:
-            self._tried_with, bank.tried = self._checked, frozenset()
+        if self.checked is not self._tried_with:
+            self._tried_with, bank.tried = self.checked, frozenset()
         ready, goal = self.activity.status.ready, self.goal
         news = goal is not None and len(ready) >= goal and not bank.tried.issuperset(ready)
         return (bank.number == self.bank and (bank.requested or news)
                 and time.monotonic() >= bank.not_before)
 
     def _calibrate(self, bank: _Bank) -> None:
-        bank.requested, given = False, self._checked
+        bank.requested, given = False, self.checked
         self.activity = replace(self.activity, calibrating=True)
         self._tell(beginning(self.activity.status))
         try:
@@ -362,7 +354,7 @@ class Learner:
             calibration = bank.calibrator.calibrate(self._progress, final=False)
             check = None if given is None else bank.questions.check(
                 given.camera, calibration, self._progress)
-            of_another = turns_of_another_camera(calibration.misfits, self._config.verdict)
+            of_another = turns_of_another_camera(calibration.misfits, self.config.verdict)
             bank.calibrator.scenes.reject(dict.fromkeys(
                 outdated(of_another | calibration.used_turns, of_another), CONTRADICTS))
         except Exception as error:
@@ -371,7 +363,7 @@ class Learner:
         finally:
             self.activity = replace(self.activity, calibrating=False, stage='')
         bank.tried, bank.failures = frozenset(calibration.misfits), 0
-        complete = calibration.turns_used >= self._config.turns.wanted
+        complete = calibration.turns_used >= self.config.turns.wanted
         self._tell(Result(calibration, complete, bank.number, given, check))
 
     def _progress(self, stage: str, share: float) -> None:

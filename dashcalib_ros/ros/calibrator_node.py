@@ -114,7 +114,7 @@ class CalibratorNode(CameraNode):
 
     def _on_watched(self, watched: Watched) -> None:
         super()._on_watched(watched)
-        if watched.camera is self._compared() and watched.monitor.agrees:
+        if watched.camera is self._trusted() and watched.monitor.agrees:
             self._confirmed = True
 
     def _judge(self, result: Result) -> None:

@@ -34,7 +34,7 @@ class CheckNode(CameraNode):
         self._given: NamedCamera | None = None
         self._size: tuple[int, int] | None = None
         self._found = NOT_YET
-        # why there is no camera, or it is not of the images
+        # why there is no camera
         self._problem = f'no camera_info on {self._given_topic} yet'
         self._answers = self._publisher(String, '~/check', latched())
         # hears reliable and best-effort drivers alike; one that is lost is followed by the next
@@ -62,7 +62,7 @@ class CheckNode(CameraNode):
     def _fit(self, source: Source) -> None:
         """Take the size of the images, which is compared with the driver's."""
         self._size = source.size
-        self._tell_size()
+        self._warn()
 
     def _on_watched(self, watched: Watched) -> None:
         """Take what new turns show; publish it where it says more than before."""
@@ -110,7 +110,13 @@ class CheckNode(CameraNode):
 
     def _warnings(self) -> list[str]:
         """Return what keeps the calibration from being checked."""
-        return [self._problem] if self._problem else []
+        if self._given is None:
+            return [self._problem]
+        if self._fits or self._size is None:
+            return []
+        (width, height), (w, h) = self._given.image_size, self._size
+        return [f'the camera_info on {self._given_topic} is for {width}x{height}, and the images '
+                f'are {w}x{h}']
 
     def _health(self, turns: str) -> Health:
         found = self._answer()
@@ -149,27 +155,20 @@ class CheckNode(CameraNode):
         if changed:
             self._log.warning(f'the calibration on {topic} has changed: it is checked anew')
         try:
-            self._given, self._problem = camera_of_message(message, topic), ''
+            self._given = camera_of_message(message, topic)
+            if self._given.faults:
+                self._log.warning(f'the calibration on {topic} is wrong: '
+                                  f'{"; ".join(self._given.faults)}')
         except InputError as error:
             self._given, self._problem = None, str(error)
-            self._log.warning(self._problem)
-        if self._given is not None and self._given.faults:
-            self._log.warning(f'the calibration on {topic} is wrong: '
-                              f'{"; ".join(self._given.faults)}')
-        self._tell_size()
+        self._warn()
         self._verdict = None
         self._drop()
         self._set_goal()
 
-    def _tell_size(self) -> None:
-        if self._given is None:
-            return
-        self._problem = ''
-        if not self._fits and self._size is not None:
-            (width, height), (w, h) = self._given.image_size, self._size
-            self._problem = (f'the camera_info on {self._given_topic} is for {width}x{height}, '
-                             f'and the images are {w}x{h}')
-            self._log.warning(self._problem)
+    def _warn(self) -> None:
+        for text in self._warnings():
+            self._log.warning(text)
 
     def _publish(self) -> None:
         values = answer_dict(self._answer(), self._changes.texts)

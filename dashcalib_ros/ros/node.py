@@ -90,7 +90,6 @@ class CameraNode(Node, ABC):
         self._verdict: Verdict | None = None
         # what the car's own sensors say of the last calibration, in words
         self._witnesses: list[str] = []
-        self._watched: NamedCamera | None = None
         # not the ROS clock: diagnostics must also be published while a simulation is paused
         self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._open(topic)
@@ -275,7 +274,7 @@ class CameraNode(Node, ABC):
                 self._on_result(news)
 
     def _on_watched(self, watched: Watched) -> None:
-        if watched.camera is self._compared():
+        if watched.camera is self._trusted():
             self._changes.take(watched.monitor)
 
     def _on_result(self, result: Result) -> None:
@@ -290,17 +289,13 @@ class CameraNode(Node, ABC):
         self._judge(result)
         self._set_goal()
 
-    def _compared(self) -> NamedCamera | None:
-        """Return the camera that each turn is compared with; the changes are of this one."""
-        if self._watched is not self._trusted():
-            self._watched = self._trusted()
-            self._changes.forget()
-        return self._watched
-
     def _set_goal(self) -> None:
         """Tell the learner from how many turns to calibrate, and what to compare turns with."""
-        self._learner.goal = self._goal()
-        self._learner.compare(self._compared(), self._checked())
+        learner, trusted = self._learner, self._trusted()
+        if learner.watched is not trusted:
+            self._changes.forget()  # those of another camera
+        learner.config, learner.goal = self._core, self._goal()
+        learner.watched, learner.checked = trusted, self._checked()
 
     # services and parameters -----------------------------------------------------------------
 
@@ -337,7 +332,6 @@ class CameraNode(Node, ABC):
         wanted = self._core.turns.wanted
         if wanted != before:
             self._log.info(f'{wanted} turns are wanted now, not {before}')
-            self._learner.want(wanted)
             self._set_goal()
         return SetParametersResult(successful=True)
 

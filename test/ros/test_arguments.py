@@ -132,9 +132,9 @@ def test_a_package_is_looked_up(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(('url', 'words'), [
-    ('ftp://host/camera.yaml', 'nothing can be kept at ftp://; use file:///'),
-    ('flash:///camera.yaml', 'nothing can be kept at flash://'),
-    ('file://camera.yaml', 'begins with /'),
+    ('ftp://host/camera.yaml', 'names no file that can be kept; use file:///'),
+    ('flash:///camera.yaml', 'names no file that can be kept'),
+    ('file://camera.yaml', 'names no file'),
     ('file:///data/', 'names no file'),
     ('package://my_car', 'names no file in a package'),
     ('file:///data/${CAMERA}.yaml', r'there is no \$\{CAMERA\}'),

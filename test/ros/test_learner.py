@@ -228,7 +228,7 @@ def test_each_turn_and_each_calibration_is_told_once(desk):
 def test_other_numbers_of_turns_can_be_wanted_while_it_runs(desk):
     core = Core.made[0]
     core.ready = at(10)
-    desk.learner.want(1)
+    desk.learner.config = CONFIG.replace({'turns.wanted': 1})
     desk.learner.goal = 1
     until(lambda: desk.results)
     assert core.wanted == 1 and desk.results[0].complete
@@ -237,7 +237,7 @@ def test_other_numbers_of_turns_can_be_wanted_while_it_runs(desk):
 
 
 def test_a_bank_is_extended_turn_by_turn_as_far_as_turns_are_kept(desk):
-    desk.learner.want(9)
+    desk.learner.config = CONFIG.replace({'turns.wanted': 9})
     assert desk.learner.extend()
     until(lambda: getattr(Core.made[0], 'wanted', None) == 10)
     assert not desk.learner.extend()
@@ -392,10 +392,10 @@ def test_new_turns_are_compared_with_the_camera_in_use_once(desk):
     core.ready = at(10)
     time.sleep(2 * room.LOOK_S)
     assert core.watched == []  # there is none in use
-    desk.learner.compare(CAMERA)
+    desk.learner.watched = CAMERA
     until(lambda: desk.watched)
     time.sleep(2 * room.LOOK_S)
-    desk.learner.compare(CAMERA)
+    desk.learner.watched = CAMERA
     core.ready = at(10, 20)
     until(lambda: len(desk.watched) == 2)
     time.sleep(2 * room.LOOK_S)
@@ -405,7 +405,7 @@ def test_new_turns_are_compared_with_the_camera_in_use_once(desk):
 
 def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
     desk.learner.goal = None
-    desk.learner.compare(CAMERA)
+    desk.learner.watched = CAMERA
     Core.made[0].strangers = Core.made[0].ready = at(10, 20)
     until(lambda: desk.watched)
     assert desk.watched[-1].monitor.lens.confirmed
@@ -417,14 +417,14 @@ def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
     until(lambda: len(desk.watched) == 2)
     assert desk.watched[-1].monitor.lens.confirmed
     # not with another calibration
-    desk.learner.compare(dataclasses.replace(CAMERA, name='another'))
+    desk.learner.watched = dataclasses.replace(CAMERA, name='another')
     until(lambda: len(desk.watched) == 3)
     assert desk.watched[-1].monitor.lens is None
 
 
 def test_turns_that_could_not_be_compared_are_told_and_tried_with_the_next(desk):
     desk.learner.goal = None
-    desk.learner.compare(CAMERA)
+    desk.learner.watched = CAMERA
     Core.failures = [WorkerError('the process died')]
     core = Core.made[0]
     core.ready = at(10)
@@ -444,24 +444,24 @@ def test_each_calibration_is_compared_with_a_camera_that_is_to_be_checked(desk):
     time.sleep(2 * room.LOOK_S)
     assert core.calls == 0
     desk.learner.goal = 2
-    desk.learner.compare(None, CAMERA)
+    desk.learner.checked = CAMERA
     until(lambda: desk.results)
     assert desk.results[0].given is CAMERA and desk.results[0].check.answer == 'right'
     time.sleep(2 * room.LOOK_S)
     assert core.calls == 1
     # another one: the same turns are used again
     other = dataclasses.replace(CAMERA, name='another')
-    desk.learner.compare(None, other)
+    desk.learner.checked = other
     until(lambda: len(desk.results) == 2)
     assert desk.results[1].given is other and core.watched == []
 
 
 def test_a_camera_that_changes_during_a_calibration_is_checked_by_the_next(desk):
     core = Core.made[0]
-    desk.learner.compare(None, CAMERA)
+    desk.learner.checked = CAMERA
     held(desk, core)
     other = dataclasses.replace(CAMERA, name='another')
-    desk.learner.compare(None, other)
+    desk.learner.checked = other
     core.hold.set()
     until(lambda: len(desk.results) == 2)
     assert [result.given for result in desk.results] == [CAMERA, other]
