@@ -124,7 +124,6 @@ class _Bank:
     calibration is to begin with the present turns. failures: of calibrations in a row.
     not_before: when the next one may begin, in s of time.monotonic(). read: the turns that were
     compared with the camera in use. earlier: what those of the banks before said of it.
-    start_s: stamp of the first image.
     """
 
     number: int
@@ -138,7 +137,6 @@ class _Bank:
     not_before: float = 0.0
     read: frozenset[TurnId] = frozenset()
     earlier: Monitor | None = None
-    start_s: float | None = None
 
 
 class Learner:
@@ -276,7 +274,6 @@ class Learner:
         try:
             image = mapped_copy(whole(message, size, bank.depth))
             status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
-            bank.start_s = stamp_ns / 1e9 if bank.start_s is None else bank.start_s
             self._show(message.header, image, bank.calibrator.detection)
         except InputError as error:
             self._tell(Trouble('undecodable', str(error)))
@@ -348,9 +345,10 @@ class Learner:
         self._tell(beginning(self.activity.status))
         try:
             stream = self.sensors.stream()
-            if bank.start_s is not None and (stream.warnings or not stream.empty):
+            found = bank.calibrator.detection
+            if found.frames and (stream.warnings or not stream.empty):
                 # both have the same clock, whichever it is
-                bank.calibrator.sense(replace(stream.shifted(-bank.start_s), absolute=False))
+                bank.calibrator.sense(replace(stream.shifted(-found.start_s), absolute=False))
             calibration = bank.calibrator.calibrate(self._progress, final=False)
             check = None if given is None else bank.questions.check(
                 given.camera, calibration, self._progress)

@@ -41,7 +41,7 @@ class CalibratorNode(CameraNode):
         # a reliable publisher reaches reliable and best-effort subscribers alike
         self._beside = self._publisher(CameraInfo, 'camera_info', 10)
         self._latched = self._publisher(CameraInfo, '~/calibration', latched())
-        self._mounting = Mounting(self, self._own)
+        self._mounting = Mounting(self, self._own, self._complaints.once)
         # what is published now, and how many were published beside images
         self._info: CameraInfo | None = None
         self._sent = 0
@@ -154,9 +154,7 @@ class CalibratorNode(CameraNode):
         frame_id = self._intake.source.frame_id if self._intake.source else ''
         kept = Kept.of(calibration, self._whose, frame_id)
         info = self._use(kept)
-        saved, text = self._save()
-        self._log.info(f'accepted: {sigma_text(kept.camera)}; '
-                       + (f'saved to {self._store.path}' if saved else f'not saved: {text}'))
+        self._log.info(f'accepted: {sigma_text(kept.camera)}; {self._save()[1]}')
         if self._own.commit:
             if self._commit is not None:
                 self._commit.end()
@@ -203,15 +201,11 @@ class CalibratorNode(CameraNode):
 
     def _retire(self) -> tuple[bool, str]:
         """Move the file aside; return whether it is out of the way, and a line about it."""
-        if self._store.taken:
-            return True, self._store.taken
         try:
-            moved = self._store.retire()
+            return True, self._store.retire()
         except OutputError as error:
-            text = f'{error}; until then the next start of the node publishes it again'
-            self._log.error(text)
-            return False, text
-        return True, 'there was no file' if moved is None else f'{self._store.path} is now {moved}'
+            self._log.error(str(error))
+            return False, str(error)
 
     def _reset(self) -> tuple[bool, str]:
         self._log.warning('reset by request: the turns and the calibration are dropped')
@@ -226,18 +220,14 @@ class CalibratorNode(CameraNode):
         if self._stale:
             return False, 'the calibration is contradicted by new turns'
         try:
-            moved = self._store.save(self._kept)
+            return True, self._store.save(self._kept)
         except OutputError as error:
             self._complaints.say('unsaved', str(error))
-            return False, str(error)
-        if moved is not None:
-            self._log.warning(f'{self._store.path} was written by another program: it is now '
-                              f'{moved}')
-        return True, f'written: {self._store.path}'
+            return False, f'not saved: {error}'
 
     def _warnings(self) -> list[str]:
         """Return warnings about the file and the topic, for the operator."""
-        found = [self._store.taken] if self._store.taken else []
+        found = [text for text in (self._store.taken, self._store.given_up) if text]
         if self._contradictions:
             found.append(f'{self._contradictions} of {self._own.contradictions} calibrations in '
                          f'a row contradict the published one: was the camera moved, its lens '
@@ -245,9 +235,6 @@ class CalibratorNode(CameraNode):
         if self._kept is not None and self._kept.edited and not self._confirmed:
             found.append(f'{self._store.path} was edited since a node wrote it: unconfirmed until '
                          f'turns agree with it')
-        if self._store.given_up:
-            found.append(f'{self._store.path} was given up, but could not be moved aside: remove '
-                         f'it, or the next start of the node publishes it again')
         beside = self._beside.topic_name
         if self.count_publishers(beside) > 1:
             found.append(f'another node publishes {beside}: remap it, or its subscribers get both')

@@ -40,8 +40,9 @@ Take = Callable[[str, float, Sequence[float]], None]
 class Mounting:
     """Publishes the mounting on ~/mount, and, where it is asked for, once on /tf_static."""
 
-    def __init__(self, node: Node, own: NodeConfig) -> None:
-        self._node, self._own = node, own
+    def __init__(self, node: Node, own: NodeConfig, warn: Callable[[str], None]) -> None:
+        """warn: logs a line unless it was logged before."""
+        self._node, self._own, self._warn = node, own, warn
         # what was published last
         self.mount: Mount | None = None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/mount', latched(),
@@ -52,7 +53,6 @@ class Mounting:
         # the parent of each frame, as others say
         self._parents: dict[str, str] = {}
         self._transforms: Any = None
-        self._told: set[str] = set()
         if own.publish_tf:
             self._prepare()
 
@@ -98,11 +98,6 @@ class Mounting:
     def _listen(self, message: Any) -> None:
         self._parents.update({each.child_frame_id.lstrip('/'): each.header.frame_id.lstrip('/')
                               for each in message.transforms})
-
-    def _warn(self, text: str) -> None:
-        if text not in self._told:
-            self._told.add(text)
-            self._node.get_logger().warning(text)
 
     def _message(self, mount: Mount) -> PoseWithCovarianceStamped:
         message = PoseWithCovarianceStamped(header=self._header())

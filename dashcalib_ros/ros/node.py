@@ -213,10 +213,6 @@ class CameraNode(Node, ABC):
 
     # images ----------------------------------------------------------------------------------
 
-    def listen(self, active: bool) -> None:
-        """Subscribe the images, or end the subscription."""
-        (self._images.start if active else self._images.stop)()
-
     def _on_image(self, message: Any) -> None:
         taken = self._intake.take(message)
         if taken is None:

@@ -70,12 +70,12 @@ class Managed(LifecycleNodeMixin, CameraNode):  # type: ignore[misc]
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe the images."""
-        self.listen(True)
+        self._images.start()
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; turns and calibration stay."""
-        self.listen(False)
+        self._images.stop()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -85,7 +85,7 @@ class Managed(LifecycleNodeMixin, CameraNode):  # type: ignore[misc]
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening for good."""
-        self.listen(False)
+        self._images.stop()
         return super().on_shutdown(state)
 
 

@@ -195,27 +195,27 @@ def _has_parameters(data: object) -> bool:
 
 
 def _row(name: str, spec: dataclasses.Field[Any]) -> str:
-    about = spec.metadata
     value = f'{spec.default}'.lower() if isinstance(spec.default, bool) else f'{spec.default!r}'
-    text = f'{about["reason"]}; default {value}'
-    if about['choices']:
-        text += f'; one of {", ".join(about["choices"])}'
+    text = f'{spec.metadata["reason"]}; default {value}{_choices(spec)}'
     name += ' *' if name in CHANGEABLE else ''
     return textwrap.fill(text, 80, initial_indent=f'  {name:<21}', subsequent_indent=' ' * 23)
 
 
 def _line(name: str, spec: dataclasses.Field[Any]) -> str:
     about = spec.metadata
-    note = str(about['reason'])
-    if about['choices']:
-        note += f'; one of {", ".join(about["choices"])}'
-    elif about['minimum'] is not None:
+    note = f'{about["reason"]}{_choices(spec)}'
+    if about['minimum'] is not None:
         note += f'; {about["minimum"]:.10g} to {about["maximum"]:.10g}'
     if name in CHANGEABLE:
         note += '; may be changed while the node runs'
     value = yaml.safe_dump(spec.default, default_flow_style=True).split('\n')[0]
     comment = textwrap.fill(note, 99, initial_indent='    # ', subsequent_indent='    # ')
     return f'{comment}\n    {name}: {value}\n'
+
+
+def _choices(spec: dataclasses.Field[Any]) -> str:
+    choices = spec.metadata['choices']
+    return f'; one of {", ".join(choices)}' if choices else ''
 
 
 if __name__ == '__main__':

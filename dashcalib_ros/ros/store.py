@@ -193,9 +193,12 @@ class Store:
                 f'camera_name or camera_info_url to give each a file of its own')
 
     @property
-    def given_up(self) -> bool:
-        """Return whether the file still has a calibration that was given up."""
-        return self._given_up is not None and self._read() == self._given_up
+    def given_up(self) -> str:
+        """Return the line where the file still has a calibration that was given up, else ''."""
+        if self._given_up is None or self._read() != self._given_up:
+            return ''
+        return (f'{self.path} was given up, but could not be moved aside: remove it, or the next '
+                f'start of the node publishes it again')
 
     def load(self) -> Kept | None:
         """Return the calibration, None if there is no file.
@@ -213,9 +216,8 @@ class Store:
             kept = Kept.read(text, self.path, self._whose)
         except (InputError, OSError, ValueError, OverflowError) as error:
             raise InputError(f'{self.path} is ignored: {error}') from error
-        if text == self._given_up:
-            raise InputError(f'{self.path} is ignored: it was given up, but could not be moved '
-                             f'aside; remove it')
+        if self.given_up:
+            raise InputError(self.given_up)
         if why := implausible(kept.camera):
             try:
                 end = f'it is now {set_aside(self.path)}'
@@ -226,11 +228,8 @@ class Store:
         # its sigma may be what was edited
         return replace(kept, camera=replace(kept.camera, sigma=None)) if kept.edited else kept
 
-    def save(self, kept: Kept) -> Path | None:
-        """Write it, completely or not at all. Raises OutputError.
-
-        Returns the new path of another program's file, None if there was none.
-        """
+    def save(self, kept: Kept) -> str:
+        """Write it, completely or not at all; return a line about it. Raises OutputError."""
         if self.taken:
             raise OutputError(self.taken)
         try:
@@ -241,29 +240,30 @@ class Store:
         moved = None if self._ours else set_aside(self.path)
         self._write(kept)
         self._given_up = None
-        return moved
+        return f'saved to {self.path}' + (
+            f'; what another program wrote there is now {moved}' if moved else '')
 
     def update(self, kept: Kept) -> None:
         """Write it where the file is still what this node read or wrote. Raises OutputError."""
         if self._ours and self.claim():
             self._write(kept)
 
-    def retire(self) -> Path | None:
-        """Set the file aside, so that it is not loaded again; return its new path.
+    def retire(self) -> str:
+        """Set the file aside, so that it is not loaded again; return a line about it.
 
-        None if there was no file. Raises OutputError when it could not be moved: this process
-        does not load it again then, but the next start of the node does; and where another node
-        has it.
+        That of another node stays. Raises OutputError when it could not be moved: this process
+        does not load it again then, but the next start of the node does.
         """
         if self.taken:
-            raise OutputError(self.taken)
+            return self.taken
         try:
             moved = set_aside(self.path)
-        except OutputError:
+        except OutputError as error:
             self._given_up = self._read()
-            raise
+            raise OutputError(f'{error}; until then the next start of the node publishes it '
+                              f'again') from error
         self._text = self._given_up = None
-        return moved
+        return f'{self.path} is now {moved}' if moved else 'there was no file'
 
     @property
     def _ours(self) -> bool:
