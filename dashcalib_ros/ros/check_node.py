@@ -66,9 +66,9 @@ class CheckNode(CameraNode):
 
     def _on_watched(self, watched: Watched) -> None:
         """Take what new turns show; publish it where it says more than before."""
-        before = self._changes.texts
+        before = self._changes()
         super()._on_watched(watched)
-        if self._changes.texts != before:
+        if self._changes() != before:
             self._publish()
 
     def _judge(self, result: Result) -> None:
@@ -95,7 +95,7 @@ class CheckNode(CameraNode):
         """Forget the answer and the changes; the driver's camera stays."""
         # as another object: what is still said of the former one is out of date
         self._given = None if self._given is None else replace(self._given)
-        self._changes.forget()
+        self._monitor = None
         self._found = NOT_YET
         if self._infos.current is not None:
             self._publish()
@@ -171,7 +171,7 @@ class CheckNode(CameraNode):
             self._log.warning(text)
 
     def _publish(self) -> None:
-        values = answer_dict(self._answer(), self._changes.texts)
+        values = answer_dict(self._answer(), tuple(self._changes().values()))
         if self._given is None:
             values['reasons'] = self._warnings()
         self._answers.publish(String(data=json.dumps(values, allow_nan=False)))

@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from dashcalib_ros.errors import one_line
-from dashcalib_ros.judge import Change, Monitor
 from dashcalib_ros.report import NamedCamera
 
 # s between two lines of one kind of problem
@@ -79,45 +78,6 @@ class Complaints:
         """Take over a count that is kept elsewhere; log when it has grown."""
         if count > self.counts[kind]:
             self.say(kind, text, count - self.counts[kind])
-
-
-class Changes:
-    """The changes of the camera in use, as its turns show them: each is told once in the log.
-
-    confirmed: by two turns or more; suspected: by one. The log gets the confirmed ones only.
-    """
-
-    confirmed: tuple[Change, ...] = ()
-    suspected: tuple[Change, ...] = ()
-
-    def __init__(self, log: RcutilsLogger) -> None:
-        self._log = log
-
-    @property
-    def misfit(self) -> str:
-        """Return why the calibration no longer fits the camera, '' where it does."""
-        return next((str(each) for each in self.confirmed if each.kind == 'lens'), '')
-
-    @property
-    def texts(self) -> tuple[str, ...]:
-        """Return the confirmed changes in words."""
-        return tuple(map(str, self.confirmed))
-
-    def take(self, monitor: Monitor) -> None:
-        """Take what the turns so far show."""
-        known = {each.kind for each in self.confirmed}
-        self.confirmed = monitor.changes
-        self.suspected = tuple(each for each in (monitor.lens, monitor.mount)
-                               if each is not None and not each.confirmed)
-        for change in self.confirmed:
-            if change.kind not in known:
-                log_line(self._log, change.kind == 'lens', str(change))
-        if 'lens' in known and not self.misfit:
-            self._log.info('the newest turns fit the calibration again')
-
-    def forget(self) -> None:
-        """Begin anew: another calibration is in use, or none."""
-        self.confirmed = self.suspected = ()
 
 
 @dataclass(frozen=True)

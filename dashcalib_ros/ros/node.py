@@ -23,13 +23,13 @@ from std_srvs.srv import Trigger
 from dashcalib_ros.calibrator import Status
 from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, one_line
 from dashcalib_ros.input.decode import check_mask, read_mask
-from dashcalib_ros.judge import Verdict
+from dashcalib_ros.judge import Monitor, Verdict
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.result import check_camera_name
 from dashcalib_ros.report.wording import witness_texts
 from dashcalib_ros.ros.background import Learner, News, Result, Trouble, Watched
 from dashcalib_ros.ros.car import Sensors
-from dashcalib_ros.ros.diagnostics import ERROR, STALE, WARN, Changes, Complaints, Health
+from dashcalib_ros.ros.diagnostics import ERROR, STALE, WARN, Complaints, Health, log_line
 from dashcalib_ros.ros.images import CURES, ImageInput, Intake, Source, since_text
 from dashcalib_ros.ros.parameters import (
     OVERRIDES,
@@ -86,7 +86,8 @@ class CameraNode(Node, ABC):
         self._complaints = Complaints(self._log.warning)
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake = self.create_guard_condition(self._empty)
-        self._changes = Changes(self._log)
+        # what turns say of the camera in use, None before they do
+        self._monitor: Monitor | None = None
         self._verdict: Verdict | None = None
         # what the car's own sensors say of the last calibration, in words
         self._witnesses: list[str] = []
@@ -270,8 +271,20 @@ class CameraNode(Node, ABC):
                 self._on_result(news)
 
     def _on_watched(self, watched: Watched) -> None:
-        if watched.camera is self._trusted():
-            self._changes.take(watched.monitor)
+        """Take what turns say of the camera in use; each change is told once in the log."""
+        if watched.camera is not self._trusted():
+            return
+        known = self._changes()
+        self._monitor = watched.monitor
+        for kind, text in self._changes().items():
+            if kind not in known:
+                log_line(self._log, kind == 'lens', text)
+        if 'lens' in known and 'lens' not in self._changes():
+            self._log.info('the newest turns fit the calibration again')
+
+    def _changes(self) -> dict[str, str]:
+        """Return the changes of the camera in use that two turns show, in words by their kind."""
+        return {each.kind: str(each) for each in self._monitor.changes} if self._monitor else {}
 
     def _on_result(self, result: Result) -> None:
         if result.bank != self._learner.bank:
@@ -289,7 +302,7 @@ class CameraNode(Node, ABC):
         """Tell the learner from how many turns to calibrate, and what to compare turns with."""
         learner, trusted = self._learner, self._trusted()
         if learner.watched is not trusted:
-            self._changes.forget()  # those of another camera
+            self._monitor = None
         learner.config, learner.goal = self._core, self._goal()
         learner.watched, learner.checked = trusted, self._checked()
 
@@ -369,8 +382,10 @@ class CameraNode(Node, ABC):
             'reasons': '; '.join(verdict.reasons) if verdict else '',
             **health.values,
             'warnings': '; '.join(warnings),
-            'change': '; '.join(self._changes.texts),
-            'suspected change': '; '.join(map(str, self._changes.suspected)),
+            'change': '; '.join(self._changes().values()),
+            'suspected change': '; '.join(
+                str(each) for each in (self._monitor.lens, self._monitor.mount)
+                if each and not each.confirmed) if self._monitor else '',
             'topic': images.topic,
             'reliability': images.reliability,
             'motion sensors': '; '.join(self._witnesses),
@@ -395,8 +410,8 @@ class CameraNode(Node, ABC):
             return STALE, f'no image on {self._images.topic} {since_text(silent_s)}'
         if health.level != ERROR and warnings:
             return WARN, f'{health.state}: {warnings[0]}'
-        if health.level != ERROR and self._changes.misfit:
-            return WARN, self._changes.misfit
+        if health.level != ERROR and 'lens' in self._changes():
+            return WARN, self._changes()['lens']
         return health.level, health.message
 
 

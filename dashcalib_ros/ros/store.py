@@ -270,8 +270,9 @@ class Store:
         return self._text is not None and self._read() == self._text
 
     def _write(self, kept: Kept) -> None:
-        write_text(self.path, kept.text)
-        self._text = kept.text
+        text = kept.text
+        write_text(self.path, text)
+        self._text = text
 
     def _read(self) -> str | None:
         try:
