@@ -247,7 +247,7 @@ class Learner:
         try:
             action()
         except Exception as error:
-            self._tell(Trouble('failed', f'the turns could not be changed: {_named(error)}'))
+            self._tell(Trouble('failed', f'an image or a request failed: {_named(error)}'))
         return True
 
     def _bank(self, number: int, use_stored: bool) -> _Bank:
@@ -274,14 +274,12 @@ class Learner:
         try:
             image = mapped_copy(whole(message, size, bank.depth))
             status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
-            self._show(message.header, image, bank.calibrator.detection)
         except InputError as error:
             self._tell(Trouble('undecodable', str(error)))
-        except Exception as error:
-            self._tell(Trouble('failed', f'an image could not be used: {_named(error)}'))
-        else:
-            self._note(bank, status)
-            self._tell(status)
+            return
+        self._show(message.header, image, bank.calibrator.detection)
+        self._note(bank, status)
+        self._tell(status)
 
     def _look(self, bank: _Bank) -> None:
         """See which turns are built now."""
