@@ -4,7 +4,6 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
-from types import FrameType
 
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, write_stdout
@@ -18,34 +17,16 @@ ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class Stopping:
-    """SIGINT and SIGTERM end the node cleanly: at any time, any number of times.
-
-    Neither raises; `requested` is True after one of them.
-    rclpy's own handlers, installed later by rclpy.init, end the spinning and call these too.
-    """
-
-    def __init__(self) -> None:
-        self.requested = False
-        for name in SIGNALS:
-            signal.signal(name, self._request)
-
-    def ignore_signals(self) -> None:
-        """Ignore both signals while the interpreter ends: by default they would kill it."""
-        for name in SIGNALS:
-            signal.signal(name, signal.SIG_IGN)
-
-    def _request(self, number: int, frame: FrameType | None) -> None:
-        self.requested = True
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node until it is stopped; return its exit code. argv: without the program's name."""
-    # the handlers come first: Ctrl-C may be pressed while the imports still run
-    stopping = Stopping()
+    # the handlers come first: Ctrl-C may be pressed while the imports still run, and again.
+    # rclpy's own handlers, installed later by rclpy.init, end the spinning and call these too
+    signals: list[int] = []
+    for each in SIGNALS:
+        signal.signal(each, lambda number, frame: signals.append(number))
     open_closed_streams()
     try:
-        from dashcalib_ros.ros.settings import check_files, help_text, parse, ros_arguments
+        from dashcalib_ros.ros.settings import check_files, help_text, parse
         arguments = list(sys.argv[1:] if argv is None else argv)
         wants_help, lifecycle = parse(arguments)
         if wants_help:
@@ -53,7 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         check_files(arguments)
         from dashcalib_ros.ros.program import run
-        return run(ros_arguments(arguments), lifecycle, lambda: stopping.requested)
+        return run([each for each in arguments if each != '--lifecycle'], lifecycle,
+                   lambda: bool(signals))
     except DashcalibError as error:
         write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
         return 2
@@ -64,4 +46,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_stderr(INSTALL.format(name=missing))
         return 2
     finally:
-        stopping.ignore_signals()
+        # while the interpreter ends, they would kill it
+        for each in SIGNALS:
+            signal.signal(each, signal.SIG_IGN)

@@ -4,16 +4,16 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Any, Protocol
+from typing import Any
 
 from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.detect.estimator import TrackedPoints
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import DashcalibError, InputError, counted, one_line
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
@@ -64,39 +64,6 @@ class Watched:
 
 
 @dataclass(frozen=True)
-class NewTurn:
-    """A turn that was reconstructed. number: its place among the turns so far, from 1.
-
-    of_this_drive: False for a stored turn of an earlier drive. total_deg: yaw of all turns so far.
-    """
-
-    number: int
-    yaw_deg: float
-    total_deg: float
-    of_this_drive: bool
-
-    def text(self, wanted: int, checking: bool) -> str:
-        """Return 'turn 2 of 5: 89°, 179° in all'; checking: it checks a published calibration."""
-        number = f'turn {self.number}' + (f' of {wanted}' if self.number <= wanted else '')
-        source = '' if self.of_this_drive else ' (of an earlier drive)'
-        purpose = ' for the next check of the calibration' if checking else ''
-        return f'{number}{purpose}{source}: {self.yaw_deg:.0f}°, {self.total_deg:.0f}° in all'
-
-
-@dataclass(frozen=True)
-class Started:
-    """A calibration begins."""
-
-    status: Status
-
-    def __str__(self) -> str:
-        found, built = self.status.turns, self.status.built
-        if not built:
-            return f'calibrating, as soon as {counted(found, "turn")} found so far can be used…'
-        return f'calibrating with {counted(built, "turn")}, {self.status.yaw_deg:.0f}° of yaw…'
-
-
-@dataclass(frozen=True)
 class Trouble:
     """A problem: its kind, for counting, and one line for the log."""
 
@@ -104,43 +71,17 @@ class Trouble:
     text: str
 
 
-News = Status | NewTurn | Started | Trouble | Result | Watched
-
-
-@dataclass(frozen=True)
-class View:
-    """What is seen in the newest frame: for pictures that people look at.
-
-    valid: (h, w) of the frame, or of the frame resized; None: no ego vehicle is known.
-    """
-
-    points: TrackedPoints
-    valid: Mask | None
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A decoded image with its message's header, and what was tracked and masked in it."""
-
-    header: Any
-    image: GreyImage
-    view: View
-
-
-class Viewer(Protocol):
-    """Who shows images to people; wanted() is called for each, show() where it returned True."""
-
-    def wanted(self) -> bool:
-        """Return whether the next image is to be shown."""
-
-    def show(self, picture: Picture) -> None:
-        """Take an image; must not wait."""
+# a text is for the log
+News = Status | str | Trouble | Result | Watched
+# takes an image with its message's header, and what was found so far; it must not wait
+Show = Callable[[Any, GreyImage, Detection], None]
 
 
 class Inbox:
     """What the background thread is to do next: commands first, then images, each in order.
 
-    put() and put_image() never wait: when too many images wait, the oldest is dropped.
+    put() and put_image() never wait: when too many images wait, the oldest is dropped. dropped:
+    how many were, because detection does not keep up.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -183,7 +124,6 @@ class _Bank:
     calibration is to begin with the present turns. failures: of calibrations in a row.
     not_before: when the next one may begin, in s of time.monotonic(). read: the turns that were
     compared with the camera in use. earlier: what those of the banks before said of it.
-    start_s: stamp of the first image.
     """
 
     number: int
@@ -197,36 +137,41 @@ class _Bank:
     not_before: float = 0.0
     read: frozenset[TurnId] = frozenset()
     earlier: Monitor | None = None
-    start_s: float | None = None
 
 
 class Learner:
     """Learns in the background. All methods are for the node's thread; none of them waits.
 
+    The node may set these at any time. config: turns.wanted counts, from the next calibration on.
     goal: calibrations start by themselves when so many turns are built, and again when others are
-    among the best; None: only by request. bank: the number of the present bank of turns; results
-    of an older one are out of date.
+    among the best; None: only by request. watched: a camera that each new turn is compared with,
+    to find changes. checked: one that each calibration is compared with, at once where it is new.
+
+    bank: the number of the present bank of turns; results of an older one are out of date.
+    activity: what the background thread does now. inbox: what it is to do. sensors: what the car's
+    own sensors say; it may be added to.
     """
 
     def __init__(self, config: Config, queue_size: int, tell: Callable[[News], None],
-                 viewer: Viewer, mask: Mask | None = None) -> None:
+                 show: Show, mask: Mask | None = None) -> None:
         """tell: called with all news, in any thread; it must neither wait nor raise.
 
-        mask: (h, w), False where the images are not to be used.
+        show: called with each image in the background thread. mask: (h, w), False where the images
+        are not to be used.
         """
+        self.config = config
         self.goal: int | None = config.turns.wanted
+        self.watched: NamedCamera | None = None
+        self.checked: NamedCamera | None = None
         self.bank = 0
-        self._config = config
         # turns of this drive that are used beyond those wanted
         self._more = 0
-        self._watched: NamedCamera | None = None
-        self._checked: NamedCamera | None = None
         self._tell = tell
-        self._viewer = viewer
+        self._show = show
         self._mask = mask
-        self._inbox = Inbox(queue_size)
-        self._sensors = SensorBuffer()
-        self._activity = Activity()
+        self.inbox = Inbox(queue_size)
+        self.sensors = SensorBuffer()
+        self.activity = Activity()
         self._closed = False
         # from here on of the background thread only
         self._now = self._bank(0, use_stored=True)
@@ -236,52 +181,27 @@ class Learner:
         self._thread = threading.Thread(target=self._run, name='learn', daemon=True)
         self._thread.start()
 
-    @property
-    def dropped(self) -> int:
-        """Return how many images were dropped because detection did not keep up."""
-        return self._inbox.dropped
-
-    def activity(self) -> Activity:
-        """Return what the background thread does now."""
-        return self._activity
-
     def offer(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int],
               frame_id: str = '') -> None:
         """Take an image message; size and frame_id are what its header says."""
-        self._inbox.put_image(lambda: self._push(index, stamp_ns, message, size, frame_id))
-
-    def sense(self, kind: str, stamp_s: float, values: Sequence[float]) -> None:
-        """Take a sample of the car's own sensors; kind: one of SensorStream's."""
-        self._sensors.add(kind, stamp_s, values)
+        self.inbox.put_image(lambda: self._push(index, stamp_ns, message, size, frame_id))
 
     def request(self) -> str:
         """Calibrate now, with the present turns; return why not, '' if it is started."""
-        if self._activity.calibrating:
+        if self.activity.calibrating:
             return 'a calibration is running already'
-        if not self._activity.status.turns:
+        if not self.activity.status.turns:
             return 'no turn was found so far: drive some'
-        self._inbox.put(self._request)
+        self.inbox.put(self._request)
         return ''
-
-    def want(self, turns: int) -> None:
-        """Use so many turns from the next calibration on."""
-        self._config = self._config.replace({'turns.wanted': turns})
 
     def extend(self) -> bool:
         """Use one turn of this drive more with this bank; False where no more are kept."""
-        turns = self._config.turns
+        turns = self.config.turns
         if turns.wanted + self._more >= turns.capacity:
             return False
         self._more += 1
         return True
-
-    def compare(self, watched: NamedCamera | None, checked: NamedCamera | None = None) -> None:
-        """Compare turns with cameras from now on; both may be called again with the same ones.
-
-        watched: each new turn is compared with it, to find changes. checked: each calibration is
-        compared with it; the present turns at once.
-        """
-        self._watched, self._checked = watched, checked
 
     def restart(self, keep_stored: bool = False) -> None:
         """Forget all turns and begin with an empty bank; a running calibration is cancelled.
@@ -291,16 +211,16 @@ class Learner:
         """
         new = self._bank(self.bank + 1, use_stored=keep_stored)
         self.bank, self._more = new.number, 0
-        self._inbox.put(lambda: self._begin(new, keep_stored), instead_of_images=True)
+        self.inbox.put(lambda: self._begin(new, keep_stored), instead_of_images=True)
 
     def forget_stored(self, but: Set[TurnId]) -> None:
         """Drop the turns of earlier drives but these: the camera has changed since."""
-        self._inbox.put(lambda: self._now.calibrator.scenes.forget_stored(but))
+        self.inbox.put(lambda: self._now.calibrator.scenes.forget_stored(but))
 
     def close(self) -> None:
         """End the thread and every child process."""
         self._closed = True
-        self._inbox.put(lambda: None)
+        self.inbox.put(lambda: None)
         self._now.calibrator.close()
         self._thread.join(timeout=10)
 
@@ -321,25 +241,25 @@ class Learner:
 
         The calibrator calls this while it waits for a child.
         """
-        action = self._inbox.get(wait_s)
+        action = self.inbox.get(wait_s)
         if action is None or self._closed:
             return False
         try:
             action()
         except Exception as error:
-            self._tell(Trouble('failed', f'the turns could not be changed: {_named(error)}'))
+            self._tell(Trouble('failed', f'an image or a request failed: {_named(error)}'))
         return True
 
     def _bank(self, number: int, use_stored: bool) -> _Bank:
         calibrator = Calibrator(
-            self._config, mask=self._mask, live=True, use_stored=use_stored,
+            self.config, mask=self._mask, live=True, use_stored=use_stored,
             warn=lambda text: self._tell(Trouble('store', text)),
             on_trouble=lambda text: self._tell(Trouble('workers', text)), on_wait=self._serve)
         return _Bank(number, calibrator, Questions(calibrator))
 
     def _begin(self, new: _Bank, keep_stored: bool) -> None:
         old, self._now = self._now, new
-        self._activity = replace(self._activity, status=NOTHING)
+        self.activity = replace(self.activity, status=NOTHING)
         old.calibrator.close()
         if not keep_stored:
             old.calibrator.scenes.clear_store()
@@ -354,28 +274,24 @@ class Learner:
         try:
             image = mapped_copy(whole(message, size, bank.depth))
             status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
-            bank.start_s = stamp_ns / 1e9 if bank.start_s is None else bank.start_s
-            if self._viewer.wanted():
-                self._viewer.show(Picture(message.header, image, _view(bank.calibrator)))
         except InputError as error:
             self._tell(Trouble('undecodable', str(error)))
-        except Exception as error:
-            self._tell(Trouble('failed', f'an image could not be used: {_named(error)}'))
-        else:
-            self._note(bank, status)
-            self._tell(status)
+            return
+        self._show(message.header, image, bank.calibrator.detection)
+        self._note(bank, status)
+        self._tell(status)
 
     def _look(self, bank: _Bank) -> None:
         """See which turns are built now."""
         try:
-            bank.calibrator.scenes.want(self._config.turns.wanted, self._more)
+            bank.calibrator.scenes.want(self.config.turns.wanted, self._more)
             status = bank.calibrator.status()
         except Exception as error:
             self._tell(Trouble('failed', f'the turns could not be counted: {_named(error)}'))
             return
         self._note(bank, status)
-        if self._watching is not self._watched:
-            self._watching, self._monitor, bank.read = self._watched, None, frozenset()
+        if self._watching is not self.watched:
+            self._watching, self._monitor, bank.read = self.watched, None, frozenset()
         turns = frozenset(status.reconstructed)
         if self._watching is not None and not turns <= bank.read:
             self._read(bank, self._watching, turns)
@@ -407,45 +323,47 @@ class Learner:
         self._tell(Watched(camera, found))
 
     def _note(self, bank: _Bank, status: Status) -> None:
-        self._activity = replace(self._activity, status=status)
-        for turn in new_turns(bank.told, status):
-            self._tell(turn)
+        self.activity = replace(self.activity, status=status)
+        for line in new_turns(bank.told, status, self.config.turns.wanted,
+                              self.watched is not None):
+            self._tell(line)
         bank.told |= set(status.ready)
 
     def _due(self, bank: _Bank) -> bool:
-        if self._checked is not self._tried_with:
-            self._tried_with, bank.tried = self._checked, frozenset()
-        ready, goal = self._activity.status.ready, self.goal
+        if self.checked is not self._tried_with:
+            self._tried_with, bank.tried = self.checked, frozenset()
+        ready, goal = self.activity.status.ready, self.goal
         news = goal is not None and len(ready) >= goal and not bank.tried.issuperset(ready)
         return (bank.number == self.bank and (bank.requested or news)
                 and time.monotonic() >= bank.not_before)
 
     def _calibrate(self, bank: _Bank) -> None:
-        bank.requested, given = False, self._checked
-        self._activity = replace(self._activity, calibrating=True)
-        self._tell(Started(self._activity.status))
+        bank.requested, given = False, self.checked
+        self.activity = replace(self.activity, calibrating=True)
+        self._tell(beginning(self.activity.status))
         try:
-            stream = self._sensors.stream()
-            if bank.start_s is not None and (stream.warnings or not stream.empty):
+            stream = self.sensors.stream()
+            found = bank.calibrator.detection
+            if found.frames and (stream.warnings or not stream.empty):
                 # both have the same clock, whichever it is
-                bank.calibrator.sense(replace(stream.shifted(-bank.start_s), absolute=False))
+                bank.calibrator.sense(replace(stream.shifted(-found.start_s), absolute=False))
             calibration = bank.calibrator.calibrate(self._progress, final=False)
             check = None if given is None else bank.questions.check(
                 given.camera, calibration, self._progress)
-            of_another = turns_of_another_camera(calibration.misfits, self._config.verdict)
+            of_another = turns_of_another_camera(calibration.misfits, self.config.verdict)
             bank.calibrator.scenes.reject(dict.fromkeys(
                 outdated(of_another | calibration.used_turns, of_another), CONTRADICTS))
         except Exception as error:
             self._failed(bank, error)
             return
         finally:
-            self._activity = replace(self._activity, calibrating=False, stage='')
+            self.activity = replace(self.activity, calibrating=False, stage='')
         bank.tried, bank.failures = frozenset(calibration.misfits), 0
-        complete = calibration.turns_used >= self._config.turns.wanted
+        complete = calibration.turns_used >= self.config.turns.wanted
         self._tell(Result(calibration, complete, bank.number, given, check))
 
     def _progress(self, stage: str, share: float) -> None:
-        self._activity = replace(self._activity, stage=stage)
+        self.activity = replace(self.activity, stage=stage)
 
     def _failed(self, bank: _Bank, error: Exception) -> None:
         if bank is not self._now or self._closed:
@@ -468,23 +386,31 @@ def whole(message: Any, size: tuple[int, int], depth: BitDepth | None = None) ->
     return image
 
 
-def _view(calibrator: Calibrator) -> View:
-    found = calibrator.detection
-    return View(found.points(), found.valid())
-
-
-def new_turns(told: Set[TurnId], now: Status) -> list[NewTurn]:
-    """Return the turns that are ready now and were not told.
+def new_turns(told: Set[TurnId], now: Status, wanted: int, checking: bool) -> list[str]:
+    """Return 'turn 2 of 5: 89°, 179° in all' for each turn that is ready now and was not told.
 
     The total is that of the turns so far; a turn that replaces another has the last number.
+    checking: the turns check a calibration in use.
     """
     fresh = [place for place, turn in enumerate(now.ready) if turn not in told]
-    old = sum(now.yaws_deg) - sum(now.yaws_deg[place] for place in fresh)
-    found = []
+    total = sum(now.yaws_deg) - sum(now.yaws_deg[place] for place in fresh)
+    purpose = ' for the next check of the calibration' if checking else ''
+    lines = []
     for count, place in enumerate(fresh, len(now.ready) - len(fresh) + 1):
-        old += now.yaws_deg[place]
-        found.append(NewTurn(count, now.yaws_deg[place], old, now.ready[place].of_this_drive))
-    return found
+        yaw = now.yaws_deg[place]
+        total += yaw
+        number = f'turn {count} of {wanted}' if count <= wanted else f'turn {count}'
+        source = '' if now.ready[place].of_this_drive else ' (of an earlier drive)'
+        lines.append(f'{number}{purpose}{source}: {yaw:.0f}°, {total:.0f}° in all')
+    return lines
+
+
+def beginning(status: Status) -> str:
+    """Return the line about a calibration that begins."""
+    if not status.built:
+        return (f'calibrating, as soon as {counted(status.turns, "turn")} found so far can be '
+                f'used…')
+    return f'calibrating with {counted(status.built, "turn")}, {status.yaw_deg:.0f}° of yaw…'
 
 
 def _named(error: Exception) -> str:

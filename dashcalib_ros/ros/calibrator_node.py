@@ -6,7 +6,6 @@ from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
@@ -16,25 +15,15 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.ros.background import Activity, Result, Watched
+from dashcalib_ros.ros.background import Result, Watched
 from dashcalib_ros.ros.car import Mounting, text_of
-from dashcalib_ros.ros.diagnostics import OK, WARN, Health
+from dashcalib_ros.ros.diagnostics import ERROR, OK, WARN, Health, log_line
 from dashcalib_ros.ros.images import Source
-from dashcalib_ros.ros.node import LATCHED, CameraNode
-from dashcalib_ros.ros.parameters import make_publisher
-from dashcalib_ros.ros.state import (
-    Action,
-    Judgement,
-    Rules,
-    judge,
-    outcome_text,
-    sigma_text,
-    state_of,
-)
+from dashcalib_ros.ros.node import CameraNode
+from dashcalib_ros.ros.parameters import latched
+from dashcalib_ros.ros.state import Judgement, judge, outcome_text, sigma_text
 from dashcalib_ros.ros.store import Kept, Store, Whose, camera_info_path
 
-# a reliable publisher reaches reliable and best-effort subscribers alike
-BESIDE_IMAGES = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # s between two looks whether the driver has answered
 LOOK_S = 0.1
 
@@ -48,17 +37,15 @@ class CalibratorNode(CameraNode):
         plain = topic == f'{self.get_namespace().rstrip("/")}/image_raw'
         self._whose = Whose(self._name, topic, plain)
         self._store = Store(camera_info_path(self._own.camera_info_url, self._name), self._whose)
-        self._rules = Rules(self._own.better, self._own.contradictions)
         self._commit: Commit | None = None
-        self._beside = make_publisher(self, CameraInfo, 'camera_info', BESIDE_IMAGES)
-        self._latched = make_publisher(self, CameraInfo, '~/calibration', LATCHED)
-        self._mounting = Mounting(self, self._own)
+        # a reliable publisher reaches reliable and best-effort subscribers alike
+        self._beside = self._publisher(CameraInfo, 'camera_info', 10)
+        self._latched = self._publisher(CameraInfo, '~/calibration', latched())
+        self._mounting = Mounting(self, self._own, self._complaints.once)
         # what is published now, and how many were published beside images
         self._info: CameraInfo | None = None
         self._sent = 0
         self._kept: Kept | None = None
-        # of calibrations in a row that contradict the one in use
-        self._contradictions = 0
         # given up, and published only because of publish_stale
         self._stale = False
         # False for one of a file until turns of this drive agree with it
@@ -70,6 +57,11 @@ class CalibratorNode(CameraNode):
         """End it, and leave the calibration's file to other nodes."""
         self._store.close()
         super().close()
+
+    @property
+    def _contradictions(self) -> int:
+        """Return how many calibrations in a row contradict the one in use."""
+        return self._kept.contradictions if self._kept else 0
 
     def _trusted(self) -> NamedCamera | None:
         """Return the camera that is published, None if it is stale."""
@@ -105,7 +97,6 @@ class CalibratorNode(CameraNode):
                               f'rectified: {self._core.rectified}, which is published; ~/save '
                               f'writes it there')
         self._use(wanted, confirmed=False)
-        self._contradictions = kept.contradictions
         self._log.info(f'loaded {self._store.path}: {sigma_text(kept.camera)}; unconfirmed until '
                        f'turns agree with it')
 
@@ -119,90 +110,102 @@ class CalibratorNode(CameraNode):
         if of != source:
             self._log.warning(f'{self._store.path} is ignored: it is for {of}, the images are '
                               f'{source}')
-            self._unpublish()
+            self._drop()
 
     def _on_watched(self, watched: Watched) -> None:
         super()._on_watched(watched)
-        if watched.camera is self._compared() and watched.monitor.agrees:
+        if watched.camera is self._trusted() and watched.monitor.agrees:
             self._confirmed = True
 
     def _judge(self, result: Result) -> None:
         """Adopt a new calibration, or not: state.py has the reasons."""
-        used = result.calibration.used_turns
-        turns = frozenset((result.bank, turn) for turn in result.calibration.misfits
+        calibration = result.calibration
+        turns = frozenset((result.bank, turn) for turn in calibration.misfits
                           if turn.of_this_drive)
-        settled = False
-        if self._trusted() is not None and turns and turns <= self._counted:
-            action: Action = 'keep'  # again, by request or with other stored turns: count once
-        else:
-            judged = judge(result.calibration, result.complete, self._trusted(),
-                           self._contradictions, self._rules)
-            action, settled = judged.action, judged.confirmed
-            self._do(judged, result.calibration, turns)
-        if action in ('adopt', 'replace'):
-            self._learner.restart()
-            if self._own.commit and self._info is not None:
-                self._commit = self._commit or Commit(self, self._own.commit_timeout,
-                                                      self._steady)
-                self._commit.call(self._info)
-        elif action == 'give_up':
-            # the turns that contradict it stay, and are used for the next one
-            self._learner.forget_stored(used)
-        elif (action == 'keep' and result.complete
-              # turns that do not confirm it may be all that is known of another camera: they stay
-              and (settled or not self._learner.extend())):
+        # by request, or with other stored turns: count once
+        again = self._trusted() is not None and bool(turns) and turns <= self._counted
+        judged = Judgement('keep') if again else judge(
+            calibration, result.complete, self._trusted(), self._contradictions, self._own)
+        match judged.action:
+            case 'adopt' | 'replace':
+                if judged.action == 'replace':
+                    self._log.warning(f'the calibration is replaced: {judged.why}')
+                self._adopt(calibration)
+                self._learner.restart()
+            case 'give_up':
+                self._log.error(f'the published calibration is given up: {judged.why}')
+                self._give_up()
+                # the turns that contradict it stay, and are used for the next one
+                self._learner.forget_stored(calibration.used_turns)
+            case 'wait' | 'keep' if not again:
+                if judged.contradictions > self._contradictions:
+                    self._counted |= turns
+                if judged.action == 'keep':
+                    self._count(judged, calibration)
+                log_line(self._log, judged.contradictions > 0,
+                         outcome_text(calibration, judged.why))
+        # turns that do not confirm it may be all that is known of another camera: they stay
+        if judged.action == 'keep' and result.complete and (
+                judged.confirmed or not self._learner.extend()):
             # the next calibration must be independent: it uses new turns only
             self._learner.restart()
 
-    def _do(self, judged: Judgement, calibration: Calibration,
-            turns: frozenset[tuple[int, TurnId]]) -> None:
-        """Do what was decided about a calibration, and log it. turns: of this drive."""
-        if judged.action in ('adopt', 'replace'):
-            if judged.action == 'replace':
-                self._log.warning(f'the calibration is replaced: {judged.why}')
-            frame_id = self._intake.source.frame_id if self._intake.source else ''
-            self._adopt(Kept.of(calibration, self._whose, frame_id))
+    def _adopt(self, calibration: Calibration) -> None:
+        frame_id = self._intake.source.frame_id if self._intake.source else ''
+        kept = Kept.of(calibration, self._whose, frame_id)
+        info = self._use(kept)
+        self._log.info(f'accepted: {sigma_text(kept.camera)}; {self._save()[1]}')
+        if self._own.commit:
+            if self._commit is not None:
+                self._commit.end()
+            self._commit = Commit(self, info, self._own.commit_timeout, self._steady)
+
+    def _give_up(self) -> None:
+        self._retire()
+        if self._own.publish_stale and self._kept is not None:
+            self._stale, self._kept = True, self._kept.contradicted(0)
+        else:
+            self._drop()
+
+    def _count(self, judged: Judgement, calibration: Calibration) -> None:
+        """Keep what a calibration says of the one in use; its file outlives the node."""
+        if self._kept is None:
             return
-        if judged.action == 'give_up':
-            self._log.error(f'the published calibration is given up: {judged.why}')
-            self._contradictions = 0
-            self._retire()
-            if self._own.publish_stale:
-                self._stale = True
-            else:
-                self._unpublish()
-            return
-        if judged.action == 'keep':
-            if judged.contradictions > self._contradictions:
-                self._counted |= turns
-            self._count(judged.contradictions)
-            self._confirmed = self._confirmed or judged.confirmed
-            if judged.confirmed and calibration.mount is not None and self._kept is not None:
+        if judged.contradictions != self._contradictions:
+            self._kept = self._kept.contradicted(judged.contradictions)
+            try:
+                self._store.update(self._kept)
+            except OutputError as error:
+                self._complaints.say('unsaved', str(error))
+        if judged.confirmed:
+            self._confirmed = True
+            if calibration.mount is not None:
                 # the newest, as a camera may have been pushed
                 self._mounting.show(calibration.mount, self._kept.frame_id or '')
-        text = outcome_text(calibration, judged.why)
-        # rclpy takes one severity for each line of code
-        if judged.contradictions:
-            self._log.warning(text)
-        else:
-            self._log.info(text)
+
+    def _use(self, kept: Kept, confirmed: bool = True) -> CameraInfo:
+        self._kept, self._stale, self._confirmed = kept, False, confirmed
+        self._info = camera_info(kept.camera.camera, self._header(kept.frame_id or ''),
+                                 self._core.rectified)
+        self._latched.publish(self._info)
+        self._mounting.show(kept.mount, kept.frame_id or '')
+        return self._info
 
     def _drop(self) -> None:
         """Use no calibration, as at the start; the file stays where it is."""
-        self._unpublish()
-        self._contradictions = 0
+        if self._info is not None:
+            # K[0] = 0 says that it is uncalibrated (sensor_msgs)
+            self._latched.publish(CameraInfo(header=self._header(self._info.header.frame_id)))
+        self._kept, self._stale, self._info = None, False, None
+        self._mounting.show(None, '')
 
     def _retire(self) -> tuple[bool, str]:
         """Move the file aside; return whether it is out of the way, and a line about it."""
-        if self._store.taken:
-            return True, self._store.taken
         try:
-            moved = self._store.retire()
+            return True, self._store.retire()
         except OutputError as error:
-            text = f'{error}; until then the next start of the node publishes it again'
-            self._log.error(text)
-            return False, text
-        return True, 'there was no file' if moved is None else f'{self._store.path} is now {moved}'
+            self._log.error(str(error))
+            return False, str(error)
 
     def _reset(self) -> tuple[bool, str]:
         self._log.warning('reset by request: the turns and the calibration are dropped')
@@ -217,148 +220,103 @@ class CalibratorNode(CameraNode):
         if self._stale:
             return False, 'the calibration is contradicted by new turns'
         try:
-            moved = self._store.save(self._kept)
+            return True, self._store.save(self._kept)
         except OutputError as error:
             self._complaints.say('unsaved', str(error))
-            return False, str(error)
-        if moved is not None:
-            self._log.warning(f'{self._store.path} was written by another program: it is now '
-                              f'{moved}')
-        return True, f'written: {self._store.path}'
+            return False, f'not saved: {error}'
 
     def _warnings(self) -> list[str]:
         """Return warnings about the file and the topic, for the operator."""
-        found = [self._store.taken] if self._store.taken else []
+        found = [text for text in (self._store.taken, self._store.given_up) if text]
         if self._contradictions:
-            found.append(f'{self._contradictions} of {self._rules.contradictions} calibrations in '
+            found.append(f'{self._contradictions} of {self._own.contradictions} calibrations in '
                          f'a row contradict the published one: was the camera moved, its lens '
                          f'changed, or a stabiliser switched on?')
         if self._kept is not None and self._kept.edited and not self._confirmed:
             found.append(f'{self._store.path} was edited since a node wrote it: unconfirmed until '
                          f'turns agree with it')
-        if self._store.given_up:
-            found.append(f'{self._store.path} was given up, but could not be moved aside: remove '
-                         f'it, or the next start of the node publishes it again')
         beside = self._beside.topic_name
         if self.count_publishers(beside) > 1:
             found.append(f'another node publishes {beside}: remap it, or its subscribers get both')
         return found
 
-    def _health(self, activity: Activity, turns: str) -> Health:
-        verdict = self._verdict
-        state = state_of(self._trusted() is not None, activity.calibrating,
-                         verdict is not None and verdict.level != 'accepted')
-        if self._kept is not None:
-            known = 'calibrated' if self._confirmed else 'calibrated, unconfirmed'
-            level, message = OK, f'{known}; {turns} for the next check of it'
-        elif state == 'calibrating':
-            level, message = WARN, f'calibrating with {turns}: {activity.stage}'
-        elif state == 'refused_so_far' and verdict is not None:
-            why = verdict.reasons[0] if verdict.reasons else verdict.level
-            level, message = WARN, f'not calibrated, {turns}; so far {verdict.level}: {why}'
-        else:
-            level, message = WARN, f'not calibrated yet: {turns}'
-        error = f'the published calibration is contradicted; new turns: {turns}'
-        return Health(state, level, message, self._kept.camera if self._kept else None,
-                      self._confirmed, error if self._stale else '', str(self._store.path),
-                      counts={'camera_info published': self._sent,
-                              'contradictions': self._contradictions,
-                              'mounting': ('unknown' if self._mounting.mount is None else
-                                           text_of(self._mounting.mount))})
-
-    def _count(self, contradictions: int) -> None:
-        """Keep the count in the file too: it outlives the node."""
-        if contradictions == self._contradictions or self._kept is None:
-            return
-        self._contradictions = contradictions
-        self._kept = self._kept.contradicted(contradictions)
-        try:
-            self._store.update(self._kept)
-        except OutputError as error:
-            self._complaints.say('unsaved', str(error))
-
-    def _adopt(self, kept: Kept) -> None:
-        self._use(kept)
-        self._contradictions = 0
-        saved, text = self._save()
-        self._log.info(f'accepted: {sigma_text(kept.camera)}; '
-                       + (f'saved to {self._store.path}' if saved else f'not saved: {text}'))
-
-    def _use(self, kept: Kept, confirmed: bool = True) -> None:
-        self._kept, self._stale, self._confirmed = kept, False, confirmed
-        self._info = camera_info(kept.camera.camera, self._header(kept.frame_id or ''),
-                                 self._core.rectified)
-        self._latched.publish(self._info)
-        self._mounting.show(kept.mount, kept.frame_id or '')
+    def _health(self, turns: str) -> Health:
+        verdict, activity = self._verdict, self._learner.activity
+        camera = self._kept.camera if self._kept else None
+        known = 'confirmed' if self._confirmed else 'unconfirmed'
+        state, level, message = 'collecting', WARN, f'not calibrated yet: {turns}'
+        if activity.calibrating:
+            state, message = 'calibrating', f'calibrating with {turns}: {activity.stage}'
+        elif verdict is not None and verdict.level != 'accepted':
+            state = 'refused_so_far'
+            message = (f'not calibrated, {turns}; so far {verdict.level}: '
+                       f'{"; ".join(verdict.reasons[:1])}')
+        if self._stale:
+            level = ERROR
+            message = f'the published calibration is contradicted; new turns: {turns}'
+        elif camera:
+            state, level = 'calibrated', OK
+            message = f'calibrated, {known}; {turns} for the next check of it'
+        sigma = camera.sigma if camera else None
+        mount = self._mounting.mount
+        return Health(state, level, message, camera, {
+            'published': sigma_text(camera) if camera else 'nothing',
+            'calibration': known if camera else '',
+            'camera model': camera.camera.model if camera else '',
+            'sigma fx (px)': f'{sigma["fx"]:.3f}' if sigma else '',
+            'file': self._store.path,
+            'camera_info published': self._sent,
+            'contradictions': self._contradictions,
+            'mounting': text_of(mount) if mount else 'unknown'})
 
     def _on_tick(self) -> None:
         super()._on_tick()
         self._mounting.tick()
-
-    def _unpublish(self) -> None:
-        if self._info is not None:
-            # K[0] = 0 says that it is uncalibrated (sensor_msgs)
-            self._latched.publish(CameraInfo(header=self._header(self._info.header.frame_id)))
-        self._kept, self._stale, self._info = None, False, None
-        self._mounting.show(None, '')
 
     def _header(self, frame_id: str) -> Header:
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame_id)
 
 
 class Commit:
-    """Calls the driver's service without waiting for it; logs the outcome.
+    """Gives a calibration to the driver's service without waiting for it; logs the outcome.
 
     There is one warning if the driver has no service, does not answer, or dies meanwhile.
     """
 
-    def __init__(self, node: Node, timeout_s: float, clock: Clock) -> None:
-        self._node = node
-        self._timeout_s = timeout_s
-        self._name = node.resolve_service_name('set_camera_info')
+    def __init__(self, node: Node, info: CameraInfo, timeout_s: float, clock: Clock) -> None:
+        self._node, self._info, self._timeout_s = node, info, timeout_s
         self._client = node.create_client(SetCameraInfo, 'set_camera_info')
-        self._timer = node.create_timer(LOOK_S, self._look, clock=clock, autostart=False)
-        self._waiting: CameraInfo | None = None
         self._answer: Any = None
-        self._deadline = 0.0
+        self._deadline = time.monotonic() + timeout_s
+        self._timer = node.create_timer(LOOK_S, self._look, clock=clock)
 
-    def call(self, info: CameraInfo) -> None:
-        """Send a calibration; an earlier call that is not answered yet is cancelled."""
-        self._forget()
-        self._waiting = info
-        self._deadline = time.monotonic() + self._timeout_s
-        self._timer.reset()
+    def end(self) -> None:
+        """Wait for an answer no longer."""
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_client(self._client)
 
     def _look(self) -> None:
         if self._answer is None and self._client.service_is_ready():
-            request = SetCameraInfo.Request(camera_info=self._waiting)
-            self._answer = self._client.call_async(request)
-        if self._answer is not None and self._answer.done():
-            self._report(self._answer)
-            self._forget()
-        elif time.monotonic() > self._deadline:
-            trouble = (f'there is no service {self._name}' if self._answer is None else
-                       f'{self._name} did not answer within {self._timeout_s:g} s')
-            self._node.get_logger().warning(
-                f'{trouble}: the camera driver does not have the calibration; start a driver with '
-                f'that service, or set commit to false')
-            self._forget()
-
-    def _report(self, answer: Any) -> None:
-        if answer.exception() is not None:
-            text = f'{self._name} failed: {answer.exception()}'
-        elif answer.result().success:
-            self._node.get_logger().info(f'{self._name} took the calibration')
+            self._answer = self._client.call_async(SetCameraInfo.Request(camera_info=self._info))
+        answered = self._answer is not None and self._answer.done()
+        if not answered and time.monotonic() < self._deadline:
+            return
+        self.end()
+        log = self._node.get_logger()
+        name = self._node.resolve_service_name('set_camera_info')
+        if self._answer is None:
+            trouble = f'there is no service {name}'
+        elif not answered:
+            trouble = f'{name} did not answer within {self._timeout_s:g} s'
+        elif self._answer.exception() is not None:
+            trouble = f'{name} failed: {self._answer.exception()}'
+        elif self._answer.result().success:
+            log.info(f'{name} took the calibration')
             return
         else:
-            text = f'{self._name} refused: {answer.result().status_message}'
-        self._node.get_logger().warning(text)
-
-    def _forget(self) -> None:
-        if self._answer is not None and not self._answer.done():
-            self._client.remove_pending_request(self._answer)
-        self._answer = self._waiting = None
-        self._timer.cancel()
+            trouble = f'{name} refused: {self._answer.result().status_message}'
+        log.warning(f'{trouble}: the camera driver does not have the calibration; start a driver '
+                    f'with that service, or set commit to false')
 
 
 def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:

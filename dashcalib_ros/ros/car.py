@@ -16,17 +16,15 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
+from std_msgs.msg import Header
 
 from dashcalib_ros.input.motion import local_metres
 from dashcalib_ros.judge.calibration import Mount
-from dashcalib_ros.ros.parameters import make_publisher
+from dashcalib_ros.ros.parameters import OVERRIDES, latched
 from dashcalib_ros.ros.settings import NodeConfig
 
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
-                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # of all that publish static transforms
-STATIC = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE,
-                    durability=DurabilityPolicy.TRANSIENT_LOCAL)
+STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TOPIC = '/tf_static'
 # s; so long others may take to say that they have the frame
 LISTEN_S = 2.0
@@ -42,18 +40,19 @@ Take = Callable[[str, float, Sequence[float]], None]
 class Mounting:
     """Publishes the mounting on ~/mount, and, where it is asked for, once on /tf_static."""
 
-    def __init__(self, node: Node, own: NodeConfig) -> None:
-        self._node, self._own = node, own
+    def __init__(self, node: Node, own: NodeConfig, warn: Callable[[str], None]) -> None:
+        """warn: logs a line unless it was logged before."""
+        self._node, self._own, self._warn = node, own, warn
         # what was published last
         self.mount: Mount | None = None
-        self._pose = make_publisher(node, PoseWithCovarianceStamped, '~/mount', LATCHED)
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/mount', latched(),
+                                           qos_overriding_options=OVERRIDES)
         self._sent: Mount | None = None
         self._waiting: tuple[Mount, str] | None = None
         self._since = time.monotonic()
         # the parent of each frame, as others say
         self._parents: dict[str, str] = {}
         self._transforms: Any = None
-        self._told: set[str] = set()
         if own.publish_tf:
             self._prepare()
 
@@ -100,19 +99,10 @@ class Mounting:
         self._parents.update({each.child_frame_id.lstrip('/'): each.header.frame_id.lstrip('/')
                               for each in message.transforms})
 
-    def _warn(self, text: str) -> None:
-        if text not in self._told:
-            self._told.add(text)
-            self._node.get_logger().warning(text)
-
     def _message(self, mount: Mount) -> PoseWithCovarianceStamped:
-        message = PoseWithCovarianceStamped()
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        message.header.frame_id = self._own.base_frame
-        place = message.pose.pose.position
-        place.x, place.y, place.z = self._place(mount)
-        turn = message.pose.pose.orientation
-        turn.x, turn.y, turn.z, turn.w = mount.quaternion
+        message = PoseWithCovarianceStamped(header=self._header())
+        pose = message.pose.pose
+        self._place(mount, pose.position, pose.orientation)
         found = mount.sigma['height_m'] if not self._own.mount_z else None
         variances = [0.0, 0.0, (found or 0.0)**2]
         for name in ('roll_right_deg', 'pitch_up_deg', 'yaw_left_deg'):
@@ -122,18 +112,20 @@ class Mounting:
         return message
 
     def _transform(self, mount: Mount, frame: str) -> TransformStamped:
-        transform = TransformStamped(child_frame_id=frame)
-        transform.header.stamp = self._node.get_clock().now().to_msg()
-        transform.header.frame_id = self._own.base_frame
-        place = transform.transform.translation
-        place.x, place.y, place.z = self._place(mount)
-        turn = transform.transform.rotation
-        turn.x, turn.y, turn.z, turn.w = mount.quaternion
-        return transform
+        message = TransformStamped(header=self._header(), child_frame_id=frame)
+        self._place(mount, message.transform.translation, message.transform.rotation)
+        return message
 
-    def _place(self, mount: Mount) -> tuple[float, float, float]:
+    def _header(self) -> Header:
+        return Header(stamp=self._node.get_clock().now().to_msg(), frame_id=self._own.base_frame)
+
+    def _place(self, mount: Mount, place: Any, turn: Any) -> None:
+        """Fill in a position and an orientation."""
         own = self._own
-        return own.mount_x, own.mount_y, own.mount_z or mount.height_m or 0.0
+        # a parameter of 1 is an integer
+        place.x, place.y, place.z = map(
+            float, (own.mount_x, own.mount_y, own.mount_z or mount.height_m or 0.0))
+        turn.x, turn.y, turn.z, turn.w = mount.quaternion
 
 
 def differs(mount: Mount, other: Mount) -> bool:

@@ -13,14 +13,12 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.judge import Check, with_faults
 from dashcalib_ros.report import NamedCamera, answer_dict
 from dashcalib_ros.report.camera_file import camera_of_message
-from dashcalib_ros.ros.background import Activity, Result, Watched
-from dashcalib_ros.ros.diagnostics import OK, WARN, Health
+from dashcalib_ros.ros.background import Result, Watched
+from dashcalib_ros.ros.diagnostics import OK, WARN, Health, log_line
 from dashcalib_ros.ros.images import Source, SourceWatch
-from dashcalib_ros.ros.node import LATCHED, CameraNode
-from dashcalib_ros.ros.parameters import make_publisher, make_subscription
+from dashcalib_ros.ros.node import CameraNode
+from dashcalib_ros.ros.parameters import OVERRIDES, latched
 
-# hears reliable and best-effort drivers alike; one that is lost is followed by the next image's
-FROM_DRIVER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 NOT_YET = Check('cannot tell', ('the turns wanted are not there yet',))
 UNTOUCHED = 'check_only: the calibration is the driver\'s, and stays as it is'
 
@@ -36,10 +34,14 @@ class CheckNode(CameraNode):
         self._given: NamedCamera | None = None
         self._size: tuple[int, int] | None = None
         self._found = NOT_YET
-        # why there is no camera, or it is not of the images
+        # why there is no camera
         self._problem = f'no camera_info on {self._given_topic} yet'
-        self._answers = make_publisher(self, String, '~/check', LATCHED)
-        make_subscription(self, CameraInfo, 'camera_info', self._on_info, FROM_DRIVER)
+        self._answers = self._publisher(String, '~/check', latched())
+        # hears reliable and best-effort drivers alike; one that is lost is followed by the next
+        self.create_subscription(
+            CameraInfo, 'camera_info', self._on_info,
+            QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT),
+            qos_overriding_options=OVERRIDES)
 
     def _trusted(self) -> NamedCamera | None:
         """Return the driver's camera, None if it is for other images."""
@@ -60,13 +62,13 @@ class CheckNode(CameraNode):
     def _fit(self, source: Source) -> None:
         """Take the size of the images, which is compared with the driver's."""
         self._size = source.size
-        self._tell_size()
+        self._warn()
 
     def _on_watched(self, watched: Watched) -> None:
         """Take what new turns show; publish it where it says more than before."""
-        before = self._changes.texts
+        before = self._changes()
         super()._on_watched(watched)
-        if self._changes.texts != before:
+        if self._changes() != before:
             self._publish()
 
     def _judge(self, result: Result) -> None:
@@ -80,16 +82,11 @@ class CheckNode(CameraNode):
         self._publish()
         if not result.complete and found.answer == before:
             return
-        answer, topic = self._answer(), self._given_topic
-        reasons = '; '.join(answer.reasons)
-        # rclpy takes one severity for each line of code
-        if answer.answer == 'wrong':
-            self._log.warning(f'the calibration on {topic} is wrong: {reasons}')
-        elif answer.answer == 'right':
-            self._log.info(f'the calibration on {topic} is right: {reasons}')
-        else:
-            self._log.info(f'the turns cannot tell whether the calibration on {topic} is right: '
-                           f'{reasons}')
+        answer = self._answer()
+        said = f'the calibration on {self._given_topic} is'
+        log_line(self._log, answer.answer == 'wrong', (
+            f'the turns cannot tell whether {said} right' if answer.answer == 'cannot tell' else
+            f'{said} {answer.answer}') + f': {"; ".join(answer.reasons)}')
         if result.complete and found.answer != 'cannot tell':
             # the next answer must be independent: it uses new turns only
             self._learner.restart()
@@ -98,7 +95,7 @@ class CheckNode(CameraNode):
         """Forget the answer and the changes; the driver's camera stays."""
         # as another object: what is still said of the former one is out of date
         self._given = None if self._given is None else replace(self._given)
-        self._changes.forget()
+        self._monitor = None
         self._found = NOT_YET
         if self._infos.current is not None:
             self._publish()
@@ -113,9 +110,15 @@ class CheckNode(CameraNode):
 
     def _warnings(self) -> list[str]:
         """Return what keeps the calibration from being checked."""
-        return [self._problem] if self._problem else []
+        if self._given is None:
+            return [self._problem]
+        if self._fits or self._size is None:
+            return []
+        (width, height), (w, h) = self._given.image_size, self._size
+        return [f'the camera_info on {self._given_topic} is for {width}x{height}, and the images '
+                f'are {w}x{h}']
 
-    def _health(self, activity: Activity, turns: str) -> Health:
+    def _health(self, turns: str) -> Health:
         found = self._answer()
         if found.answer == 'wrong':
             level, message = WARN, f'the calibration is wrong: {found.reasons[0]}'
@@ -123,7 +126,8 @@ class CheckNode(CameraNode):
             level, message = OK, f'the calibration is right; {turns} for the next check'
         else:
             level, message = OK, f'checking the calibration, {turns}: {found.reasons[0]}'
-        return Health('checking', level, message, check=found.answer, check_reasons=found.reasons)
+        return Health('checking', level, message, self._trusted(), {
+            'check': found.answer, 'check reasons': '; '.join(found.reasons)})
 
     def _answer(self) -> Check:
         """Return what the turns say of it, and what no turn is needed for."""
@@ -151,30 +155,23 @@ class CheckNode(CameraNode):
         if changed:
             self._log.warning(f'the calibration on {topic} has changed: it is checked anew')
         try:
-            self._given, self._problem = camera_of_message(message, topic), ''
+            self._given = camera_of_message(message, topic)
+            if self._given.faults:
+                self._log.warning(f'the calibration on {topic} is wrong: '
+                                  f'{"; ".join(self._given.faults)}')
         except InputError as error:
             self._given, self._problem = None, str(error)
-            self._log.warning(self._problem)
-        if self._given is not None and self._given.faults:
-            self._log.warning(f'the calibration on {topic} is wrong: '
-                              f'{"; ".join(self._given.faults)}')
-        self._tell_size()
+        self._warn()
         self._verdict = None
         self._drop()
         self._set_goal()
 
-    def _tell_size(self) -> None:
-        if self._given is None:
-            return
-        self._problem = ''
-        if not self._fits and self._size is not None:
-            (width, height), (w, h) = self._given.image_size, self._size
-            self._problem = (f'the camera_info on {self._given_topic} is for {width}x{height}, '
-                             f'and the images are {w}x{h}')
-            self._log.warning(self._problem)
+    def _warn(self) -> None:
+        for text in self._warnings():
+            self._log.warning(text)
 
     def _publish(self) -> None:
-        values = answer_dict(self._answer(), self._changes.texts)
+        values = answer_dict(self._answer(), tuple(self._changes().values()))
         if self._given is None:
             values['reasons'] = self._warnings()
         self._answers.publish(String(data=json.dumps(values, allow_nan=False)))

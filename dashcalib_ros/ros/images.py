@@ -12,22 +12,18 @@ from typing import Any, Generic, Literal, TypeVar
 
 from rclpy.clock import Clock
 from rclpy.node import Node
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    QoSPolicyKind,
-    QoSProfile,
-    ReliabilityPolicy,
-)
+from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import CompressedImage, Image
 
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, counted
 from dashcalib_ros.input.decode import message_size
 from dashcalib_ros.input.stamps import StampGate
 from dashcalib_ros.ros.background import whole
-from dashcalib_ros.ros.diagnostics import Complaints, since_text
-from dashcalib_ros.ros.parameters import make_subscription, override_of
+from dashcalib_ros.ros.diagnostics import Complaints
+from dashcalib_ros.ros.parameters import RELIABILITIES
 from dashcalib_ros.ros.settings import NodeConfig
 
 # messages in a row of another size, frame or calibration that count as a change: those of a
@@ -51,10 +47,11 @@ CURES = {
 DEPTH = 5
 # s between two checks of the publishers: images before the right subscription are lost
 LOOK_S = 0.25
-NAMED = {'best_effort': ReliabilityPolicy.BEST_EFFORT, 'reliable': ReliabilityPolicy.RELIABLE}
 # s without an image before it is told, and between two such lines
 SILENT_S, AGAIN_S = 4.0, 60.0
-IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
+# types of topics, and their transports
+KINDS = {'sensor_msgs/msg/Image': 'raw', 'sensor_msgs/msg/CompressedImage': 'compressed'}
+# that are listed in one line
 MOST_TOPICS = 8
 
 
@@ -178,24 +175,28 @@ class ImageInput:
     are. An override of its QoS comes first: then nothing is followed.
 
     topic: its full name. compressed: whether it has compressed images. publishers: how many there
-    are. listening: from start() to stop(). reliability: of the present subscription.
+    are. reliability: of the present subscription.
     """
 
     def __init__(self, node: Node, config: NodeConfig, callback: Callable[[Any], None],
                  clock: Clock) -> None:
         self._node = node
         self._callback = callback
-        self.compressed = config.image_transport == 'compressed'
+        self._kind = CompressedImage if config.image_transport == 'compressed' else Image
         # as image_transport does: remap the base topic, then append the transport
         base = node.resolve_topic_name('image_raw')
-        self.topic = f'{base}/compressed' if self.compressed else base
+        self.topic = f'{base}/compressed' if self._kind is CompressedImage else base
         self.publishers = 0
-        overridden = override_of(node, self.topic, QoSPolicyKind.RELIABILITY)
-        named = overridden if overridden in NAMED else config.reliability
-        self._auto = overridden is None and config.reliability == 'auto'
-        # a parameter would hold the first value for each later subscription
-        self._fixed = (QoSPolicyKind.RELIABILITY,) if overridden is None else ()
-        self._reliability = NAMED.get(named, ReliabilityPolicy.BEST_EFFORT)
+        override = node._parameter_overrides.get(
+            f'qos_overrides.{self.topic}.subscription.reliability')
+        # without an override, rclpy's parameter would hold the first value for each later one
+        self._overridable = QoSOverridingOptions(
+            (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
+             *([QoSPolicyKind.RELIABILITY] if override else [])))
+        self.reliability = override.value if override else config.reliability
+        self._auto = self.reliability not in RELIABILITIES
+        if self._auto:
+            self.reliability = 'best_effort'
         self._subscription: Subscription | None = None
         self._started = time.monotonic()
         self._said: float | None = None
@@ -217,31 +218,23 @@ class ImageInput:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
-    @property
-    def reliability(self) -> str:
-        """Return the reliability of the present subscription."""
-        return self._reliability.name.lower()
-
     def _subscribe(self) -> Subscription:
-        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH,
-                             reliability=self._reliability, durability=DurabilityPolicy.VOLATILE)
-        kind = CompressedImage if self.compressed else Image
-        return make_subscription(self._node, kind, self.topic, self._callback, profile,
-                                 self._fixed)
+        profile = QoSProfile(depth=DEPTH,
+                             reliability=ReliabilityPolicy[self.reliability.upper()])
+        return self._node.create_subscription(self._kind, self.topic, self._callback, profile,
+                                              qos_overriding_options=self._overridable)
 
     def _look(self) -> None:
-        offered = [info.qos_profile.reliability
-                   for info in self._node.get_publishers_info_by_topic(self.topic)]
-        self.publishers = len(offered)
-        if not self._auto or not offered or not self.listening:
+        infos = self._node.get_publishers_info_by_topic(self.topic)
+        self.publishers = len(infos)
+        if not self._auto or not infos or not self.listening:
             return
-        every = all(each == ReliabilityPolicy.RELIABLE for each in offered)
-        fitting = ReliabilityPolicy.RELIABLE if every else ReliabilityPolicy.BEST_EFFORT
-        if fitting != self._reliability:
-            self._node.get_logger().info(
-                f'{self.topic}: subscribing {fitting.name.lower()}, as its publishers do')
+        fitting = 'reliable' if all(map(_reliable, infos)) else 'best_effort'
+        if fitting != self.reliability:
+            self._node.get_logger().info(f'{self.topic}: subscribing {fitting}, as its publishers '
+                                         f'do')
             self.stop()
-            self._reliability = fitting
+            self.reliability = fitting
             self.start()
 
     def tell_silence(self, silent_s: float | None) -> None:
@@ -257,55 +250,39 @@ class ImageInput:
 
     def _reason(self) -> str:
         """Return why, as far as it is known, and the cure."""
-        topic = self.topic
-        if self._node.count_publishers(topic):
-            return self._mismatch()
-        wanted, other = ((COMPRESSED, IMAGE) if self.compressed else (IMAGE, COMPRESSED))
-        found, others = self._published(wanted), self._published(other)
-        if found:
-            name = found[0].removesuffix('/compressed')
-            return (f'publishers of {_short(wanted)}: {_listed(found)}; '
-                    f'remap with -r image_raw:={name}')
-        if others:
-            transport, name = (('raw', others[0]) if self.compressed else
-                               ('compressed', others[0].removesuffix('/compressed')))
-            return (f'there are no publishers of {_short(wanted)}, but of {_short(other)}: '
-                    f'{_listed(others)}; set -p image_transport:={transport} '
-                    f'-r image_raw:={name}')
-        return (f'there are no publishers of {_short(wanted)}: start the camera driver or play a '
-                f'bag, with the same ROS_DOMAIN_ID as this node')
-
-    def _mismatch(self) -> str:
-        """Return what keeps the images of existing publishers away."""
         infos = self._node.get_publishers_info_by_topic(self.topic)
-        kind = COMPRESSED if self.compressed else IMAGE
-        types = sorted({info.topic_type for info in infos} - {kind})
-        if types:
-            return (f'its publisher sends {", ".join(map(_short, types))}, not {_short(kind)}: '
-                    f'remap another topic with -r image_raw:=TOPIC')
-        best_effort = any(info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-                          for info in infos)
-        if best_effort and self.reliability == 'reliable':
+        if not infos:
+            found = self._published()
+            return (f'publishers of images: {" or ".join(found)}' if found else
+                    'there are no publishers of images: start the camera driver or play a bag, '
+                    'with the same ROS_DOMAIN_ID as this node')
+        others = {info.topic_type for info in infos if not info.topic_type.endswith(
+            f'/{self._kind.__name__}')}
+        if others:
+            return (f'its publisher sends {", ".join(sorted(others))}: remap another topic with '
+                    f'-r image_raw:=TOPIC')
+        if self.reliability == 'reliable' and not all(map(_reliable, infos)):
             return ('its publisher is best effort, which a reliable subscription does not hear: '
                     'set -p reliability:=auto')
-        return (f'it has {len(infos)} publisher{"" if len(infos) == 1 else "s"} that '
-                f'send{"s" if len(infos) == 1 else ""} nothing: look at the camera driver')
+        return f'its {counted(len(infos), "publisher")} sent nothing: look at the camera driver'
 
-    def _published(self, kind: str) -> list[str]:
-        """Return the topics of a type that others publish."""
-        own = {name for name, _ in self._node.get_publisher_names_and_types_by_node(
-            self._node.get_name(), self._node.get_namespace())}
-        # image_transport knows a compressed topic by its name only
-        end = '/compressed' if kind == COMPRESSED else ''
-        return sorted(name for name, types in self._node.get_topic_names_and_types()
-                      if kind in types and name.endswith(end) and name not in own
-                      and self._node.count_publishers(name))
-
-
-def _short(kind: str) -> str:
-    return kind.replace('/msg/', '/')
+    def _published(self) -> list[str]:
+        """Return the arguments that let the node hear others' images, for a few topics."""
+        node = self._node
+        own = {name for name, _ in node.get_publisher_names_and_types_by_node(
+            node.get_name(), node.get_namespace())}
+        found = [(name, KINDS[kind]) for name, kinds in node.get_topic_names_and_types()
+                 for kind in kinds if kind in KINDS and name not in own]
+        return [f'-r image_raw:={name.removesuffix("/compressed")} -p image_transport:={transport}'
+                for name, transport in sorted(found) if node.count_publishers(name)
+                # image_transport knows a compressed topic by its name only
+                and (transport == 'raw' or name.endswith('/compressed'))][:MOST_TOPICS]
 
 
-def _listed(names: list[str]) -> str:
-    more = len(names) - MOST_TOPICS
-    return ', '.join(names[:MOST_TOPICS]) + (f' and {more} more' if more > 0 else '')
+def since_text(silent_s: float | None) -> str:
+    """Return since when there are no images, None: none came."""
+    return 'yet' if silent_s is None else f'for {silent_s:.0f} s'
+
+
+def _reliable(info: TopicEndpointInfo) -> bool:
+    return bool(info.qos_profile.reliability == ReliabilityPolicy.RELIABLE)

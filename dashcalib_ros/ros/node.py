@@ -5,61 +5,47 @@ import queue
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 
 from dashcalib_ros.calibrator import Status
-from dashcalib_ros.errors import DashcalibError, InputError, one_line
+from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, one_line
 from dashcalib_ros.input.decode import check_mask, read_mask
-from dashcalib_ros.judge import Verdict
+from dashcalib_ros.judge import Monitor, Verdict
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.result import check_camera_name
 from dashcalib_ros.report.wording import witness_texts
-from dashcalib_ros.ros.background import (
-    Activity,
-    Learner,
-    News,
-    NewTurn,
-    Result,
-    Started,
-    Trouble,
-    Watched,
-)
+from dashcalib_ros.ros.background import Learner, News, Result, Trouble, Watched
 from dashcalib_ros.ros.car import Sensors
-from dashcalib_ros.ros.diagnostics import (
-    Changes,
-    Complaints,
-    Health,
-    diagnostic_status,
-    silence,
-    turns_text,
-)
-from dashcalib_ros.ros.images import CURES, ImageInput, Intake, Source
+from dashcalib_ros.ros.diagnostics import ERROR, STALE, WARN, Complaints, Health, log_line
+from dashcalib_ros.ros.images import CURES, ImageInput, Intake, Source, since_text
 from dashcalib_ros.ros.parameters import (
+    OVERRIDES,
     camera_name,
     changed,
     check_known,
     declare,
-    make_publisher,
     refusal,
     why_read_only,
 )
 from dashcalib_ros.ros.preview import Preview
 
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
-                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # s between two messages on /diagnostics
 PERIOD_S = 1.0
+# s without an image, after which a camera has stopped
+SILENT_S = 5.0
 # further kinds of problems than those of CURES, which come with a message of their own
 TROUBLES = ('undecodable', 'strays', 'failed', 'failed_calibrations', 'failed_watches', 'unsaved',
             'store', 'workers', 'failed_callbacks', 'preview', 'other_calibrations')
@@ -69,45 +55,12 @@ class SetupError(DashcalibError):
     """The node's parameters do not fit its images: it ends."""
 
 
-class Mailbox:
-    """Actions that other threads leave for the executor's thread.
-
-    A guard condition wakes the executor, whose thread then runs what was put in, in order.
-    failed: called in that thread with what an action raised.
-    """
-
-    def __init__(self, node: Node, failed: Callable[[Exception], None]) -> None:
-        self._failed = failed
-        self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self.wake = node.create_guard_condition(self._empty)
-
-    def put(self, action: Callable[[], None]) -> None:
-        """Let the executor's thread run an action; may be called from any thread."""
-        self._actions.put(action)
-        with suppress(RuntimeError):  # rclpy's, when the context is shut down already
-            self.wake.trigger()
-
-    def blocked(self) -> bool:
-        """Return whether rclpy calls no callback any more, after an exception of its own."""
-        return not self.wake.callback_group.can_execute(self.wake)
-
-    def _empty(self) -> None:
-        with suppress(queue.Empty):
-            while True:
-                action = self._actions.get_nowait()
-                try:
-                    action()
-                except Exception as error:
-                    # the other actions must not wait for the next trigger
-                    self._failed(error)
-
-
 class CameraNode(Node, ABC):
     """What the node that calibrates and the one that checks have in common.
 
     It gives the images to the background thread, and compares each turn with a camera in use.
-    Every callback runs in the executor's single thread and is short. The background thread puts
-    its news into a mailbox, which is emptied in that same thread: no lock is needed.
+    Every callback runs in the executor's single thread and is short. What other threads leave with
+    _later() is done in that same thread: no lock is needed.
     """
 
     # what the node does with the camera, for its first line in the log
@@ -131,21 +84,21 @@ class CameraNode(Node, ABC):
         self._mask = read_mask(Path(self._own.mask_file)) if self._own.mask_file else None
         self._log = self.get_logger()
         self._complaints = Complaints(self._log.warning)
-        self._mail = Mailbox(self, self.survive)
-        self._changes = Changes(self._log)
+        self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._wake = self.create_guard_condition(self._empty)
+        # what turns say of the camera in use, None before they do
+        self._monitor: Monitor | None = None
         self._verdict: Verdict | None = None
         # what the car's own sensors say of the last calibration, in words
         self._witnesses: list[str] = []
-        self._watched: NamedCamera | None = None
         # not the ROS clock: diagnostics must also be published while a simulation is paused
         self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._open(topic)
-        self._magnitude = make_publisher(self, Float64, '~/turn_magnitude', QoSProfile(depth=10))
-        self._diagnostics = make_publisher(self, DiagnosticArray, '/diagnostics',
-                                           QoSProfile(depth=10))
-        self._preview = Preview(self, self._own, self._core.rectified,
-                                lambda error: self._later(
-                                    lambda: self._failed('preview', error)))
+        self._magnitude = self._publisher(Float64, '~/turn_magnitude', 10)
+        self._diagnostics = self._publisher(DiagnosticArray, '/diagnostics', 10)
+        self._preview = Preview(
+            self, self._own, self._core.rectified,
+            lambda error: self._later(lambda: self.survive(error, 'preview')))
         self._intake = Intake(self._core.motion.rate, self._complaints, self._on_source)
         self._images = ImageInput(self, self._own, self._on_image, steady)
         self._images.start()
@@ -158,17 +111,20 @@ class CameraNode(Node, ABC):
         self._most_turns = max(self._core.turns.capacity, self._core.turns.wanted)
         self._learner = Learner(self._core, self._own.queue_size,
                                 lambda news: self._later(lambda: self._on_news(news)),
-                                self._preview, self._mask)
-        self._sensors = Sensors(self, self._own, self._learner.sense)
+                                self._preview.take, self._mask)
+        self._sensors = Sensors(self, self._own, self._learner.sensors.add)
         self._set_goal()
         self.create_timer(PERIOD_S, self._on_tick, clock=steady)
         for name, action in (('calibrate', self._calibrate), ('reset', self._reset),
                              ('save', self._save)):
-            self.create_service(Trigger, f'~/{name}', _service(action))
+            self.create_service(Trigger, f'~/{name}', partial(_trigger, action))
         self.answer_always()
         self.add_on_set_parameters_callback(self._on_parameters)
         self._log.info(f'{self.doing} the camera {self._name!r} from the turns seen on '
                        f'{self._images.topic}')
+
+    def _publisher(self, kind: type, topic: str, qos: QoSProfile | int) -> Publisher:
+        return self.create_publisher(kind, topic, qos, qos_overriding_options=OVERRIDES)
 
     # what the two nodes do in their own ways --------------------------------------------------
 
@@ -219,7 +175,7 @@ class CameraNode(Node, ABC):
         """Return warnings for the operator, about the camera in use."""
 
     @abstractmethod
-    def _health(self, activity: Activity, turns: str) -> Health:
+    def _health(self, turns: str) -> Health:
         """Return what is said of the camera in use; turns: how many there are, in words."""
 
     # the end, and what fails ------------------------------------------------------------------
@@ -230,28 +186,33 @@ class CameraNode(Node, ABC):
         self._preview.close()
         self.destroy_node()
 
-    def survive(self, error: Exception) -> None:
+    def survive(self, error: Exception, kind: str = 'failed_callbacks') -> None:
         """Log and count what a callback raised, unless the context was shut down meanwhile."""
-        self._failed('failed_callbacks', error)
-
-    def _failed(self, kind: str, error: Exception) -> None:
         # a callback that is at work while the node is stopped may raise nearly anything
         if self.context.ok():
             self._complaints.failure(kind, error)
 
     def blocked(self) -> bool:
         """Return whether rclpy calls no callback any more, after an exception of its own."""
-        return self._mail.blocked()
+        return not self._wake.callback_group.can_execute(self._wake)
 
     def _later(self, action: Callable[[], None]) -> None:
-        """Let the executor's thread run an action; called from other threads."""
-        self._mail.put(action)
+        """Let the executor's thread run an action, in order; called from other threads."""
+        self._actions.put(action)
+        with suppress(RuntimeError):  # rclpy's, when the context is shut down already
+            self._wake.trigger()
+
+    def _empty(self) -> None:
+        with suppress(queue.Empty):
+            while True:
+                action = self._actions.get_nowait()
+                try:
+                    action()
+                except Exception as error:
+                    # the other actions must not wait for the next trigger
+                    self.survive(error)
 
     # images ----------------------------------------------------------------------------------
-
-    def listen(self, active: bool) -> None:
-        """Subscribe the images, or end the subscription."""
-        (self._images.start if active else self._images.stop)()
 
     def _on_image(self, message: Any) -> None:
         taken = self._intake.take(message)
@@ -300,10 +261,8 @@ class CameraNode(Node, ABC):
         match news:
             case Status():
                 self._magnitude.publish(Float64(data=float(news.magnitude)))
-            case NewTurn():
-                self._log.info(news.text(self._core.turns.wanted, self._trusted() is not None))
-            case Started():
-                self._log.info(str(news))
+            case str():
+                self._log.info(news)
             case Trouble():
                 self._complaints.say(news.kind, news.text)
             case Watched():
@@ -312,8 +271,20 @@ class CameraNode(Node, ABC):
                 self._on_result(news)
 
     def _on_watched(self, watched: Watched) -> None:
-        if watched.camera is self._compared():
-            self._changes.take(watched.monitor)
+        """Take what turns say of the camera in use; each change is told once in the log."""
+        if watched.camera is not self._trusted():
+            return
+        known = self._changes()
+        self._monitor = watched.monitor
+        for kind, text in self._changes().items():
+            if kind not in known:
+                log_line(self._log, kind == 'lens', text)
+        if 'lens' in known and 'lens' not in self._changes():
+            self._log.info('the newest turns fit the calibration again')
+
+    def _changes(self) -> dict[str, str]:
+        """Return the changes of the camera in use that two turns show, in words by their kind."""
+        return {each.kind: str(each) for each in self._monitor.changes} if self._monitor else {}
 
     def _on_result(self, result: Result) -> None:
         if result.bank != self._learner.bank:
@@ -327,17 +298,13 @@ class CameraNode(Node, ABC):
         self._judge(result)
         self._set_goal()
 
-    def _compared(self) -> NamedCamera | None:
-        """Return the camera that each turn is compared with; the changes are of this one."""
-        if self._watched is not self._trusted():
-            self._watched = self._trusted()
-            self._changes.forget()
-        return self._watched
-
     def _set_goal(self) -> None:
         """Tell the learner from how many turns to calibrate, and what to compare turns with."""
-        self._learner.goal = self._goal()
-        self._learner.compare(self._compared(), self._checked())
+        learner, trusted = self._learner, self._trusted()
+        if learner.watched is not trusted:
+            self._monitor = None
+        learner.config, learner.goal = self._core, self._goal()
+        learner.watched, learner.checked = trusted, self._checked()
 
     # services and parameters -----------------------------------------------------------------
 
@@ -367,14 +334,15 @@ class CameraNode(Node, ABC):
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         before = self._core.turns.wanted
-        self._core, self._own, result = changed(self._core, self._own, parameters,
-                                                self._most_turns)
+        try:
+            self._core, self._own = changed(self._core, self._own, parameters, self._most_turns)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         wanted = self._core.turns.wanted
         if wanted != before:
             self._log.info(f'{wanted} turns are wanted now, not {before}')
-            self._learner.want(wanted)
             self._set_goal()
-        return result
+        return SetParametersResult(successful=True)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters as rclpy does, and say why where one is read-only."""
@@ -388,35 +356,67 @@ class CameraNode(Node, ABC):
 
     def _on_tick(self) -> None:
         images, intake, learner = self._images, self._intake, self._learner
-        intake.complain(learner.dropped)
+        intake.complain(learner.inbox.dropped)
         if images.listening:
             images.tell_silence(intake.silent_s)
-        activity, wanted = learner.activity(), self._core.turns.wanted
         warnings = self._warnings()
         if images.publishers > 1:
             warnings.append(f'{images.publishers} publishers on {images.topic}: remap all but one '
                             f'camera')
-        health = self._health(activity, turns_text(activity, wanted))
-        status = diagnostic_status(
-            silence(images.topic, images.listening, intake.silent_s), activity, wanted,
-            self._verdict, self._changes, warnings, health,
-            {'topic': images.topic, 'reliability': images.reliability,
-             'motion sensors': '; '.join(self._witnesses), 'received': intake.received,
-             **health.counts,
-             **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},
-             'pictures published': self._preview.published})
-        status.name = f'{self.get_fully_qualified_name().strip("/")}: camera calibration'
-        status.hardware_id = self._name
-        camera = self._trusted() if health.published is None else health.published
-        self._preview.tell(status.message, camera.camera if camera else None)
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+        now, wanted = learner.activity.status, self._core.turns.wanted
+        health = self._health(f'{min(now.built, wanted)} of {wanted} turns, {now.yaw_deg:.0f}° of '
+                              f'yaw')
+        verdict = self._verdict
+        values = {
+            'state': health.state,
+            'stage': learner.activity.stage,
+            'turns found': now.turns,
+            'turns stored': now.stored,
+            'turns built': now.built,
+            'turns wanted': wanted,
+            'yaw (deg)': f'{now.yaw_deg:.0f}',
+            'percent': min(100, round(100 * now.built / wanted)),
+            'turning magnitude': f'{now.magnitude:.4f}',
+            'standing': now.standing,
+            'verdict': verdict.level if verdict else '',
+            'reasons': '; '.join(verdict.reasons) if verdict else '',
+            **health.values,
+            'warnings': '; '.join(warnings),
+            'change': '; '.join(self._changes().values()),
+            'suspected change': '; '.join(
+                str(each) for each in (self._monitor.lens, self._monitor.mount)
+                if each and not each.confirmed) if self._monitor else '',
+            'topic': images.topic,
+            'reliability': images.reliability,
+            'motion sensors': '; '.join(self._witnesses),
+            'received': intake.received,
+            **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},
+            'pictures published': self._preview.published}
+        level, message = self._level(health, warnings)
+        self._preview.tell(message, health.camera.camera if health.camera else None)
+        array = DiagnosticArray(status=[DiagnosticStatus(
+            level=level, message=message, hardware_id=self._name,
+            name=f'{self.get_fully_qualified_name().strip("/")}: camera calibration',
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def _level(self, health: Health, warnings: list[str]) -> tuple[bytes, str]:
+        """Return the level of /diagnostics and its message: the worst of what is to be said."""
+        silent_s = self._intake.silent_s
+        if not self._images.listening:
+            return WARN, 'inactive: the node subscribes no images until it is activated'
+        if silent_s is None or silent_s > SILENT_S:
+            return STALE, f'no image on {self._images.topic} {since_text(silent_s)}'
+        if health.level != ERROR and warnings:
+            return WARN, f'{health.state}: {warnings[0]}'
+        if health.level != ERROR and 'lens' in self._changes():
+            return WARN, self._changes()['lens']
+        return health.level, health.message
 
 
-def _service(action: Callable[[], tuple[bool, str]]) -> Callable[..., Trigger.Response]:
-    """Return a service's callback; action: returns success and a message."""
-    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = action()
-        return response
-    return answer
+def _trigger(action: Callable[[], tuple[bool, str]], _: Trigger.Request,
+             response: Trigger.Response) -> Trigger.Response:
+    """Answer a service; action: returns success and a message."""
+    response.success, response.message = action()
+    return response

@@ -4,8 +4,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -17,20 +16,24 @@ from rcl_interfaces.msg import (
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
-from rclpy.qos import QoSPolicyKind, QoSProfile
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
-from rclpy.subscription import Subscription
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import Trigger
 
-from dashcalib_ros.config import Config, describe
+from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.report.result import CAMERA_NAME
-from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig
+from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, specs, with_changes
 
-# of the QoS that users may override: durability is not among them, as a latched topic that is not
-# latched would break its readers
-POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+# history, depth and reliability; not durability, as a latched topic that is not latched would
+# break its readers
+OVERRIDES = QoSOverridingOptions.with_default_policies()
+RELIABILITIES = ('best_effort', 'reliable')
+
+
+def latched() -> QoSProfile:
+    """Return the QoS of a topic that late subscribers hear; rclpy writes overrides into it."""
+    return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def declare(node: Node) -> tuple[Config, NodeConfig]:
@@ -40,10 +43,12 @@ def declare(node: Node) -> tuple[Config, NodeConfig]:
     Raises ConfigError, or rclpy's ParameterException for a value out of its range.
     """
     given = node._parameter_overrides
-    changes = {name: _declared(node, name, spec) for name, spec in describe()
-               if not spec.metadata['expert'] or name in given}
-    own = {spec.name: _declared(node, spec.name, spec) for spec in dataclasses.fields(NodeConfig)}
-    return Config().replace(changes), NodeConfig(**_floats(own))
+    for name, parameter in given.items():
+        if name.startswith('qos_overrides.'):
+            _check_qos(name, parameter.value)
+    return with_changes(Config(), NodeConfig(), {
+        name: _declared(node, name, spec) for name, spec in specs().items()
+        if not spec.metadata['expert'] or name in CHANGEABLE or name in given})
 
 
 def check_known(names: Iterable[str], declared: Iterable[str]) -> None:
@@ -51,7 +56,7 @@ def check_known(names: Iterable[str], declared: Iterable[str]) -> None:
 
     Raises ConfigError with the nearest name that there is.
     """
-    known = [*declared, *(name for name, _ in describe())]
+    known = [*declared, *specs()]
     for name in names:
         if name in known:
             continue
@@ -62,34 +67,23 @@ def check_known(names: Iterable[str], declared: Iterable[str]) -> None:
 
 
 def changed(core: Config, own: NodeConfig, parameters: Iterable[Parameter], most_turns: int
-            ) -> tuple[Config, NodeConfig, SetParametersResult]:
-    """Return the changed settings, or the same ones and the reason for the refusal.
+            ) -> tuple[Config, NodeConfig]:
+    """Return the changed settings; raises ConfigError.
 
     most_turns: how many turns the learner was made for.
     """
-    values = {each.name: each.value for each in parameters if each.name in CHANGEABLE}
-    of_core = {name: values.pop(name) for name in list(values) if '.' in name}
-    try:
-        new = core.replace(of_core), dataclasses.replace(own, **values)
-    except ConfigError as error:
-        return core, own, SetParametersResult(successful=False, reason=str(error))
+    new = with_changes(core, own, {
+        each.name: each.value for each in parameters if each.name in CHANGEABLE})
     if new[0].turns.wanted > most_turns:
-        return core, own, SetParametersResult(successful=False, reason=(
-            f'turns.wanted can be {most_turns} at the most while the node runs, as so many turns '
-            f'are kept; for more, start the node with it'))
-    return *new, SetParametersResult(successful=True)
+        raise ConfigError(f'turns.wanted can be {most_turns} at the most while the node runs, as '
+                          f'so many turns are kept; for more, start the node with it')
+    return new
 
 
 def why_read_only(name: str) -> str:
     """Return why a parameter cannot be changed while the node runs, and what to do instead."""
-    if name in Config().flat():
-        why = 'the turns found so far were made with it'
-    elif name.startswith('qos_overrides'):
-        why = 'the topic was made with it'
-    else:
-        why = 'it is read when the node starts'
-    return (f'{name} is read-only while the node runs: {why}; start the node with '
-            f'-p {name}:=VALUE. These can be changed: {", ".join(CHANGEABLE)}')
+    return (f'{name} is read-only while the node runs: it is read at the start; start the node '
+            f'with -p {name}:=VALUE. These can be changed: {", ".join(CHANGEABLE)}')
 
 
 def refusal(request: Any, response: Any, reason: str) -> Any:
@@ -127,50 +121,10 @@ def _declared(node: Node, name: str, spec: dataclasses.Field[Any]) -> Any:
     return node.declare_parameter(name, spec.default, descriptor).value
 
 
-def _floats(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Let an integer be a float where the default is one."""
-    defaults = NodeConfig()
-    return {name: float(value) if type(value) is int and isinstance(getattr(defaults, name), float)
-            else value for name, value in values.items()}
-
-
-def make_publisher(node: Node, kind: type, topic: str, profile: QoSProfile) -> Publisher:
-    """Make a publisher; raises ConfigError for an override that QoS has not."""
-    options = QoSOverridingOptions(POLICIES, callback=_checked)
-    with _told(topic, 'publisher'):
-        return node.create_publisher(kind, topic, profile, qos_overriding_options=options)
-
-
-def make_subscription(node: Node, kind: type, topic: str, callback: Callable[[Any], None],
-                      profile: QoSProfile, fixed: Iterable[QoSPolicyKind] = ()) -> Subscription:
-    """Make a subscription; fixed: policies that are not for the user.
-
-    Raises ConfigError for an override that QoS has not.
-    """
-    options = QoSOverridingOptions([each for each in POLICIES if each not in fixed],
-                                   callback=_checked)
-    with _told(topic, 'subscription'):
-        return node.create_subscription(kind, topic, callback, profile,
-                                        qos_overriding_options=options)
-
-
-def override_of(node: Node, topic: str, policy: QoSPolicyKind) -> Any:
-    """Return the user's value of a policy of a subscription, None if there is none."""
-    name = f'qos_overrides.{topic}.subscription.{policy.name.lower()}'
-    given = node._parameter_overrides.get(name)
-    return None if given is None else given.value
-
-
-def _checked(profile: QoSProfile) -> SetParametersResult:
-    return SetParametersResult(successful=profile.depth > 0, reason='depth must be 1 or more')
-
-
-@contextmanager
-def _told(topic: str, what: str) -> Iterator[None]:
-    """Turn what rclpy raises for an odd override into a ConfigError."""
-    try:
-        yield
-    except (RuntimeError, InvalidQosOverridesError) as error:
-        raise ConfigError(f'qos_overrides of the {what} of {topic}: {error}; history is keep_last '
-                          f'or keep_all, depth a number, reliability reliable or '
-                          f'best_effort') from error
+def _check_qos(name: str, value: Any) -> None:
+    policy = name.rpartition('.')[2]
+    fits = {'history': value in ('keep_last', 'keep_all'), 'reliability': value in RELIABILITIES,
+            'depth': type(value) is int and value > 0}
+    if not fits.get(policy, True):
+        raise ConfigError(f'{name} cannot be {value!r}: history is keep_last or keep_all, depth a '
+                          f'number from 1 on, reliability reliable or best_effort')

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -19,18 +20,16 @@ import numpy as np
 import numpy.typing as npt
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage
 
 from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera_info import rectified_matrix
-from dashcalib_ros.ros.background import Picture, View
-from dashcalib_ros.ros.parameters import make_publisher
+from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.detect.estimator import TrackedPoints
+from dashcalib_ros.ros.parameters import OVERRIDES
 from dashcalib_ros.ros.settings import NodeConfig
 
-# a viewer wants the newest only; a reliable publisher reaches both kinds of subscribers
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 # of the pictures as JPEG; 95 takes twice the space
 QUALITY = 80
 # of the drawing thread: the node's other work comes first
@@ -39,31 +38,43 @@ NICE = 10
 EARLY = 0.1
 # blue, green, red
 TRACK, INK = (90, 230, 90), (255, 255, 255)
-# the tint: what is taken away, and what is added
-LESS, MORE = (80.0, 80.0, 0.0, 0.0), (0.0, 0.0, 60.0, 0.0)
+# added to the ego vehicle's: white and black places become red, too
+TINT = (-80, -80, 60)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 # binary digits after the point that cv2 draws with
 SHIFT = 4
 # outside of the picture, for pixels that the camera does not see
 NOWHERE = -1e6
-# rows that are projected at a time: rays of a whole large picture are some 100 MB
-BAND = 64
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image with its message's header, and what was tracked and masked in it.
+
+    valid: (h, w) of the image, or of the image resized; None: no ego vehicle is known.
+    """
+
+    header: Any
+    image: GreyImage
+    points: TrackedPoints
+    valid: Mask | None
 
 
 class Preview:
     """Publishes ~/overlay/compressed and ~/rectified/compressed.
 
-    The background thread asks wanted() for each image and gives those that are to show(). Only the
-    newest is kept, so that neither it nor the image callback ever waits for a drawing.
-    published: how many pictures, of both kinds.
+    Only the newest image waits for the drawing thread: neither the background thread, which calls
+    take(), nor the image callback ever waits for it. published: how many pictures, of both kinds.
     """
 
     def __init__(self, node: Node, config: NodeConfig, view: str,
                  failed: Callable[[Exception], None]) -> None:
         """view: the setting `rectified`. failed: called with what a drawing raised."""
         self.published = 0
-        self._overlay = make_publisher(node, CompressedImage, '~/overlay/compressed', NEWEST)
-        self._rectified = make_publisher(node, CompressedImage, '~/rectified/compressed', NEWEST)
+        self._overlay, self._rectified = (
+            node.create_publisher(CompressedImage, f'~/{name}/compressed', 1,
+                                  qos_overriding_options=OVERRIDES)
+            for name in ('overlay', 'rectified'))
         self._period_s = (1 - EARLY) / config.preview_rate
         self._failed = failed
         self._view = view
@@ -74,20 +85,16 @@ class Preview:
         self._state: tuple[str, Camera | None] = ('', None)
         self._thread = threading.Thread(target=self._draw, name='preview', daemon=True)
 
-    def wanted(self) -> bool:
-        """Return whether the next image is to be shown: someone subscribes, and it is due."""
+    def take(self, header: Any, image: GreyImage, found: Detection) -> None:
+        """Have an image drawn if someone subscribes and it is due; one that waits is dropped."""
         now = time.monotonic()
         if now < self._due:
-            return False
+            return
         self._due = now + self._period_s
-        return bool(self._overlay.get_subscription_count()
-                    or self._rectified.get_subscription_count())
-
-    def show(self, picture: Picture) -> None:
-        """Take an image to draw; one that waits still is dropped."""
-        if not self._thread.is_alive():
-            self._thread.start()
-        self._put(picture)
+        if self._overlay.get_subscription_count() or self._rectified.get_subscription_count():
+            if not self._thread.is_alive():
+                self._thread.start()
+            self._put(Picture(header, image, found.points(), found.valid()))
 
     def tell(self, text: str, camera: Camera | None) -> None:
         """Take the state that the overlay shows, and the camera in use."""
@@ -117,7 +124,7 @@ class Preview:
 
     def _publish(self, picture: Picture, text: str, camera: Camera | None) -> None:
         if self._overlay.get_subscription_count():
-            self._send(self._overlay, picture, overlay(picture.image, picture.view, text))
+            self._send(self._overlay, picture, overlay(picture, text))
         fits = camera is not None and camera.image_size == picture.image.shape[::-1]
         if camera is not None and fits and self._rectified.get_subscription_count():
             self._send(self._rectified, picture, rectified(picture.image, camera, self._view))
@@ -130,14 +137,16 @@ class Preview:
         self.published += 1
 
 
-def overlay(image: GreyImage, view: View, text: str) -> npt.NDArray[np.uint8]:
+def overlay(picture: Picture, text: str) -> npt.NDArray[np.uint8]:
     """Return (h, w, 3), bgr: the image with tracks, the ego vehicle tinted, and a line of text."""
-    drawn: Any = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    if view.valid is not None:
-        _tint(drawn, view.valid)
-    thickness = max(1, round(image.shape[1] / 640))
+    drawn: Any = cv2.cvtColor(picture.image, cv2.COLOR_GRAY2BGR)
+    if picture.valid is not None:
+        hidden = cv2.resize((~picture.valid).astype(np.uint8), drawn.shape[1::-1],
+                            interpolation=cv2.INTER_NEAREST) > 0
+        drawn[hidden] = np.clip(drawn[hidden].astype(np.int16) + TINT, 0, 255)
+    thickness = max(1, round(drawn.shape[1] / 640))
     before, now = (np.rint(xy * (1 << SHIFT)).astype(np.int32)
-                   for xy in (view.points.before, view.points.now))
+                   for xy in (picture.points.before, picture.points.now))
     cv2.polylines(drawn, list(np.stack([before, now], axis=1)), False, TRACK, thickness,
                   cv2.LINE_AA, SHIFT)
     for x, y in now.tolist():
@@ -145,17 +154,6 @@ def overlay(image: GreyImage, view: View, text: str) -> npt.NDArray[np.uint8]:
     if text:
         _write(drawn, text)
     return np.asarray(drawn)
-
-
-def _tint(drawn: Any, valid: Mask) -> None:
-    """Tint what is not valid, in place; valid may be of the image in another size."""
-    size = drawn.shape[1::-1]
-    hidden = cv2.resize((~valid).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    # both: white and black places become red, too; cv2's stubs do not know numbers for pictures
-    subtract: Any = cv2.subtract
-    add: Any = cv2.add
-    subtract(drawn, LESS, drawn, hidden)
-    add(drawn, MORE, drawn, hidden)
 
 
 def _write(drawn: Any, text: str) -> None:
@@ -179,22 +177,20 @@ def rectified(image: GreyImage, camera: Camera, view: str) -> GreyImage:
 
     image: of the camera's size. view: what the picture shows, the setting `rectified`.
     """
-    return np.asarray(cv2.remap(image, *_maps(camera, view), cv2.INTER_LINEAR), np.uint8)
+    # cv2's stubs do not know that both maps may be in one
+    remap: Any = cv2.remap
+    return np.asarray(remap(image, _places(camera, view), None, cv2.INTER_LINEAR), np.uint8)
 
 
 @lru_cache(maxsize=1)
-def _maps(camera: Camera, view: str) -> tuple[Any, Any]:
-    """Return where each pixel of the rectified picture is in the image, as cv2 has it."""
+def _places(camera: Camera, view: str) -> npt.NDArray[np.float32]:
+    """Return (h, w, 2): where each pixel of the rectified picture is in the image, px."""
     matrix = rectified_matrix(camera, view)
     width, height = camera.image_size
+    x = (np.arange(width) - matrix[0, 2]) / matrix[0, 0]
     places = np.empty((height, width, 2), np.float32)
-    for top in range(0, height, BAND):
-        band = places[top:top + BAND]
-        y, x = np.mgrid[top:top + len(band), :width]
-        rays = np.stack([(x - matrix[0, 2]) / matrix[0, 0], (y - matrix[1, 2]) / matrix[1, 1],
-                         np.ones(x.shape)], axis=-1)
-        band[:] = np.nan_to_num(camera.project(rays), nan=NOWHERE)
-    # cv2's stubs do not know that both maps may be in one
-    convert: Any = cv2.convertMaps
-    whole, fractions = convert(places, None, cv2.CV_16SC2)
-    return whole, fractions
+    for row in range(height):  # rays of a whole large picture are some 100 MB
+        y = np.full(width, (row - matrix[1, 2]) / matrix[1, 1])
+        rays = np.stack([x, y, np.ones(width)], axis=-1)
+        places[row] = np.nan_to_num(camera.project(rays), nan=NOWHERE)
+    return places

@@ -11,6 +11,7 @@ import rclpy.utilities
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
 from dashcalib_ros.errors import ConfigError, DashcalibError
@@ -55,17 +56,57 @@ def run(argv: Sequence[str], lifecycle: bool, stopped: Callable[[], bool]) -> in
     return 0
 
 
+class Managed(LifecycleNodeMixin, CameraNode):  # type: ignore[misc]
+    """A node with a lifecycle. What it learned outlives deactivate; cleanup drops it.
+
+    Images are subscribed, and camera_info is published beside them, only while it is active. The
+    kept calibration stays latched on ~/calibration in every state.
+    """
+
+    def __init__(self) -> None:
+        CameraNode.__init__(self, listen=False)
+        LifecycleNodeMixin.__init__(self)
+        self.answer_always()
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe the images."""
+        self._images.start()
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop listening; turns and calibration stay."""
+        self._images.stop()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin anew: with the kept calibration and without turns."""
+        self.begin_anew()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop listening for good."""
+        self._images.stop()
+        return super().on_shutdown(state)
+
+
+class ManagedCalibratorNode(Managed, CalibratorNode):
+    """A managed node that calibrates."""
+
+
+class ManagedCheckNode(Managed, CheckNode):
+    """A managed node that checks."""
+
+
 def make_node(lifecycle: bool) -> CameraNode:
-    """Make the node; what only a managed one needs is imported for it only."""
+    """Make the node that the parameters ask for."""
     # a parameter tells which node is to be made, and only a node knows its parameters
     asked = Node('calibrator', enable_rosout=False, start_parameter_services=False)
     any_type = ParameterDescriptor(dynamic_typing=True)
     check_only = asked.declare_parameter('check_only', False, any_type).value is True
     asked.destroy_node()
-    if not lifecycle:
-        return CheckNode() if check_only else CalibratorNode()
-    from dashcalib_ros.ros.lifecycle import ManagedCalibratorNode, ManagedCheckNode
-    return ManagedCheckNode() if check_only else ManagedCalibratorNode()
+    if lifecycle:
+        return ManagedCheckNode() if check_only else ManagedCalibratorNode()
+    return CheckNode() if check_only else CalibratorNode()
 
 
 def start_ros(argv: Sequence[str]) -> None:

@@ -1,14 +1,20 @@
-"""What only the node is told: its settings and its command line. No ROS is imported."""
+"""The node's settings and its command line; no ROS is imported.
+
+Writes config/calibrator.yaml: python -m dashcalib_ros.ros.settings > config/calibrator.yaml.
+"""
 from __future__ import annotations
 
 import dataclasses
 import itertools
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from dashcalib_ros.config import _check, describe, expert, setting
+import yaml
+
+from dashcalib_ros.config import Config, _check, describe, expert, setting
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 
@@ -52,7 +58,17 @@ example:
   ros2 run dashcalib_ros calibrator --ros-args -r __ns:=/front \\
       -r image_raw:=image -p image_transport:=compressed -p turns.wanted:=3
 """
-COLUMNS = 80
+SAMPLE = """\
+# Every parameter of the node 'calibrator' with its default: first those that users set, then those
+# for experts. Made by dashcalib_ros.ros.settings from the code's own settings; keep only the lines
+# that you change. Names with a dot, seed, threads, model, rectified, max_width and min_width are
+# settings of the core, which dashcalib run --set NAME=VALUE takes, too; the others are the node's
+# own. Topics are remapped, not parameters: image_raw in, camera_info out.
+/**:
+  ros__parameters:
+{users}
+    # For experts: few users need these. What was measured for them: docs/notebook/lessons.md
+{experts}"""
 # settings of the core that are most often set
 CORE = ('model', 'rectified', 'turns.wanted', 'turns.store', 'motion.rate', 'verdict.max_sigma')
 
@@ -111,14 +127,33 @@ class NodeConfig:
                               'checks: set one of them')
 
 
+def specs() -> dict[str, dataclasses.Field[Any]]:
+    """Return every setting by its name: the node's own, then the core's."""
+    return {**{spec.name: spec for spec in dataclasses.fields(NodeConfig)}, **dict(describe())}
+
+
+def with_changes(core: Config, own: NodeConfig, values: Mapping[str, Any]
+                 ) -> tuple[Config, NodeConfig]:
+    """Return both with settings changed by name; raises ConfigError."""
+    names = {spec.name for spec in dataclasses.fields(NodeConfig)}
+    return (core.replace({name: value for name, value in values.items() if name not in names}),
+            dataclasses.replace(own, **{name: value for name, value in values.items()
+                                        if name in names}))
+
+
 def help_text() -> str:
     """Return what --help prints."""
-    core = list(describe())
-    own = [(spec.name, spec) for spec in dataclasses.fields(NodeConfig)]
-    main = [each for each in own if not each[1].metadata['expert']]
-    main += [each for each in core if each[0] in CORE]
-    return HELP.format(parameters='\n'.join(_row(*each) for each in main),
-                       count=len(own) + len(core))
+    known, core = specs(), dict(describe())
+    rows = [_row(name, spec) for name, spec in known.items()
+            if (name in CORE if name in core else not spec.metadata['expert'])]
+    return HELP.format(parameters='\n'.join(rows), count=len(known))
+
+
+def sample() -> str:
+    """Return the text of config/calibrator.yaml."""
+    users, experts = (''.join(_line(name, spec) for name, spec in specs().items()
+                              if spec.metadata['expert'] is wanted) for wanted in (False, True))
+    return SAMPLE.format(users=users, experts=experts)
 
 
 def parse(argv: Sequence[str]) -> tuple[bool, bool]:
@@ -126,20 +161,19 @@ def parse(argv: Sequence[str]) -> tuple[bool, bool]:
 
     argv: without the program's name. Raises ConfigError for arguments that there are not.
     """
-    wanted = {'--help': False, '--lifecycle': False}
-    for argument in _own(argv):
-        name = '--help' if argument == '-h' else argument
-        if name not in wanted:
+    own, of_ros = [], False
+    for argument in argv:  # those between --ros-args and -- are for ROS
+        if argument == '--ros-args':
+            of_ros = True
+        elif of_ros:
+            of_ros = argument != '--'
+        elif argument in ('-h', '--help', '--lifecycle'):
+            own.append(argument)
+        else:
             raise ConfigError(f'unknown argument {argument!r}: topics and parameters go after '
                               f'--ros-args, as in --ros-args -r image_raw:=/camera/image_raw; '
                               f'--help tells more')
-        wanted[name] = True
-    return wanted['--help'], wanted['--lifecycle']
-
-
-def ros_arguments(argv: Sequence[str]) -> list[str]:
-    """Return the arguments without the node's own."""
-    return [each for each in argv if each != '--lifecycle']
+    return '-h' in own or '--help' in own, '--lifecycle' in own
 
 
 def check_files(argv: Sequence[str]) -> None:
@@ -155,31 +189,34 @@ def check_files(argv: Sequence[str]) -> None:
 
 def _has_parameters(data: object) -> bool:
     """Return whether ros__parameters stands below a node's name, in namespaces or not."""
-    if not isinstance(data, dict):
-        return False
-    return any(isinstance(value, dict) and (isinstance(value.get('ros__parameters'), dict)
-                                            or _has_parameters(value))
-               for value in data.values())
+    return isinstance(data, dict) and any(
+        isinstance(value, dict) if name == 'ros__parameters' else _has_parameters(value)
+        for name, value in data.items())
 
 
-def _own(argv: Sequence[str]) -> list[str]:
-    """Return the arguments outside of --ros-args ... [--]."""
-    own, of_ros = [], False
-    for argument in argv:
-        if argument == '--ros-args':
-            of_ros = True
-        elif of_ros:
-            of_ros = argument != '--'
-        else:
-            own.append(argument)
-    return own
-
-
-def _row(name: str, spec: dataclasses.Field[object]) -> str:
-    about = spec.metadata
+def _row(name: str, spec: dataclasses.Field[Any]) -> str:
     value = f'{spec.default}'.lower() if isinstance(spec.default, bool) else f'{spec.default!r}'
-    text = f'{about["reason"]}; default {value}'
-    if about['choices']:
-        text += f'; one of {", ".join(about["choices"])}'
+    text = f'{spec.metadata["reason"]}; default {value}{_choices(spec)}'
     name += ' *' if name in CHANGEABLE else ''
-    return textwrap.fill(text, COLUMNS, initial_indent=f'  {name:<21}', subsequent_indent=' ' * 23)
+    return textwrap.fill(text, 80, initial_indent=f'  {name:<21}', subsequent_indent=' ' * 23)
+
+
+def _line(name: str, spec: dataclasses.Field[Any]) -> str:
+    about = spec.metadata
+    note = f'{about["reason"]}{_choices(spec)}'
+    if about['minimum'] is not None:
+        note += f'; {about["minimum"]:.10g} to {about["maximum"]:.10g}'
+    if name in CHANGEABLE:
+        note += '; may be changed while the node runs'
+    value = yaml.safe_dump(spec.default, default_flow_style=True).split('\n')[0]
+    comment = textwrap.fill(note, 99, initial_indent='    # ', subsequent_indent='    # ')
+    return f'{comment}\n    {name}: {value}\n'
+
+
+def _choices(spec: dataclasses.Field[Any]) -> str:
+    choices = spec.metadata['choices']
+    return f'; one of {", ".join(choices)}' if choices else ''
+
+
+if __name__ == '__main__':
+    print(sample(), end='')

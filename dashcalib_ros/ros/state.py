@@ -16,22 +16,14 @@ from dashcalib_ros.judge.difference import contradicted
 from dashcalib_ros.judge.verdict import STEADY
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.wording import digits_of
+from dashcalib_ros.ros.settings import NodeConfig
 
-State = Literal['collecting', 'calibrating', 'calibrated', 'refused_so_far', 'checking']
 Action = Literal['wait', 'adopt', 'keep', 'replace', 'give_up']
 NEXT = {
     'weak': 'it is calculated again with each better turn',
     'refused': 'it is tried again with each better turn: those of 60° or more, at town speed and '
                'in daylight, teach most',
 }
-
-
-@dataclass(frozen=True)
-class Rules:
-    """replace_ratio: of fx's sigmas, new to old. contradictions: in a row, before giving up."""
-
-    replace_ratio: float
-    contradictions: int
 
 
 @dataclass(frozen=True)
@@ -48,15 +40,15 @@ class Judgement:
 
 
 def judge(new: Calibration, complete: bool, published: NamedCamera | None, contradictions: int,
-          rules: Rules) -> Judgement:
+          limits: NodeConfig) -> Judgement:
     """Decide about a calibration.
 
     complete: it had all the turns wanted. published: what is published now, if anything;
-    contradictions: how many in a row contradicted that.
+    contradictions: how many in a row contradicted that. limits: `better` and `contradictions`.
     """
     if published is not None and STEADY in new.verdict.cures:
         return _contradicted(f'the published one, as the picture moves now: {STEADY}',
-                             contradictions, rules, 'give_up')
+                             contradictions, limits, 'give_up')
     if new.verdict.level != 'accepted' or new.camera is None or new.sigma is None:
         action: Action = 'wait' if published is None else 'keep'
         return Judgement(action, '; '.join(new.verdict.reasons), contradictions)
@@ -65,32 +57,23 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
     against = contradicted(published.camera, published.sigma, new.camera, new.sigma)
     if against:
         return _contradicted(f'the published one: {", ".join(against)}; was the camera moved, or '
-                             f'its lens changed?', contradictions, rules,
+                             f'its lens changed?', contradictions, limits,
                              'replace' if complete else 'give_up')
     # the sigma of a file that was edited is not known
     before = 'not known' if published.sigma is None else f'± {published.sigma["fx"]:.2f} px'
     after = new.sigma['fx']
     if complete and (published.sigma is None
-                     or after <= rules.replace_ratio * published.sigma['fx']):
+                     or after <= limits.better * published.sigma['fx']):
         return Judgement('replace', f'it is more exact: fx is known to ± {after:.2f} px, it was '
                                     f'{before}')
     return Judgement('keep', 'it confirms the published one', confirmed=True)
 
 
-def _contradicted(what: str, contradictions: int, rules: Rules, last: Action) -> Judgement:
+def _contradicted(what: str, contradictions: int, limits: NodeConfig, last: Action) -> Judgement:
     """Count one more contradiction. what: is contradicted, and why; last: done at the last one."""
     count = contradictions + 1
-    why = f'{count} of {rules.contradictions} calibrations in a row contradict {what}'
-    return Judgement('keep', why, count) if count < rules.contradictions else Judgement(last, why)
-
-
-def state_of(published: bool, calibrating: bool, refused: bool) -> State:
-    """Return the word for diagnostics; refused: the last calibration was not accepted."""
-    if published:
-        return 'calibrated'
-    if calibrating:
-        return 'calibrating'
-    return 'refused_so_far' if refused else 'collecting'
+    why = f'{count} of {limits.contradictions} calibrations in a row contradict {what}'
+    return Judgement('keep', why, count) if count < limits.contradictions else Judgement(last, why)
 
 
 def sigma_text(camera: NamedCamera) -> str:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -63,16 +64,16 @@ class Whose:
 
 @dataclass(frozen=True)
 class Kept:
-    """An accepted calibration: the camera, the frame its images were in, and the file's text.
+    """An accepted calibration: the camera, the frame its images were in, and the file's content.
 
     frame_id: None where the file does not say it. contradictions: how many calibrations in a row
-    contradict it. edited: the text is not what a node wrote; then the camera's sigma is unknown.
-    mount: how the camera sits on the car, where that is known.
+    contradict it. edited: it is not what a node wrote; then the camera's sigma is unknown. mount:
+    how the camera sits on the car, where that is known.
     """
 
     camera: NamedCamera
     frame_id: str | None
-    text: str
+    content: Mapping[str, Any]
     contradictions: int = 0
     edited: bool = False
     mount: Mount | None = None
@@ -81,11 +82,10 @@ class Kept:
     def of(cls, calibration: Calibration, whose: Whose, frame_id: str) -> Kept:
         """Make it of a calibration that was accepted just now."""
         now = datetime.now(timezone.utc).isoformat(timespec='seconds')
-        document = yaml.safe_load(calibration_yaml(calibration, whose.name, now))
-        own = document['dashcalib']
-        own |= {'topic': whose.topic, 'frame_id': frame_id}
-        own[CHECKSUM] = _checksum(document)
-        return cls(calibrated_camera(calibration, whose.name), frame_id, yaml_text(document),
+        content = yaml.safe_load(calibration_yaml(calibration, whose.name, now))
+        content['dashcalib'] |= {'topic': whose.topic, 'frame_id': frame_id}
+        content['dashcalib'][CHECKSUM] = _checksum(content)
+        return cls(calibrated_camera(calibration, whose.name), frame_id, content,
                    mount=calibration.mount)
 
     @classmethod
@@ -98,9 +98,9 @@ class Kept:
         if camera.verdict != 'accepted' or camera.sigma is None:
             raise InputError('it is no accepted calibration of this node; it is moved aside when '
                              'there is one')
-        document = parse_yaml(text, str(path))
-        own = document['dashcalib']
-        name, topic = document.get('camera_name'), own.get('topic')
+        content = parse_yaml(text, str(path))
+        own = content['dashcalib']
+        name, topic = content.get('camera_name'), own.get('topic')
         if name != whose.name:
             raise InputError(f'it is of the camera {name}, this one is {whose.name}; it is moved '
                              f'aside when this one is calibrated')
@@ -111,29 +111,31 @@ class Kept:
         count, frame_id = own.get(COUNT, 0), own.get('frame_id')
         # an older file has neither
         older = topic is None and CHECKSUM not in own
-        edited = not older and own.get(CHECKSUM) != _checksum(document)
-        return cls(camera, None if frame_id is None else str(frame_id), text,
+        edited = not older and own.get(CHECKSUM) != _checksum(content)
+        return cls(camera, None if frame_id is None else str(frame_id), content,
                    count if type(count) is int and count > 0 else 0, edited,
                    None if edited else read_mount(own.get('mount')))
+
+    @property
+    def text(self) -> str:
+        """Return the file's text."""
+        return yaml_text(self.content)
 
     def rectified(self, rectified: str) -> Kept:
         """Return it with the P of a setting, itself where the file has that already.
 
         P is no measurement but the user's choice: the present one counts, not the file's.
         """
-        document = parse_yaml(self.text, self.camera.name)
         p = ros_camera(self.camera.camera, rectified).p
-        before = document.get('projection_matrix')
-        if isinstance(before, dict) and _equal(before.get('data'), p):
-            return self
-        document['projection_matrix'] = matrix_block(3, 4, p)
-        return replace(self, text=yaml_text(document))
+        with suppress(KeyError, TypeError, ValueError):  # of another program's form
+            if np.allclose(self.content['projection_matrix']['data'], p, rtol=1e-9, atol=0):
+                return self
+        return replace(self, content={**self.content, 'projection_matrix': matrix_block(3, 4, p)})
 
     def contradicted(self, times: int) -> Kept:
         """Return it with another number of contradictions in a row."""
-        document = parse_yaml(self.text, self.camera.name)
-        document['dashcalib'][COUNT] = times
-        return replace(self, text=yaml_text(document), contradictions=times)
+        own = {**self.content['dashcalib'], COUNT: times}
+        return replace(self, content={**self.content, 'dashcalib': own}, contradictions=times)
 
 
 class Store:
@@ -191,9 +193,12 @@ class Store:
                 f'camera_name or camera_info_url to give each a file of its own')
 
     @property
-    def given_up(self) -> bool:
-        """Return whether the file still has a calibration that was given up."""
-        return self._given_up is not None and self._read() == self._given_up
+    def given_up(self) -> str:
+        """Return the line where the file still has a calibration that was given up, else ''."""
+        if self._given_up is None or self._read() != self._given_up:
+            return ''
+        return (f'{self.path} was given up, but could not be moved aside: remove it, or the next '
+                f'start of the node publishes it again')
 
     def load(self) -> Kept | None:
         """Return the calibration, None if there is no file.
@@ -204,17 +209,15 @@ class Store:
         self._text = None
         if self.taken:
             raise InputError(self.taken)
-        with suppress(OSError):  # reading fails, too, and raises InputError below
-            if not self._exists():
-                return None
         try:
+            if not (self.path.exists() or self.path.is_symlink()):
+                return None
             text = read_text(self.path, YAML_BYTES)
             kept = Kept.read(text, self.path, self._whose)
-        except (InputError, ValueError, OverflowError) as error:
+        except (InputError, OSError, ValueError, OverflowError) as error:
             raise InputError(f'{self.path} is ignored: {error}') from error
-        if text == self._given_up:
-            raise InputError(f'{self.path} is ignored: it was given up, but could not be moved '
-                             f'aside; remove it')
+        if self.given_up:
+            raise InputError(self.given_up)
         if why := implausible(kept.camera):
             try:
                 end = f'it is now {set_aside(self.path)}'
@@ -225,11 +228,8 @@ class Store:
         # its sigma may be what was edited
         return replace(kept, camera=replace(kept.camera, sigma=None)) if kept.edited else kept
 
-    def save(self, kept: Kept) -> Path | None:
-        """Write it, completely or not at all. Raises OutputError.
-
-        Returns the new path of another program's file, None if there was none.
-        """
+    def save(self, kept: Kept) -> str:
+        """Write it, completely or not at all; return a line about it. Raises OutputError."""
         if self.taken:
             raise OutputError(self.taken)
         try:
@@ -237,41 +237,42 @@ class Store:
         except OSError as error:
             raise OutputError(f'cannot make {self.path.parent}: {error.strerror}; set '
                               f'camera_info_url to a place you may write to') from error
-        ours = self._text is not None and self._read() == self._text
-        moved = None if ours else set_aside(self.path)
-        write_text(self.path, kept.text)
-        self._text, self._given_up = kept.text, None
-        return moved
+        moved = None if self._ours else set_aside(self.path)
+        self._write(kept)
+        self._given_up = None
+        return f'saved to {self.path}' + (
+            f'; what another program wrote there is now {moved}' if moved else '')
 
     def update(self, kept: Kept) -> None:
         """Write it where the file is still what this node read or wrote. Raises OutputError."""
-        if self._text is not None and self._read() == self._text and self.claim():
-            write_text(self.path, kept.text)
-            self._text = kept.text
+        if self._ours and self.claim():
+            self._write(kept)
 
-    def retire(self) -> Path | None:
-        """Set the file aside, so that it is not loaded again; return its new path.
+    def retire(self) -> str:
+        """Set the file aside, so that it is not loaded again; return a line about it.
 
-        None if there was no file. Raises OutputError when it could not be moved: this process
-        does not load it again then, but the next start of the node does; and where another node
-        has it.
+        That of another node stays. Raises OutputError when it could not be moved: this process
+        does not load it again then, but the next start of the node does.
         """
         if self.taken:
-            raise OutputError(self.taken)
+            return self.taken
         try:
             moved = set_aside(self.path)
-        except OutputError:
+        except OutputError as error:
             self._given_up = self._read()
-            raise
+            raise OutputError(f'{error}; until then the next start of the node publishes it '
+                              f'again') from error
         self._text = self._given_up = None
-        return moved
+        return f'{self.path} is now {moved}' if moved else 'there was no file'
 
-    def _exists(self) -> bool:
-        try:
-            self.path.lstat()
-        except (FileNotFoundError, NotADirectoryError):
-            return False
-        return True
+    @property
+    def _ours(self) -> bool:
+        return self._text is not None and self._read() == self._text
+
+    def _write(self, kept: Kept) -> None:
+        text = kept.text
+        write_text(self.path, text)
+        self._text = text
 
     def _read(self) -> str | None:
         try:
@@ -313,23 +314,16 @@ def _real(camera: Camera) -> bool:
     return bool(np.isfinite(rays).all() and not (stretch > STRETCH).any())
 
 
-def _checksum(document: dict[str, Any]) -> str:
+def _checksum(content: Mapping[str, Any]) -> str:
     """Return that of what is published and of where it is from: of all but P and the count."""
-    own = {key: value for key, value in document['dashcalib'].items()
+    own = {key: value for key, value in content['dashcalib'].items()
            if key not in (CHECKSUM, COUNT)}
-    content = {key: value for key, value in document.items() if key != 'projection_matrix'}
+    sealed = {key: value for key, value in content.items() if key != 'projection_matrix'}
     try:
-        text = json.dumps({**content, 'dashcalib': own}, sort_keys=True, default=str)
+        text = json.dumps({**sealed, 'dashcalib': own}, sort_keys=True, default=str)
     except TypeError:  # keys that are no texts: no node writes these
         return ''
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _equal(data: Any, p: list[float]) -> bool:
-    try:
-        return bool(np.allclose(np.asarray(data, np.float64), p, rtol=1e-9, atol=0))
-    except (TypeError, ValueError):
-        return False
 
 
 def camera_info_path(url: str, camera_name: str) -> Path:
@@ -339,32 +333,23 @@ def camera_info_path(url: str, camera_name: str) -> Path:
     InputError for other schemes and variables, for a package that is not installed, and for the
     home folder of an unknown user.
     """
-    text = re.sub(r'\$\{(.*?)\}', lambda found: _value(found[1], camera_name), url or DEFAULT)
-    scheme = text.partition('://')[0].lower() if '://' in text else ''
-    if scheme == 'package':
+    values = {'NAME': camera_name, 'ROS_HOME': os.environ.get('ROS_HOME') or '~/.ros'}
+    try:
+        text = re.sub(r'\$\{(.*?)\}', lambda found: values[found[1]], url or DEFAULT)
+    except KeyError as error:
+        raise InputError(f'camera_info_url {url}: there is no ${{{error.args[0]}}}; there are '
+                         f'${{ROS_HOME}} and ${{NAME}}') from error
+    scheme, separator, path = text.rpartition('://')
+    if scheme.lower() == 'package':
         return _in_package(text)
-    if scheme not in ('', 'file'):
-        raise InputError(f'camera_info_url {url}: nothing can be kept at {scheme}://; use {KNOWN}')
-    path = text[len('file://'):] if scheme else text
-    if scheme and not path.startswith(('/', '~')):
-        raise InputError(f'camera_info_url {url}: file:// needs a path that begins with /, as in '
-                         f'file:///folder/camera.yaml')
-    if not path or path.endswith('/'):
-        raise InputError(f'camera_info_url {url} names no file; use {KNOWN}')
+    if (scheme.lower() not in ('', 'file') or path.endswith('/') or not path
+            or (separator and not path.startswith(('/', '~')))):
+        raise InputError(f'camera_info_url {url} names no file that can be kept; use {KNOWN}')
     try:
         return Path(path).expanduser()
     except RuntimeError as error:  # the user, or the own home folder, is unknown
         raise InputError(f'there is no home folder for {path}; set camera_info_url to a path '
                          f'without ~') from error
-
-
-def _value(name: str, camera_name: str) -> str:
-    if name == 'NAME':
-        return camera_name
-    if name == 'ROS_HOME':
-        return os.environ.get('ROS_HOME') or '~/.ros'
-    raise InputError(f'camera_info_url: there is no ${{{name}}}; there are ${{ROS_HOME}} and '
-                     f'${{NAME}}')
 
 
 def _in_package(url: str) -> Path:

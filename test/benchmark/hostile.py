@@ -69,7 +69,7 @@ from dashcalib_ros.report import load_camera
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.calibrator_node import camera_info
 from dashcalib_ros.ros.images import LASTING
-from dashcalib_ros.ros.store import Store
+from dashcalib_ros.ros.store import Store, Whose
 
 KEPT = CAMERA_FILE.format(width=320) + OURS
 FX = 200.0
@@ -389,12 +389,21 @@ def damaged(text: str, n: int) -> bytes:
     return data.tobytes()
 
 
+def kept(path: Path) -> Any:
+    """Return what a node would use of a file."""
+    store = Store(path, Whose('dashcam', '/image_raw'))
+    try:
+        return store.load()
+    finally:
+        store.close()
+
+
 def calibration_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
     """Each is read as a camera with finite numbers, or refused with one line."""
     for n in tries:
         path = folder / f'{n}.yaml'
         path.write_bytes(damaged(KEPT, n))
-        for read in (load_camera, lambda path: Store(path).load()):
+        for read in (load_camera, kept):
             try:
                 found = read(path)
             except DashcalibError as error:

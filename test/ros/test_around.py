@@ -64,11 +64,10 @@ def test_it_says_which_images_there_are(start_node, make_bench):
     make_bench(topic='front/image_raw', listen=False)
     make_bench(topic='rear/image/compressed', image_type=CompressedImage, listen=False)
     raw, compressed = start_node(), start_node(image_transport='compressed', camera_name='rear')
-    raw.wait_for('no images on /image_raw yet; publishers of sensor_msgs/Image: '
-                 '/front/image_raw; remap with -r image_raw:=/front/image_raw')
-    compressed.wait_for('no images on /image_raw/compressed yet; publishers of '
-                        'sensor_msgs/CompressedImage: /rear/image/compressed; remap with '
-                        '-r image_raw:=/rear/image')
+    for node, topic in ((raw, '/image_raw'), (compressed, '/image_raw/compressed')):
+        node.wait_for(f'no images on {topic} yet; publishers of images: '
+                      f'-r image_raw:=/front/image_raw -p image_transport:=raw or '
+                      f'-r image_raw:=/rear/image -p image_transport:=compressed')
     assert 'WARN' not in raw.text + compressed.text
 
 

@@ -23,8 +23,7 @@ from ros_bench import REPOSITORY, SOON, Bench, NodeProcess
 
 from dashcalib_ros.config import Config, describe
 from dashcalib_ros.ros.parameters import declare
-from dashcalib_ros.ros.sample import sample
-from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig
+from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, sample
 
 COLCON = shutil.which('colcon')
 # one drive, and the node, have no use for a fleet's settings
@@ -46,7 +45,7 @@ def node_and_bench(ros_context, tmp_path_factory):
 
 
 def test_the_shipped_parameters_are_the_defaults():
-    """If this fails: python -m dashcalib_ros.ros.sample > config/calibrator.yaml."""
+    """If this fails: python -m dashcalib_ros.ros.settings > config/calibrator.yaml."""
     text = (REPOSITORY / 'config' / 'calibrator.yaml').read_text()
     assert text == sample()
     values = yaml.safe_load(text)['/**']['ros__parameters']
@@ -129,9 +128,9 @@ def test_parameters_that_may_not_change_say_so(node_and_bench):
     whole = ParameterType.PARAMETER_INTEGER
     refused = set_to('turns.at_most', type=whole, integer_value=3)
     assert not refused.successful and 'turns.at_most is read-only while' in refused.reason
-    assert 'the turns found so far were made with it; start the node with' in refused.reason
+    assert 'it is read at the start; start the node with -p turns.at_most' in refused.reason
     refused = set_to('queue_size', type=whole, integer_value=3)
-    assert not refused.successful and 'it is read when the node starts' in refused.reason
+    assert not refused.successful and 'queue_size is read-only while' in refused.reason
     refused = set_to('turns.wanted', type=whole, integer_value=11)
     assert not refused.successful and '10 at the most while the node runs' in refused.reason
     for value in (3, 5):

@@ -15,7 +15,6 @@ from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.detect.estimator import TrackedPoints
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.judge.calibration import StoredTurnSummary
@@ -24,9 +23,7 @@ from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros import background as room
 from dashcalib_ros.ros.background import (
     Learner,
-    NewTurn,
     Result,
-    Started,
     Trouble,
     Watched,
 )
@@ -60,9 +57,11 @@ class Core:
         self.hold.set()
         self.scenes = Scenes()
         self.scenes.core = self
-        self.detection = types.SimpleNamespace(
-            points=lambda: TrackedPoints(None, None), valid=lambda: None)
         Core.made.append(self)
+
+    @property
+    def detection(self):
+        return types.SimpleNamespace(frames=self.frames, start_s=0.0)
 
     def push(self, frame):
         self.frames += 1
@@ -144,19 +143,18 @@ def desk(monkeypatch):
     monkeypatch.setattr(room, 'Questions', Asked)
     Core.made, Core.failures = [], []
     heard = types.SimpleNamespace(results=[], troubles=[], statuses=[], turns=[], begun=[],
-                                  pictures=[], watching=False, watched=[])
-    viewer = types.SimpleNamespace(wanted=lambda: heard.watching, show=heard.pictures.append)
+                                  shown=[], watched=[])
 
     def hear(news):
         match news:
             case Trouble():
                 heard.troubles.append((news.kind, news.text))
-            case Started():
-                heard.begun.append(news.status)
+            case str():
+                (heard.begun if 'calibrating' in news else heard.turns).append(news)
             case _:
-                {Result: heard.results, Status: heard.statuses, NewTurn: heard.turns,
+                {Result: heard.results, Status: heard.statuses,
                  Watched: heard.watched}[type(news)].append(news)
-    heard.learner = Learner(CONFIG, 10, hear, viewer)
+    heard.learner = Learner(CONFIG, 10, hear, lambda *shown: heard.shown.append(shown))
     yield heard
     heard.learner.close()
 
@@ -176,7 +174,7 @@ def held(desk, core):
     """Have a calibration under way until core.hold is set."""
     core.ready = at(10, 20)
     core.hold.clear()
-    until(lambda: desk.learner.activity().calibrating)
+    until(lambda: desk.learner.activity.calibrating)
 
 
 def image(width=64):
@@ -226,14 +224,14 @@ def test_each_turn_and_each_calibration_is_told_once(desk):
     time.sleep(3 * room.LOOK_S)
     core.ready = at(10, 20)
     time.sleep(3 * room.LOOK_S)
-    assert [(turn.number, turn.total_deg) for turn in desk.turns] == [(1, 60.0), (2, 120.0)]
-    assert [status.built for status in desk.begun] == [2]
+    assert desk.turns == ['turn 1 of 2: 60°, 60° in all', 'turn 2 of 2: 60°, 120° in all']
+    assert desk.begun == ['calibrating with 2 turns, 120° of yaw…']
 
 
 def test_other_numbers_of_turns_can_be_wanted_while_it_runs(desk):
     core = Core.made[0]
     core.ready = at(10)
-    desk.learner.want(1)
+    desk.learner.config = CONFIG.replace({'turns.wanted': 1})
     desk.learner.goal = 1
     until(lambda: desk.results)
     assert core.wanted == 1 and desk.results[0].complete
@@ -242,7 +240,7 @@ def test_other_numbers_of_turns_can_be_wanted_while_it_runs(desk):
 
 
 def test_a_bank_is_extended_turn_by_turn_as_far_as_turns_are_kept(desk):
-    desk.learner.want(9)
+    desk.learner.config = CONFIG.replace({'turns.wanted': 9})
     assert desk.learner.extend()
     until(lambda: getattr(Core.made[0], 'wanted', None) == 10)
     assert not desk.learner.extend()
@@ -251,17 +249,13 @@ def test_a_bank_is_extended_turn_by_turn_as_far_as_turns_are_kept(desk):
     until(lambda: len(Core.made) == 2 and getattr(Core.made[1], 'wanted', None) == 9)
 
 
-def test_pictures_are_handed_on_only_while_someone_watches(desk):
+def test_images_are_shown_with_what_was_found(desk):
     message = image()
     desk.learner.offer(0, 0, message, (64, 48))
-    until(lambda: len(desk.statuses) == 1)
-    assert desk.pictures == []
-    desk.watching = True
-    desk.learner.offer(1, 10**8, message, (64, 48))
-    until(lambda: len(desk.statuses) == 2)
-    picture, = desk.pictures
-    assert picture.header is message.header and picture.image.shape == (48, 64)
-    assert desk.troubles == []
+    until(lambda: desk.statuses)
+    (header, picture, found), = desk.shown
+    assert header is message.header and picture.shape == (48, 64)
+    assert found.frames == 1 and desk.troubles == []
 
 
 def test_a_lower_goal_calibrates_sooner_but_not_completely(desk):
@@ -277,11 +271,11 @@ def test_a_request_needs_turns_and_only_one_runs(desk):
     core.ready = at(10)
     core.hold.clear()
     until(lambda: desk.learner.request() == '')
-    until(lambda: desk.learner.activity().calibrating)
+    until(lambda: desk.learner.activity.calibrating)
     assert 'running already' in desk.learner.request()
     core.hold.set()
     until(lambda: desk.results)
-    assert not desk.learner.activity().calibrating
+    assert not desk.learner.activity.calibrating
 
 
 def test_a_failed_calibration_is_told_and_tried_again(desk):
@@ -299,7 +293,7 @@ def test_a_restart_cancels_what_runs_and_its_result_is_out_of_date(desk):
     held(desk, first)
     desk.learner.restart()
     until(first.closed.is_set)
-    until(lambda: not desk.learner.activity().calibrating)
+    until(lambda: not desk.learner.activity.calibrating)
     assert desk.troubles == [] and desk.results == [] and desk.learner.bank == 1
     Core.made[1].ready = at(30, 40)
     until(lambda: desk.results)
@@ -364,7 +358,7 @@ def test_images_that_cannot_be_used_are_told(desk):
 
 def test_sensors_that_cannot_be_used_are_told_at_the_next_calibration(desk):
     for n in range(100):
-        desk.learner.sense('rate', 7.0, (0.1 * n, 0.0, 0.0))
+        desk.learner.sensors.add('rate', 7.0, (0.1 * n, 0.0, 0.0))
     desk.learner.offer(1, 10**9, image(), (64, 48))
     until(lambda: desk.statuses)
     core = Core.made[0]
@@ -401,10 +395,10 @@ def test_new_turns_are_compared_with_the_camera_in_use_once(desk):
     core.ready = at(10)
     time.sleep(2 * room.LOOK_S)
     assert core.watched == []  # there is none in use
-    desk.learner.compare(CAMERA)
+    desk.learner.watched = CAMERA
     until(lambda: desk.watched)
     time.sleep(2 * room.LOOK_S)
-    desk.learner.compare(CAMERA)
+    desk.learner.watched = CAMERA
     core.ready = at(10, 20)
     until(lambda: len(desk.watched) == 2)
     time.sleep(2 * room.LOOK_S)
@@ -414,7 +408,7 @@ def test_new_turns_are_compared_with_the_camera_in_use_once(desk):
 
 def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
     desk.learner.goal = None
-    desk.learner.compare(CAMERA)
+    desk.learner.watched = CAMERA
     Core.made[0].strangers = Core.made[0].ready = at(10, 20)
     until(lambda: desk.watched)
     assert desk.watched[-1].monitor.lens.confirmed
@@ -426,14 +420,14 @@ def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
     until(lambda: len(desk.watched) == 2)
     assert desk.watched[-1].monitor.lens.confirmed
     # not with another calibration
-    desk.learner.compare(dataclasses.replace(CAMERA, name='another'))
+    desk.learner.watched = dataclasses.replace(CAMERA, name='another')
     until(lambda: len(desk.watched) == 3)
     assert desk.watched[-1].monitor.lens is None
 
 
 def test_turns_that_could_not_be_compared_are_told_and_tried_with_the_next(desk):
     desk.learner.goal = None
-    desk.learner.compare(CAMERA)
+    desk.learner.watched = CAMERA
     Core.failures = [WorkerError('the process died')]
     core = Core.made[0]
     core.ready = at(10)
@@ -453,24 +447,24 @@ def test_each_calibration_is_compared_with_a_camera_that_is_to_be_checked(desk):
     time.sleep(2 * room.LOOK_S)
     assert core.calls == 0
     desk.learner.goal = 2
-    desk.learner.compare(None, CAMERA)
+    desk.learner.checked = CAMERA
     until(lambda: desk.results)
     assert desk.results[0].given is CAMERA and desk.results[0].check.answer == 'right'
     time.sleep(2 * room.LOOK_S)
     assert core.calls == 1
     # another one: the same turns are used again
     other = dataclasses.replace(CAMERA, name='another')
-    desk.learner.compare(None, other)
+    desk.learner.checked = other
     until(lambda: len(desk.results) == 2)
     assert desk.results[1].given is other and core.watched == []
 
 
 def test_a_camera_that_changes_during_a_calibration_is_checked_by_the_next(desk):
     core = Core.made[0]
-    desk.learner.compare(None, CAMERA)
+    desk.learner.checked = CAMERA
     held(desk, core)
     other = dataclasses.replace(CAMERA, name='another')
-    desk.learner.compare(None, other)
+    desk.learner.checked = other
     core.hold.set()
     until(lambda: len(desk.results) == 2)
     assert [result.given for result in desk.results] == [CAMERA, other]

@@ -15,6 +15,7 @@ from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.ros import car
 from dashcalib_ros.ros.car import Mounting, Sensors, differs
+from dashcalib_ros.ros.diagnostics import Complaints
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.store import Kept, Whose
 
@@ -62,7 +63,8 @@ def tf2(monkeypatch):
 
 def made(**settings):
     node = FakeNode()
-    return node, Mounting(node, NodeConfig(publish_tf=True, **settings))
+    complaints = Complaints(node.lines.append)
+    return node, Mounting(node, NodeConfig(publish_tf=True, **settings), complaints.once)
 
 
 def test_a_kept_mounting_is_published_and_kept(start_node, make_bench, tmp_path):

@@ -414,7 +414,7 @@ class Node(calibrator_node.CalibratorNode):
         if kind == 'callback' and self._intake.received % 2:
             raise ZeroDivisionError('odd image')
         if kind == 'stuck':
-            self._mail.wake.callback_group.ending_execution = lambda entity: None
+            self._wake.callback_group.ending_execution = lambda entity: None
             raise ZeroDivisionError('odd image')
         if kind == 'stopped':
             self._later(self.publish_while_stopped)

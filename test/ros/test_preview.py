@@ -12,8 +12,6 @@ from dashcalib_ros.camera.camera_info import rectified_matrix
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.estimator import TrackedPoints
 from dashcalib_ros.input import Frame
-from dashcalib_ros.ros.background import View
-from dashcalib_ros.ros.preview import TRACK, overlay, rectified
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
@@ -24,6 +22,7 @@ from sensor_msgs.msg import CompressedImage
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.ros import preview as room
+from dashcalib_ros.ros.preview import TRACK, Picture, overlay, rectified
 
 LENS = Radial((320, 240), 260.0, 261.0, 165.0, 118.0, -0.25, 0.05)
 WIDE = Fisheye((320, 240), 110.0, 111.0, 161.0, 118.0, -0.02, 0.003, -0.001, 0.0002)
@@ -40,7 +39,7 @@ def texture(size=(320, 240)):
 def test_tracks_are_drawn_from_where_they_were_to_where_they_are():
     points = TrackedPoints(np.array([[40.0, 50.0]], np.float32), np.array([[80.0, 50.0]],
                                                                           np.float32))
-    drawn = overlay(np.zeros((240, 320), np.uint8), View(points, None), '')
+    drawn = overlay(Picture(None, np.zeros((240, 320), np.uint8), points, None), '')
     assert drawn.shape == (240, 320, 3)
     for x in (60, 80):
         assert np.abs(drawn[50, x].astype(int) - TRACK).max() < 30  # its border is smooth
@@ -50,7 +49,7 @@ def test_tracks_are_drawn_from_where_they_were_to_where_they_are():
 def test_the_ego_vehicle_is_tinted_also_where_its_mask_is_smaller():
     valid = np.ones((120, 160), bool)
     valid[100:] = False
-    drawn = overlay(np.full((240, 320), 100, np.uint8), View(EMPTY, valid), '')
+    drawn = overlay(Picture(None, np.full((240, 320), 100, np.uint8), EMPTY, valid), '')
     assert drawn[150, 10].tolist() == [100, 100, 100]
     assert drawn[220, 10].tolist() == [20, 20, 160]
 
@@ -58,7 +57,8 @@ def test_the_ego_vehicle_is_tinted_also_where_its_mask_is_smaller():
 @pytest.mark.parametrize('size', [(320, 240), (1280, 720), (64, 48)])
 def test_the_state_is_written_on_a_bar_and_fits(size):
     grey = np.full(size[::-1], 200, np.uint8)
-    drawn = overlay(grey, View(EMPTY, None), 'not calibrated yet: 2 of 5 turns, 179° of yaw')
+    picture = Picture(None, grey, EMPTY, None)
+    drawn = overlay(picture, 'not calibrated yet: 2 of 5 turns, 179° of yaw')
     bar = np.flatnonzero(drawn[:, 0, 0] == 50)
     assert len(bar) and bar[-1] == size[1] - 1
     ink = drawn[bar].max(axis=(0, 2)) > 60
@@ -176,11 +176,11 @@ def test_a_drawing_that_takes_long_holds_up_nothing(make_desk, drawings):
     desk.until(lambda: publish(desk, 1) or overlays)
     drawings.hold.clear()
     before, infos = drawings.count, len(desk.bench.infos)
-    searched = desk.node._learner.activity().status.frames
+    searched = desk.node._learner.activity.status.frames
     publish(desk, 20)
     desk.until(lambda: len(desk.bench.infos) == infos + 20)
-    desk.until(lambda: desk.node._learner.activity().status.frames >= searched + 20)
-    assert desk.node._learner.dropped == 0
+    desk.until(lambda: desk.node._learner.activity.status.frames >= searched + 20)
+    assert desk.node._learner.inbox.dropped == 0
     # one is being drawn all the time, and only the newest waits
     assert drawings.count <= before + 1
     drawings.hold.set()

@@ -12,9 +12,10 @@ from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.judge.difference import contradicted
 from dashcalib_ros.judge.verdict import STEADY
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.ros.state import Rules, judge, sigma_text, state_of
+from dashcalib_ros.ros.settings import NodeConfig
+from dashcalib_ros.ros.state import judge, sigma_text
 
-RULES = Rules(replace_ratio=0.7, contradictions=3)
+RULES = NodeConfig(better=0.7, contradictions=3)
 TRUTH = Radial((640, 360), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
 SIGMA = {'fx': 2.0, 'fy': 2.0, 'cx': 2.0, 'cy': 2.0, 'k1': 0.01, 'k2': 0.01}
 OLD = NamedCamera('old', TRUTH, SIGMA, 'accepted')
@@ -112,10 +113,3 @@ def test_sigmas_too_good_to_be_true_do_not_contradict():
     tiny = dict.fromkeys(SIGMA, 1e-6)
     old = dataclasses.replace(OLD, sigma=tiny)
     assert not contradicted(old.camera, old.sigma, dataclasses.replace(TRUTH, fx=402.0), tiny)
-
-
-def test_states():
-    assert state_of(True, True, True) == 'calibrated'
-    assert state_of(False, True, True) == 'calibrating'
-    assert state_of(False, False, True) == 'refused_so_far'
-    assert state_of(False, False, False) == 'collecting'

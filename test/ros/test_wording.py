@@ -5,7 +5,7 @@ from dashcalib_ros.calibrator import Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
-from dashcalib_ros.ros.background import Started, new_turns
+from dashcalib_ros.ros.background import beginning, new_turns
 from dashcalib_ros.ros.state import outcome_text
 
 
@@ -16,7 +16,7 @@ def status(*turns):
 
 
 def lines(told, now, wanted=5, checking=False):
-    return [turn.text(wanted, checking) for turn in new_turns(told, now)]
+    return new_turns(told, now, wanted, checking)
 
 
 A, B, C = TurnId.at(10), TurnId.at(20), TurnId.at(30)
@@ -45,7 +45,7 @@ def test_stored_turns_and_checks_are_told_as_such():
 
 
 def test_a_calibration_begins_and_ends_with_a_line():
-    assert str(Started(status((A, 90.0)))) == 'calibrating with 1 turn, 90° of yaw…'
+    assert beginning(status((A, 90.0))) == 'calibrating with 1 turn, 90° of yaw…'
     turn = TurnSummary(10, 0, 20, 1.0, 0.05, 30, 30, True)
     weak = Calibration(Verdict('weak', ('few turns',)), (320, 240), None, None, (turn,), 10, 0.3,
                        {}, {}, Config())
@@ -55,4 +55,4 @@ def test_a_calibration_begins_and_ends_with_a_line():
 
 def test_a_calibration_on_request_may_begin_before_its_turn_is_built():
     found = Status(10, 1, 0, 0.0, 0.1, False)
-    assert str(Started(found)) == 'calibrating, as soon as 1 turn found so far can be used…'
+    assert beginning(found) == 'calibrating, as soon as 1 turn found so far can be used…'
