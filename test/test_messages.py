@@ -34,8 +34,7 @@ PARTS = {
     'input/bag_read.py': {
         '… does not start like a bag', '… has a broken chunk (…)', 'a packed part is cut off',
         'a part of the bag unpacks to more than … MB',
-        '… unpacks to more than … MB, which is no recording; if it is one, unpack it first '
-        '(zstd -d)', 'the index does not lead to all messages'},
+        'the index does not lead to all messages'},
     'input/bag_storage.py': {
         '… images; how many are lost is not known', '… (…, … images…)',
         '… of … images; … are lost', '… of … images; none is lost',
