@@ -1,4 +1,4 @@
-"""A fleet, from its manifest to its tables: the whole story on one screen.
+"""A fleet, from its manifest to its tables: the whole story.
 
 Each clip is gathered, each camera solved as soon as its clips are, each make's prior made from its
 cameras, and each camera published with it. Whatever is done has a file, and is not done again.
@@ -178,8 +178,8 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
             for row, result in reversed(clips) if result.file}
     name = solved_file(camera, make, [(clip, *used[clip]) for clip in sorted(used)], config)
     data = read(joined(out, name))
-    result = None if data is None else solved.decoded(data, name)
-    if result is None:
+    again = data is not None
+    if data is None:
         loaded = {}
         for clip, (file, content) in used.items():
             found = gathered(out, file)
@@ -188,11 +188,11 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
                                  f'it and start again')
             # what was read has this content, whatever it says
             loaded[clip] = replace(found, content=content)
-        text = solved.encoded(fuse(camera, make, loaded, config))
-        result = solved.decoded(text, name)
-        write(joined(out, name), text)
+        data = solved.encoded(fuse(camera, make, loaded, config))
+        write(joined(out, name), data)
+    result = solved.decoded(data, name)
     return Own(name, result.calibration.verdict.level, result.shares, solved.unit_of(result),
-               data is not None)
+               again)
 
 
 def solved_file(camera: str, make: str, clips: Sequence[tuple[str, str, str]], config: Config
