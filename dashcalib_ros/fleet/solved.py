@@ -67,12 +67,12 @@ def _estimate(fused: Fused) -> Estimate | None:
     if solution is None:
         return None
     px = fused.scale.px
-    units = np.where(np.arange(len(solution.sigma)) < 4, px, 1.0)
+    units = solution.camera.units(px)
     return Estimate(
         solution.camera.resized(px, fused.calibration.image_size),
         solution.covariance * np.outer(units, units),
         (solution.covariance - solution.known.covariance_between_turns) * np.outer(units, units),
-        PictureSigma(solution.picture.rms * px, solution.picture.worst * px),
+        solution.picture.times(px),
         solution.reprojection_error_px * px, fused.sound)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.judge.calibration import MOVED_DEG, MOVED_SIGMAS, Mount
@@ -72,12 +73,12 @@ class _Pairs:
     points: Floats
 
 
-def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str, px: float,
+def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str,
              speed: Speed | None) -> Mount | None:
     """Return how the camera sits on the car; None where nothing tells.
 
     straights, lines: in the scenes' pixels. level: the lens's verdict; the mount's is never
-    better. px: of the input, in one pixel of the scenes. speed: m/s (n,) at stamps (n,), s.
+    better. speed: m/s (n,) at stamps (n,), s.
     """
     camera = solution.camera
     pairs = _fitted(camera, _without_field(straights, solution))
@@ -96,7 +97,7 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
         return None
     angles, sigma = found
     ahead = _direction(angles, np.radians(roll[0] if roll else 0.0))
-    travel = camera.project(ahead[None])[0]
+    travel = resized_pixels(camera.project(ahead[None])[0], solution.px)
     own = np.degrees(solution.sigma[2:4] / solution.camera.params[:2])
     total = np.hypot(sigma, own)
     down = _direction(np.array([0.0, 90.0]), np.radians(roll[0] if roll else 0.0))
@@ -117,8 +118,8 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
         sigma={'yaw_left_deg': float(total[0]), 'pitch_up_deg': float(total[1]),
                'roll_right_deg': None if roll is None else roll[1],
                'height_m': None if height is None else height[1]},
-        travel_px=(float((travel[0] + 0.5) * px - 0.5), float((travel[1] + 0.5) * px - 0.5)),
-        travel_sigma_px=float(px * np.radians(np.hypot(*sigma)) * camera.fx / np.sqrt(2)),
+        travel_px=(float(travel[0]), float(travel[1])),
+        travel_sigma_px=float(solution.px * np.radians(np.hypot(*sigma)) * camera.fx / np.sqrt(2)),
         straight_m=metres, moved_s=moved_s)
 
 

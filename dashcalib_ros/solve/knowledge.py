@@ -46,6 +46,10 @@ class PictureSigma:
     rms: float
     worst: float
 
+    def times(self, px: float) -> PictureSigma:
+        """Return the same in pixels that are px times smaller."""
+        return PictureSigma(px * self.rms, px * self.worst)
+
 
 @dataclass(frozen=True)
 class SigmaMap:
