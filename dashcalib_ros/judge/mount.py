@@ -92,19 +92,20 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
         scenes = [scene for scene in scenes if scene.turn.of_this_drive
                   and scene.tracks.stamps_ns[0] / 1e9 > moved_s]
         roll = _roll(scenes, lines and lines.chosen(lines.stamps_s > moved_s), camera)
-    found = _heading(pairs, kept, scenes, np.radians(roll[0] if roll else 0.0))
+    turned = float(np.radians(roll[0] if roll else 0.0))
+    found = _heading(pairs, kept, scenes, turned)
     if found is None:
         return None
     angles, sigma = found
-    ahead = _direction(angles, np.radians(roll[0] if roll else 0.0))
-    travel = resized_pixels(camera.project(ahead[None])[0], solution.px)
+    travel = resized_pixels(camera.project(_direction(angles, turned)[None])[0], solution.px)
     own = np.degrees(solution.sigma[2:4] / solution.camera.params[:2])
     total = np.hypot(sigma, own)
-    down = _direction(np.array([0.0, 90.0]), np.radians(roll[0] if roll else 0.0))
+    # downwards, at a right angle to the direction of travel
+    down = _direction(np.array([angles[0], angles[1] + 90.0]), turned)
     # where the speed is not known, a second is the unit
     halfway_s = straights.stamps_s - straights.apart_s / 2
     way = straights.apart_s * (1.0 if speed is None else speed(halfway_s))
-    height = _height(pairs, kept, way, _level(down, ahead))
+    height = _height(pairs, kept, way, down)
     metres = float(way[kept].sum() / 2)
     if speed is None:
         metres *= USUAL_SPEED if height is None else USUAL_HEIGHT_M / height[0]
@@ -357,12 +358,6 @@ def _roll_of_lines(lines: Lines, camera: Camera) -> float:
         up = np.linalg.eigh(normals.T * weights @ normals)[1][:, 0]
         up *= -np.sign(up[1])
     return float(np.degrees(np.arctan2(-up[0], -up[1])))
-
-
-def _level(down: Floats, ahead: Floats) -> Floats:
-    """Return the direction downwards (3,) that is at a right angle to the direction of travel."""
-    level = down - ahead * float(down @ ahead)
-    return np.asarray(level / np.linalg.norm(level))
 
 
 def _height(pairs: _Pairs, kept: Mask, way: Floats, down: Floats) -> tuple[float, float] | None:
