@@ -97,11 +97,14 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
     if found is None:
         return None
     angles, sigma = found
-    travel = resized_pixels(camera.project(_direction(angles, turned)[None])[0], solution.px)
+    ahead = _direction(angles, turned)
+    travel = resized_pixels(camera.project(ahead[None])[0], solution.px)
     own = np.degrees(solution.sigma[2:4] / solution.camera.params[:2])
     total = np.hypot(sigma, own)
     # downwards, at a right angle to the direction of travel
-    down = _direction(np.array([angles[0], angles[1] + 90.0]), turned)
+    down = _direction(np.array([0.0, 90.0]), turned)
+    down = down - ahead * float(down @ ahead)
+    down = down / np.linalg.norm(down)
     # where the speed is not known, a second is the unit
     halfway_s = straights.stamps_s - straights.apart_s / 2
     way = straights.apart_s * (1.0 if speed is None else speed(halfway_s))
