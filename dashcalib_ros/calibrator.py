@@ -141,22 +141,23 @@ class Calibrator:
                 - contradicted, CONTRADICTS))
         self.solution = solution
         # the solution itself is judged
-        evidence = replace(self._evidence(started), motion=self._motion,
-                           asked=replace(asked, solution=None))
+        evidence = self._evidence(started, replace(asked, solution=None))
         if not self._live or solution is None:
             return conclude(solution, evidence, config)
         # it takes a second or two, and a live drive goes on meanwhile
         found: Calibration = self.scenes.run(conclude, solution, evidence, config)
         return found
 
-    def _evidence(self, started: float) -> Evidence:
+    def _evidence(self, started: float, asked: Asked) -> Evidence:
         now = time.monotonic()
         timing = {'detect': self._detect_s, 'calibrate': now - started,
                   'total': now - self._started}
-        return evidence_of_detection(
-            self.detection, self.scenes.built(), timing, tuple(self.scenes.warnings),
-            self.scenes.stored_before(), self.scenes.left_out(),
-            None if self._live else self.scenes.pictures())
+        seen = evidence_of_detection(self.detection, self.scenes.built())
+        return replace(
+            seen, timing=timing, warnings=(*seen.warnings, *self.scenes.warnings),
+            stored=self.scenes.stored_before(), left_out=self.scenes.left_out(),
+            pictures=None if self._live else self.scenes.pictures(), motion=self._motion,
+            asked=asked)
 
     def turns(self) -> tuple[Turn, ...]:
         """Return the bank's turns, the most prominent first."""

@@ -85,10 +85,9 @@ class Questions:
             readings: tuple[Reading, ...] = self._run(
                 'the turns with the camera in use', progress, readings_of, new, small, config)
             self._read |= {reading.turn: reading for reading in readings}
-        # fx, fy, cx and cy are pixels
+        units = dict(zip(small.names(), small.units(scale.px).tolist(), strict=True))
         scaled = None if sigma is None else {
-            name: value / scale.px if name in small.names()[:4] else value
-            for name, value in sigma.items()}
+            name: value / units.get(name, 1.0) for name, value in sigma.items()}
         # a stored turn that was driven again counts once
         return judge.watch((reading for turn, reading in sorted(self._read.items())
                       if turn.of_this_drive or turn in scenes), small, scaled, config.monitor)

@@ -135,6 +135,13 @@ class Camera(ABC):
         """Return the parameters by name."""
         return {name: getattr(self, name) for name in self.names()}
 
+    def units(self, px: float) -> Floats:
+        """Return (n,) the units of the parameters in pictures px times as large, for sigmas.
+
+        fx, fy, cx and cy are pixels; the other parameters have no unit.
+        """
+        return np.where(np.arange(len(self.names())) < 4, px, 1.0)
+
     def with_params(self, params: npt.ArrayLike) -> Self:
         """Return the camera with other parameters (n,)."""
         return self.of(self.image_size, params)

@@ -25,7 +25,6 @@ from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.reconstruct.scene_file import Origin, SceneFile, StoredTurn
 from dashcalib_ros.solve import solve
-from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 
 # solutions at the most; each leaves out the clips that contradict the one before
@@ -87,12 +86,11 @@ def _estimate(solution: Solution | None, origin: Origin, config: Config) -> Esti
     if solution is None:
         return None
     px = origin.scale.px
-    units = np.where(np.arange(len(solution.sigma)) < 4, px, 1.0)
-    units = np.outer(units, units)
+    units = np.outer(solution.camera.units(px), solution.camera.units(px))
     return Estimate(
         solution.camera.resized(px, origin.image_size), solution.covariance * units,
         (solution.covariance - solution.known.covariance_between_turns) * units,
-        PictureSigma(solution.picture.rms * px, solution.picture.worst * px),
+        solution.picture.times(px),
         solution.reprojection_error_px * px, lacks_knowledge_only(solution, config.verdict))
 
 

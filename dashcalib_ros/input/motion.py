@@ -41,6 +41,17 @@ class Samples:
     stamps_s: Floats
     values: Floats
 
+    def at(self, stamps_s: Floats) -> Floats:
+        """Return (k, d) the values at stamps (k,), between samples on a straight line."""
+        return np.stack([np.interp(stamps_s, self.stamps_s, column)
+                         for column in self.values.T], axis=1)
+
+    @property
+    def integral(self) -> Samples:
+        """Return the values added up over time since the first sample: angles, of rates."""
+        steps = np.diff(self.stamps_s)[:, None] * (self.values[1:] + self.values[:-1]) / 2
+        return Samples(self.stamps_s, np.cumsum(np.pad(steps, ((1, 0), (0, 0))), axis=0))
+
 
 @dataclass(frozen=True)
 class SensorStream:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
 from importlib import metadata
-from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -44,8 +44,7 @@ from dashcalib_ros.judge.witnesses import Asked
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, picture_of, rms_px
 from dashcalib_ros.reconstruct.scene_file import StoredTurn
 from dashcalib_ros.solve.fixed_camera import largest_crop
-from dashcalib_ros.solve.knowledge import PictureSigma
-from dashcalib_ros.solve.solution import LeftOut, Solution, cross_validation
+from dashcalib_ros.solve.solution import Solution, cross_validation
 
 # why turns are not used
 CONTRADICTS = 'the camera of the other turns does not explain it'
@@ -91,95 +90,95 @@ class Evidence:
     asked: Asked = default(default_factory=Asked)
 
 
-def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] = (),
-                          timing: Mapping[str, float] | None = None,
-                          warnings: tuple[str, ...] = (),
-                          stored: tuple[StoredTurn, ...] = (),
-                          left_out: Mapping[TurnId, str] | None = None,
-                          pictures: Mapping[TurnId, TurnPicture] | None = MappingProxyType({})
-                          ) -> Evidence:
+def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] = ()) -> Evidence:
     """Return the evidence from the first stage and from the scenes of its turns.
 
-    scenes: in any order; a turn without one is listed as not reconstructed. left_out, pictures:
-    as Evidence's.
+    scenes: in any order; a turn without one is listed as not reconstructed.
     """
     return Evidence(
         image_size=detection.size or (0, 0), scale=detection.scale, frames=detection.frames,
         turns=detection.turns(), magnitudes=detection.magnitudes(), mask=detection.valid(),
-        built={scene.turn: scene for scene in scenes if scene is not None},
-        timing=dict(timing or {}), warnings=(*detection.warnings(), *warnings), stored=stored,
-        left_out=left_out or {}, pictures=pictures, start_s=detection.start_s,
-        lines=detection.lines(), straights=detection.straights())
+        built={scene.turn: scene for scene in scenes if scene is not None}, timing={},
+        warnings=detection.warnings(), start_s=detection.start_s, lines=detection.lines(),
+        straights=detection.straights())
 
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
     """Return the calibration; a refused one has no intrinsics, so that they cannot be used."""
+    scenes = {turn.scene.turn: turn.scene for turn in evidence.stored} | evidence.built
     if solution is not None:
         solution = replace(solution, px=evidence.scale.px)
-    witness = _witness(solution, evidence, config)
-    asked = evidence.asked
-    verdict = (judge(solution, config.verdict, witness, True, asked.witnesses) if solution
-               else _verdict_without_solution(evidence))
-    camera = sigma = error = shutter = sigma_px = stabiliser = straight_lines = None
-    field = mount = None
-    details: dict[str, object] = {}
-    without: tuple[LeftOut, ...] = ()
-    warnings = evidence.warnings + asked.unused
-    if solution is not None and verdict.level != 'accepted' and config.model != AUTO:
-        warnings += (f'the lens model {config.model} was asked for and may be why the result is '
-                     f'{verdict.level}: --model {AUTO} takes the one that the turns prove',)
-    if solution is not None:
-        details = _details(solution)
-        if solution.alone is not None:
-            details['pictures_alone'] = _alone(solution.alone, evidence.scale.px)
-        if verdict.level != 'refused':
-            px = evidence.scale.px
-            camera = solution.camera.resized(px, evidence.image_size)
-            # fx, fy, cx and cy are pixels
-            units = np.where(np.arange(len(solution.sigma)) < 4, px, 1)
-            sigma = dict(zip(camera.names(), (solution.sigma * units).tolist(), strict=True))
-            wider = solution.wider_covariance
-            units = np.where(np.arange(len(wider)) < 4, px, 1)
-            details['picture_covariance'] = (wider * np.outer(units, units)).tolist()
-            error = solution.reprojection_error_px * px
-            sigma_px = PictureSigma(solution.picture.rms * px, solution.picture.worst * px)
-            without = tuple(each.times(px) for each in cross_validation(solution))
-            straight_lines = witness and witness.resized(px)
-            warnings += _model_error_warnings(solution, px, config)
-            field = _field(solution, px, evidence.image_size)
-            if field is not None and field.used and field.rms_px >= TOLD_FIELD_PX:
-                warnings += (f'the picture is bent by {field.rms_px:.1f} px (up to '
-                             f'{field.worst_px:.1f} px), as by a windscreen or a rectification: '
-                             f'camera_info cannot say that, and sigma over the picture allows '
-                             f'for it; `dashcalib export --to rays` has it',)
-            mount = _mount(solution, evidence, verdict.level, config)
-            if mount is not None and mount.moved_s is not None:
-                warnings += (f'the camera was moved on the car '
-                             f'{mount.moved_s - evidence.start_s:.0f} s into the drive: how it '
-                             f'sits is told from there on',)
-            if solution.readout_s:
-                shutter = Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
-        if solution.crops:
-            stabiliser = Stabiliser(largest_crop(solution.crops) * evidence.scale.px)
-            if STEADY not in verdict.cures:
-                warnings += (f'the picture seems to move by up to {stabiliser.largest_px:.0f} px '
-                             f'against the lens, no more than the lens is uncertain; that was '
-                             f'taken out: {STEADY}',)
-    return Calibration(
-        verdict=verdict, image_size=evidence.image_size, camera=camera, sigma=sigma,
-        turns=tuple(_summary(turn, evidence, solution)
+        scenes |= {scene.turn: scene for scene in solution.scenes}
+    lines = _straight_lines(solution, evidence, config)
+    said = evidence.asked.witnesses
+    found = Calibration(
+        verdict=(judge(solution, config.verdict, lines, True, said) if solution
+                 else _verdict_without_solution(evidence)),
+        image_size=evidence.image_size, camera=None, sigma=None,
+        turns=tuple(_summary(turn, scenes.get(turn.id), evidence, solution)
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
-        frames=evidence.frames, reprojection_error_px=error, timing=evidence.timing,
-        versions=_versions(), config=config, magnitudes=evidence.magnitudes,
-        mask=_of_size(evidence.mask, evidence.image_size), held_out=without,
-        details=details, rolling_shutter=shutter, stabiliser=stabiliser, sigma_px=sigma_px,
-        field=field, mount=mount, warnings=warnings, start_s=evidence.start_s,
-        straight_lines=straight_lines, witnesses=asked.witnesses,
-        material=_material(solution, evidence),
-        stored_turns=tuple(_stored_summary(turn, evidence, solution) for turn in evidence.stored))
+        frames=evidence.frames, reprojection_error_px=None, timing=evidence.timing,
+        versions=_versions(), config=config, warnings=evidence.warnings + evidence.asked.unused,
+        magnitudes=evidence.magnitudes, mask=_of_size(evidence.mask, evidence.image_size),
+        stored_turns=tuple(_stored_summary(turn, scenes[turn.scene.turn], evidence, solution)
+                           for turn in evidence.stored),
+        start_s=evidence.start_s, witnesses=said, material=_material(scenes, solution, evidence))
+    if solution is None:
+        return found
+    crop_px = largest_crop(solution.crops) * solution.px if solution.crops else None
+    found = replace(found, details=_details(solution),
+                    stabiliser=None if crop_px is None else Stabiliser(largest_px=crop_px))
+    if found.verdict.level != 'refused':
+        found = _with_numbers(found, solution, lines, evidence)
+    return replace(found, warnings=found.warnings + _warnings(found, solution))
 
 
-def _witness(solution: Solution | None, evidence: Evidence, config: Config) -> Bend | None:
+def _with_numbers(found: Calibration, solution: Solution, lines: Bend | None, evidence: Evidence
+                  ) -> Calibration:
+    """Return the calibration with what a refused one has not, in the input's pixels."""
+    px, camera = solution.px, solution.camera.resized(solution.px, evidence.image_size)
+    units = camera.widened().units(px)
+    return replace(
+        found, camera=camera,
+        sigma=dict(zip(camera.names(), (solution.sigma * camera.units(px)).tolist(), strict=True)),
+        reprojection_error_px=solution.reprojection_error_px * px,
+        details=found.details | {'picture_covariance': (
+            solution.wider_covariance * np.outer(units, units)).tolist()},
+        sigma_px=solution.picture.times(px),
+        held_out=tuple(each.times(px) for each in cross_validation(solution)),
+        straight_lines=lines and lines.resized(px), field=_field(solution, evidence.image_size),
+        mount=_mount(solution, evidence, found.verdict.level, found.config),
+        rolling_shutter=Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
+        if solution.readout_s else None)
+
+
+def _warnings(found: Calibration, solution: Solution) -> tuple[str, ...]:
+    """Return what the user must know of the numbers, which are no reason for the verdict."""
+    level, asked_for, field = found.verdict.level, found.config.model, found.field
+    warnings = []
+    if level != 'accepted' and asked_for != AUTO:
+        warnings.append(
+            f'the lens model {asked_for} was asked for and may be why the result is {level}: '
+            f'--model {AUTO} takes the one that the turns prove')
+    if found.camera is not None:
+        warnings += _model_error_warnings(solution)
+    if field is not None and field.used and field.rms_px >= TOLD_FIELD_PX:
+        warnings.append(
+            f'the picture is bent by {field.rms_px:.1f} px (up to {field.worst_px:.1f} px), as by '
+            f'a windscreen or a rectification: camera_info cannot say that, and sigma over the '
+            f'picture allows for it; `dashcalib export --to rays` has it')
+    if found.mount is not None and found.mount.moved_s is not None:
+        warnings.append(
+            f'the camera was moved on the car {found.mount.moved_s - found.start_s:.0f} s into '
+            f'the drive: how it sits is told from there on')
+    if found.stabiliser is not None and STEADY not in found.verdict.cures:
+        warnings.append(
+            f'the picture seems to move by up to {found.stabiliser.largest_px:.0f} px against the '
+            f'lens, no more than the lens is uncertain; that was taken out: {STEADY}')
+    return tuple(warnings)
+
+
+def _straight_lines(solution: Solution | None, evidence: Evidence, config: Config) -> Bend | None:
     """Return what straight lines say of the solution, in the resized images."""
     if solution is None or evidence.lines is None:
         return None
@@ -191,7 +190,7 @@ def _mount(solution: Solution, evidence: Evidence, level: str, config: Config) -
     if evidence.straights is None or not config.mount.enabled:
         return None
     with suppress(np.linalg.LinAlgError, ValueError):
-        return mount_of(evidence.straights, evidence.lines, solution, level, evidence.scale.px,
+        return mount_of(evidence.straights, evidence.lines, solution, level,
                         _speed(evidence, config))
     return None
 
@@ -219,32 +218,30 @@ def _of_size(mask: Mask | None, size: tuple[int, int]) -> Mask | None:
     return np.asarray(mask[np.ix_(row, column)], bool)
 
 
-def _field(solution: Solution, px: float, image_size: tuple[int, int]) -> LensField | None:
-    """Return the field for the full-size images; px: of the input, in one pixel of the scenes."""
+def _field(solution: Solution, image_size: tuple[int, int]) -> LensField | None:
+    """Return the field for the full-size images."""
     if solution.field is None:
         return None
+    px = solution.px
     sizes = px * solution.field.field.over(solution.camera)
     return LensField(
         solution.field.field.resized(px, image_size), solution.field.used,
         float(np.sqrt(np.mean(sizes**2))), float(sizes.max()), px * solution.rays_sigma_px)
 
 
-def _model_error_warnings(solution: Solution, px: float, config: Config) -> tuple[str, ...]:
-    """Return a warning if a wider model would clearly change fx, fy, cx or cy.
-
-    px: of the input, in one pixel of the scenes.
-    """
+def _model_error_warnings(solution: Solution) -> list[str]:
+    """Return a warning if a wider model would clearly change fx, fy, cx or cy."""
     count, names = len(solution.known.own), solution.camera.widened().names()
     step = solution.known.step_to_wider_model
     shifts, others = step[:4], step[count:]
     scale = np.repeat([solution.camera.fx, solution.camera.image_size[0]], 2)
     if not np.max(np.abs(shifts) / scale) > MAX_UNTOLD_MODEL_ERROR:
-        return ()
-    changes = ', '.join(f'{name} by {px * shift:+.1f}'
+        return []
+    changes = ', '.join(f'{name} by {solution.px * shift:+.1f}'
                         for name, shift in zip(names, shifts, strict=False))
     found = [f'{name} {value:+.4f}' for name, value in zip(names[count:], others, strict=True)]
-    return (f'the lens seems to have more distortion than the model {solution.camera.model} tells '
-            f'({", ".join(found)}), which would change {changes} px: the sigmas allow for that',)
+    return [f'the lens seems to have more distortion than the model {solution.camera.model} tells '
+            f'({", ".join(found)}), which would change {changes} px: the sigmas allow for that']
 
 
 def _verdict_without_solution(evidence: Evidence) -> Verdict:
@@ -262,45 +259,55 @@ def _verdict_without_solution(evidence: Evidence) -> Verdict:
     return verdict_of([Finding('refused', what, cure)])
 
 
-def _summary(turn: Turn, evidence: Evidence, solution: Solution | None) -> TurnSummary:
-    used = {scene.turn: scene for scene in solution.scenes} if solution else {}
-    scene = used.get(turn.id) or evidence.built.get(turn.id)
-    error = None if scene is None else _error_px(scene, evidence, solution)
+def _summary(turn: Turn, scene: Scene | None, evidence: Evidence, solution: Solution | None
+             ) -> TurnSummary:
     return TurnSummary(
         center=turn.center, first=turn.first, last=turn.last, stamp_s=turn.stamp_s,
         prominence=turn.prominence, images=len(scene.tracks.frames) if scene else turn.images,
         registered=int(scene.structure.registered.sum()) if scene else 0,
-        used=turn.id in used, yaw_deg=scene.yaw_deg if scene else None,
-        reprojection_error_px=error,
-        misfit=solution.misfits.get(turn.id) if solution else None,
-        unused_because=None if turn.id in used else _unused_because(turn, evidence, solution))
+        yaw_deg=scene.yaw_deg if scene else None, **_use(turn.id, scene, evidence, solution))
 
 
-def _unused_because(turn: Turn, evidence: Evidence, solution: Solution | None) -> str:
-    """Return why a turn of this drive is not used, in words."""
-    if turn.id in evidence.left_out:
-        return evidence.left_out[turn.id]
-    if turn.id in evidence.built:
-        return _scene_unused_because(turn.id, solution)
-    return NOT_NEEDED if solution else 'it was not reconstructed'
+def _stored_summary(turn: StoredTurn, scene: Scene, evidence: Evidence, solution: Solution | None
+                    ) -> StoredTurnSummary:
+    return StoredTurnSummary(
+        id=scene.turn, stamp_s=turn.stamp_s, prominence=turn.prominence,
+        yaw_deg=turn.scene.yaw_deg, images=len(scene.tracks.frames),
+        **_use(scene.turn, scene, evidence, solution))
 
 
-def _scene_unused_because(turn: TurnId, solution: Solution | None) -> str:
+def _use(turn: TurnId, scene: Scene | None, evidence: Evidence, solution: Solution | None
+         ) -> dict[str, Any]:
+    """Return how a turn was used: what both kinds of summary have; errors in the input's px.
+
+    scene: as the solution has it; where it has none, as it was reconstructed.
+    """
+    used = solution is not None and any(scene is each for each in solution.scenes)
+    error = None
+    if scene is not None:
+        camera = solution.camera if solution and used else scene.camera
+        error = rms_px([scene], camera) * evidence.scale.px
+    return {'used': used, 'reprojection_error_px': error,
+            'misfit': solution.misfits.get(turn) if solution else None,
+            'unused_because': None if used else evidence.left_out.get(
+                turn, _unused_because(turn, scene, solution))}
+
+
+def _unused_because(turn: TurnId, scene: Scene | None, solution: Solution | None) -> str:
     if solution is None:
-        return 'no camera explains what was seen in it'
+        return ('it was not reconstructed' if scene is None else
+                'no camera explains what was seen in it')
     misfit = solution.misfits.get(turn)
-    if misfit is None:
+    if scene is None or misfit is None:
         return NOT_NEEDED
     return f'{CONTRADICTS}, with {misfit:.1f} times the error of a camera of its own'
 
 
-def _material(solution: Solution | None, evidence: Evidence) -> Material | None:
+def _material(scenes: Mapping[TurnId, Scene], solution: Solution | None, evidence: Evidence
+              ) -> Material | None:
     """Return what the report draws; None where none is wanted."""
     if evidence.pictures is None:
         return None
-    scenes = {turn.scene.turn: turn.scene for turn in evidence.stored} | evidence.built
-    if solution is not None:
-        scenes |= {scene.turn: scene for scene in solution.scenes}
     pictures = dict(evidence.pictures)
     for turn in evidence.turns:
         picture = None if turn.id in pictures else picture_of(turn, scenes.get(turn.id))
@@ -309,29 +316,10 @@ def _material(solution: Solution | None, evidence: Evidence) -> Material | None:
     return Material(evidence.scale.px, solution, scenes, pictures)
 
 
-def _stored_summary(turn: StoredTurn, evidence: Evidence, solution: Solution | None
-                    ) -> StoredTurnSummary:
-    used = {each.turn: each for each in solution.scenes} if solution else {}
-    scene = used.get(turn.scene.turn, turn.scene)
-    return StoredTurnSummary(scene.turn, turn.stamp_s, turn.prominence, turn.scene.yaw_deg,
-                             len(scene.tracks.frames), scene.turn in used,
-                             solution.misfits.get(scene.turn) if solution else None,
-                             None if scene.turn in used else evidence.left_out.get(
-                                 scene.turn, _scene_unused_because(scene.turn, solution)),
-                             _error_px(scene, evidence, solution))
-
-
-def _error_px(scene: Scene, evidence: Evidence, solution: Solution | None) -> float:
-    """Return a turn's reprojection error in px of the input; unused, by its own camera."""
-    used = solution is not None and any(scene is each for each in solution.scenes)
-    camera = solution.camera if solution and used else scene.camera
-    return rms_px([scene], camera) * evidence.scale.px
-
-
-def _details(solution: Solution) -> dict[str, object]:
+def _details(solution: Solution) -> dict[str, Any]:
     width = solution.camera.image_size[0]
-    others = len(solution.known.own)
-    return {
+    others, alone = len(solution.known.own), solution.alone
+    details: dict[str, Any] = {
         'step1': {'f_over_width': solution.centred.fx / width,
                   **dict(list(solution.centred.named.items())[4:])},
         'focal_profile': {'f_over_width': solution.around.ratios.tolist(),
@@ -345,11 +333,11 @@ def _details(solution: Solution) -> dict[str, object]:
         'models': [asdict(candidate) for candidate in solution.tried],
         'correlation': (solution.covariance / np.outer(solution.sigma, solution.sigma)).tolist(),
     }
-
-
-def _alone(solution: Solution, px: float) -> dict[str, float]:
-    """Return what pictures alone say of fx, where a gyro is in the solution, px of the input."""
-    return {'fx': px * solution.camera.fx, 'sigma_fx': px * float(solution.sigma[0])}
+    if alone is not None:
+        # what pictures alone say, where a gyro is in the solution
+        details['pictures_alone'] = {'fx': solution.px * alone.camera.fx,
+                                     'sigma_fx': solution.px * float(alone.sigma[0])}
+    return details
 
 
 def _versions() -> dict[str, str]:

@@ -196,8 +196,7 @@ def distance(offsets: Floats, covariance: Floats, allowed: Floats | None = None)
     return float(np.sqrt(2 * lsq_linear(slack, away, (-1.0, 1.0), method='bvls').cost))
 
 
-def difference_of(given: Camera, solution: Solution, px: float
-                  ) -> Difference:
+def difference_of(given: Camera, solution: Solution, px: float) -> Difference:
     """Compare a camera with a solution.
 
     given: of the input's pictures. px: of the input, in one pixel of the solution's pictures.
@@ -209,12 +208,12 @@ def difference_of(given: Camera, solution: Solution, px: float
     padded = type(wide).of(wide.image_size, np.pad(
         alike.params, (0, len(wide.params) - len(alike.params))))
     offsets = solution.known.seen_by_turns(padded) - found.params
-    units = np.where(np.arange(len(offsets)) < 4, px, 1.0)
+    units = found.units(px)
     own = found.resized(px, given.image_size)
     return Difference(
         given, own, offsets * units,
         solution.covariance * np.outer(units, units), apart(given, own),
-        PictureSigma(solution.picture.rms * px, solution.picture.worst * px))
+        solution.picture.times(px))
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ def scale_by_gps(rate: Samples, position: Samples) -> tuple[float, float] | None
 
 def _straights(stamps_s: Floats, rate: Floats, position: Samples) -> list[_Straight]:
     """Return where the car drove straight on. rate: (n,) rad/s to the left."""
-    yaw = np.r_[0.0, np.cumsum(np.diff(stamps_s) * (rate[1:] + rate[:-1]) / 2)]
+    yaw = Samples(stamps_s, rate[:, None]).integral.values[:, 0]
     half = RATE_OVER_S / 2
     turning = np.interp(stamps_s + half, stamps_s, yaw) - np.interp(stamps_s - half, stamps_s, yaw)
     gap = np.r_[False, np.diff(stamps_s) > LONGEST_GAP_S]
@@ -98,21 +98,29 @@ def _straight(begin_s: float, end_s: float, position: Samples) -> _Straight | No
     for _ in range(2):
         if len(where) < FIXES or np.ptp(when) < STRAIGHT_S:
             return None
+        direction = line_through(where)[0]
         away = where - np.median(where, axis=0)
-        direction = np.linalg.svd(where - where.mean(axis=0), full_matrices=False)[2][0]
         off = np.abs(away @ np.array([-direction[1], direction[0]]))
         kept = off <= max(JUMP * float(np.median(off)), LEAST_NOISE_M)
         when, where = when[kept], where[kept]
     if len(where) < FIXES or np.ptp(when) < STRAIGHT_S:
         return None
-    away = where - where.mean(axis=0)
-    direction = np.linalg.svd(away, full_matrices=False)[2][0]
-    direction = direction * np.sign(direction @ (where[-1] - where[0]))
-    along, left = away @ direction, away @ np.array([-direction[1], direction[0]])
+    direction, along, left = line_through(where)
     if np.ptp(along) < STRAIGHT_M:
         return None
     return _Straight(float(when.mean()), float(np.arctan2(direction[1], direction[0])),
                      float(left @ left), float(along @ along), len(where))
+
+
+def line_through(where: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the direction (2,) in which fixes (n, 2) were driven, and where they are from it.
+
+    (n,) along it and (n,) to its left, from their mean.
+    """
+    away = where - where.mean(axis=0)
+    direction = np.linalg.svd(away, full_matrices=False)[2][0]
+    direction = direction * np.sign(direction @ (where[-1] - where[0]))
+    return direction, away @ direction, away @ np.array([-direction[1], direction[0]])
 
 
 def _fitted(straights: list[_Straight]) -> tuple[float, float] | None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.judge.calibration import MOVED_DEG, MOVED_SIGMAS, Mount
@@ -72,12 +73,12 @@ class _Pairs:
     points: Floats
 
 
-def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str, px: float,
+def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str,
              speed: Speed | None) -> Mount | None:
     """Return how the camera sits on the car; None where nothing tells.
 
     straights, lines: in the scenes' pixels. level: the lens's verdict; the mount's is never
-    better. px: of the input, in one pixel of the scenes. speed: m/s (n,) at stamps (n,), s.
+    better. speed: m/s (n,) at stamps (n,), s.
     """
     camera = solution.camera
     pairs = _fitted(camera, _without_field(straights, solution))
@@ -91,19 +92,23 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
         scenes = [scene for scene in scenes if scene.turn.of_this_drive
                   and scene.tracks.stamps_ns[0] / 1e9 > moved_s]
         roll = _roll(scenes, lines and lines.chosen(lines.stamps_s > moved_s), camera)
-    found = _heading(pairs, kept, scenes, np.radians(roll[0] if roll else 0.0))
+    turned = float(np.radians(roll[0] if roll else 0.0))
+    found = _heading(pairs, kept, scenes, turned)
     if found is None:
         return None
     angles, sigma = found
-    ahead = _direction(angles, np.radians(roll[0] if roll else 0.0))
-    travel = camera.project(ahead[None])[0]
+    ahead = _direction(angles, turned)
+    travel = resized_pixels(camera.project(ahead[None])[0], solution.px)
     own = np.degrees(solution.sigma[2:4] / solution.camera.params[:2])
     total = np.hypot(sigma, own)
-    down = _direction(np.array([0.0, 90.0]), np.radians(roll[0] if roll else 0.0))
+    # downwards, at a right angle to the direction of travel
+    down = _direction(np.array([0.0, 90.0]), turned)
+    down = down - ahead * float(down @ ahead)
+    down = down / np.linalg.norm(down)
     # where the speed is not known, a second is the unit
     halfway_s = straights.stamps_s - straights.apart_s / 2
     way = straights.apart_s * (1.0 if speed is None else speed(halfway_s))
-    height = _height(pairs, kept, way, _level(down, ahead))
+    height = _height(pairs, kept, way, down)
     metres = float(way[kept].sum() / 2)
     if speed is None:
         metres *= USUAL_SPEED if height is None else USUAL_HEIGHT_M / height[0]
@@ -117,8 +122,8 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
         sigma={'yaw_left_deg': float(total[0]), 'pitch_up_deg': float(total[1]),
                'roll_right_deg': None if roll is None else roll[1],
                'height_m': None if height is None else height[1]},
-        travel_px=(float((travel[0] + 0.5) * px - 0.5), float((travel[1] + 0.5) * px - 0.5)),
-        travel_sigma_px=float(px * np.radians(np.hypot(*sigma)) * camera.fx / np.sqrt(2)),
+        travel_px=(float(travel[0]), float(travel[1])),
+        travel_sigma_px=float(solution.px * np.radians(np.hypot(*sigma)) * camera.fx / np.sqrt(2)),
         straight_m=metres, moved_s=moved_s)
 
 
@@ -356,12 +361,6 @@ def _roll_of_lines(lines: Lines, camera: Camera) -> float:
         up = np.linalg.eigh(normals.T * weights @ normals)[1][:, 0]
         up *= -np.sign(up[1])
     return float(np.degrees(np.arctan2(-up[0], -up[1])))
-
-
-def _level(down: Floats, ahead: Floats) -> Floats:
-    """Return the direction downwards (3,) that is at a right angle to the direction of travel."""
-    level = down - ahead * float(down @ ahead)
-    return np.asarray(level / np.linalg.norm(level))
 
 
 def _height(pairs: _Pairs, kept: Mask, way: Floats, down: Floats) -> tuple[float, float] | None:

@@ -21,6 +21,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.motion import Samples
+from dashcalib_ros.judge.calibration import OPTICAL
 from dashcalib_ros.limits import read_text
 from dashcalib_ros.reconstruct.scene import Scene
 
@@ -81,14 +82,15 @@ class Odometry:
 
     def medians(self) -> dict[str, dict[str, float]]:
         """Return the medians over the turns, by what is measured and by the camera's name."""
-        def of(value: str, name: str) -> float:
-            values = {'rotation_deg': lambda turn: turn.rotation_deg(name),
-                      'rotation_deg_per_100m':
-                          lambda turn: 100 * turn.rotation_deg(name) / max(turn.length_m, 1e-9),
-                      'scale_drift': lambda turn: abs(turn.scale_drift(name))}
-            return float(np.median([values[value](turn) for turn in self.turns]))
-        return {value: {name: of(value, name) for name in self.names}
-                for value in ('rotation_deg', 'rotation_deg_per_100m', 'scale_drift')}
+        found: dict[str, dict[str, float]] = {
+            'rotation_deg': {}, 'rotation_deg_per_100m': {}, 'scale_drift': {}}
+        for name in self.names:
+            rows = [(turn.rotation_deg(name),
+                     100 * turn.rotation_deg(name) / max(turn.length_m, 1e-9),
+                     abs(turn.scale_drift(name))) for turn in self.turns]
+            for each, median in zip(found.values(), np.median(rows, axis=0), strict=True):
+                each[name] = float(median)
+        return found
 
 
 def trivial_guess(image_size: tuple[int, int]) -> Camera:
@@ -136,11 +138,8 @@ def _turn(scene: Scene, cameras: Mapping[str, Camera], poses: Poses, config: Con
 
 def angle_deg(rotations: Floats) -> float:
     """Return the angle of the rotation from the first to the last of (k, 3, 3)."""
-    between = rotations[0].T @ rotations[-1]
-    # exact for small angles, too
-    sine = np.linalg.norm([between[2, 1] - between[1, 2], between[0, 2] - between[2, 0],
-                           between[1, 0] - between[0, 1]]) / 2
-    return float(np.degrees(np.arctan2(sine, (np.trace(between) - 1) / 2)))
+    from scipy.spatial.transform import Rotation
+    return float(np.degrees(Rotation.from_matrix(rotations[0].T @ rotations[-1]).magnitude()))
 
 
 def length(positions: Floats) -> float:
@@ -190,10 +189,8 @@ class Poses:
         inside = (wanted >= own[0]) & (wanted <= own[-1])
         known = np.asarray(inside & (own[after] - own[after - 1] <= LONGEST_GAP_S), bool)
         held = np.clip(wanted, own[0], own[-1])
-        share = ((held - own[after - 1]) / (own[after] - own[after - 1]))[:, None]
-        positions = self.positions[after - 1] * (1 - share) + self.positions[after] * share
         rotations = Slerp(own, Rotation.from_matrix(self.rotations))(held).as_matrix()
-        return np.asarray(rotations), np.asarray(positions), known
+        return np.asarray(rotations), Samples(own, self.positions).at(held), known
 
 
 def read_poses(path: Path) -> Poses:
@@ -201,19 +198,19 @@ def read_poses(path: Path) -> Poses:
 
     Raises InputError for anything else.
     """
-    lines = [line for line in read_text(path, POSES_BYTES, f'the poses {path}').splitlines()
-             if line.strip() and not line.lstrip().startswith('#')]
-    counts = {len(line.split()) for line in lines}
-    if len(counts) != 1 or not counts <= {KITTI, KITTI_TIMED, TUM} or len(lines) < 2:
+    lines = read_text(path, POSES_BYTES, f'the poses {path}').splitlines()
+    rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith('#')]
+    columns = {len(row) for row in rows}
+    if len(rows) < 2 or columns not in ({KITTI}, {KITTI_TIMED}, {TUM}):
         raise InputError(f"{path} has no poses in KITTI's format (12 numbers a line, one line for "
                          f"each frame) nor in TUM's (t x y z qx qy qz qw)")
     try:
-        table = np.array([[float(value) for value in line.split()] for line in lines])
+        table = np.array(rows, np.float64)
     except ValueError as error:
         raise InputError(f'{path} has a line that is not all numbers: {error}') from error
     if not np.isfinite(table).all():
         raise InputError(f'{path} has numbers that are not finite; leave these poses out')
-    return _tum(table, path) if counts == {TUM} else _kitti(table[:, -KITTI:], path)
+    return _tum(table, path) if columns == {TUM} else _kitti(table[:, -KITTI:], path)
 
 
 def track_poses(position: Samples, start_s: float) -> Poses:
@@ -224,25 +221,20 @@ def track_poses(position: Samples, start_s: float) -> Poses:
     track is shorter.
     """
     from scipy.spatial.transform import Rotation
-    stamps, places = position.stamps_s, position.values
+    stamps = position.stamps_s
     inside = stamps[(stamps >= stamps[0] + COURSE_S) & (stamps <= stamps[-1] - COURSE_S)]
     if len(inside) < 2:
         raise InputError('the GPS track is too short for headings: record it during the drive')
-
-    def at(when: Floats) -> Floats:
-        return np.stack([np.interp(when, stamps, column) for column in places.T], axis=1)
-
-    way = at(inside + COURSE_S) - at(inside - COURSE_S)
+    way = position.at(inside + COURSE_S) - position.at(inside - COURSE_S)
     heading = np.arctan2(way[:, 1], way[:, 0])
     # one that stands has no heading: it keeps the one before
     moves = np.linalg.norm(way[:, :2], axis=1) > STANDING_M
     if not moves.any():
         raise InputError('the GPS track does not move: record it during the drive')
     last = np.maximum.accumulate(np.where(moves, np.arange(len(moves)), int(np.argmax(moves))))
-    # to the world (east, north, up), from axes as a camera's: right, down, ahead
-    axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    turned = Rotation.from_rotvec(heading[last][:, None] * [0.0, 0.0, 1.0]).as_matrix() @ axes
-    return Poses(np.asarray(turned), at(inside), inside + start_s)
+    # to the world (east, north, up), from axes as a camera's
+    turned = Rotation.from_rotvec(heading[last][:, None] * [0.0, 0.0, 1.0]).as_matrix() @ OPTICAL
+    return Poses(np.asarray(turned), position.at(inside), inside + start_s)
 
 
 def _kitti(table: Floats, path: Path) -> Poses:
@@ -359,8 +351,8 @@ def _panel(turn: TurnOdometry, names: tuple[str, ...], left: int, top: int) -> s
 
 def _fitted(path: Floats, true: Floats) -> Floats:
     """Return the path (k, 3) scaled, turned and moved onto the true one (Umeyama)."""
+    from scipy.spatial.transform import Rotation
     own, other = path - path.mean(axis=0), true - true.mean(axis=0)
-    u, values, v = np.linalg.svd(other.T @ own)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    scale = float((values * signs).sum() / max(float((own**2).sum()), 1e-12))
-    return np.asarray(scale * own @ ((u * signs) @ v).T + true.mean(axis=0))
+    turned = Rotation.align_vectors(other, own)[0].apply(own)
+    scale = float((turned * other).sum()) / max(float((own**2).sum()), 1e-12)
+    return np.asarray(scale * turned + true.mean(axis=0))

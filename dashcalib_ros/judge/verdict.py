@@ -144,15 +144,9 @@ def profile_contrast(solution: Solution) -> float:
 
     Negative when another focal length explains the observations better than the result.
     """
-    at = _index_of_result(solution)
-    costs = solution.around.costs
+    costs, ratio = solution.around.costs, solution.camera.fx / solution.camera.image_size[0]
+    at = int(np.argmin(np.abs(solution.around.ratios - ratio)))
     return float(np.delete(costs, at).min() / costs[at] - 1)
-
-
-def _index_of_result(solution: Solution) -> int:
-    """Return the index of the profile's probe at the resulting focal length."""
-    ratio = solution.camera.fx / solution.camera.image_size[0]
-    return int(np.argmin(np.abs(solution.around.ratios - ratio)))
 
 
 def _far_from_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -235,7 +229,11 @@ def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
         return None
     if clear[0].kind == 'shift':
         return _moving('about', clear[0].size, solution)
-    return Finding('weak', *_texts_of_test(clear[0], solution))
+    if clear[0].kind == 'bend':
+        return Finding('weak', f'the picture is bent in places, as no lens of the model '
+                               f'{solution.camera.model} bends it',
+                       'take away the windscreen or cover that does so, or try another --model')
+    return Finding('weak', _zoomed(clear[0]), 'fix the zoom and the focus')
 
 
 def _moving(how: str, px: float, solution: Solution) -> Finding:
@@ -245,21 +243,14 @@ def _moving(how: str, px: float, solution: Solution) -> Finding:
                            f'all pictures', STEADY, cause=True)
 
 
-def _texts_of_test(test: FixedCameraTest, solution: Solution) -> tuple[str, str]:
-    """Return what is wrong, and what to do."""
-    if test.kind == 'bend':
-        return (f'the picture is bent in places, as no lens of the model {solution.camera.model} '
-                f'bends it', 'take away the windscreen or cover that does so, or try another '
-                             '--model')
+def _zoomed(test: FixedCameraTest) -> str:
     zooms = test.by_turn
     larger = sorted(turn for turn, zoom in zooms.items() if zoom > np.mean(list(zooms.values())))
     apart = max(zooms.values()) - min(zooms.values())
-    cure = 'fix the zoom and the focus'
     if apart < test.size:
-        return (f'the zoom changes from image to image, by about {100 * test.size:.1f} %',
-                cure)
+        return f'the zoom changes from image to image, by about {100 * test.size:.1f} %'
     return (f'the zoom changes by about {100 * apart:.1f} %, it is larger in {_turns(larger)} '
-            f'than in the others', cure)
+            f'than in the others')
 
 
 def _turned_pictures(solution: Solution, config: VerdictConfig) -> Finding | None:

@@ -28,9 +28,19 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge.calibration import Witness, Witnesses
-from dashcalib_ros.judge.gyro_scale import scale_by_gps
+from dashcalib_ros.judge.gyro_scale import (
+    FIXES,
+    HEADING_SIGMA_DEG,
+    JUMP,
+    LEAST_NOISE_M,
+    LONGEST_GAP_S,
+    SCALES,
+    line_through,
+    scale_by_gps,
+)
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
 from dashcalib_ros.solve.earlier import with_doubt
+from dashcalib_ros.solve.knowledge import variance_if_turns_differ
 from dashcalib_ros.solve.normal import normal_equations, used_keyframes
 from dashcalib_ros.solve.prior import loss_px_of
 from dashcalib_ros.solve.solution import Solution
@@ -39,8 +49,6 @@ from dashcalib_ros.solve.solution import Solution
 LARGEST_OFFSET_S = 0.5
 # s between the offsets that are tried first; a turn takes seconds
 COARSE_S = 0.02
-# s between samples of a gyro; over more the angle between them is not known
-LONGEST_GAP_S = 0.35
 # s over which a rate is taken, to know how an angle follows the offset
 RATE_S = 0.03
 # keyframes of a turn at the least
@@ -49,8 +57,7 @@ LEAST_KEYFRAMES = 5
 LEAST_TURNED_DEG = 10.0
 # of the squared angles; a sensor that explains less is of another drive, or its clock is
 LEAST_EXPLAINED = 0.9
-# times ours; a scale farther off is one of units
-SCALES = (0.7, 1.4)
+# times ours; a scale farther off than SCALES, and in between, is one of units
 DEGREES = (40.0, 80.0)
 # of a turn's angle: what pictures of real drives may be off in one turn, beyond their noise
 TURN_SIGMA = 0.0045
@@ -65,21 +72,14 @@ STEPS, WEIGHED = 8, (1, 4)
 # sigmas; where a witness is farther off, it contradicts
 CONTRADICTED = 3.0
 
-
 # degrees by which the car may turn on what counts as a straight
 STRAIGHT_DEG = 1.5
 # degrees of a turn at the least, between two headings of GPS
 LEAST_GPS_DEG = 30.0
 # m from the rear axle, which goes where the car points, to the aerial
 LEVER_M = 2.0
-# m and fixes of a straight at the least
-STRAIGHT_M, STRAIGHT_FIXES = 8.0, 3
-# m that fixes are off at the least: those of one receiver share errors, which no residual shows
-LEAST_NOISE_M = 0.05
-# of the median; straights of which fixes are farther off have jumps
-JUMP = 4.0
-# degrees; a heading that is known worse says nothing
-HEADING_SIGMA_DEG = 5.0
+# m of a straight at the least
+STRAIGHT_M = 8.0
 # times the sigma that the pictures leave of the angles; a gyro that knows them worse is a witness
 # only: one that is 3 % off, and does not say so, must not move an accepted camera
 WORTH = 1.0
@@ -117,7 +117,7 @@ def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s:
                  if len(used_keyframes(scene)) >= LEAST_KEYFRAMES
                  and (steps := steps_of(scene, solution, loss_px, start_s)) is not None]
         if stream.rate is not None:
-            fit = _with_clocks(fit_to(turns, stream.rate), turns, stream.rate)
+            fit = _with_clocks(turns, stream.rate)
             own = _own_scale(stream.rate, stream.position, config.motion.gyro_scale_sigma)
             fit = None if fit is None else replace(
                 fit, inverse_scale=fit.inverse_scale * own.scale)
@@ -203,13 +203,17 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness 
         return None, (f'the gyro is not used: its stamps and those of the pictures do not keep '
                       f'pace (turns are {1e3 * fit.skew_s:.0f} ms apart): check --fps, and that '
                       f'no images are missing')
-    kappa_sigma = float(np.sqrt(fit.covariance[6, 6]))
-    said = _witness(fit.inverse_scale, kappa_sigma, own.sigma, fit.by_camera, solution, fit)
-    return replace(said, scale_by_gps=own.by_gps), ''
+    sigmas = np.sqrt(np.diag(fit.covariance))
+    said = _witness(fit.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
+    return replace(
+        said, time_offset_s=fit.offset_s, time_sigma_s=float(sigmas[7]),
+        camera_from_sensor=tuple(tuple(row) for row in fit.alignment.tolist()),
+        alignment_sigma_deg=float(np.degrees(np.sqrt(np.trace(fit.covariance[:3, :3])))),
+        bias_rad_s=tuple(fit.bias.tolist()), scale_by_gps=own.by_gps), ''
 
 
 def _witness(inverse_scale: float, sigma: float, own_sigma: float, by_camera: Floats,
-             solution: Solution, fit: Fit | None = None) -> Witness:
+             solution: Solution) -> Witness:
     """Return a witness. own_sigma: what the sensor's own scale may be off.
 
     Of all cameras that make up for the scale the likeliest is told, given what turns know.
@@ -219,16 +223,9 @@ def _witness(inverse_scale: float, sigma: float, own_sigma: float, by_camera: Fl
     percent = 100 * float(along[0]) / variance / solution.camera.fx
     known = float(np.hypot(sigma, own_sigma))
     scale = 1 / inverse_scale
-    details: dict[str, Any] = {} if fit is None else {
-        'camera_from_sensor': tuple(tuple(row) for row in fit.alignment.tolist()),
-        'alignment_sigma_deg': float(np.degrees(np.sqrt(np.trace(fit.covariance[:3, :3])))),
-        'bias_rad_s': tuple(fit.bias.tolist())}
     return Witness(
-        None if fit is None else fit.offset_s,
-        None if fit is None else float(np.sqrt(fit.covariance[7, 7])),
-        scale, sigma * scale**2, percent * (1 - inverse_scale), abs(percent) * known,
-        bool(abs(1 - inverse_scale) <= CONTRADICTED * np.hypot(known, np.sqrt(variance))),
-        **details)
+        None, None, scale, sigma * scale**2, percent * (1 - inverse_scale), abs(percent) * known,
+        bool(abs(1 - inverse_scale) <= CONTRADICTED * np.hypot(known, np.sqrt(variance))))
 
 
 @dataclass(frozen=True)
@@ -267,11 +264,6 @@ class Fit:
         """Return the sensor's angles over the camera's."""
         return 1 / self.inverse_scale
 
-    @property
-    def scale_sigma(self) -> float:
-        """Return the sigma of the scale."""
-        return float(np.sqrt(self.covariance[6, 6])) * self.scale**2
-
 
 def steps_of(scene: Scene, solution: Solution, loss_px: float, start_s: float) -> Steps:
     """Return how a scene's camera turned. start_s: stamp of the drive's first image."""
@@ -297,69 +289,45 @@ def _turned(rotations: Floats) -> Floats:
         rotations[:-1] @ rotations[1:].transpose(0, 2, 1)).as_rotvec())
 
 
-@dataclass(frozen=True)
-class Angles:
-    """A gyro's rates, added up. stamps_s: (n,); sums: (n, 3) rad since the first sample."""
+def _covered(turn: Steps, stamps_s: Floats, offset: float) -> Steps | None:
+    """Return the part of a turn for which there are samples; None where it is too short.
 
-    stamps_s: Floats
-    sums: Floats
-
-    @staticmethod
-    def of(rate: Samples) -> Angles:
-        """Return the angles of rates (n, 3)."""
-        steps = np.diff(rate.stamps_s)[:, None] * (rate.values[1:] + rate.values[:-1]) / 2
-        return Angles(rate.stamps_s, np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]))
-
-    def at(self, stamps_s: Floats) -> Floats:
-        """Return (k, 3) the angles at stamps (k,)."""
-        return np.stack([np.interp(stamps_s, self.stamps_s, column)
-                         for column in self.sums.T], axis=1)
-
-    def turned(self, stamps_s: Floats) -> Floats:
-        """Return (k - 1, 3) what was turned between stamps (k,)."""
-        return np.diff(self.at(stamps_s), axis=0)
-
-    def covered(self, turn: Steps, offset: float = 0.0) -> Steps | None:
-        """Return the part of a turn for which there are samples; None where it is too short.
-
-        offset: by which the sensor's clock is late, s.
-        """
-        gaps = np.flatnonzero(np.diff(self.stamps_s) > LONGEST_GAP_S)
-        piece = np.searchsorted(self.stamps_s[gaps + 1], turn.stamps_s + offset, side='right')
-        begins = np.r_[self.stamps_s[0], self.stamps_s[gaps + 1]][piece]
-        ends = np.r_[self.stamps_s[gaps], self.stamps_s[-1]][piece]
-        inside = ((turn.stamps_s + offset > begins + 2 * RATE_S)
-                  & (turn.stamps_s + offset < ends - 2 * RATE_S))
-        best = max((np.flatnonzero(inside & (piece == each)) for each in np.unique(piece)),
-                   key=len)
-        if len(best) < LEAST_KEYFRAMES:
-            return None
-        first, last = int(best[0]), int(best[-1])
-        return Steps(turn.stamps_s[first:last + 1], turn.turned[first:last],
-                     turn.follow[first:last])
+    stamps_s: (n,) of a sensor whose clock is late by offset, s.
+    """
+    when = turn.stamps_s + offset
+    gaps = np.flatnonzero(np.diff(stamps_s) > LONGEST_GAP_S)
+    piece = np.searchsorted(stamps_s[gaps + 1], when, side='right')
+    begins = np.r_[stamps_s[0], stamps_s[gaps + 1]][piece]
+    ends = np.r_[stamps_s[gaps], stamps_s[-1]][piece]
+    inside = (when > begins + 2 * RATE_S) & (when < ends - 2 * RATE_S)
+    best = max((np.flatnonzero(inside & (piece == each)) for each in np.unique(piece)), key=len)
+    if len(best) < LEAST_KEYFRAMES:
+        return None
+    first, last = int(best[0]), int(best[-1])
+    return Steps(turn.stamps_s[first:last + 1], turn.turned[first:last], turn.follow[first:last])
 
 
 def fit_to(turns: Sequence[Steps], rate: Samples) -> Fit | None:
     """Return how a gyro fits to the turns, those parts of them for which it has samples."""
-    angles, found = Angles.of(rate), None
+    angles, found = rate.integral, None
     for _ in range(2):
         offset = 0.0 if found is None else found.offset_s
-        covered = [part for turn in turns if (part := angles.covered(turn, offset)) is not None]
-        found = fit_gyro(covered, angles)
+        covered = [part for turn in turns
+                   if (part := _covered(turn, rate.stamps_s, offset)) is not None]
+        found = _fit_gyro(covered, angles)
         if found is None or not abs(found.offset_s) < LARGEST_OFFSET_S:
             break
     return found
 
 
-def _with_clocks(fit: Fit | None, turns: Sequence[Steps], rate: Samples) -> Fit | None:
+def _with_clocks(turns: Sequence[Steps], rate: Samples) -> Fit | None:
     """Return the fit with what clocks that do not keep pace add to the sigma of the scale.
 
     Whole turns are hardly changed by that; those that an edge cuts are.
     """
-    stretched = [] if fit is None else [replace(
-        turn, stamps_s=turn.stamps_s + PACE * (turn.stamps_s - turn.stamps_s.mean()))
-        for turn in turns]
-    other = fit_to(stretched, rate) if stretched else None
+    fit, other = (fit_to([replace(
+        turn, stamps_s=turn.stamps_s + pace * (turn.stamps_s - turn.stamps_s.mean()))
+        for turn in turns], rate) for pace in (0.0, PACE))
     if fit is None or other is None:
         return fit
     covariance = fit.covariance.copy()
@@ -367,8 +335,11 @@ def _with_clocks(fit: Fit | None, turns: Sequence[Steps], rate: Samples) -> Fit 
     return replace(fit, covariance=covariance)
 
 
-def fit_gyro(turns: Sequence[Steps], angles: Angles) -> Fit | None:
-    """Return how a gyro fits to the turns; None where too little was turned."""
+def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
+    """Return how a gyro fits to the turns; None where too little was turned.
+
+    angles: (n, 3) rad, the gyro's rates added up.
+    """
     total = np.degrees(sum(np.linalg.norm(turn.turned.sum(axis=0)) for turn in turns))
     if not turns or total < LEAST_TURNED_DEG:
         return None
@@ -393,10 +364,9 @@ def fit_gyro(turns: Sequence[Steps], angles: Angles) -> Fit | None:
     covariance = noise * np.linalg.inv(hessian)
     parts, rests = _by_turn(turns, jacobian), _by_turn(turns, residual)
     # what each turn alone would change of the scale and of the offset, all else as it is
-    own = [noise / np.sum(part[:, 6:]**2, axis=0) for part in parts]
-    off = [part[:, 6:].T @ rest / np.sum(part[:, 6:]**2, axis=0)
-           for part, rest in zip(parts, rests, strict=True)]
-    alone, variances = np.array(off), np.array(own)
+    variances = np.array([noise / np.sum(part[:, 6:]**2, axis=0) for part in parts])
+    alone = np.array([part[:, 6:].T @ rest / np.sum(part[:, 6:]**2, axis=0)
+                      for part, rest in zip(parts, rests, strict=True)])
     covariance[6, 6] += _between_turns(alone[:, 0], variances[:, 0], inverse_scale)
     clear = np.abs(alone[:, 1]) > SKEW_SIGMAS * np.sqrt(variances[:, 1])
     turned = np.concatenate([turn.turned for turn in turns])
@@ -408,30 +378,21 @@ def fit_gyro(turns: Sequence[Steps], angles: Angles) -> Fit | None:
 
 
 def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:
-    """Return the variance of a common value that turns which differ add to it.
+    """Return the variance of a common value that turns which differ by TURN_SIGMA add to it.
 
-    offsets, variances: (t,) of each turn's own value. Turns differ as their noise says, or by
-    TURN_SIGMA more: both are as likely before, and are weighed by how well they explain the turns.
+    offsets, variances: (t,) of each turn's own value, which is of this size.
     """
     more = (TURN_SIGMA * size)**2
     if len(offsets) == 1:
         return more
-    logs, found = [], []
-    for extra in (0.0, more):
-        weights = 1 / (variances + extra)
-        mean = float(np.average(offsets, weights=weights))
-        squares = float(weights @ (offsets - mean)**2)
-        logs.append(0.5 * float(np.log(weights).sum() - np.log(weights.sum())) - 0.5 * squares)
-        # they may differ by still more
-        found.append(max(squares / (len(offsets) - 1), 1.0) / float(weights.sum()) + mean**2)
-    share = 1 / (1 + np.exp(np.clip(logs[0] - logs[1], -100, 100)))
-    return float(max((1 - share) * found[0] + share * found[1] - 1 / np.sum(1 / variances), 0.0))
+    whole = variance_if_turns_differ(offsets, variances, more, still_more=True)
+    return float(max(whole - 1 / np.sum(1 / variances), 0.0))
 
 
-def _aligned(turns: Sequence[Steps], angles: Angles, offset: float
+def _aligned(turns: Sequence[Steps], angles: Samples, offset: float
              ) -> tuple[float, Floats, float, float]:
     """Return what is left, the rotation, 1 / scale for an offset: a start, without bias."""
-    sensor = np.concatenate([angles.turned(turn.stamps_s + offset) for turn in turns])
+    sensor = np.concatenate([_between(angles, turn.stamps_s + offset) for turn in turns])
     camera = np.concatenate([turn.turned for turn in turns])
     u, sizes, v = np.linalg.svd(camera.T @ sensor)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
@@ -441,13 +402,18 @@ def _aligned(turns: Sequence[Steps], angles: Angles, offset: float
     return left, rotation, gain, float(offset)
 
 
-def _linear(turn: Steps, angles: Angles, alignment: Floats, bias: Floats, inverse_scale: float,
+def _between(angles: Samples, stamps_s: Floats) -> Floats:
+    """Return (k - 1, 3) what was turned between stamps (k,)."""
+    return np.diff(angles.at(stamps_s), axis=0)
+
+
+def _linear(turn: Steps, angles: Samples, alignment: Floats, bias: Floats, inverse_scale: float,
             offset: float) -> tuple[Floats, Floats]:
     """Return (k - 1, 3, 8) derivatives of the prediction, and (k - 1, 3) what it leaves."""
     when, apart = turn.stamps_s + offset, np.diff(turn.stamps_s)[:, None]
-    plain = (angles.turned(when) - bias * apart) @ alignment.T
+    plain = (_between(angles, when) - bias * apart) @ alignment.T
     predicted = inverse_scale * plain
-    by_offset = inverse_scale * (angles.turned(when + RATE_S) - angles.turned(when - RATE_S)
+    by_offset = inverse_scale * (_between(angles, when + RATE_S) - _between(angles, when - RATE_S)
                                  ) @ alignment.T / (2 * RATE_S)
     jacobian = np.zeros((len(plain), 3, 8))
     # a small rotation w of the alignment moves the prediction p by w x p
@@ -585,20 +551,16 @@ def _straights(turn: Steps, position: Samples) -> tuple[Heading, Heading] | None
         inside = ((position.stamps_s >= turn.stamps_s[first])
                   & (position.stamps_s <= turn.stamps_s[past]))
         where, when = position.values[inside, :2], position.stamps_s[inside]
-        if past <= first or len(where) < STRAIGHT_FIXES:
+        if past <= first or len(where) < FIXES:
             return None
-        away = where - where.mean(axis=0)
-        direction = np.linalg.svd(away, full_matrices=False)[2][0]
-        direction = direction * np.sign(direction @ (where[-1] - where[0]))
-        along = away @ direction
+        direction, along, left = line_through(where)
         if np.ptp(along) < STRAIGHT_M:
             return None
-        left = np.array([-direction[1], direction[0]])
         found.append(Heading(
             float(np.arctan2(direction[1], direction[0])),
             float(np.interp(when, turn.stamps_s, yaw).mean()),
             np.array([np.interp(when, turn.stamps_s, column).mean() for column in follow.T]),
-            float(np.sqrt(np.mean((away @ left)**2))), float(along @ along), len(where) - 2,
+            float(np.sqrt(np.mean(left**2))), float(along @ along), len(where) - 2,
             float(np.hypot(np.ptp(yaw[first:past + 1]) * LEVER_M / np.ptp(along),
-                           2 * np.polyfit(along, away @ left, 2)[0] * np.ptp(along)))))
+                           2 * np.polyfit(along, left, 2)[0] * np.ptp(along)))))
     return found[0], found[1]

@@ -46,6 +46,10 @@ class PictureSigma:
     rms: float
     worst: float
 
+    def times(self, px: float) -> PictureSigma:
+        """Return the same in pixels that are px times smaller."""
+        return PictureSigma(px * self.rms, px * self.worst)
+
 
 @dataclass(frozen=True)
 class SigmaMap:
@@ -241,24 +245,11 @@ class Knowledge:
         return np.outer(along, along)
 
     def _variance_of_fx(self) -> float:
-        """Return the variance of fx if each turn may be off by one_turn_sigma more.
-
-        Either turns differ as their noise says, or by that more: both are as likely before, and
-        are weighed by how well they explain what each turn alone says of fx. Several sharp turns
-        that agree leave nothing of the second case; where one turn knows nearly all, it stays.
-        """
+        """Return the variance of fx if each turn may be off by one_turn_sigma more."""
         alone = [self.of([n]) for n in range(len(self.turns))]
         offsets = np.array([self.offset_of(each)[0] for each in alone])
         variances = np.array([each._largest_estimate()[0, 0] for each in alone])
-        logs, found = [], []
-        for more in (0.0, self.one_turn_sigma**2):
-            weights = 1 / (variances + more)
-            mean = float(np.average(offsets, weights=weights))
-            logs.append(0.5 * float(np.log(weights).sum() - np.log(weights.sum())
-                                    - weights @ (offsets - mean)**2))
-            found.append(1 / float(weights.sum()) + mean**2)
-        share = 1 / (1 + np.exp(min(logs[0] - logs[1], LARGEST_LOG)))
-        return float((1 - share) * found[0] + share * found[1])
+        return variance_if_turns_differ(offsets, variances, self.one_turn_sigma**2)
 
     def _largest_estimate(self) -> Floats:
         root, count = np.linalg.cholesky(self.total.covariance), len(self.own)
@@ -300,6 +291,28 @@ class Knowledge:
         if field is not None:
             sigma = np.hypot(sigma, np.linalg.norm(field.displacement(pixels), axis=-1))
         return SigmaMap(pixels, sigma)
+
+
+def variance_if_turns_differ(offsets: Floats, variances: Floats, more: float,
+                             still_more: bool = False) -> float:
+    """Return the variance of a common value where each turn may be off by a variance more.
+
+    offsets, variances: (t,) of what each of at least two turns says alone. Either turns differ as
+    their noise says, or by that more: both are as likely before, and are weighed by how well they
+    explain the turns. Several sharp turns that agree leave nothing of the second case; where one
+    turn knows nearly all, it stays. still_more: where they differ by more than a case says, its
+    variance grows with that.
+    """
+    logs, found = [], []
+    for extra in (0.0, more):
+        weights = 1 / (variances + extra)
+        mean = float(np.average(offsets, weights=weights))
+        squares = weights @ (offsets - mean)**2
+        logs.append(0.5 * float(np.log(weights).sum() - np.log(weights.sum()) - squares))
+        ratio = max(float(squares) / (len(offsets) - 1), 1.0) if still_more else 1.0
+        found.append(ratio / float(weights.sum()) + mean**2)
+    share = 1 / (1 + np.exp(min(logs[0] - logs[1], LARGEST_LOG)))
+    return float((1 - share) * found[0] + share * found[1])
 
 
 def scatter_between_turns(turns: Sequence[Quadratic], covariance: Floats, basis: Floats) -> float:

@@ -69,7 +69,7 @@ def main() -> None:
         before = drive(rng, rng.uniform(*BEFORE_M), angles)
         still = drive(rng, arguments.metres, angles)
         after = drive(rng, arguments.metres, moved)
-        found, quiet = (mount_of(joined([*before, *then]), None, known, 'accepted', 1.0, None)
+        found, quiet = (mount_of(joined([*before, *then]), None, known, 'accepted', None)
                         for then in (after, still))
         assert found is not None and quiet is not None
         nothing += quiet.moved_s is not None

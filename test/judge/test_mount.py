@@ -67,7 +67,7 @@ def at(speed):
 @pytest.mark.parametrize('angles', [(0.0, 0.0, 0.0), (3.5, -2.0, 1.0), (-2.5, 3.0, -3.0)])
 def test_straights_tell_where_it_points(solution, angles):
     known = replace(solution, camera=LENS, scenes=())
-    found = mount_of(pairs_of(mounted(*angles)), None, known, 'accepted', 1.0, None)
+    found = mount_of(pairs_of(mounted(*angles)), None, known, 'accepted', None)
     axis = np.degrees(np.arccos(np.clip(found.rotation[:, 2] @ mounted(*angles)[:, 2], -1, 1)))
     # without a turn or lines roll is unknown, and counts as none
     assert found.roll_right_deg is None and found.sigma['roll_right_deg'] is None
@@ -78,26 +78,26 @@ def test_straights_tell_where_it_points(solution, angles):
 
 def test_points_that_stay_do_not_spoil_it(solution):
     known = replace(solution, camera=LENS, scenes=())
-    found = mount_of(pairs_of(mounted(2.0, 1.0, 0.0), still=0.2), None, known, 'accepted', 1.0,
+    found = mount_of(pairs_of(mounted(2.0, 1.0, 0.0), still=0.2), None, known, 'accepted',
                      None)
     assert abs(found.yaw_left_deg - 2.0) < 0.15 and abs(found.pitch_up_deg - 1.0) < 0.15
 
 
 def test_height_needs_a_speed(solution):
     known, pairs = replace(solution, camera=LENS, scenes=()), pairs_of(mounted(0.5, 0.5, 0.0))
-    without = mount_of(pairs, None, known, 'accepted', 1.0, None)
+    without = mount_of(pairs, None, known, 'accepted', None)
     assert without.height_m is None and without.sigma['height_m'] is None
-    found = mount_of(pairs, None, known, 'accepted', 1.0, at(SPEED))
+    found = mount_of(pairs, None, known, 'accepted', at(SPEED))
     assert abs(found.height_m - HEIGHT_M) < 2 * found.sigma['height_m'] < 0.15
     assert found.straight_m == pytest.approx(SPEED * SPACING_S / 2 * len(pairs), rel=0.3)
     # an error of speed is one of height
-    fast = mount_of(pairs, None, known, 'accepted', 1.0, at(SPEED * 4.0 / 3.6))
+    fast = mount_of(pairs, None, known, 'accepted', at(SPEED * 4.0 / 3.6))
     assert fast.height_m / found.height_m == pytest.approx(4.0 / 3.6)
 
 
 def test_turns_alone_tell_all_angles(solution):
     none = StraightCollector().straights()
-    found = mount_of(none, None, solution, 'accepted', 1.0, None)
+    found = mount_of(none, None, solution, 'accepted', None)
     for key in ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg'):
         assert abs(getattr(found, key)) < 2 * found.sigma[key] + 0.1, key
     # a crowned road of 2 % leans the car by 1.15 degrees in all turns alike
@@ -113,26 +113,26 @@ def test_height_follows_the_speed_halfway(solution):
     def braking(stamps_s):
         return np.array([at_second.get(stamp, SPEED / 2) for stamp in stamps_s])
 
-    found = mount_of(pairs, None, known, 'accepted', 1.0, braking)
+    found = mount_of(pairs, None, known, 'accepted', braking)
     assert abs(found.height_m - HEIGHT_M) < 2 * found.sigma['height_m']
 
 
 def test_nothing_seen_is_no_mount(solution):
     assert mount_of(StraightCollector().straights(), None, replace(solution, scenes=()),
-                    'accepted', 1.0, None) is None
+                    'accepted', None) is None
 
 
 def test_it_is_never_better_than_the_lens(solution):
     pairs = pairs_of(mounted(1.0, 0.0, 0.0))
     known = replace(solution, camera=LENS, scenes=())
-    assert mount_of(pairs, None, known, 'accepted', 1.0, None).verdict == 'accepted'
-    weak = mount_of(pairs, None, known, 'weak', 1.0, None)
+    assert mount_of(pairs, None, known, 'accepted', None).verdict == 'accepted'
+    weak = mount_of(pairs, None, known, 'weak', None)
     assert weak.verdict == 'weak' and 'the lens is weak' in weak.reasons[0]
-    assert mount_of(pairs, None, known, 'refused', 1.0, None).verdict == 'weak'
+    assert mount_of(pairs, None, known, 'refused', None).verdict == 'weak'
     # 5 px of cy are half a degree of pitch, but not of the pixel of travel
     vague = np.array(solution.covariance)
     vague[3, 3] = 5.0**2
-    found = mount_of(pairs, None, replace(known, covariance=vague), 'accepted', 1.0, None)
+    found = mount_of(pairs, None, replace(known, covariance=vague), 'accepted', None)
     assert found.verdict == 'weak' and 'drive more turns' in found.reasons[0]
     assert found.sigma['pitch_up_deg'] > np.degrees(5.0 / LENS.fy)
     assert found.travel_sigma_px == weak.travel_sigma_px
@@ -154,14 +154,14 @@ def drives():
 def test_a_lens_that_is_not_accepted_never_has_an_accepted_mount(
         solution, drives, which, level, scale, px, speed, turns):
     known = replace(solution, covariance=scale * np.eye(len(solution.covariance)),
-                    scenes=solution.scenes[:turns])
-    found = mount_of(drives[which], None, known, level, px, at(speed) if speed else None)
+                    scenes=solution.scenes[:turns], px=px)
+    found = mount_of(drives[which], None, known, level, at(speed) if speed else None)
     if found is None:
         assert which == 0 and turns == 0
         return
     assert found.verdict == 'weak' and f'the lens is {level}' in found.reasons[0]
     # with the same evidence, only sigma decides for an accepted lens
-    better = mount_of(drives[which], None, known, 'accepted', px, None)
+    better = mount_of(drives[which], None, known, 'accepted', None)
     known_well = max(better.sigma['yaw_left_deg'], better.sigma['pitch_up_deg']) <= 0.2
     assert (better.verdict == 'accepted') == known_well
 
@@ -169,7 +169,7 @@ def test_a_lens_that_is_not_accepted_never_has_an_accepted_mount(
 def test_few_straights_say_to_drive_on(solution):
     known = replace(solution, camera=LENS, scenes=(), covariance=1e-4 * np.eye(6))
     found = mount_of(pairs_of(mounted(0, 0, 0), count=10, noise_px=4.0), None, known, 'accepted',
-                     1.0, None)
+                     None)
     assert found.verdict == 'weak' and 'drive straight on' in found.reasons[0]
 
 
@@ -217,7 +217,7 @@ def test_a_failure_does_not_cost_the_lens(solution, monkeypatch):
 def test_a_camera_that_was_moved(solution):
     known = replace(solution, camera=LENS, scenes=())
     here, nearby, moved = (mount_of(pairs_of(mounted(yaw, 0.0, 0.0), seed=seed), None, known,
-                                    'accepted', 1.0, None)
+                                    'accepted', None)
                            for seed, yaw in enumerate((0.0, 0.3, 1.0)))
     degrees, sigma = moved.apart(here)['yaw_left_deg']
     assert abs(degrees - 1.0) < 2 * sigma < 0.5
@@ -243,10 +243,10 @@ def test_a_camera_that_is_moved_during_the_drive_begins_anew(solution, moved):
     known = replace(solution, camera=LENS, scenes=())
     first, then = pairs_of(mounted(0.5, 1.0, 0.0), count=60), pairs_of(mounted(*moved), count=25,
                                                                        seed=1)
-    found = mount_of(joined(first, then), None, known, 'accepted', 1.0, None)
+    found = mount_of(joined(first, then), None, known, 'accepted', None)
     assert found.moved_s == pytest.approx(first.stamps_s[-1], abs=3.0)
     assert abs(found.yaw_left_deg - moved[0]) < 0.3 and abs(found.pitch_up_deg - moved[1]) < 0.3
-    assert mount_of(first, None, known, 'accepted', 1.0, None).moved_s is None
+    assert mount_of(first, None, known, 'accepted', None).moved_s is None
 
 
 def test_a_camera_that_stays_is_not_said_to_be_moved(solution):
@@ -255,5 +255,5 @@ def test_a_camera_that_stays_is_not_said_to_be_moved(solution):
         # other roads: 0.3 degrees
         first, then = (pairs_of(mounted(0.5 + more, 1.0, 0.0), seed=2 * seed + n)
                        for n, more in enumerate((0.0, 0.3)))
-        found = mount_of(joined(first, then), None, known, 'accepted', 1.0, None)
+        found = mount_of(joined(first, then), None, known, 'accepted', None)
         assert found.moved_s is None

@@ -113,7 +113,7 @@ def test_sigmas_hold(drive):
     for seed in range(30):
         said = fit_to(turns, gyro(drive, density_deg=0.1, seed=seed).rate)
         pulls.append([(said.offset_s - LATE_S) / np.sqrt(said.covariance[7, 7]),
-                      (said.scale - 1) / said.scale_sigma])
+                      (said.inverse_scale - 1) / np.sqrt(said.covariance[6, 6])])
     assert (np.abs(pulls) < 2).mean(axis=0).min() >= 0.9
 
 
