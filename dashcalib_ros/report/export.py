@@ -128,7 +128,7 @@ def _mrcal(camera: Camera, field: Field | None = None) -> str:
     """
     if field is None and not _is_fisheye(camera):
         d = camera.ros_distortion()
-        name, lens = f'LENSMODEL_OPENCV{len(d)}', [*camera.params[:4], *d]
+        name, lens = f'LENSMODEL_OPENCV{len(d)}', np.array([*camera.params[:4], *d])
     else:
         name, lens = splined_lens(camera, field)
     values = ', '.join(repr(float(value)) for value in lens)

@@ -36,7 +36,8 @@ def splined_lens(camera: Camera, field: Field | None) -> tuple[str, Floats]:
     few = [np.unique(np.linspace(0, side - 1, count).round())
            for side, count in zip(camera.image_size, SAMPLES, strict=True)]
     places, wanted = _corrections(camera, field, *few)
-    all_places, all_wanted = _corrections(camera, field, np.arange(width), np.arange(height))
+    all_places, all_wanted = _corrections(camera, field, np.arange(0.0, width),
+                                          np.arange(0.0, height))
     across, down = np.abs(all_places).max(axis=0)
     fov_deg = int(np.degrees(4 * np.arctan(across / 2))) + 1
     worst = np.inf
@@ -58,7 +59,7 @@ def splined_lens(camera: Camera, field: Field | None) -> tuple[str, Floats]:
 def _corrections(camera: Camera, field: Field | None, columns: Floats, rows: Floats
                  ) -> tuple[Floats, Floats]:
     """Return (n, 2) u of the rays of these pixels, and (n, 2) what the spline must add there."""
-    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2).astype(np.float64)
+    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
     rays = camera.rays(pixels if field is None else field.ideal(pixels))
     known = np.isfinite(rays).all(axis=1)
     pixels, rays = pixels[known], rays[known]
@@ -68,7 +69,7 @@ def _corrections(camera: Camera, field: Field | None, columns: Floats, rows: Flo
 
 def _on_grid(u: Floats, per_u: float, shape: tuple[int, int]) -> Floats:
     """Return (2, n) where u is on the grid of control points: row and column, from 0."""
-    return u[:, ::-1].T * per_u + (np.array(shape)[:, None] - 1) / 2
+    return np.asarray(u[:, ::-1].T * per_u + (np.array(shape)[:, None] - 1) / 2)
 
 
 def _fitted(at: Floats, wanted: Floats, shape: tuple[int, int]) -> Floats:

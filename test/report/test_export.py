@@ -85,7 +85,7 @@ def test_a_lens_that_a_program_has_not_is_refused(kind, model):
 def test_each_export_is_read_back(lens, kind, tmp_path):
     path = written(lens, kind, tmp_path)
     if (kind, lens.model) == ('mrcal', 'fisheye'):
-        with pytest.raises(InputError, match='SPLINED.* none of the models here'):
+        with pytest.raises(InputError, match=r'SPLINED.* none of the models here'):
             load_camera(path)
         return
     read = load_camera(path)
@@ -117,7 +117,7 @@ def test_maps_are_opencv_s(lens, kind, tmp_path):
 
 
 def mrcal_sees(path, rays):
-    """Return (n, 2) where the distribution's own mrcal sees rays (n, 3), and its picture's size."""
+    """Return (n, 2) where the distribution's mrcal sees rays (n, 3), and its picture's size."""
     program = ('import mrcal, numpy, sys\n'
                'model = mrcal.cameramodel(sys.argv[1])\n'
                'seen = mrcal.project(numpy.load(sys.argv[2]), *model.intrinsics())\n'
