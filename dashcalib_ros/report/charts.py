@@ -99,7 +99,7 @@ def strokes(lines: Iterable[Floats], kind: str, more: str = '') -> str:
 
 def outline(lines: Iterable[Floats]) -> str:
     """Return the d of such a path."""
-    return ''.join('M' + ' '.join(f'{x:.1f} {y:.1f}' for x, y in points)
+    return ''.join('M' + 'L'.join(f'{x:.1f} {y:.1f}' for x, y in points)
                    + 'h0' * (len(points) == 1) for points in lines)
 
 
