@@ -11,15 +11,9 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any
 
-from dashcalib_ros.cli.arguments import BAD_INPUT, INTERRUPTED, PROGRAM, make_parser
+from dashcalib_ros.cli.arguments import BAD_INPUT, COMMANDS, INTERRUPTED, PROGRAM, make_parser
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import folded, open_closed_streams, write_stderr
-
-# imported only when they are called: --help must not wait for numpy and OpenCV
-COMMANDS = {'run': 'dashcalib_ros.cli.run', 'turns': 'dashcalib_ros.cli.run',
-            'demo': 'dashcalib_ros.cli.run', 'compare': 'dashcalib_ros.cli.cameras',
-            'export': 'dashcalib_ros.cli.cameras', 'check': 'dashcalib_ros.cli.check',
-            'batch': 'dashcalib_ros.cli.batch'}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,7 +25,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _complete(parser)
         args = parser.parse_args(argv)
         with _sigterm_like_ctrl_c():
-            command = getattr(import_module(COMMANDS[args.command]), args.command)
+            # imported only here: --help must not wait for numpy and OpenCV
+            command = getattr(import_module(COMMANDS[args.command].module), args.command)
             code: int = command(args)
             return code
     except SystemExit as end:  # argparse's way to end after --help and --version

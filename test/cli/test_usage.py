@@ -285,9 +285,10 @@ def test_an_interrupt_while_a_module_is_imported_has_its_own_exit_code(tmp_path)
     # dataclasses make their methods by exec() of a text; Python remembers an interrupt from there
     (tmp_path / 'interrupting.py').write_text('exec("raise KeyboardInterrupt")')
     (tmp_path / 'interrupted.py').write_text(
-        'import sys\n'
+        'import dataclasses, sys\n'
         'from dashcalib_ros.cli import program\n'
-        'program.COMMANDS["demo"] = "interrupting"\n'
+        'demo = dataclasses.replace(program.COMMANDS["demo"], module="interrupting")\n'
+        'program.COMMANDS["demo"] = demo\n'
         'sys.exit(program.main(["demo"]))\n')
     done = subprocess.run([sys.executable, '-m', 'interrupted'], cwd=tmp_path, timeout=60,
                           capture_output=True, text=True)
