@@ -94,15 +94,6 @@ def _fx_alone(c: Calibration, with_field: bool = True) -> dict[TurnId, tuple[flo
     return alone if np.isfinite(list(alone.values())).all() else {}
 
 
-def focal_by_turn(c: Calibration) -> str:
-    """Return the plot of what all turns say of fx, '' where there is none."""
-    alone = _fx_alone(c)
-    if not alone or c.camera is None or c.sigma is None:
-        return ''
-    return estimates_svg([(f'turn {name}', *alone[turn]) for turn, name in names(c).items()
-                          if turn in alone], (c.camera.fx, c.sigma['fx']))
-
-
 def names(c: Calibration) -> dict[TurnId, str]:
     """Return the turns' short names: numbers in the order of time, s1, s2 for stored ones."""
     own = {turn.id: str(n) for n, turn in enumerate(c.turns, 1)}
@@ -251,11 +242,13 @@ def direction(scene: Scene) -> str:
     return 'to the right' if net > 0 else 'to the left'
 
 
-def estimates_svg(rows: list[tuple[str, float, float]], joint: tuple[float, float]) -> str:
-    """Return what each turn says of fx, beside the result of all.
-
-    rows: a name, fx and its sigma, px. joint: fx and its sigma.
-    """
+def focal_by_turn(c: Calibration) -> str:
+    """Return what each turn says of fx, beside the result of all; '' where there is nothing."""
+    alone = _fx_alone(c)
+    if not alone or c.camera is None or c.sigma is None:
+        return ''
+    rows = [(f'turn {name}', *alone[turn]) for turn, name in names(c).items() if turn in alone]
+    joint = c.camera.fx, c.sigma['fx']
     row, right, top = 21, 122, 8
     reach = 4 * joint[1]
     for _, fx, sigma in rows:

@@ -15,10 +15,7 @@ from dashcalib_ros.judge import Calibration, TurnSummary
 from dashcalib_ros.judge.agreement import focal_disagreement, leverages
 from dashcalib_ros.judge.calibration import (
     Mount,
-    Shutter,
-    Stabiliser,
     StoredTurnSummary,
-    Witness,
     Witnesses,
 )
 from dashcalib_ros.judge.verdict import (
@@ -30,7 +27,6 @@ from dashcalib_ros.judge.verdict import (
     sigma_too_large,
     turns_disagree,
 )
-from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import Solution
 
 ADVICE = {
@@ -45,23 +41,19 @@ PIXELS = ('fx', 'fy', 'cx', 'cy')
 
 def parameter_rows(calibration: Calibration) -> list[tuple[str, str, str, str]]:
     """Return each parameter's name, value, sigma and sigma in percent, as text."""
-    if calibration.camera is None:
-        return []
-    sigma = calibration.sigma or {}
-    return [_parameter_row(name, value, sigma.get(name))
-            for name, value in calibration.camera.named.items()]
-
-
-def _parameter_row(name: str, value: float, sigma: float | None) -> tuple[str, str, str, str]:
-    if sigma is None or not math.isfinite(sigma):
-        return name, number(name, value), 'unknown', ''
-    relative = percent(100 * sigma / abs(value)) if value else ''
-    return name, number(name, value), '± ' + number(name, sigma), relative
-
-
-def percent(value: float) -> str:
-    """Return a share with its sensible digits; a sigma as large as its value has none."""
-    return 'over 100 %' if value > 100 else f'{value:.0f} %' if value >= 10 else f'{value:.2f} %'
+    rows = []
+    for name, value in ({} if calibration.camera is None else calibration.camera.named).items():
+        sigma = (calibration.sigma or {}).get(name, math.inf)
+        said, relative = '± ' + number(name, sigma), ''
+        if not math.isfinite(sigma):
+            said = 'unknown'
+        elif value:
+            share = 100 * sigma / abs(value)
+            # one as large as its value has no sensible digits
+            relative = ('over 100 %' if share > 100 else
+                        f'{share:.0f} %' if share >= 10 else f'{share:.2f} %')
+        rows.append((name, number(name, value), said, relative))
+    return rows
 
 
 def number(name: str, value: float) -> str:
@@ -83,15 +75,16 @@ def stored_text(turns: Sequence[StoredTurnSummary]) -> str:
     return f'{used} of {counted(len(turns), "stored turn")} used'
 
 
-def stabiliser_text(stabiliser: Stabiliser) -> str:
-    """Return what became of a stabilised video."""
-    return f'picture stabilised by up to {stabiliser.largest_px:.0f} px, found and removed'
-
-
-def shutter_text(shutter: Shutter) -> str:
-    """Return a line about the rolling shutter that was found."""
-    return (f'rolling shutter of {shutter.readout_ms:.1f} ± {shutter.sigma_ms:.1f} ms found and '
-            'removed')
+def removed_effects(c: Calibration) -> list[tuple[str, str]]:
+    """Return what was found and taken out, each with its name: a shutter, a stabiliser."""
+    found = []
+    if c.rolling_shutter is not None:
+        found.append(('Shutter', f'rolling shutter of {c.rolling_shutter.readout_ms:.1f} ± '
+                                 f'{c.rolling_shutter.sigma_ms:.1f} ms found and removed'))
+    if c.stabiliser is not None:
+        found.append(('Stabiliser', f'picture stabilised by up to {c.stabiliser.largest_px:.0f} '
+                                    'px, found and removed'))
+    return found
 
 
 def lines_text(lines: Bend) -> str:
@@ -127,27 +120,21 @@ def mount_text(mount: Mount) -> str:
             f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± {mount.travel_sigma_px:.1f}')
 
 
-def witness_text(name: str, said: Witness) -> str:
-    """Return a line about what a sensor says of the focal length."""
-    text = (f'the {name} {"agrees" if said.agrees else "contradicts"}: fx off by '
-            f'{said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} %')
-    if said.time_offset_s is not None and said.time_sigma_s is not None:
-        text += (f', its stamps late by {1e3 * said.time_offset_s:.0f} ± '
-                 f'{max(1e3 * said.time_sigma_s, 0.1):.1f} ms')
-    if said.scale_by_gps is not None:
-        text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*said.scale_by_gps)
-    return text
-
-
 def witness_texts(witnesses: Witnesses) -> list[str]:
-    """Return a line for each sensor that says something."""
-    return [witness_text(name, said) for name, said in
-            (('gyro', witnesses.gyro), ('GPS', witnesses.gps)) if said is not None]
-
-
-def picture_text(sigma: PictureSigma) -> str:
-    """Return a line about how far the whole camera may be off."""
-    return f'{sigma.rms:.2f} px over the picture, {sigma.worst:.2f} px at the worst'
+    """Return a line for each sensor that says something of the focal length."""
+    lines = []
+    for name, said in (('gyro', witnesses.gyro), ('GPS', witnesses.gps)):
+        if said is None:
+            continue
+        text = (f'the {name} {"agrees" if said.agrees else "contradicts"}: fx off by '
+                f'{said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} %')
+        if said.time_offset_s is not None and said.time_sigma_s is not None:
+            text += (f', its stamps late by {1e3 * said.time_offset_s:.0f} ± '
+                     f'{max(1e3 * said.time_sigma_s, 0.1):.1f} ms')
+        if said.scale_by_gps is not None:
+            text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*said.scale_by_gps)
+        lines.append(text)
+    return lines
 
 
 def since_start(turn: TurnSummary, calibration: Calibration) -> str:
@@ -223,16 +210,6 @@ def next_steps(c: Calibration) -> list[str]:
     if c.verdict.level == 'weak':
         steps.append('To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.')
     return steps
-
-
-def removed_effects(c: Calibration) -> list[str]:
-    """Return what was found and taken out: a rolling shutter, a stabiliser's movement."""
-    lines = []
-    if c.rolling_shutter is not None:
-        lines.append('Shutter: ' + shutter_text(c.rolling_shutter))
-    if c.stabiliser is not None:
-        lines.append('Stabiliser: ' + stabiliser_text(c.stabiliser))
-    return lines
 
 
 def run_facts(c: Calibration) -> list[tuple[str, str]]:
