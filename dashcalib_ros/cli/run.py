@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 from rich.text import Text
 
@@ -18,7 +17,6 @@ from dashcalib_ros.camera import Radial, camera_of
 from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
 from dashcalib_ros.cli.drive import calibrate, feed, open_drive, read_config, read_sensors
 from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
-from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, OutputError, counted
 from dashcalib_ros.input import FrameSource
@@ -117,15 +115,20 @@ def turns(args: argparse.Namespace) -> int:
     with Stages(args.quiet) as stages:
         frames = feed(detection, source, mask, stages)
     detection.finish()
-    found = [_row(turn) for turn in detection.turns()]
+    found = detection.turns()
     warn((*source.warnings, *detection.warnings()))
     if args.json:
         write_stdout(json.dumps(plain_values({
-            'input': source.name, 'frames': frames, 'turns': found,
+            'input': source.name, 'frames': frames,
+            'turns': [{'center': turn.center, 'first': turn.first, 'last': turn.last,
+                       'stamp': turn.stamp_s, 'prominence': turn.prominence,
+                       'images': turn.images} for turn in found],
             'warnings': (*source.warnings, *detection.warnings())}), indent=2, allow_nan=False))
         return ACCEPTED
     if found:
-        show(TextTable(COLUMNS, [_cells(row, detection.start_s) for row in found]))
+        show(TextTable(COLUMNS, [
+            (f'{turn.stamp_s - detection.start_s:.1f}', str(turn.center), str(turn.first),
+             str(turn.last), str(turn.images), f'{turn.prominence:.4f}') for turn in found]))
         show(Text(PROMINENCE))
     show(Text(_conclusion(len(found), config.turns.wanted, frames)))
     return ACCEPTED
@@ -136,16 +139,6 @@ def _conclusion(found: int, wanted: int, frames: int) -> str:
     if found:
         return f'{text}\nnext: dashcalib run, with the same INPUT'
     return f'{text}\nnext: record a drive with turns at crossings, in daylight'
-
-
-def _row(turn: Turn) -> dict[str, Any]:
-    return {'center': turn.center, 'first': turn.first, 'last': turn.last,
-            'stamp': turn.stamp_s, 'prominence': turn.prominence, 'images': turn.images}
-
-
-def _cells(row: dict[str, Any], start_s: float) -> tuple[str, ...]:
-    return (f'{row["stamp"] - start_s:.1f}', str(row['center']), str(row['first']),
-            str(row['last']), str(row['images']), f'{row["prominence"]:.4f}')
 
 
 def demo(args: argparse.Namespace) -> int:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary
@@ -19,7 +18,6 @@ from dashcalib_ros.judge.calibration import (
     Witnesses,
 )
 from dashcalib_ros.judge.verdict import (
-    Rule,
     flat_profile,
     one_turn_dominates,
     other_camera,
@@ -27,7 +25,6 @@ from dashcalib_ros.judge.verdict import (
     sigma_too_large,
     turns_disagree,
 )
-from dashcalib_ros.solve.solution import Solution
 
 ADVICE = {
     'accepted': 'Good to use.',
@@ -243,34 +240,29 @@ class Check:
     passed: bool
 
 
-def checks(calibration: Calibration) -> tuple[Check, ...]:
+def checks(calibration: Calibration) -> list[Check]:
     """Return the conditions that can be put in a number, those of the evidence first."""
     needed = calibration.config.verdict
-    solution = None if calibration.material is None else calibration.material.solution
-    count = calibration.turns_used
-    yaw = calibration.yaw_deg
+    count, yaw = calibration.turns_used, calibration.yaw_deg
     found = [Check('turns used', f'{count}', f'at least {needed.min_turns}',
                    count >= needed.min_turns),
              Check('yaw of these turns together', f'{yaw:.0f}°',
                    f'at least {needed.min_yaw_deg:.0f}°', yaw >= needed.min_yaw_deg)]
-    return (*found, *([] if solution is None else _of_solution(solution, needed)))
-
-
-def _of_solution(solution: Solution, needed: VerdictConfig) -> list[Check]:
-    def check(name: str, found: str, limit: str, rule: Rule) -> Check:
-        return Check(name, found, limit, rule(solution, needed) is None)
-
+    solution = None if calibration.material is None else calibration.material.solution
+    if solution is None:
+        return found
     share = max(leverages(solution).values(), default=1.0)
-    return [
-        check('rise of the error when the focal length is 20 % off',
-              f'{100 * max(profile_contrast(solution), 0.0):.1f} %',
-              f'at least {100 * needed.min_contrast:.0f} %', flat_profile),
-        check('uncertainty of fx', f'{100 * float(solution.sigma[0] / solution.camera.fx):.2g} %',
-              f'at most {100 * needed.max_sigma:.3g} %', sigma_too_large),
-        check('scatter of fx between the turns', f'{100 * focal_disagreement(solution):.2g} %',
-              f'at most {100 * needed.max_disagreement:.3g} %', turns_disagree),
-        check('share of the turn that knows most of fx', f'{100 * min(share, 1.0):.0f} %',
-              f'at most {100 * needed.max_leverage:.0f} %', one_turn_dominates),
-        check('a turn’s error, over that with a camera of its own',
-              f'{max(solution.misfits.values(), default=0.0):.2g} times',
-              f'at most {needed.max_misfit:.2g} times', other_camera)]
+    return found + [Check(name, value, limit, rule(solution, needed) is None)
+                    for name, value, limit, rule in (
+        ('rise of the error when the focal length is 20 % off',
+         f'{100 * max(profile_contrast(solution), 0.0):.1f} %',
+         f'at least {100 * needed.min_contrast:.0f} %', flat_profile),
+        ('uncertainty of fx', f'{100 * float(solution.sigma[0] / solution.camera.fx):.2g} %',
+         f'at most {100 * needed.max_sigma:.3g} %', sigma_too_large),
+        ('scatter of fx between the turns', f'{100 * focal_disagreement(solution):.2g} %',
+         f'at most {100 * needed.max_disagreement:.3g} %', turns_disagree),
+        ('share of the turn that knows most of fx', f'{100 * min(share, 1.0):.0f} %',
+         f'at most {100 * needed.max_leverage:.0f} %', one_turn_dominates),
+        ('a turn’s error, over that with a camera of its own',
+         f'{max(solution.misfits.values(), default=0.0):.2g} times',
+         f'at most {needed.max_misfit:.2g} times', other_camera))]
