@@ -11,6 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from time import perf_counter
 
+from rich.console import RenderableType
 from rich.text import Text
 
 from dashcalib_ros.camera import Radial, camera_of
@@ -50,13 +51,12 @@ def run(args: argparse.Namespace) -> int:
         with Stages(args.quiet) as stages:
             calibration = calibrate(source, config, mask, args.verbose, stages, motion)
         written = write_results(calibration, args.out, created=now())
-    warn((*calibration.warnings, *set_aside_lines(written)))
+    _warn(calibration, written)
     if args.json:
         write_stdout(result_json(calibration).rstrip('\n'))
     screen = Screen(args.quiet, to_stderr=bool(args.json))
-    screen.show(conclusion(calibration.verdict))
-    screen.show(summary(calibration))
-    screen.show(Text(files_line(args.out, written.files)))
+    screen.show(conclusion(calibration.verdict), summary(calibration),
+                _files(args.out, written.files))
     if args.write_bag is not None:
         _write_bag(args, str(source.topic), calibration, screen)
     screen.show(next_step(calibration.verdict))
@@ -84,17 +84,17 @@ def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration, s
                      f'{camera_info_topic(topic)}'))
 
 
-def files_line(folder: Path, files: Sequence[Path]) -> str:
+def _files(folder: Path, files: Sequence[Path]) -> Text:
     """Return a line that tells which files are in the output folder now."""
-    return f'written to {folder}: {", ".join(file.name for file in files)}'
+    return Text(f'written to {folder}: {", ".join(file.name for file in files)}')
 
 
-def set_aside_lines(written: Written) -> tuple[str, ...]:
-    """Return a warning if an earlier calibration was set aside."""
-    if written.set_aside is None:
-        return ()
-    old = written.set_aside.with_name(ACCEPTED_FILE)
-    return (f'the calibration that was in {old} is now {written.set_aside}',)
+def _warn(calibration: Calibration, written: Written) -> None:
+    """Print the calibration's warnings, and whether an earlier one was set aside."""
+    warn(calibration.warnings)
+    if written.set_aside is not None:
+        old = written.set_aside.with_name(ACCEPTED_FILE)
+        warn([f'the calibration that was in {old} is now {written.set_aside}'])
 
 
 def now() -> str:
@@ -158,19 +158,16 @@ def demo(args: argparse.Namespace) -> int:
         written = write_results(calibration, out, created=now(), truth=truth)
         values = {**drive.truth, 'width': size[0], 'height': size[1]}
         write_text(out / TRUTH, json.dumps(values, allow_nan=False) + '\n')
-    warn((*calibration.warnings, *set_aside_lines(written)))
+    _warn(calibration, written)
+    compared: list[RenderableType] = [Text('no estimate to compare with the truth')]
+    if calibration.camera is not None:
+        compared = [Text('\nagainst the truth'),
+                    against_truth(compare(calibrated_camera(calibration), truth))]
     files = [*written.files, out / TRUTH, *([out / 'bag'] if args.keep_bag else [])]
-    screen = Screen(args.quiet)
-    screen.show(conclusion(calibration.verdict))
-    screen.show(summary(calibration))
-    if calibration.camera is None:
-        screen.show(Text('no estimate to compare with the truth'))
-    else:
-        screen.show(Text('\nagainst the truth'))
-        screen.show(against_truth(compare(calibrated_camera(calibration), truth)))
-    screen.show(Text(files_line(out, files)))
-    screen.show(Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'))
-    screen.show(next_step(calibration.verdict))
+    Screen(args.quiet).show(
+        conclusion(calibration.verdict), summary(calibration), *compared, _files(out, files),
+        Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'),
+        next_step(calibration.verdict))
     return exit_code(calibration.verdict.level)
 
 
