@@ -22,6 +22,8 @@ COLUMNS = (24, 32, 48, 64, 96, 128, 192)
 EXACT_PX = 1e-3
 # of the picture's sides; the spline is fitted to so many pixels, and checked at all
 SAMPLES = (480, 320)
+# rows whose pixels are looked at together: a field's terms take memory
+STRIP = 64
 # what the control points' second differences weigh in the fit, beside a pixel: where the picture
 # ends, the spline goes on smoothly
 SMOOTH = 1e-4
@@ -36,8 +38,10 @@ def splined_lens(camera: Camera, field: Field | None) -> tuple[str, Floats]:
     few = [np.unique(np.linspace(0, side - 1, count).round())
            for side, count in zip(camera.image_size, SAMPLES, strict=True)]
     places, wanted = _corrections(camera, field, *few)
-    all_places, all_wanted = _corrections(camera, field, np.arange(0.0, width),
-                                          np.arange(0.0, height))
+    strips = [_corrections(camera, field, np.arange(0.0, width),
+                           np.arange(top, min(top + STRIP, height), dtype=float))
+              for top in range(0, height, STRIP)]
+    all_places, all_wanted = map(np.concatenate, zip(*strips, strict=True))
     across, down = np.abs(all_places).max(axis=0)
     fov_deg = int(np.degrees(4 * np.arctan(across / 2))) + 1
     worst = np.inf
