@@ -40,6 +40,9 @@ def export(args: argparse.Namespace) -> int:
         raise UsageError('the field over the picture holds for the whole one; leave --size and '
                          '--crop away')
     text = exported(camera, args.to, found.field)
+    if found.field is not None and args.to not in WITH_FIELD:
+        warn([f'{found.name} has a field over the picture, for which {args.to} has no place: it '
+              f'is left out; {", ".join(WITH_FIELD)} have it'])
     if found.verdict == 'weak':
         warn([f'{found.name} is weak: look at its sigmas before you use it'])
     if args.out is not None:

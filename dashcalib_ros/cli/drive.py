@@ -4,7 +4,6 @@ from __future__ import annotations
 import argparse
 import re
 import signal
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import searched
+from dashcalib_ros.cli.program import handling
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError, counted, shortened
@@ -104,7 +104,7 @@ def open_calibrator(config: Config, mask: Mask | None, verbose: bool) -> Iterato
     try:
         yield calibrator
     finally:
-        with _undisturbed():
+        with handling(signal.SIG_IGN, signal.SIGINT, signal.SIGTERM):
             calibrator.close()
 
 
@@ -127,18 +127,3 @@ def calibrate(source: FrameSource, config: Config, mask: Mask | None, verbose: b
         feed(calibrator, source, mask, stages)
         calibration: Calibration = calibrator.calibrate(stages.show)
     return with_source(calibration, source)
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Ignore Ctrl-C and SIGTERM while child processes are being ended."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before: dict[signal.Signals, Any] = {
-        name: signal.signal(name, signal.SIG_IGN) for name in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for name, handler in before.items():
-            signal.signal(name, handler)

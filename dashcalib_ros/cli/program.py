@@ -11,15 +11,9 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any
 
-from dashcalib_ros.cli.arguments import BAD_INPUT, INTERRUPTED, PROGRAM, make_parser
+from dashcalib_ros.cli.arguments import BAD_INPUT, COMMANDS, INTERRUPTED, PROGRAM, make_parser
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import folded, open_closed_streams, write_stderr
-
-# imported only when they are called: --help must not wait for numpy and OpenCV
-COMMANDS = {'run': 'dashcalib_ros.cli.run', 'turns': 'dashcalib_ros.cli.run',
-            'demo': 'dashcalib_ros.cli.run', 'compare': 'dashcalib_ros.cli.cameras',
-            'export': 'dashcalib_ros.cli.cameras', 'check': 'dashcalib_ros.cli.check',
-            'batch': 'dashcalib_ros.cli.batch'}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -30,8 +24,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser = make_parser()
         _complete(parser)
         args = parser.parse_args(argv)
-        with _sigterm_like_ctrl_c():
-            command = getattr(import_module(COMMANDS[args.command]), args.command)
+        # SIGTERM unwinds the program as Ctrl-C does, so that everything is closed
+        with handling(signal.default_int_handler, signal.SIGTERM):
+            # imported only here: --help must not wait for numpy and OpenCV
+            command = getattr(import_module(COMMANDS[args.command].module), args.command)
             code: int = command(args)
             return code
     except SystemExit as end:  # argparse's way to end after --help and --version
@@ -65,16 +61,17 @@ def _complete(parser: argparse.ArgumentParser) -> None:
 
 
 @contextmanager
-def _sigterm_like_ctrl_c() -> Iterator[None]:
-    """Let SIGTERM unwind the program as Ctrl-C does, so that everything is closed."""
+def handling(handler: Any, *signals: signal.Signals) -> Iterator[None]:
+    """Handle signals in another way for a while; only the main thread may."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may set handlers
+        yield
         return
-    before: Any = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before: dict[signal.Signals, Any] = {each: signal.signal(each, handler) for each in signals}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, earlier in before.items():
+            signal.signal(each, earlier)
 
 
 def _fail(message: str, code: int = BAD_INPUT) -> int:

@@ -10,15 +10,14 @@ from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
+from rich.console import RenderableType
 from rich.text import Text
 
 from dashcalib_ros.camera import Radial, camera_of
 from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
 from dashcalib_ros.cli.drive import calibrate, feed, open_drive, read_config, read_sensors
 from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
-from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, OutputError, counted
 from dashcalib_ros.input import FrameSource
@@ -52,13 +51,12 @@ def run(args: argparse.Namespace) -> int:
         with Stages(args.quiet) as stages:
             calibration = calibrate(source, config, mask, args.verbose, stages, motion)
         written = write_results(calibration, args.out, created=now())
-    warn((*calibration.warnings, *set_aside_lines(written)))
+    _warn(calibration, written)
     if args.json:
         write_stdout(result_json(calibration).rstrip('\n'))
     screen = Screen(args.quiet, to_stderr=bool(args.json))
-    screen.show(conclusion(calibration.verdict))
-    screen.show(summary(calibration))
-    screen.show(Text(files_line(args.out, written.files)))
+    screen.show(conclusion(calibration.verdict), summary(calibration),
+                _files(args.out, written.files))
     if args.write_bag is not None:
         _write_bag(args, str(source.topic), calibration, screen)
     screen.show(next_step(calibration.verdict))
@@ -86,17 +84,17 @@ def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration, s
                      f'{camera_info_topic(topic)}'))
 
 
-def files_line(folder: Path, files: Sequence[Path]) -> str:
+def _files(folder: Path, files: Sequence[Path]) -> Text:
     """Return a line that tells which files are in the output folder now."""
-    return f'written to {folder}: {", ".join(file.name for file in files)}'
+    return Text(f'written to {folder}: {", ".join(file.name for file in files)}')
 
 
-def set_aside_lines(written: Written) -> tuple[str, ...]:
-    """Return a warning if an earlier calibration was set aside."""
-    if written.set_aside is None:
-        return ()
-    old = written.set_aside.with_name(ACCEPTED_FILE)
-    return (f'the calibration that was in {old} is now {written.set_aside}',)
+def _warn(calibration: Calibration, written: Written) -> None:
+    """Print the calibration's warnings, and whether an earlier one was set aside."""
+    warn(calibration.warnings)
+    if written.set_aside is not None:
+        old = written.set_aside.with_name(ACCEPTED_FILE)
+        warn([f'the calibration that was in {old} is now {written.set_aside}'])
 
 
 def now() -> str:
@@ -117,15 +115,20 @@ def turns(args: argparse.Namespace) -> int:
     with Stages(args.quiet) as stages:
         frames = feed(detection, source, mask, stages)
     detection.finish()
-    found = [_row(turn) for turn in detection.turns()]
+    found = detection.turns()
     warn((*source.warnings, *detection.warnings()))
     if args.json:
         write_stdout(json.dumps(plain_values({
-            'input': source.name, 'frames': frames, 'turns': found,
+            'input': source.name, 'frames': frames,
+            'turns': [{'center': turn.center, 'first': turn.first, 'last': turn.last,
+                       'stamp': turn.stamp_s, 'prominence': turn.prominence,
+                       'images': turn.images} for turn in found],
             'warnings': (*source.warnings, *detection.warnings())}), indent=2, allow_nan=False))
         return ACCEPTED
     if found:
-        show(TextTable(COLUMNS, [_cells(row, detection.start_s) for row in found]))
+        show(TextTable(COLUMNS, [
+            (f'{turn.stamp_s - detection.start_s:.1f}', str(turn.center), str(turn.first),
+             str(turn.last), str(turn.images), f'{turn.prominence:.4f}') for turn in found]))
         show(Text(PROMINENCE))
     show(Text(_conclusion(len(found), config.turns.wanted, frames)))
     return ACCEPTED
@@ -136,16 +139,6 @@ def _conclusion(found: int, wanted: int, frames: int) -> str:
     if found:
         return f'{text}\nnext: dashcalib run, with the same INPUT'
     return f'{text}\nnext: record a drive with turns at crossings, in daylight'
-
-
-def _row(turn: Turn) -> dict[str, Any]:
-    return {'center': turn.center, 'first': turn.first, 'last': turn.last,
-            'stamp': turn.stamp_s, 'prominence': turn.prominence, 'images': turn.images}
-
-
-def _cells(row: dict[str, Any], start_s: float) -> tuple[str, ...]:
-    return (f'{row["stamp"] - start_s:.1f}', str(row['center']), str(row['first']),
-            str(row['last']), str(row['images']), f'{row["prominence"]:.4f}')
 
 
 def demo(args: argparse.Namespace) -> int:
@@ -165,19 +158,16 @@ def demo(args: argparse.Namespace) -> int:
         written = write_results(calibration, out, created=now(), truth=truth)
         values = {**drive.truth, 'width': size[0], 'height': size[1]}
         write_text(out / TRUTH, json.dumps(values, allow_nan=False) + '\n')
-    warn((*calibration.warnings, *set_aside_lines(written)))
+    _warn(calibration, written)
+    compared: list[RenderableType] = [Text('no estimate to compare with the truth')]
+    if calibration.camera is not None:
+        compared = [Text('\nagainst the truth'),
+                    against_truth(compare(calibrated_camera(calibration), truth))]
     files = [*written.files, out / TRUTH, *([out / 'bag'] if args.keep_bag else [])]
-    screen = Screen(args.quiet)
-    screen.show(conclusion(calibration.verdict))
-    screen.show(summary(calibration))
-    if calibration.camera is None:
-        screen.show(Text('no estimate to compare with the truth'))
-    else:
-        screen.show(Text('\nagainst the truth'))
-        screen.show(against_truth(compare(calibrated_camera(calibration), truth)))
-    screen.show(Text(files_line(out, files)))
-    screen.show(Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'))
-    screen.show(next_step(calibration.verdict))
+    Screen(args.quiet).show(
+        conclusion(calibration.verdict), summary(calibration), *compared, _files(out, files),
+        Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'),
+        next_step(calibration.verdict))
     return exit_code(calibration.verdict.level)
 
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterable
 from types import TracebackType
 
-from rich.console import Console, RenderableType
+from rich.console import Console, Group, RenderableType
 from rich.progress import (
     BarColumn,
     Progress,
@@ -51,12 +51,12 @@ class Screen:
     def __init__(self, quiet: bool, to_stderr: bool = False) -> None:
         self._quiet, self._to_stderr = quiet, to_stderr
 
-    def show(self, renderable: RenderableType) -> None:
-        """Print a part of the summary."""
+    def show(self, *renderables: RenderableType) -> None:
+        """Print parts of the summary."""
         if self._quiet:
             return
         try:
-            show(renderable, self._to_stderr)
+            show(Group(*renderables), self._to_stderr)
         except OutputError as error:
             self._quiet = True  # one warning is enough
             warn([str(error)])

@@ -12,7 +12,7 @@ import numpy as np
 
 from dashcalib_ros.errors import shortened
 from dashcalib_ros.fleet.tables import YEAR_S
-from dashcalib_ros.report.charts import Axes, dots, log_ticks, polyline, svg, text, ticks
+from dashcalib_ros.report.charts import Axes, log_ticks, strokes, svg, text, ticks
 from dashcalib_ros.report.files import REPORT
 from dashcalib_ros.report.page import template
 from dashcalib_ros.report.wording import optional
@@ -134,8 +134,7 @@ def _drift(cameras: Rows, clips: Rows) -> Section:
             middle, off = own_clips.mean(axis=0)
             ends = np.array([own_clips[:, 0].min(), own_clips[:, 0].max()])
             line = off + row['drift_percent_per_year'] * (ends - middle)
-            parts.append(polyline(np.column_stack([axes.across(ends), axes.down(line)]),
-                                  'all-turns'))
+            parts.append(strokes([axes.places(ends, line)], 'all-turns'))
     return Section(
         'Drift', ('camera', '% per year', 'sigma'),
         [(row['camera'], f'{row["drift_percent_per_year"]:+.2f}', f'{row["drift_sigma"]:.2f}')
@@ -155,9 +154,9 @@ def _dots(axes: Axes, found: Sequence[tuple[float, float, str]]) -> str:
     """Return (x, y, verdict) as dots, LISTED at the most, evenly chosen."""
     some = found[::-(-len(found) // LISTED)]
     return ''.join(
-        f'<g class="{verdict}">' + dots(np.column_stack([
-            axes.across(np.array([x for x, _, each in some if each == verdict], float)),
-            axes.down(np.array([y for _, y, each in some if each == verdict], float))]),
+        f'<g class="{verdict}">' + strokes(axes.places(
+            np.array([x for x, _, each in some if each == verdict], float),
+            np.array([y for _, y, each in some if each == verdict], float))[:, None],
             'dot all' if verdict else 'dot own') + '</g>'
         for verdict in sorted({each for _, _, each in some}))
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, Literal
@@ -21,6 +21,7 @@ PLOT_WIDTH, PLOT_HEIGHT = 900, 250  # px of the plot
 ROW, NUMBERS_APART = 16, 24  # px; of the turns' numbers, and how far apart two in one row must be
 MASK_WIDTH = 640  # px; enough for the details of a mask
 JPEG_QUALITY = 78
+MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,10 @@ class Axes:
         """Return where values lie from top to bottom, px."""
         share = _share(y, self.y, self.log_y)
         return self.height - self.bottom - share * (self.height - self.top - self.bottom)
+
+    def places(self, x: Floats, y: Floats) -> Floats:
+        """Return (n, 2) where points lie, px."""
+        return np.column_stack([self.across(x), self.down(y)])
 
     def frame(self, x_label: str, y_label: str, x_ticks: Sequence[float],
               y_ticks: Sequence[float]) -> str:
@@ -84,22 +89,42 @@ def line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
     return f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
 
 
-def polyline(xy: Floats, kind: str) -> str:
-    """Return a line through points (n, 2)."""
-    points = ' '.join(f'{x:.1f},{y:.1f}' for x, y in xy)
-    return f'<polyline class="{kind}" points="{points}"/>'
+def strokes(lines: Iterable[Floats], kind: str, more: str = '') -> str:
+    """Return one path of lines, each through points (n, 2); one of a single point is a dot.
+
+    more: attributes of the path.
+    """
+    return f'<path class="{kind}"{more} d="{outline(lines)}"/>'
 
 
-def dots(xy: Floats, kind: str) -> str:
-    """Return one path of round dots at points (n, 2), as large as its stroke is wide."""
-    return f'<path class="{kind}" d="{"".join(f"M{x:.1f} {y:.1f}h0" for x, y in xy)}"/>'
+def outline(lines: Iterable[Floats]) -> str:
+    """Return the d of such a path."""
+    return ''.join('M' + 'L'.join(f'{x:.1f} {y:.1f}' for x, y in points)
+                   + 'h0' * (len(points) == 1) for points in lines)
 
 
-def segments(starts: Floats, moves: Floats, kind: str) -> str:
-    """Return one path of separate lines from points (n, 2) by moves (n, 2)."""
-    parts = (f'M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}'
-             for (x, y), (dx, dy) in zip(starts, moves, strict=True))
-    return f'<path class="{kind}" d="{"".join(parts)}"/>'
+def arrows(starts: Floats, moves: Floats, kind: str) -> str:
+    """Return one path of lines from points (n, 2) by moves (n, 2)."""
+    return strokes(np.stack([starts, starts + moves], 1), kind)
+
+
+def picture(href: str, width: float, height: float, more: str = '') -> str:
+    """Return an image that fills a drawing of this size."""
+    return (f'<image href="{href}" width="{width:g}" height="{height:g}" '
+            f'preserveAspectRatio="none"{more}/>')
+
+
+def mask_over(mask_id: str | None, width: float, height: float) -> str:
+    """Return the page's mask over a drawing of this size; '' where there is none."""
+    return '' if mask_id is None else (
+        f'<svg width="{width:g}" height="{height:g}" viewBox="0 0 100 100" '
+        f'preserveAspectRatio="none"><use href="#{mask_id}"/></svg>')
+
+
+def magnification(moves: Floats, longest: float) -> int:
+    """Return how many times as long moves (n, 2) may be drawn, so that nine of ten fit."""
+    long = float(np.quantile(np.linalg.norm(moves, axis=1), 0.9)) if len(moves) else 0.0
+    return max((times for times in MAGNIFICATIONS if times * long <= longest), default=1)
 
 
 def ticks(low: float, high: float, wanted: int = 5) -> list[float]:
@@ -150,8 +175,7 @@ def magnitude_svg(magnitudes: Floats, turns: Sequence[TurnSummary],
     rows = _rows([x for _, _, x in marks])
     axes = Axes(PLOT_WIDTH, PLOT_HEIGHT + ROW * max(rows, default=0), ends, (0.0, peak),
                 top=40 + ROW * max(rows, default=0))
-    lines = ''.join(polyline(part, 'signal') for part in _pieces(
-        np.column_stack([axes.across(seconds), axes.down(magnitudes[:, 1])]), finite))
+    lines = strokes(_pieces(axes.places(seconds, magnitudes[:, 1]), finite), 'signal')
     found = ''.join(_mark(n, turn, x, row, axes)
                     for (n, turn, x), row in zip(marks, rows, strict=True))
     frame = axes.frame('s since the start', 'turning magnitude, of the picture’s width',

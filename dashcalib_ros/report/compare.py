@@ -120,12 +120,18 @@ def answers(found: Comparison) -> list[str]:
     whose = ' and '.join(side for side, camera in (('A', found.a), ('B', found.b))
                          if camera.sigma_px is not None)
     lines = list(answers_of(found.whole, whose))
-    if found.unseen and found.whole.apart is not None:
-        lines[0] += (f', without the {100 * found.unseen:.0f} % of the picture that the '
-                     f'{found.a.camera.model} model cannot see')
+    if found.whole.apart is not None:
+        lines[0] += unseen_text(found)
     if found.a.mount is not None and found.b.mount is not None:
         lines.append(mounts_text(found.a.mount, found.b.mount))
     return lines
+
+
+def unseen_text(found: Comparison) -> str:
+    """Return which part of the picture a distance leaves out, as an end of its sentence."""
+    return '' if not found.unseen else (
+        f', without the {100 * found.unseen:.0f} % of the picture that the '
+        f'{found.a.camera.model} model cannot see')
 
 
 def difference_row(d: Difference) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.report.camera_file import EQUIDISTANT, RATIONAL, TERMS
 from dashcalib_ros.report.result import camera_info_yaml
+from dashcalib_ros.report.splined import splined_lens
 
 # a resized picture's columns and rows may round differently by so much
 ROUNDING_PX = 1.0
@@ -34,7 +35,7 @@ def exported(camera: Camera, kind: str, field: Field | None = None) -> str | byt
 
     field: what the camera leaves over; WITH_FIELD has the kinds that can tell it, the others
     leave it out. Raises ConfigError for a kind that there is not, and for a lens that it cannot
-    describe.
+    describe, and OutputError for one that mrcal's spline cannot.
     """
     if kind not in EXPORTS:
         raise ConfigError(f'there is no export to {kind!r}; choose one of {", ".join(EXPORTS)}')
@@ -120,14 +121,19 @@ def _nerfstudio(camera: Camera) -> str:
         **_coefficients(camera, 5, 'nerfstudio'), 'frames': []}, indent=2) + '\n'
 
 
-def _mrcal(camera: Camera) -> str:
-    """Return mrcal's .cameramodel."""
-    if _is_fisheye(camera):
-        raise ConfigError('mrcal has no fisheye lens of four coefficients; export to opencv')
-    d = camera.ros_distortion()
-    values = ', '.join(repr(float(value)) for value in [*camera.params[:4], *d])
+def _mrcal(camera: Camera, field: Field | None = None) -> str:
+    """Return mrcal's .cameramodel: the splined one for a fisheye, which it has not, and a field.
+
+    field: what the camera leaves over.
+    """
+    if field is None and not _is_fisheye(camera):
+        d = camera.ros_distortion()
+        name, lens = f'LENSMODEL_OPENCV{len(d)}', np.array([*camera.params[:4], *d])
+    else:
+        name, lens = splined_lens(camera, field)
+    values = ', '.join(repr(float(value)) for value in lens)
     width, height = camera.image_size
-    return (f"{{\n    'lensmodel':  'LENSMODEL_OPENCV{len(d)}',\n"
+    return (f"{{\n    'lensmodel':  '{name}',\n"
             f"    'intrinsics': [ {values} ],\n"
             f"    'extrinsics': [ 0, 0, 0, 0, 0, 0 ],\n"
             f"    'imagersize': [ {width}, {height} ],\n}}\n")
@@ -195,5 +201,5 @@ EXPORTS: dict[str, Callable[[Camera], str | bytes]] = {
     'nerfstudio': _nerfstudio, 'mrcal': _mrcal, 'ros': camera_info_yaml, 'rays': rays_file,
     'maps': maps_file}
 # those that can tell a field
-WITH_FIELD: dict[str, Callable[[Camera, Field | None], bytes]] = {
-    'rays': rays_file, 'maps': maps_file}
+WITH_FIELD: dict[str, Callable[[Camera, Field | None], str | bytes]] = {
+    'mrcal': _mrcal, 'rays': rays_file, 'maps': maps_file}

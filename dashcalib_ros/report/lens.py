@@ -15,12 +15,15 @@ from dashcalib_ros.judge.calibration import Material, Mount
 from dashcalib_ros.reconstruct.scene import Profile, Scene, residuals_px
 from dashcalib_ros.report.charts import (
     Axes,
+    arrows,
     data_uri,
-    dots,
     line,
     log_ticks,
-    polyline,
-    segments,
+    magnification,
+    mask_over,
+    outline,
+    picture,
+    strokes,
     svg,
     text,
     ticks,
@@ -112,37 +115,88 @@ def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
 
 
 def _profile(c: Calibration, material: Material, scenes: list[Scene]) -> Drawing:
+    """Return the error that is left at each focal length held fixed, by turn and for all."""
     solution, fx = material.solution, None if c.camera is None else c.camera.fx
+    each = [scene.profile for scene in scenes]
     if solution is not None and c.camera is not None:
         # one kind of lens: the profiles of others mean something else
         family = c.camera.family
-        each = [scene.starts[family].profile for scene in scenes if family in scene.starts]
-    else:
-        each = [scene.profile for scene in scenes]
-    each = [profile for profile in each if len(profile.ratios)]
-    if not each:
-        each = [scene.profile for scene in scenes]
-    total = None if solution is None else solution.coarse
-    caption = ('Each turn (thin) and all together (thick) were explained with the focal length '
-               'held fixed. A clear minimum means that the turns know it; a flat line means that '
-               'they do not.')
-    return Drawing('Focal profile', profile_svg(each, total, c.image_size[0], fx), caption)
+        own = [scene.starts[family].profile for scene in scenes if family in scene.starts]
+        each = [profile for profile in own if len(profile.ratios)] or each
+    width_px = c.image_size[0]
+    ratios = np.concatenate([profile.ratios for profile in each])
+    ends = float(ratios.min() * width_px), float(ratios.max() * width_px)
+    if fx is not None:
+        ends = min(ends[0], fx / 1.05), max(ends[1], fx * 1.05)
+    highest = max(float(profile.costs.max(initial=0.0)) for profile in each)
+    axes = Axes(WIDTH, 220, ends, (0.0, 1.08 * highest), log_x=True)
+
+    def curves(profiles: Sequence[Profile], kind: str) -> str:
+        return strokes((axes.places(profile.ratios * width_px, profile.costs)
+                        for profile in profiles), kind)
+
+    content = axes.frame('focal length, px', 'error left, px² per observation', log_ticks(*ends),
+                         ticks(0.0, axes.y[1], 4)) + curves(each, 'one-turn')
+    if solution is not None:
+        content += curves([solution.coarse], 'all-turns')
+    if fx is not None:
+        x = float(axes.across(fx))
+        content += line(x, axes.top, x, axes.height - axes.bottom, 'joint')
+    return Drawing(
+        'Focal profile', svg(WIDTH, axes.height, 'focal profile', content),
+        'Each turn (thin) and all together (thick) were explained with the focal length held '
+        'fixed. A clear minimum means that the turns know it; a flat line means that they do not.')
 
 
 def _growth(c: Calibration, solution: Solution, px: float) -> list[Drawing]:
+    """Return the sigma of fx, in %, with the first turn, with two of them, and so on."""
     assert c.camera is not None
     percent = [100 * sigma * px / c.camera.fx for sigma in sigma_by_count(solution)]
     if not np.isfinite(percent).all() or not percent:
         return []
-    return [Drawing('Uncertainty against number of turns', growth_svg(percent),
+    low, high = min(percent) / 1.5, max(percent) * 2
+    count = len(percent)
+    axes = Axes(WIDTH, 220, (0.5, count + 0.5), (low, high), log_y=True)
+    where = axes.places(np.arange(1.0, count + 1), np.array(percent))
+    content = axes.frame('turns', 'sigma of fx, %', list(range(1, count + 1)),
+                         log_ticks(low, high))
+    if count > 2:
+        # one turn does not show how much turns differ
+        content += strokes([where[1:]], 'all-turns')
+    content += (strokes(where[:1, None], 'dot other') + strokes(where[1:, None], 'dot own')
+                + ''.join(text(x, y - 9, f'{value:.2g}', 'mid strong halo')
+                          for (x, y), value in zip(where, percent, strict=True)))
+    return [Drawing('Uncertainty against number of turns',
+                    svg(WIDTH, axes.height, 'sigma of fx over the number of turns', content),
                     'The most prominent turn first. One turn (grey) does not show how much turns '
                     'differ; that comes in with the second, and few turns know it badly.')]
 
 
 def _residuals(xy: Floats, residual: Floats, size: tuple[int, int], px: float) -> Drawing:
-    drawn, magnified = residual_svg(xy, residual, size)
+    """Return the residuals over the picture: each cell's root mean square and mean.
+
+    size: (width, height) of the scenes' images. px: of the input, in one of theirs.
+    """
+    cell, (rows, columns) = _cells(xy, size)
+    count = np.bincount(cell, minlength=rows * columns)
+    squares, *sums = (np.bincount(cell, each, len(count))
+                      for each in (np.sum(residual**2, axis=1), *residual.T))
+    mean = np.stack(sums, 1) / np.maximum(count, 1)[:, None]
+    rms = np.sqrt(squares / np.maximum(count, 1))
+    enough = count >= FEWEST
+    height = _height(size)
+    top = float(np.quantile(rms[enough], 0.95)) if enough.any() else 1.0
+    shown = np.where(enough, np.minimum(rms / max(top, 1e-12), 1.0) * 0.75, np.nan)
+    row, column = np.divmod(np.flatnonzero(enough), columns)
+    centres = np.column_stack([(column + 0.5) * WIDTH / columns, (row + 0.5) * height / rows])
+    moves = mean[enough] * WIDTH / size[0]
+    magnified = magnification(moves, 0.8 * WIDTH / CELLS)
+    content = (_heat(shown.reshape(rows, columns), WIDTH, height)
+               + arrows(centres, magnified * moves, 'arrow')
+               + strokes(centres[:, None], 'arrow-foot'))
     half = np.median(np.linalg.norm(residual, axis=1)) * px
-    return Drawing('Residuals over the picture', drawn,
+    return Drawing('Residuals over the picture',
+                   svg(WIDTH, height, 'residuals over the picture', content, 'plot map'),
                    f'Half of the {len(residual):,} are below {half:.2f} px. Arrows: mean residual '
                    f'of a cell, {magnified} times as long as it is; tint: how much residuals '
                    'scatter there. Arrows that point the same way over a large part of the '
@@ -150,10 +204,18 @@ def _residuals(xy: Floats, residual: Floats, size: tuple[int, int], px: float) -
 
 
 def _coverage(xy: Floats, size: tuple[int, int], mask_id: str | None) -> Drawing:
-    drawn, empty = coverage_svg(xy, size, mask_id)
-    caption = f'Where points were observed. {100 * empty:.0f} % of the picture has none'
-    return Drawing('Coverage', drawn, caption + (
-        '; what is tinted moves with the car and is not used.' if mask_id else '.'))
+    """Return how many observations each part of the picture has."""
+    cell, shape = _cells(xy, size)
+    count = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
+    height = _height(size)
+    shown = np.sqrt(count.astype(np.float64) / max(int(count.max()), 1))
+    content = (_heat(np.where(count > 0, shown, np.nan), WIDTH, height)
+               + mask_over(mask_id, WIDTH, height))
+    masked = '; what is tinted moves with the car and is not used' if mask_id else ''
+    return Drawing('Coverage',
+                   svg(WIDTH, height, 'observations over the picture', content, 'plot map'),
+                   f'Where points were observed. {100 * float(np.mean(count == 0)):.0f} % of the '
+                   f'picture has none{masked}.')
 
 
 def sigma_svg(found: SigmaMap, size: tuple[int, int], px: float,
@@ -197,90 +259,6 @@ def observations_of(scenes: Sequence[Scene], camera: Camera | None) -> tuple[Flo
     return xy[known], residual[known]
 
 
-def residual_svg(xy: Floats, residual: Floats, size: tuple[int, int]) -> tuple[str, int]:
-    """Return the residuals over the picture, and by how much the arrows are magnified.
-
-    The tint is their root mean square in each cell, the arrow their mean. size: (width, height) of
-    the scenes' images.
-    """
-    cell, shape = _cells(xy, size)
-    count = np.bincount(cell, minlength=shape[0] * shape[1])
-    squares = np.bincount(cell, np.sum(residual**2, axis=1), len(count))
-    rms = np.sqrt(squares / np.maximum(count, 1))
-    sums = np.stack([np.bincount(cell, residual[:, n], len(count)) for n in (0, 1)], 1)
-    mean = sums / np.maximum(count, 1)[:, None]
-    enough = count >= FEWEST
-    height = _height(size)
-    top = float(np.quantile(rms[enough], 0.95)) if enough.any() else 1.0
-    shown = np.where(enough, np.minimum(rms / max(top, 1e-12), 1.0) * 0.75, np.nan)
-    row, column = np.divmod(np.flatnonzero(enough), shape[1])
-    centres = np.column_stack([(column + 0.5) * WIDTH / shape[1], (row + 0.5) * height / shape[0]])
-    lengths = np.linalg.norm(mean[enough], axis=1)
-    long = float(np.quantile(lengths, 0.9)) if len(lengths) else 0.0
-    magnified = next((m for m in (500, 200, 100, 50, 20, 10, 5, 2)
-                      if m * long * WIDTH / size[0] <= 0.8 * WIDTH / CELLS), 1)
-    arrows = segments(centres, magnified * mean[enough] * WIDTH / size[0], 'arrow')
-    content = _heat(shown.reshape(shape), WIDTH, height) + arrows + dots(centres, 'arrow-foot')
-    return svg(WIDTH, height, 'residuals over the picture', content, 'plot map'), magnified
-
-
-def coverage_svg(xy: Floats, size: tuple[int, int], mask_id: str | None) -> tuple[str, float]:
-    """Return how many observations each part of the picture has, and the share that has none."""
-    cell, shape = _cells(xy, size)
-    count = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
-    height = _height(size)
-    shown = np.sqrt(count.astype(np.float64) / max(int(count.max()), 1))
-    content = _heat(np.where(count > 0, shown, np.nan), WIDTH, height)
-    if mask_id is not None:
-        content += (f'<svg width="{WIDTH}" height="{height}" viewBox="0 0 100 100" '
-                    f'preserveAspectRatio="none"><use href="#{mask_id}"/></svg>')
-    return (svg(WIDTH, height, 'observations over the picture', content, 'plot map'),
-            float(np.mean(count == 0)))
-
-
-def profile_svg(each: Sequence[Profile], total: Profile | None, width_px: float,
-                fx: float | None) -> str:
-    """Return the error that is left at each focal length held fixed, by turn and for all.
-
-    width_px: of the input's pictures. fx: the result, px of the input.
-    """
-    ratios = np.concatenate([profile.ratios for profile in each])
-    costs = np.concatenate([profile.costs for profile in each])
-    ends = float(ratios.min() * width_px), float(ratios.max() * width_px)
-    if fx is not None:
-        ends = min(ends[0], fx / 1.05), max(ends[1], fx * 1.05)
-    axes = Axes(WIDTH, 220, ends, (0.0, 1.08 * float(costs.max())), log_x=True)
-
-    def curve(profile: Profile, kind: str) -> str:
-        return polyline(np.column_stack([axes.across(profile.ratios * width_px),
-                                         axes.down(profile.costs)]), kind)
-
-    frame = axes.frame('focal length, px', 'error left, px² per observation', log_ticks(*ends),
-                       ticks(0.0, axes.y[1], 4))
-    content = frame + ''.join(curve(profile, 'one-turn') for profile in each)
-    if total is not None:
-        content += curve(total, 'all-turns')
-    if fx is not None:
-        x = float(axes.across(fx))
-        content += line(x, axes.top, x, axes.height - axes.bottom, 'joint')
-    return svg(WIDTH, axes.height, 'focal profile', content)
-
-
-def growth_svg(percent: Sequence[float]) -> str:
-    """Return the sigma of fx, in %, with the first turn, with two of them, and so on."""
-    low, high = min(percent) / 1.5, max(percent) * 2
-    count = len(percent)
-    axes = Axes(WIDTH, 220, (0.5, count + 0.5), (low, high), log_y=True)
-    where = np.column_stack([axes.across(np.arange(1.0, count + 1)), axes.down(np.array(percent))])
-    frame = axes.frame('turns', 'sigma of fx, %', list(range(1, count + 1)), log_ticks(low, high))
-    labels = ''.join(text(x, y - 9, f'{value:.2g}', 'mid strong halo')
-                     for (x, y), value in zip(where, percent, strict=True))
-    # one turn does not show how much turns differ
-    drawn = polyline(where[1:], 'all-turns') if count > 2 else ''
-    return svg(WIDTH, axes.height, 'sigma of fx over the number of turns',
-               frame + drawn + dots(where[:1], 'dot other') + dots(where[1:], 'dot own') + labels)
-
-
 def undistorted(image: Pixels, camera: Camera, rectified: str
                 ) -> tuple[Pixels, str, str, float]:
     """Return an image without distortion, and a grid over it and over the original.
@@ -308,8 +286,9 @@ def undistorted(image: Pixels, camera: Camera, rectified: str
         plain = rays[:, :2] / rays[:, 2:] * camera.params[:2] + camera.params[2:4]
         moved = np.linalg.norm(plain - places, axis=1)[rays[:, 2] > np.cos(WIDEST)]
     most = float(moved.max(initial=0.0))
-    ends = [each[[0, -1]] for each in lines]
-    return np.asarray(straight, np.uint8), _path(bent), _path(ends), most
+    seen = [xy[np.abs(xy).max(axis=1) < 1e5] for xy in bent]
+    return (np.asarray(straight, np.uint8), outline(xy for xy in seen if len(xy) > 1),
+            outline(each[[0, -1]] for each in lines), most)
 
 
 def _seen_at(pixels: Floats, matrix: Floats, camera: Camera) -> Floats:
@@ -317,15 +296,6 @@ def _seen_at(pixels: Floats, matrix: Floats, camera: Camera) -> Floats:
     rays = np.concatenate([(pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]],
                            np.ones((*pixels.shape[:-1], 1))], axis=-1)
     return np.asarray(np.nan_to_num(camera.project(rays), nan=-1e6))
-
-
-def _path(lines: Sequence[Floats]) -> str:
-    parts = []
-    for xy in lines:
-        known = xy[np.abs(xy).max(axis=1) < 1e5]
-        if len(known) > 1:
-            parts.append('M' + 'L'.join(f'{x:.1f} {y:.1f}' for x, y in known))
-    return ''.join(parts)
 
 
 def _heat(share: Floats, width: float, height: float) -> str:
@@ -337,9 +307,7 @@ def _heat(share: Floats, width: float, height: float) -> str:
     colour = RAMP[below] * (1 - part) + RAMP[below + 1] * part
     image = np.dstack([colour, np.where(known, 255, 0)]).round().astype(np.uint8)
     smooth = '' if share.shape[1] > 40 else ' style="image-rendering:pixelated"'
-    href = data_uri(image, 'png')
-    return (f'<image href="{href}" width="{width:g}" height="{height:g}" '
-            f'preserveAspectRatio="none"{smooth}/>')
+    return picture(data_uri(image, 'png'), width, height, smooth)
 
 
 def _cells(xy: Floats, size: tuple[int, int]) -> tuple[Ints, tuple[int, int]]:
@@ -392,22 +360,22 @@ def field_of(c: Calibration) -> list[Drawing]:
     moves = c.field.field.displacement(pixels)
     longest = max(float(np.linalg.norm(moves, axis=1).max()), np.finfo(float).tiny)
     small = WIDTH / width
-    arrows = segments(pixels * small, moves * small * cell / longest, 'arrow')
+    drawn = arrows(pixels * small, moves * small * cell / longest, 'arrow')
     return [Drawing(
-        'The field', svg(WIDTH, height * small, 'displacements over the picture', arrows, 'map'),
+        'The field', svg(WIDTH, height * small, 'displacements over the picture', drawn, 'map'),
         f'What the lens model leaves over, as a windscreen does: {c.field.rms_px:.2f} px RMS, '
         f'{c.field.worst_px:.2f} px at the worst. The longest arrow is {longest:.2f} px.')]
 
 
-def _car(outline: np.ndarray, camera: tuple[float, float], turned_deg: float, label: str) -> str:
+def _car(side: Floats, camera: tuple[float, float], turned_deg: float, label: str) -> str:
     """Return a car that drives to the right; turned_deg: of the camera's axis, clockwise."""
     angle = np.radians(ENLARGED * turned_deg)
     end = np.array(camera) + AXIS * np.array([np.cos(angle), np.sin(angle)])
     return svg(WIDTH, HEIGHT, f'the car {label}', ''.join([
-        polyline(outline, 'camera'),
+        strokes([side], 'camera'),
         line(*camera, camera[0] + AXIS, camera[1], 'unused'),
         line(*camera, float(end[0]), float(end[1]), 'all-turns'),
-        dots(np.array([camera]), 'dot all'),
+        strokes([np.array([camera])], 'dot all'),
         text(20, HEIGHT - 8, 'dashed: direction of travel')]))
 
 
@@ -423,12 +391,10 @@ def _horizon(c: Calibration, mount: Mount, camera: Camera) -> Drawing:
     small = WIDTH / width
     pictures = {} if c.material is None else c.material.pictures
     shown = next((pictures[turn.id].image for turn in c.turns if turn.id in pictures), None)
-    below = '' if shown is None else (
-        f'<image href="{data_uri(shown)}" width="{WIDTH}" height="{height * small:g}" '
-        f'preserveAspectRatio="none"/>')
+    below = '' if shown is None else picture(data_uri(shown), WIDTH, height * small)
     u, v = small * mount.travel_px[0], small * mount.travel_px[1]
-    marks = ''.join([polyline(small * seen[inside], 'ruler') if inside.sum() > 1 else '',
-                     line(u - 9, v, u + 9, v, 'residual'), line(u, v - 9, u, v + 9, 'residual')])
+    marks = (strokes([small * seen[inside]], 'ruler') + line(u - 9, v, u + 9, v, 'residual')
+             + line(u, v - 9, u, v + 9, 'residual'))
     return Drawing('In the picture',
                    svg(WIDTH, height * small, 'horizon and point of travel', below + marks, 'map'),
                    f'The horizon of a flat road, and the pixel towards which the car travels: '

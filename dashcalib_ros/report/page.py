@@ -15,7 +15,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.report.camera_file import calibrated_camera
-from dashcalib_ros.report.charts import magnitude_svg, mask_data_uri, segments
+from dashcalib_ros.report.charts import arrows, magnitude_svg, mask_data_uri
 from dashcalib_ros.report.compare import Comparison, answers, compare, comparison_rows
 from dashcalib_ros.report.lens import (
     WIDTH,
@@ -149,9 +149,9 @@ def _maps(found: Comparison) -> list[Drawing]:
     apart, lengths = whole.apart, whole.apart.lengths
     scale = LONGEST / max(float(lengths.max()), 1e-12)
     # every other one: a chessboard of them is dense enough
-    arrows = segments(apart.pixels[::2] * WIDTH / size[0], scale * apart.offsets[::2], 'arrow')
+    drawn = arrows(apart.pixels[::2] * WIDTH / size[0], scale * apart.offsets[::2], 'arrow')
     maps = [Drawing('Pixels apart', sigma_svg(SigmaMap(apart.pixels, lengths), size, 1.0,
-                                              'pixels apart over the picture', arrows),
+                                              'pixels apart over the picture', drawn),
                     f'How far A sees a ray from where B sees it, px, the best common rotation '
                     f'removed: {apart.rms:.2f} px over the picture (RMS), {apart.worst:.2f} px at '
                     f'the worst. Arrows: from B to A, {scale * size[0] / WIDTH:.3g} times as long '

@@ -117,15 +117,13 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
 
 def calibration_of(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
     """Return the calibration that result_dict() gave these values."""
-    def made(kind: type[Any], key: str) -> Any:
-        return None if data.get(key) is None else kind(**data[key])
+    def made(kind: type[Any], values: Mapping[str, Any] | None, **more: Any) -> Any:
+        return None if values is None else kind(**more, **{
+            ('stamp_s' if key == 'stamp' else key): _frozen(item) for key, item in values.items()})
 
     known = Config().flat()
     config = Config().replace({name: value for name, value in data.get('config', {}).items()
                                if name in known})
-    stored = [StoredTurnSummary(id=TurnId.stored(place), stamp_s=turn['stamp'],
-                                **{key: turn[key] for key in turn if key != 'stamp'})
-              for place, turn in enumerate(data.get('stored_turns', ()))]
     held_out = [LeftOut(
         TurnId.stored(place) if turn['center'] is None else TurnId.at(turn['center']),
         turn['px'], turn['sigma_px'], turn['others_sigma_px'])
@@ -137,31 +135,29 @@ def calibration_of(data: Mapping[str, Any], camera: Camera | None) -> Calibratio
         image_size=size, camera=camera,
         sigma=None if sigma is None else {name: math.nan if value is None else float(value)
                                           for name, value in sigma.items()},
-        turns=tuple(TurnSummary(stamp_s=turn['stamp'],
-                                **{key: turn[key] for key in turn if key != 'stamp'})
-                    for turn in data.get('turns', ())),
+        turns=tuple(made(TurnSummary, turn) for turn in data.get('turns', ())),
         frames=data.get('frames', 0), reprojection_error_px=data.get('reprojection_error_px'),
         timing=dict(data.get('timing', {})), versions=dict(data.get('versions', {})),
         config=config.replace({'seed': data.get('seed', config.seed)}),
         input_name=data.get('input', ''), warnings=tuple(data.get('warnings', ())),
-        details=dict(data.get('details', {})), stored_turns=tuple(stored),
-        rolling_shutter=made(Shutter, 'rolling_shutter'),
-        sigma_px=made(PictureSigma, 'sigma_px'), stabiliser=made(Stabiliser, 'stabiliser'),
+        details=dict(data.get('details', {})), stored_turns=tuple(
+            made(StoredTurnSummary, turn, id=TurnId.stored(place))
+            for place, turn in enumerate(data.get('stored_turns', ()))),
+        rolling_shutter=made(Shutter, data.get('rolling_shutter')),
+        sigma_px=made(PictureSigma, data.get('sigma_px')),
+        stabiliser=made(Stabiliser, data.get('stabiliser')),
         field=None if field is None else LensField(
             Field(size, np.array(field['coefficients'], np.float64)), bool(field['used']),
             field['rms_px'], field['worst_px'], field['sigma_px']),
         mount=read_mount(data.get('mount')),
-        held_out=tuple(held_out), straight_lines=made(Bend, 'straight_lines'),
-        witnesses=_witnesses(data.get('witnesses') or {}))
+        held_out=tuple(held_out), straight_lines=made(Bend, data.get('straight_lines')),
+        witnesses=Witnesses(**{name: made(Witness, said) for name, said
+                               in (data.get('witnesses') or {}).items()}))
 
 
-def _witnesses(data: Mapping[str, Any]) -> Witnesses:
-    """Return the witnesses that result_dict() gave these values; lists are tuples again."""
-    def frozen(value: Any) -> Any:
-        return tuple(map(frozen, value)) if isinstance(value, list) else value
-    return Witnesses(**{
-        name: Witness(**{key: frozen(value) for key, value in said.items()})
-        for name, said in data.items() if said is not None})
+def _frozen(value: Any) -> Any:
+    """Return the value with tuples for its lists."""
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
 def plain_values(value: Any) -> Any:

@@ -14,16 +14,20 @@ from rich.text import Text
 
 from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
-from dashcalib_ros.report.compare import Comparison, answers, comparison_rows, difference_row
+from dashcalib_ros.report.compare import (
+    Comparison,
+    answers,
+    comparison_rows,
+    difference_row,
+    unseen_text,
+)
 from dashcalib_ros.report.wording import (
     lines_text,
     mount_text,
     number,
     optional,
     parameter_rows,
-    picture_text,
-    shutter_text,
-    stabiliser_text,
+    removed_effects,
     stored_text,
     witness_texts,
 )
@@ -96,18 +100,10 @@ def against_truth(found: Comparison) -> RenderableType:
              '-' if d.sigma is None else '± ' + number(d.name, d.sigma), number(d.name, d.b),
              *difference_row(d)[-2:]) for d in found.differences]
     head = ('', 'estimate', 'sigma', 'truth', 'error', 'in sigmas')
-    return Group(TextTable(head, rows), mapping_text(found))
-
-
-def mapping_text(found: Comparison) -> Text:
-    """Return the line with the mapping error."""
-    if found.mapping_px is None or not math.isfinite(found.mapping_px):
-        return Text('mapping error: unknown, a lens model folds over inside the image')
-    text = f'mapping error: {found.mapping_px:.2f} px'
-    if found.unseen:
-        text += (f', without the {100 * found.unseen:.0f} % of the picture that the '
-                 f'{found.a.camera.model} model cannot see')
-    return Text(text)
+    known = found.mapping_px is not None and math.isfinite(found.mapping_px)
+    mapping = (f'{found.mapping_px:.2f} px{unseen_text(found)}' if known else
+               'unknown, a lens model folds over inside the image')
+    return Group(TextTable(head, rows), Text(f'mapping error: {mapping}'))
 
 
 class TextTable:
@@ -150,11 +146,9 @@ def _facts(c: Calibration) -> str:
     if c.reprojection_error_px is not None:
         facts.append('reprojection error ' + optional(c.reprojection_error_px, 3, ' px'))
     if c.sigma_px is not None:
-        facts.append('sigma ' + picture_text(c.sigma_px))
-    if c.rolling_shutter is not None:
-        facts.append(shutter_text(c.rolling_shutter))
-    if c.stabiliser is not None:
-        facts.append(stabiliser_text(c.stabiliser))
+        facts.append(f'sigma {c.sigma_px.rms:.2f} px over the picture, {c.sigma_px.worst:.2f} px '
+                     'at the worst')
+    facts += [text for _, text in removed_effects(c)]
     if c.straight_lines is not None:
         facts.append(lines_text(c.straight_lines))
     if c.mask is not None:

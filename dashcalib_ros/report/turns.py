@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.detect.turn import TurnId
@@ -14,14 +14,24 @@ from dashcalib_ros.judge import Calibration, TurnSummary
 from dashcalib_ros.judge.agreement import focal_alone, leverages
 from dashcalib_ros.judge.calibration import Material, StoredTurnSummary
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, residuals_px
-from dashcalib_ros.report.charts import data_uri, dots, line, segments, svg, text
+from dashcalib_ros.report.charts import (
+    Axes,
+    arrows,
+    data_uri,
+    line,
+    magnification,
+    mask_over,
+    picture,
+    strokes,
+    svg,
+    text,
+)
 from dashcalib_ros.report.wording import optional, since_start
 
 # keyframes before and after the picture whose observations are drawn as a track
 TRAIL = 4
 # px of the drawing; a residual that only one of ten exceeds is drawn about so long
 ARROW = 9.0
-MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 # px; of the view in space, its margin, and how long its cameras are
 VIEW, MARGIN, CAMERA = (440, 270), 8, 13.0
 # degrees, as in script.js; 90 is from above
@@ -84,15 +94,6 @@ def _fx_alone(c: Calibration, with_field: bool = True) -> dict[TurnId, tuple[flo
     return alone if np.isfinite(list(alone.values())).all() else {}
 
 
-def focal_by_turn(c: Calibration) -> str:
-    """Return the plot of what all turns say of fx, '' where there is none."""
-    alone = _fx_alone(c)
-    if not alone or c.camera is None or c.sigma is None:
-        return ''
-    return estimates_svg([(f'turn {name}', *alone[turn]) for turn, name in names(c).items()
-                          if turn in alone], (c.camera.fx, c.sigma['fx']))
-
-
 def names(c: Calibration) -> dict[TurnId, str]:
     """Return the turns' short names: numbers in the order of time, s1, s2 for stored ones."""
     own = {turn.id: str(n) for n, turn in enumerate(c.turns, 1)}
@@ -101,19 +102,14 @@ def names(c: Calibration) -> dict[TurnId, str]:
 
 def _section(turn: AnySummary, c: Calibration, material: Material,
              alone: str, mask_id: str | None) -> TurnSection:
-    scene, picture = material.scenes.get(turn.id), material.pictures.get(turn.id)
-    camera = None
-    if scene is not None and turn.used and material.solution is not None:
-        camera = material.solution.camera
-    drawn, magnified = ('', 0)
-    if picture is not None:
-        drawn, magnified = picture_svg(picture, scene, camera, mask_id)
+    scene, shown = material.scenes.get(turn.id), material.pictures.get(turn.id)
+    camera = material.solution.camera if turn.used and material.solution is not None else None
+    drawn, magnified = ('', 0) if shown is None else picture_svg(shown, scene, camera, mask_id)
     kind = 'Stored turn' if isinstance(turn, StoredTurnSummary) else 'Turn'
+    frame = None if shown is None else shown.frame
     return TurnSection(
         f'{kind} {names(c)[turn.id]}', _facts(turn, scene, c), turn.used, turn.unused_because,
-        drawn, None if picture is None else picture.frame, magnified,
-        '' if scene is None else view_svg(scene, None if picture is None else picture.frame),
-        alone)
+        drawn, frame, magnified, '' if scene is None else view_svg(scene, frame), alone)
 
 
 def _facts(turn: AnySummary, scene: Scene | None, c: Calibration) -> tuple[str, ...]:
@@ -154,50 +150,29 @@ def turn_rows(c: Calibration) -> list[dict[str, str]]:
     return rows
 
 
-def picture_svg(picture: TurnPicture, scene: Scene | None, camera: Camera | None,
+def picture_svg(shown: TurnPicture, scene: Scene | None, camera: Camera | None,
                 mask_id: str | None) -> tuple[str, int]:
     """Return a turn's picture with its tracks and residuals, and how much these are magnified.
 
     camera: of the scene's images. mask_id: of an element of the page that is the mask.
     """
-    height, width = picture.image.shape[:2]
-    parts = [f'<image href="{data_uri(picture.image)}" width="{width}" height="{height}"/>']
-    if mask_id is not None:
-        parts.append(f'<svg width="{width}" height="{height}" viewBox="0 0 100 100" '
-                     f'preserveAspectRatio="none"><use href="#{mask_id}"/></svg>')
+    height, width = shown.image.shape[:2]
+    drawn = picture(data_uri(shown.image), width, height) + mask_over(mask_id, width, height)
     magnified = 0
     if scene is not None:
-        drawn, magnified = _observations(picture, scene, camera or scene.camera)
-        parts.append(drawn)
-    return svg(width, height, 'a picture of the turn', ''.join(parts), 'picture'), magnified
-
-
-def _observations(picture: TurnPicture, scene: Scene, camera: Camera) -> tuple[str, int]:
-    [at] = np.flatnonzero(scene.tracks.frames == picture.frame)[:1] or [0]
-    px = picture.image.shape[1] / scene.tracks.image_size[0]
-    xy = resized_pixels(scene.tracks.xy, px)
-    used = scene.structure.used
-    trails = [xy[max(at - TRAIL, 0):at + TRAIL + 1, n][used[max(at - TRAIL, 0):at + TRAIL + 1, n]]
-              for n in np.flatnonzero(used[at])]
-    here = xy[at, used[at]]
-    residual = residuals_px(scene, camera)[at, used[at]] * px
-    residual = np.where(np.isfinite(residual), residual, 0.0)
-    long = float(np.quantile(np.linalg.norm(residual, axis=1), 0.9)) if len(residual) else 0.0
-    magnified = max((m for m in MAGNIFICATIONS if m * long <= ARROW), default=1)
-    return (_trails(trails) + dots(here, 'seen')
-            + segments(here, magnified * residual, 'residual')), magnified
-
-
-def _trails(trails: list[Floats]) -> str:
-    """Return one path through all tracks (n, 2)."""
-    parts = []
-    for xy in trails:
-        if len(xy) < 2:
-            continue
-        steps = np.diff(np.round(xy, 1), axis=0)
-        parts.append(f'M{xy[0, 0]:.1f} {xy[0, 1]:.1f}l'
-                     + ' '.join(f'{dx:.1f} {dy:.1f}' for dx, dy in steps))
-    return f'<path class="track" d="{"".join(parts)}"/>'
+        [at] = np.flatnonzero(scene.tracks.frames == shown.frame)[:1] or [0]
+        px = width / scene.tracks.image_size[0]
+        xy = resized_pixels(scene.tracks.xy, px)
+        used = scene.structure.used
+        near = slice(max(at - TRAIL, 0), at + TRAIL + 1)
+        here = xy[at, used[at]]
+        residual = np.nan_to_num(
+            residuals_px(scene, camera or scene.camera)[at, used[at]] * px, posinf=0, neginf=0)
+        magnified = magnification(residual, ARROW)
+        drawn += (strokes((xy[near, n][used[near, n]] for n in np.flatnonzero(used[at])), 'track')
+                  + strokes(here[:, None], 'seen')
+                  + arrows(here, magnified * residual, 'residual'))
+    return svg(width, height, 'a picture of the turn', drawn, 'picture'), magnified
 
 
 def view_svg(scene: Scene, frame: int | None = None) -> str:
@@ -215,7 +190,8 @@ def view_svg(scene: Scene, frame: int | None = None) -> str:
     path = centres @ axes
     points = structure.points[structure.used.any(axis=0)] @ axes
     reach = 2.0 * max(float(np.ptp(path[:, :2], axis=0).max()), 1e-9)
-    points = points[_inside(points, path.min(axis=0) - reach, path.max(axis=0) + reach)][:POINTS]
+    near = (points >= path.min(axis=0) - reach) & (points <= path.max(axis=0) + reach)
+    points = points[near.all(axis=1)][:POINTS]
     # all of the path is seen, and most of the points
     most = np.quantile(points, (0.12, 0.88), axis=0) if len(points) else path
     low, high = np.minimum(path, most[0]).min(axis=0), np.maximum(path, most[-1]).max(axis=0)
@@ -230,12 +206,9 @@ def view_svg(scene: Scene, frame: int | None = None) -> str:
     def part(xyz: Floats, kind: str) -> str:
         """Return a path of strokes (n, points of each, 3)."""
         placed = (xyz - (low + high) / 2) * scale
-        shown = np.array(VIEW) / 2 + _seen(placed)
-        run = xyz.shape[1]
-        strokes = ''.join('M' + 'L'.join(f'{u:.1f} {v:.1f}' for u, v in stroke) + 'h0' * (run == 1)
-                          for stroke in shown)
         flat = ' '.join(f'{value:.1f}' for value in placed.ravel())
-        return f'<path class="{kind}" data-run="{run}" data-xyz="{flat}" d="{strokes}"/>'
+        return strokes(np.array(VIEW) / 2 + _seen(placed), kind,
+                       f' data-run="{xyz.shape[1]}" data-xyz="{flat}"')
 
     drawn = (part(points[:, None], 'point') + part(path[None], 'path')
              + part(cameras @ axes, 'camera') + part(path[:1, None], 'start'))
@@ -260,10 +233,6 @@ def _axes(rotations: Floats) -> Floats:
     return np.column_stack([np.cross(down, ahead), ahead, -down])
 
 
-def _inside(points: Floats, low: Floats, high: Floats) -> Mask:
-    return np.asarray(((points >= low) & (points <= high)).all(axis=1))
-
-
 def direction(scene: Scene) -> str:
     """Return where the turn goes: 'to the right', 'to the left', or 'one way and back'."""
     yaws = scene.yaws_deg
@@ -273,42 +242,43 @@ def direction(scene: Scene) -> str:
     return 'to the right' if net > 0 else 'to the left'
 
 
-def estimates_svg(rows: list[tuple[str, float, float]], joint: tuple[float, float]) -> str:
-    """Return what each turn says of fx, beside the result of all.
-
-    rows: a name, fx and its sigma, px. joint: fx and its sigma.
-    """
-    width, row, left, right, top = 440, 21, 62, 122, 8
+def focal_by_turn(c: Calibration) -> str:
+    """Return what each turn says of fx, beside the result of all; '' where there is nothing."""
+    alone = _fx_alone(c)
+    if not alone or c.camera is None or c.sigma is None:
+        return ''
+    rows = [(f'turn {name}', *alone[turn]) for turn, name in names(c).items() if turn in alone]
+    joint = c.camera.fx, c.sigma['fx']
+    row, right, top = 21, 122, 8
     reach = 4 * joint[1]
     for _, fx, sigma in rows:
         # a turn that knows next to nothing must not make the others small
         if sigma < 8 * joint[1]:
             reach = max(reach, abs(fx - joint[0]) + 1.1 * sigma)
-    height = top + row * (len(rows) + 1) + 28
+    ends = joint[0] - reach, joint[0] + reach
+    axes = Axes(440, top + row * (len(rows) + 1) + 28, ends, (0.0, 1.0), 62, right, top, 26)
+    bottom = axes.height - axes.bottom
 
     def across(fx: float) -> float:
-        share = (fx - joint[0]) / (2 * reach) + 0.5
-        return left + min(max(share, 0.0), 1.0) * (width - left - right)
+        return float(axes.across(min(max(fx, ends[0]), ends[1])))
 
-    bottom = height - 26
-    parts = [f'<rect class="band" x="{across(joint[0] - joint[1]):.1f}" y="{top}" '
-             f'width="{across(joint[0] + joint[1]) - across(joint[0] - joint[1]):.1f}" '
+    low, high = (across(joint[0] + each) for each in (-joint[1], joint[1]))
+    parts = [f'<rect class="band" x="{low:.1f}" y="{top}" width="{high - low:.1f}" '
              f'height="{bottom - top}"/>',
              line(across(joint[0]), top, across(joint[0]), bottom, 'joint'),
-             line(left, bottom, width - right, bottom, 'grid')]
+             line(axes.left, bottom, axes.width - right, bottom, 'grid')]
     for n, (name, fx, sigma) in enumerate([*rows, ('all', *joint)]):
         y = top + row * (n + 0.5)
         kind = 'all' if n == len(rows) else 'other'
-        beyond = abs(fx - joint[0]) > reach
         parts.append(line(across(fx - sigma), y, across(fx + sigma), y, f'bar {kind}'))
-        if not beyond:
-            parts.append(dots(np.array([[across(fx), y]]), f'dot {kind}'))
-        parts.append(text(left - 8, y + 4, name, f'end {kind}-text'))
-        parts.append(text(width, y + 4, with_sigma(fx, sigma), f'end {kind}-text'))
+        if ends[0] <= fx <= ends[1]:
+            parts.append(strokes([np.array([[across(fx), y]])], f'dot {kind}'))
+        parts.append(text(axes.left - 8, y + 4, name, f'end {kind}-text'))
+        parts.append(text(axes.width, y + 4, with_sigma(fx, sigma), f'end {kind}-text'))
     digits = max(0, math.ceil(-math.log10(reach / 10)))
-    for fx, kind in ((joint[0] - reach, ''), (joint[0], 'mid'), (joint[0] + reach, 'end')):
+    for fx, kind in ((ends[0], ''), (joint[0], 'mid'), (ends[1], 'end')):
         parts.append(text(across(fx), bottom + 17, f'{fx:.{digits}f}', kind))
-    return svg(width, height, 'fx by turn', ''.join(parts))
+    return svg(axes.width, axes.height, 'fx by turn', ''.join(parts))
 
 
 def with_sigma(fx: float, sigma: float) -> str:

@@ -8,21 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary
 from dashcalib_ros.judge.agreement import focal_disagreement, leverages
 from dashcalib_ros.judge.calibration import (
     Mount,
-    Shutter,
-    Stabiliser,
     StoredTurnSummary,
-    Witness,
     Witnesses,
 )
 from dashcalib_ros.judge.verdict import (
-    Rule,
     flat_profile,
     one_turn_dominates,
     other_camera,
@@ -30,8 +25,6 @@ from dashcalib_ros.judge.verdict import (
     sigma_too_large,
     turns_disagree,
 )
-from dashcalib_ros.solve.knowledge import PictureSigma
-from dashcalib_ros.solve.solution import Solution
 
 ADVICE = {
     'accepted': 'Good to use.',
@@ -45,23 +38,19 @@ PIXELS = ('fx', 'fy', 'cx', 'cy')
 
 def parameter_rows(calibration: Calibration) -> list[tuple[str, str, str, str]]:
     """Return each parameter's name, value, sigma and sigma in percent, as text."""
-    if calibration.camera is None:
-        return []
-    sigma = calibration.sigma or {}
-    return [_parameter_row(name, value, sigma.get(name))
-            for name, value in calibration.camera.named.items()]
-
-
-def _parameter_row(name: str, value: float, sigma: float | None) -> tuple[str, str, str, str]:
-    if sigma is None or not math.isfinite(sigma):
-        return name, number(name, value), 'unknown', ''
-    relative = percent(100 * sigma / abs(value)) if value else ''
-    return name, number(name, value), '± ' + number(name, sigma), relative
-
-
-def percent(value: float) -> str:
-    """Return a share with its sensible digits; a sigma as large as its value has none."""
-    return 'over 100 %' if value > 100 else f'{value:.0f} %' if value >= 10 else f'{value:.2f} %'
+    rows = []
+    for name, value in ({} if calibration.camera is None else calibration.camera.named).items():
+        sigma = (calibration.sigma or {}).get(name, math.inf)
+        said, relative = '± ' + number(name, sigma), ''
+        if not math.isfinite(sigma):
+            said = 'unknown'
+        elif value:
+            share = 100 * sigma / abs(value)
+            # one as large as its value has no sensible digits
+            relative = ('over 100 %' if share > 100 else
+                        f'{share:.0f} %' if share >= 10 else f'{share:.2f} %')
+        rows.append((name, number(name, value), said, relative))
+    return rows
 
 
 def number(name: str, value: float) -> str:
@@ -83,15 +72,16 @@ def stored_text(turns: Sequence[StoredTurnSummary]) -> str:
     return f'{used} of {counted(len(turns), "stored turn")} used'
 
 
-def stabiliser_text(stabiliser: Stabiliser) -> str:
-    """Return what became of a stabilised video."""
-    return f'picture stabilised by up to {stabiliser.largest_px:.0f} px, found and removed'
-
-
-def shutter_text(shutter: Shutter) -> str:
-    """Return a line about the rolling shutter that was found."""
-    return (f'rolling shutter of {shutter.readout_ms:.1f} ± {shutter.sigma_ms:.1f} ms found and '
-            'removed')
+def removed_effects(c: Calibration) -> list[tuple[str, str]]:
+    """Return what was found and taken out, each with its name: a shutter, a stabiliser."""
+    found = []
+    if c.rolling_shutter is not None:
+        found.append(('Shutter', f'rolling shutter of {c.rolling_shutter.readout_ms:.1f} ± '
+                                 f'{c.rolling_shutter.sigma_ms:.1f} ms found and removed'))
+    if c.stabiliser is not None:
+        found.append(('Stabiliser', f'picture stabilised by up to {c.stabiliser.largest_px:.0f} '
+                                    'px, found and removed'))
+    return found
 
 
 def lines_text(lines: Bend) -> str:
@@ -127,27 +117,21 @@ def mount_text(mount: Mount) -> str:
             f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± {mount.travel_sigma_px:.1f}')
 
 
-def witness_text(name: str, said: Witness) -> str:
-    """Return a line about what a sensor says of the focal length."""
-    text = (f'the {name} {"agrees" if said.agrees else "contradicts"}: fx off by '
-            f'{said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} %')
-    if said.time_offset_s is not None and said.time_sigma_s is not None:
-        text += (f', its stamps late by {1e3 * said.time_offset_s:.0f} ± '
-                 f'{max(1e3 * said.time_sigma_s, 0.1):.1f} ms')
-    if said.scale_by_gps is not None:
-        text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*said.scale_by_gps)
-    return text
-
-
 def witness_texts(witnesses: Witnesses) -> list[str]:
-    """Return a line for each sensor that says something."""
-    return [witness_text(name, said) for name, said in
-            (('gyro', witnesses.gyro), ('GPS', witnesses.gps)) if said is not None]
-
-
-def picture_text(sigma: PictureSigma) -> str:
-    """Return a line about how far the whole camera may be off."""
-    return f'{sigma.rms:.2f} px over the picture, {sigma.worst:.2f} px at the worst'
+    """Return a line for each sensor that says something of the focal length."""
+    lines = []
+    for name, said in (('gyro', witnesses.gyro), ('GPS', witnesses.gps)):
+        if said is None:
+            continue
+        text = (f'the {name} {"agrees" if said.agrees else "contradicts"}: fx off by '
+                f'{said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} %')
+        if said.time_offset_s is not None and said.time_sigma_s is not None:
+            text += (f', its stamps late by {1e3 * said.time_offset_s:.0f} ± '
+                     f'{max(1e3 * said.time_sigma_s, 0.1):.1f} ms')
+        if said.scale_by_gps is not None:
+            text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*said.scale_by_gps)
+        lines.append(text)
+    return lines
 
 
 def since_start(turn: TurnSummary, calibration: Calibration) -> str:
@@ -225,16 +209,6 @@ def next_steps(c: Calibration) -> list[str]:
     return steps
 
 
-def removed_effects(c: Calibration) -> list[str]:
-    """Return what was found and taken out: a rolling shutter, a stabiliser's movement."""
-    lines = []
-    if c.rolling_shutter is not None:
-        lines.append('Shutter: ' + shutter_text(c.rolling_shutter))
-    if c.stabiliser is not None:
-        lines.append('Stabiliser: ' + stabiliser_text(c.stabiliser))
-    return lines
-
-
 def run_facts(c: Calibration) -> list[tuple[str, str]]:
     """Return what else is to be said of the run."""
     facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
@@ -266,34 +240,29 @@ class Check:
     passed: bool
 
 
-def checks(calibration: Calibration) -> tuple[Check, ...]:
+def checks(calibration: Calibration) -> list[Check]:
     """Return the conditions that can be put in a number, those of the evidence first."""
     needed = calibration.config.verdict
-    solution = None if calibration.material is None else calibration.material.solution
-    count = calibration.turns_used
-    yaw = calibration.yaw_deg
+    count, yaw = calibration.turns_used, calibration.yaw_deg
     found = [Check('turns used', f'{count}', f'at least {needed.min_turns}',
                    count >= needed.min_turns),
              Check('yaw of these turns together', f'{yaw:.0f}°',
                    f'at least {needed.min_yaw_deg:.0f}°', yaw >= needed.min_yaw_deg)]
-    return (*found, *([] if solution is None else _of_solution(solution, needed)))
-
-
-def _of_solution(solution: Solution, needed: VerdictConfig) -> list[Check]:
-    def check(name: str, found: str, limit: str, rule: Rule) -> Check:
-        return Check(name, found, limit, rule(solution, needed) is None)
-
+    solution = None if calibration.material is None else calibration.material.solution
+    if solution is None:
+        return found
     share = max(leverages(solution).values(), default=1.0)
-    return [
-        check('rise of the error when the focal length is 20 % off',
-              f'{100 * max(profile_contrast(solution), 0.0):.1f} %',
-              f'at least {100 * needed.min_contrast:.0f} %', flat_profile),
-        check('uncertainty of fx', f'{100 * float(solution.sigma[0] / solution.camera.fx):.2g} %',
-              f'at most {100 * needed.max_sigma:.3g} %', sigma_too_large),
-        check('scatter of fx between the turns', f'{100 * focal_disagreement(solution):.2g} %',
-              f'at most {100 * needed.max_disagreement:.3g} %', turns_disagree),
-        check('share of the turn that knows most of fx', f'{100 * min(share, 1.0):.0f} %',
-              f'at most {100 * needed.max_leverage:.0f} %', one_turn_dominates),
-        check('a turn’s error, over that with a camera of its own',
-              f'{max(solution.misfits.values(), default=0.0):.2g} times',
-              f'at most {needed.max_misfit:.2g} times', other_camera)]
+    return found + [Check(name, value, limit, rule(solution, needed) is None)
+                    for name, value, limit, rule in (
+        ('rise of the error when the focal length is 20 % off',
+         f'{100 * max(profile_contrast(solution), 0.0):.1f} %',
+         f'at least {100 * needed.min_contrast:.0f} %', flat_profile),
+        ('uncertainty of fx', f'{100 * float(solution.sigma[0] / solution.camera.fx):.2g} %',
+         f'at most {100 * needed.max_sigma:.3g} %', sigma_too_large),
+        ('scatter of fx between the turns', f'{100 * focal_disagreement(solution):.2g} %',
+         f'at most {100 * needed.max_disagreement:.3g} %', turns_disagree),
+        ('share of the turn that knows most of fx', f'{100 * min(share, 1.0):.0f} %',
+         f'at most {100 * needed.max_leverage:.0f} %', one_turn_dominates),
+        ('a turn’s error, over that with a camera of its own',
+         f'{max(solution.misfits.values(), default=0.0):.2g} times',
+         f'at most {needed.max_misfit:.2g} times', other_camera))]

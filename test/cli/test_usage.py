@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from made_calibration import TRUTH, make_calibration
 
+from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.cli import main
 from dashcalib_ros.report import write_results
 
@@ -162,6 +163,20 @@ def test_export_prints_or_writes_a_camera_file(here, results):
     assert here('compare', results / 'a', results / 'rays.npz').returncode == 0
 
 
+def test_export_tells_where_the_field_over_the_picture_goes(here, results, tmp_path):
+    data = json.loads((results / 'a/result.json').read_text())
+    data['field'] = {'used': True, 'coefficients': np.zeros((2, len(FIELD_TERMS))).tolist()}
+    path = tmp_path / 'result.json'
+    path.write_text(json.dumps(data))
+    splined = here('export', path, '--to', 'mrcal')
+    assert (splined.returncode, splined.stderr) == (0, '')
+    assert 'LENSMODEL_SPLINED_STEREOGRAPHIC_order=3' in splined.stdout
+    without = here('export', path, '--to', 'ros')
+    assert without.returncode == 0
+    assert 'has a field over the picture, for which ros has no place' in without.stderr
+    assert_one_line_error(here('export', path, '--to', 'mrcal', '--crop', '0,0,640,375'))
+
+
 def test_export_to_what_there_is_not(here, results):
     done = here('export', results / 'a', '--to', 'matlab')
     assert_one_line_error(done)
@@ -270,9 +285,10 @@ def test_an_interrupt_while_a_module_is_imported_has_its_own_exit_code(tmp_path)
     # dataclasses make their methods by exec() of a text; Python remembers an interrupt from there
     (tmp_path / 'interrupting.py').write_text('exec("raise KeyboardInterrupt")')
     (tmp_path / 'interrupted.py').write_text(
-        'import sys\n'
+        'import dataclasses, sys\n'
         'from dashcalib_ros.cli import program\n'
-        'program.COMMANDS["demo"] = "interrupting"\n'
+        'demo = dataclasses.replace(program.COMMANDS["demo"], module="interrupting")\n'
+        'program.COMMANDS["demo"] = demo\n'
         'sys.exit(program.main(["demo"]))\n')
     done = subprocess.run([sys.executable, '-m', 'interrupted'], cwd=tmp_path, timeout=60,
                           capture_output=True, text=True)

@@ -1,7 +1,9 @@
 """Exports: each read back by the program it is for, or by its format's rules."""
 from __future__ import annotations
 
+import ast
 import json
+import re
 import subprocess
 
 import cv2
@@ -9,10 +11,12 @@ import numpy as np
 import pycolmap
 import pytest
 import yaml
-from made_calibration import EACH_MODEL
+from made_calibration import EACH_MODEL, TRUTH
 
 from dashcalib_ros.camera import camera_from_ros
-from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
+from dashcalib_ros.camera.field import Field
+from dashcalib_ros.errors import ConfigError, InputError, OutputError
 from dashcalib_ros.report import NamedCamera, compare, load_camera, write_text
 from dashcalib_ros.report.export import EXPORTS, cropped, exported, resized
 
@@ -49,9 +53,7 @@ def test_colmap_projects_the_same_half_a_pixel_off(lens):
 # what a program cannot describe: the models, and what its export says
 LACKS = {'kalibr': {'brown': 'no k3', 'rational_polynomial': 'no k3, k4, k5, k6'},
          'opensfm': {'rational_polynomial': 'no k4'},
-         'nerfstudio': {'rational_polynomial': 'no k4'}, 'mrcal': {'fisheye': 'no fisheye'}}
-
-
+         'nerfstudio': {'rational_polynomial': 'no k4'}}
 CANNOT = [(kind, model) for kind, models in LACKS.items() for model in models]
 
 
@@ -81,7 +83,12 @@ def test_a_lens_that_a_program_has_not_is_refused(kind, model):
 
 @lenses(*EXPORTS)
 def test_each_export_is_read_back(lens, kind, tmp_path):
-    read = load_camera(written(lens, kind, tmp_path))
+    path = written(lens, kind, tmp_path)
+    if (kind, lens.model) == ('mrcal', 'fisheye'):
+        with pytest.raises(InputError, match=r'SPLINED.* none of the models here'):
+            load_camera(path)
+        return
+    read = load_camera(path)
     assert read.sigma is None and read.verdict is None
     np.testing.assert_allclose(read.camera.params, lens.params, rtol=1e-13)
     assert compare(read, NamedCamera('given', lens)).mapping_px < 1e-6
@@ -109,20 +116,88 @@ def test_maps_are_opencv_s(lens, kind, tmp_path):
         assert maps[name].dtype == np.float32
 
 
-@lenses('mrcal')
-def test_mrcal_projects_the_same(lens, kind, tmp_path):
-    path = written(lens, kind, tmp_path)
-    program = ('import json, mrcal, numpy, sys\n'
+def mrcal_sees(path, rays):
+    """Return (n, 2) where the distribution's mrcal sees rays (n, 3), and its picture's size."""
+    program = ('import mrcal, numpy, sys\n'
                'model = mrcal.cameramodel(sys.argv[1])\n'
-               'seen = mrcal.project(numpy.array(json.loads(sys.argv[2])), *model.intrinsics())\n'
-               'print(json.dumps([seen.tolist(), model.imagersize().tolist()]))')
+               'seen = mrcal.project(numpy.load(sys.argv[2]), *model.intrinsics())\n'
+               'numpy.savez(sys.argv[3], seen=seen, size=model.imagersize())')
     if subprocess.run(['/usr/bin/python3', '-c', 'import mrcal'], capture_output=True).returncode:
         pytest.skip('the distribution\'s python3-mrcal is not installed')
-    told = subprocess.run(['/usr/bin/python3', '-c', program, path, json.dumps(POINTS.tolist())],
-                          check=True, capture_output=True, text=True).stdout
-    seen, size = json.loads(told)
-    np.testing.assert_allclose(seen, lens.project(POINTS), atol=1e-6)
-    assert tuple(size) == lens.image_size
+    given, told = path.with_name('rays.npy'), path.with_name('told.npz')
+    np.save(given, rays)
+    subprocess.run(['/usr/bin/python3', '-c', program, path, given, told], check=True)
+    return np.load(told)['seen'], tuple(np.load(told)['size'])
+
+
+@lenses('mrcal')
+def test_mrcal_projects_the_same(lens, kind, tmp_path):
+    seen, size = mrcal_sees(written(lens, kind, tmp_path), POINTS)
+    np.testing.assert_allclose(seen, lens.project(POINTS),
+                               atol=1e-3 if lens.model == 'fisheye' else 1e-6)
+    assert size == lens.image_size
+
+
+def a_field(size, rms_px):
+    """Return a field whose terms are all about as large."""
+    field = Field(size, np.random.default_rng(5).normal(size=(2, len(FIELD_TERMS))))
+    x, y = np.meshgrid(np.linspace(0, size[0] - 1, 40), np.linspace(0, size[1] - 1, 40))
+    lengths = np.linalg.norm(field.displacement(np.stack([x, y], -1)), axis=-1)
+    return field.resized(rms_px / np.sqrt(np.mean(lengths**2)), size)
+
+
+def seen_by_spline(text, rays):
+    """Return (n, 2) where a splined .cameramodel sees rays (n, 3), by mrcal's documentation."""
+    model = ast.literal_eval(text)
+    rows, columns, fov_deg = (int(re.search(f'{key}=([0-9]+)', model['lensmodel'])[1])
+                              for key in ('Ny', 'Nx', 'fov_x_deg'))
+    focal, centre = np.array(model['intrinsics'][:4]).reshape(2, 2)
+    control = np.array(model['intrinsics'][4:]).reshape(rows, columns, 2)
+    angle = np.arccos(rays[:, 2] / np.linalg.norm(rays, axis=1))
+    u = (2 * np.tan(angle / 2) / np.linalg.norm(rays[:, :2], axis=1))[:, None] * rays[:, :2]
+    # a cubic spline needs a whole interval beyond the field of view at each end
+    apart = 4 * np.tan(np.radians(fov_deg) / 4) / (columns - 3)
+    places = u / apart + (np.array([columns, rows]) - 1) / 2
+    first = np.floor(places).astype(int)
+    t = places - first
+    weights = np.stack([(1 - t)**3, 3 * t**3 - 6 * t**2 + 4,
+                        -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]) / 6
+    added = sum(weights[i, :, 0, None] * weights[j, :, 1, None]
+                * control[first[:, 1] + j - 1, first[:, 0] + i - 1]
+                for i in range(4) for j in range(4))
+    return focal * (u + added) + centre
+
+
+PART = (640, 375)
+
+
+@pytest.fixture(scope='module', params=('radial', 'brown', 'fisheye'))
+def bent(request):
+    """Return a lens, the mrcal file of it with a field of 1 px, all pixels and these' rays."""
+    lens = cropped(EACH_MODEL[request.param], 0, 0, *PART)
+    field = a_field(PART, 1.0)
+    pixels = np.stack(np.meshgrid(*map(np.arange, PART)), -1).reshape(-1, 2).astype(float)
+    return lens, exported(lens, 'mrcal', field), pixels, lens.rays(field.ideal(pixels))
+
+
+def test_mrcal_s_spline_has_the_field(bent):
+    lens, text, pixels, rays = bent
+    assert np.linalg.norm(seen_by_spline(text, rays) - pixels, axis=1).max() < 1e-3
+    # the lens alone is off by the field
+    assert np.linalg.norm(lens.project(rays) - pixels, axis=1).mean() > 0.5
+
+
+def test_mrcal_itself_sees_the_field(bent, tmp_path):
+    _, text, pixels, rays = bent
+    path = tmp_path / 'a.cameramodel'
+    path.write_text(text)
+    seen, size = mrcal_sees(path, rays)
+    assert np.linalg.norm(seen - pixels, axis=1).max() < 1e-3 and size == PART
+
+
+def test_a_field_that_no_spline_has_is_refused():
+    with pytest.raises(OutputError, match=r'to 0.001 px, but to .* export to rays'):
+        exported(TRUTH.resized(1 / 3, (414, 125)), 'mrcal', a_field((414, 125), 5.0))
 
 
 @lenses('kalibr')
