@@ -104,7 +104,7 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
                                  PATCH_HALF_WINDOW, MAX_SHIFT_PX)
     scene = retriangulated(replace(scene, tracks=registered), scene.camera,
                            settings.error_px, settings.min_angle_deg)
-    scene = _refined(scene, settings, reach)
+    scene = _refined(scene, settings, reach, rounds=1)
     return scene if scene.structure.used.any() else None
 
 

@@ -86,8 +86,11 @@ def ray_errors_px(camera: Camera, rays: Floats, rotations: Floats, translations:
 def _errors_px(flat: Camera, rays: Floats, pixels: Floats, rotations: Floats,
                translations: Floats, points: Floats) -> Floats:
     local = points @ rotations.transpose(0, 2, 1) + translations[:, None]
-    along = np.einsum('ktc,ktc->kt', local, rays) > ALONG * np.linalg.norm(local, axis=2)
-    error = np.linalg.norm(flat.project(local) - pixels, axis=2)
+    # einsum takes a third of the time of norm
+    along = np.einsum('ktc,ktc->kt', local, rays) > ALONG * np.sqrt(
+        np.einsum('ktc,ktc->kt', local, local))
+    off = flat.project(local) - pixels
+    error = np.sqrt(np.einsum('ktc,ktc->kt', off, off))
     return np.asarray(np.where(along & np.isfinite(error), error, np.inf))
 
 
