@@ -24,7 +24,7 @@ NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow en
             'the car hardly moved')
 ALONE = 'this drive has no turn that could agree with it'
 OTHER_CAMERA = 'the turns of this drive are of another camera'
-# turns that wait in memory for better ones; of KITTI 03 only the five that are used are reconstructed
+# turns that wait in memory for better ones; of KITTI 03 five are reconstructed then, not eight
 WAITING = 3
 
 

@@ -40,10 +40,6 @@ GRID = (6, 3)
 MIN_TRACKS = 80
 # px^2 per observation; a turn that costs more is chained with other tracks, too
 GOOD_COST = 1.2
-# px; of the affine registration
-PATCH_HALF_WINDOW = 7
-# px; a registration that moves a point farther is wrong
-MAX_SHIFT_PX = 3.0
 
 
 def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft | None:
@@ -100,8 +96,7 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
     scene = _refined(scene, settings, reach, tolerance=ROUGH)
     by_index = {frame.index: frame.image for frame in turn.frames}
     images = [by_index[int(index)] for index in scene.tracks.frames]
-    registered = register_tracks(scene.tracks, scene.structure, scene.camera, images,
-                                 PATCH_HALF_WINDOW, MAX_SHIFT_PX)
+    registered = register_tracks(scene.tracks, scene.structure, scene.camera, images)
     scene = retriangulated(replace(scene, tracks=registered), scene.camera,
                            settings.error_px, settings.min_angle_deg)
     scene = _refined(scene, settings, reach, rounds=1)

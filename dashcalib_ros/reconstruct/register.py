@@ -18,6 +18,10 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruct.scene import Structure
 from dashcalib_ros.reconstruct.tracks import Tracks
 
+# px; patches are twice as wide, and one
+HALF_WINDOW = 7
+# px; a registration that moves a point farther is wrong
+MAX_SHIFT_PX = 3.0
 # affine steps converge slowly; a patch that has not converged by then is dropped
 ITERATIONS = 10
 # ratio of scales beyond which a patch and its reference look too different
@@ -29,17 +33,15 @@ SETTLED_PX = 0.01
 
 
 def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
-                    images: Sequence[GreyImage], half_window: int, max_shift_px: float
-                    ) -> Tracks:
+                    images: Sequence[GreyImage]) -> Tracks:
     """Return the tracks with every used observation registered against its track's reference.
 
-    images: the keyframes' pictures. half_window: px; patches are (2 half_window + 1) wide.
-    max_shift_px: an observation that moves farther than this, or whose patch does not look like
-    the reference, is dropped.
+    images: the keyframes' pictures. An observation that moves too far, or whose patch does not
+    look like the reference, is dropped.
     """
     depth = _depths(structure, camera)
     reference = _reference_rows(structure.used, depth)
-    step = np.arange(-half_window, half_window + 1, dtype=np.float32)
+    step = np.arange(-HALF_WINDOW, HALF_WINDOW + 1, dtype=np.float32)
     grid = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
     template, steps = _templates(tracks, reference, images, grid)
     xy = np.full_like(tracks.xy, np.nan)
@@ -53,7 +55,7 @@ def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
         found, good = _align(_smooth(image), tracks.xy[k, wanted], scale[wanted],
                              template[wanted], steps[wanted], grid)
         shift = np.linalg.norm(found - tracks.xy[k, wanted], axis=1)
-        good &= (shift < max_shift_px) | (reference[wanted] == k)
+        good &= (shift < MAX_SHIFT_PX) | (reference[wanted] == k)
         xy[k, wanted[good]] = found[good]
     return replace(tracks, xy=xy)
 
