@@ -24,8 +24,8 @@ NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow en
             'the car hardly moved')
 ALONE = 'this drive has no turn that could agree with it'
 OTHER_CAMERA = 'the turns of this drive are of another camera'
-# turns that wait in memory for better ones; of KITTI 03 six are reconstructed then, not eight
-WAITING = 2
+# turns that wait in memory for better ones; of KITTI 03 five are reconstructed then, not eight
+WAITING = 3
 
 
 class SceneSelection:

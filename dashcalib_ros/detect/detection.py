@@ -90,11 +90,11 @@ class Detection:
 
     def turns(self) -> tuple[Turn, ...]:
         """Return the turns found so far, the most prominent first."""
-        return self._turns.turns()
+        return self._turns.bank.turns()
 
     def release(self, center: int) -> None:
         """Drop a turn's frames, once they are handed over."""
-        self._turns.release(center)
+        self._turns.bank.release(center)
 
     def magnitudes(self) -> Floats:
         """Return (n, 2): stamp in s and filtered turning magnitude, decimated."""
@@ -129,7 +129,7 @@ class Detection:
         """
         if new:
             for turn in self.turns():
-                self._turns.fix(turn.center)
+                self._turns.bank.fix(turn.center)
         return new
 
     def _check_size(self, frame: Frame) -> None:

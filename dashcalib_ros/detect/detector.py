@@ -84,7 +84,7 @@ class TurnDetector:
             step = frame.stamp_ns - self._last_ns
             # no turn extends over a gap, or over a long pause of the camera
             if motion.after_gap or step > self.config.half_width * 1e9:
-                changed += self._end()
+                changed += self.finish()
         self._last_ns = frame.stamp_ns
         self.bank.collect(frame, self._needed_ns(frame))
         if motion.center is not None and motion.center_ns is not None:
@@ -94,22 +94,6 @@ class TurnDetector:
             for stamp_ns, median in self._median.push(motion.center_ns, value):
                 self._filtered(stamp_ns, median)
         return changed + self.bank.settle(frame.stamp_ns)
-
-    def finish(self) -> list[Turn]:
-        """End the drive; return the turns that this completes or changes."""
-        return self._end()
-
-    def turns(self) -> tuple[Turn, ...]:
-        """Return the turns found so far, best first."""
-        return self.bank.turns()
-
-    def fix(self, center: int) -> None:
-        """Fix a turn's frames: turns that overlap it are not merged with it."""
-        self.bank.fix(center)
-
-    def release(self, center: int) -> None:
-        """Drop a turn's frames after they were handed over; the turn is fixed, too."""
-        self.bank.release(center)
 
     def magnitudes(self) -> Floats:
         """Return (n, 2): stamp in s and filtered magnitude of the drive so far, decimated."""
@@ -127,7 +111,8 @@ class TurnDetector:
         self._open: dict[int, int] = {}
         self._position = 0
 
-    def _end(self) -> list[Turn]:
+    def finish(self) -> list[Turn]:
+        """End the drive, or what comes before a gap; return the turns that are new or changed."""
         for stamp_ns, median in self._median.finish():
             self._filtered(stamp_ns, median)
         self._found(self._peaks.end())

@@ -87,11 +87,7 @@ class _Seen:
 class MotionEstimator:
     """Tracks points through the drive and measures how much the car turns."""
 
-    _seen: deque[_Seen]
-    _pairs: dict[tuple[int, int], Floats | None]
-    _last: GreyImage | None
-    _ids: Ints
-    _xy: Floats32
+    _last: GreyImage | None = None
     _ego: EgoMask | None = None
     _segmented: SegmentationMask | None = None
     _valid: Mask | None = None
@@ -202,11 +198,11 @@ class MotionEstimator:
     def _reset(self) -> None:
         """Drop all points: the next image does not continue the last one."""
         keep = math.ceil(2 * self.config.spacing_s * self.config.rate / (1 - EARLY)) + 3
-        self._seen = deque(maxlen=keep)
-        self._pairs = {}
+        self._seen: deque[_Seen] = deque(maxlen=keep)
+        self._pairs: dict[tuple[int, int], Floats | None] = {}
         self._last = None
-        self._ids = np.zeros(0, np.int64)
-        self._xy = np.zeros((0, 2), np.float32)
+        self._ids: Ints = np.zeros(0, np.int64)
+        self._xy: Floats32 = np.zeros((0, 2), np.float32)
         self._born = 0
         self._perhaps_gap = False
 

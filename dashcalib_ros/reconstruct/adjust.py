@@ -34,7 +34,6 @@ class Solver:
     loss_px: float = 1.0
     iterations: int = 30
     tolerance: float = 1e-5
-    threads: int = 1
 
 
 def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
@@ -162,7 +161,7 @@ def _adjuster(reconstruction: pycolmap.Reconstruction, solver: Solver, refine_fo
     options.ceres.loss_function_scale = solver.loss_px
     options.ceres.solver_options.max_num_iterations = solver.iterations
     options.ceres.solver_options.function_tolerance = solver.tolerance
-    options.ceres.solver_options.num_threads = solver.threads
+    options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
         config.add_image(image_id)

@@ -40,10 +40,6 @@ GRID = (6, 3)
 MIN_TRACKS = 80
 # px^2 per observation; a turn that costs more is chained with other tracks, too
 GOOD_COST = 1.2
-# px; of the affine registration
-PATCH_HALF_WINDOW = 7
-# px; a registration that moves a point farther is wrong
-MAX_SHIFT_PX = 3.0
 
 
 def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft | None:
@@ -100,11 +96,10 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
     scene = _refined(scene, settings, reach, tolerance=ROUGH)
     by_index = {frame.index: frame.image for frame in turn.frames}
     images = [by_index[int(index)] for index in scene.tracks.frames]
-    registered = register_tracks(scene.tracks, scene.structure, scene.camera, images,
-                                 PATCH_HALF_WINDOW, MAX_SHIFT_PX)
+    registered = register_tracks(scene.tracks, scene.structure, scene.camera, images)
     scene = retriangulated(replace(scene, tracks=registered), scene.camera,
                            settings.error_px, settings.min_angle_deg)
-    scene = _refined(scene, settings, reach)
+    scene = _refined(scene, settings, reach, rounds=1)
     return scene if scene.structure.used.any() else None
 
 
@@ -152,31 +147,48 @@ def _cost_of(scene: Scene) -> float:
 
 def _profile_trials(tracks: Tracks, turn: Turn, config: Config, model: type[Camera]
                     ) -> dict[float, Scene]:
-    """Return the scenes at focal lengths held fixed: every second one, then around the best."""
-    settings, seed, ratios = config.scene, config.seed, model.focal_ratios
-    trials: dict[float, Scene] = {}
-    tried: set[int] = set()
+    """Return the scenes at focal lengths held fixed: every second one, then around the best.
 
-    def attempt(n: int) -> None:
-        if n in tried or not 0 <= n < len(ratios):
-            return
-        tried.add(n)
+    Each is adjusted once. Only the best and its neighbours are completed where they explain the
+    turn: what is far from the best costs as much time, and changes only how bad it is.
+    """
+    settings, seed, ratios = config.scene, config.seed, model.focal_ratios
+    observations = int(tracks.seen.sum())
+    begun: dict[int, Scene | None] = {}
+    completed: set[int] = set()
+
+    def with_cost(n: int, scene: Scene) -> Scene:
+        cost = truncated_cost(scene, scene.camera, settings.error_px)
+        return replace(scene, profile=Profile(
+            np.array([ratios[n]]), np.array([cost]), observations))
+
+    def begin(n: int) -> None:
         camera = model.centred(tracks.image_size, ratios[n] * tracks.image_size[0])
         scene = chain_scene(tracks, turn.id, camera, _NO_PROFILE, settings, seed)
-        if scene is not None:
-            scene = _completed(_refined(scene, settings, None, tolerance=ROUGH), settings, seed)
-            cost = truncated_cost(scene, scene.camera, settings.error_px)
-            trials[ratios[n]] = replace(scene, profile=Profile(
-                np.array([ratios[n]]), np.array([cost]), int(tracks.seen.sum())))
+        begun[n] = scene and with_cost(n, _refined(scene, settings, None, 1, ROUGH))
+
+    def complete(n: int) -> None:
+        completed.add(n)
+        if n not in begun:
+            begin(n)
+        if (scene := begun[n]) is not None:
+            scene = _refined(scene, settings, None, 1, ROUGH)
+            begun[n] = with_cost(n, _completed(scene, settings, seed))
+
+    def found() -> dict[int, Scene]:
+        return {n: scene for n, scene in begun.items() if scene is not None}
 
     for n in range(1, len(ratios), 2):
-        attempt(n)
-    if trials:
-        best = ratios.index(_profile_of(trials).best)
-        attempt(best - 1)
-        attempt(best + 1)
-        # if one of them is the new best, its other neighbour is on the coarse grid
-    return trials
+        begin(n)
+    while trials := found():
+        best = min(trials, key=lambda n: (_cost_of(trials[n]), n))
+        near = range(max(best - 1, 0), min(best + 2, len(ratios)))
+        wanted = set(near if _cost_of(trials[best]) <= GOOD_COST else [*near, *trials]) - completed
+        if not wanted:
+            break
+        for n in sorted(wanted):
+            complete(n)
+    return {ratios[n]: scene for n, scene in found().items()}
 
 
 def _completed(scene: Scene, config: SceneConfig, seed: int) -> Scene:

@@ -18,6 +18,10 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruct.scene import Structure
 from dashcalib_ros.reconstruct.tracks import Tracks
 
+# px; patches are twice as wide, and one
+HALF_WINDOW = 7
+# px; a registration that moves a point farther is wrong
+MAX_SHIFT_PX = 3.0
 # affine steps converge slowly; a patch that has not converged by then is dropped
 ITERATIONS = 10
 # ratio of scales beyond which a patch and its reference look too different
@@ -29,19 +33,17 @@ SETTLED_PX = 0.01
 
 
 def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
-                    images: Sequence[GreyImage], half_window: int, max_shift_px: float
-                    ) -> Tracks:
+                    images: Sequence[GreyImage]) -> Tracks:
     """Return the tracks with every used observation registered against its track's reference.
 
-    images: the keyframes' pictures. half_window: px; patches are (2 half_window + 1) wide.
-    max_shift_px: an observation that moves farther than this, or whose patch does not look like
-    the reference, is dropped.
+    images: the keyframes' pictures. An observation that moves too far, or whose patch does not
+    look like the reference, is dropped.
     """
     depth = _depths(structure, camera)
     reference = _reference_rows(structure.used, depth)
-    step = np.arange(-half_window, half_window + 1, dtype=np.float32)
+    step = np.arange(-HALF_WINDOW, HALF_WINDOW + 1, dtype=np.float32)
     grid = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
-    template, descent, inverse = _templates(tracks, reference, images, grid)
+    template, steps = _templates(tracks, reference, images, grid)
     xy = np.full_like(tracks.xy, np.nan)
     every = np.arange(tracks.xy.shape[1])
     for k, image in enumerate(images):
@@ -50,10 +52,10 @@ def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
             structure.used[k] & (scale < MAX_SCALE) & (scale > 1 / MAX_SCALE))
         if len(wanted) == 0:
             continue
-        found, good = _align(_smooth(image), tracks.xy[k, wanted], scale[wanted], template[wanted],
-                             descent[wanted], inverse[wanted], grid)
+        found, good = _align(_smooth(image), tracks.xy[k, wanted], scale[wanted],
+                             template[wanted], steps[wanted], grid)
         shift = np.linalg.norm(found - tracks.xy[k, wanted], axis=1)
-        good &= (shift < max_shift_px) | (reference[wanted] == k)
+        good &= (shift < MAX_SHIFT_PX) | (reference[wanted] == k)
         xy[k, wanted[good]] = found[good]
     return replace(tracks, xy=xy)
 
@@ -79,19 +81,22 @@ def _smooth(image: GreyImage) -> Floats32:
 
 
 def _sample(image: Floats32, xy: Floats) -> Floats32:
-    """Return (n, p) intensities at (n, p, 2) positions.
+    """Return (n, p) intensities at positions (n, 2, p).
 
     Lanczos: OpenCV's cubic kernel shifts the picture by up to 0.05 px between the pixels.
     """
     where = xy.astype(np.float32)
-    return np.asarray(cv2.remap(image, where[:, :, 0], where[:, :, 1], cv2.INTER_LANCZOS4,
+    return np.asarray(cv2.remap(image, where[:, 0], where[:, 1], cv2.INTER_LANCZOS4,
                                 borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
 def _templates(tracks: Tracks, reference: Ints,
                images: Sequence[GreyImage], grid: Floats32
-               ) -> tuple[Floats32, Floats32, Floats32]:
-    """Return normalised patches (t, p), steepest descent (t, p, 6), inverse Hessians (t, 6, 6)."""
+               ) -> tuple[Floats32, Floats32]:
+    """Return normalised patches (t, p), and what a difference from them asks for (t, 6, p).
+
+    The latter times the difference (p,) is the step of the six parameters.
+    """
     count, pixels = len(reference), len(grid)
     template = np.zeros((count, pixels), np.float32)
     gradient = np.zeros((count, pixels, 2), np.float32)
@@ -99,7 +104,7 @@ def _templates(tracks: Tracks, reference: Ints,
         rows = np.flatnonzero((reference == k) & np.isfinite(tracks.xy[k, :, 0]))
         if len(rows) == 0:
             continue  # all of them are tracks that the structure does not use
-        centre, image = tracks.xy[k, rows][:, None] + grid, _smooth(images[k])
+        centre, image = tracks.xy[k, rows][:, :, None] + grid.T, _smooth(images[k])
         template[rows] = _sample(image, centre)
         for axis, kernel in enumerate(((1, 0), (0, 1))):
             slope = cv2.Sobel(image, cv2.CV_32F, *kernel, ksize=3, scale=1 / 8)
@@ -113,32 +118,34 @@ def _templates(tracks: Tracks, reference: Ints,
     hessian = (descent.transpose(0, 2, 1) @ descent).astype(np.float64)
     damping = 1e-3 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9
     inverse = np.linalg.inv(hessian + damping * np.eye(6)).astype(np.float32)
-    return template, descent, inverse
+    return template, inverse @ descent.transpose(0, 2, 1)
 
 
-def _align(image: Floats32, start: Floats, scale: Floats, template: Floats32,
-           descent: Floats32, inverse: Floats32, grid: Floats32
-           ) -> tuple[Floats, Mask]:
+def _align(image: Floats32, start: Floats, scale: Floats, template: Floats32, steps: Floats32,
+           grid: Floats32) -> tuple[Floats, Mask]:
     """Return (n, 2) positions where the patches match their templates, and (n,) if they do."""
+    found, good = start.copy(), np.zeros(len(start), bool)
+    # of the patches that still move, in the order of their numbers
+    numbers, centre = np.arange(len(start)), start
     linear = scale[:, None, None] * np.eye(2)
-    centre = start.copy()
-    shift = np.full(len(start), np.inf)
-    correlation = np.zeros(len(start))
-    moving = np.arange(len(start))
     for _ in range(ITERATIONS):
-        patch = _sample(image, grid @ linear[moving].transpose(0, 2, 1) + centre[moving, None])
+        patch = _sample(image, linear[:, :, :1] * grid[:, 0] + linear[:, :, 1:] * grid[:, 1]
+                        + centre[:, :, None])
         patch -= patch.mean(axis=1, keepdims=True)
-        patch /= np.maximum(patch.std(axis=1, keepdims=True), 1e-3)
-        correlation[moving] = np.mean(patch * template[moving], axis=1)
-        error = (patch - template[moving])[:, None]
-        step = (inverse[moving] @ (error @ descent[moving]).transpose(0, 2, 1))[:, :, 0]
+        patch /= np.maximum(np.sqrt(np.mean(patch * patch, axis=1, keepdims=True)), 1e-3)
+        correlation = np.mean(patch * template, axis=1)
+        step = (steps @ (patch - template)[:, :, None])[:, :, 0].astype(np.float64)
         # keep single steps small: the patch is only a few pixels wide
         warp = np.eye(2) + np.clip(step[:, :4], -0.2, 0.2).reshape(-1, 2, 2)
-        linear[moving] = linear[moving] @ np.linalg.inv(warp)
-        move = linear[moving] @ np.clip(step[:, 4:], -1.5, 1.5)[:, :, None]
-        centre[moving] -= move[:, :, 0]
-        shift[moving] = np.linalg.norm(move[:, :, 0], axis=1)
-        moving = moving[shift[moving] > SETTLED_PX]
-        if len(moving) == 0:
+        linear = linear @ np.linalg.inv(warp)
+        move = (linear @ np.clip(step[:, 4:], -1.5, 1.5)[:, :, None])[:, :, 0]
+        centre = centre - move
+        shift = np.linalg.norm(move, axis=1)
+        found[numbers] = centre
+        good[numbers] = (shift < 10 * SETTLED_PX) & (correlation > MIN_CORRELATION)
+        moving = shift > SETTLED_PX
+        if not moving.any():
             break
-    return centre, (shift < 10 * SETTLED_PX) & (correlation > MIN_CORRELATION)
+        numbers, centre, linear = numbers[moving], centre[moving], linear[moving]
+        template, steps = template[moving], steps[moving]
+    return found, good

@@ -45,10 +45,15 @@ def triangulate(camera: Camera, rays: Floats, rotations: Floats, translations: F
     Returns points (t, 3) and used (k, t): the good observations of the points that are kept. Those
     have at least 2 good observations and a triangulation angle of at least min_angle_deg.
     """
-    seen = np.isfinite(rays[:, :, 0]) & registered[:, None]
+    rays, rotations, translations = (
+        each[registered] for each in (rays, rotations, translations))
+    seen = np.isfinite(rays[:, :, 0])
+    flat = camera.without_distortion()
+    pixels = flat.project(rays)
 
     def good_of(points: Floats, tracks: Mask | slice) -> Mask:
-        error = ray_errors_px(camera, rays[:, tracks], rotations, translations, points)
+        error = _errors_px(flat, rays[:, tracks], pixels[:, tracks], rotations, translations,
+                           points)
         return np.asarray(seen[:, tracks] & (error < error_px), bool)
 
     points = _linear_points(rays, rotations, translations, seen)
@@ -61,7 +66,9 @@ def triangulate(camera: Camera, rays: Floats, rotations: Floats, translations: F
         good[:, spoiled] = good_of(points[spoiled], spoiled)
     enough = (good.sum(axis=0) >= 2) & (
         _widest_angle(rotations, translations, points, good) > np.radians(min_angle_deg))
-    return points, good & enough
+    used = np.zeros((len(registered), len(points)), bool)
+    used[registered] = good & enough
+    return points, used
 
 
 def ray_errors_px(camera: Camera, rays: Floats, rotations: Floats, translations: Floats,
@@ -73,9 +80,17 @@ def ray_errors_px(camera: Camera, rays: Floats, rotations: Floats, translations:
     pixel, too: those do not count.
     """
     flat = camera.without_distortion()
+    return _errors_px(flat, rays, flat.project(rays), rotations, translations, points)
+
+
+def _errors_px(flat: Camera, rays: Floats, pixels: Floats, rotations: Floats,
+               translations: Floats, points: Floats) -> Floats:
     local = points @ rotations.transpose(0, 2, 1) + translations[:, None]
-    along = np.einsum('ktc,ktc->kt', local, rays) > ALONG * np.linalg.norm(local, axis=2)
-    error = np.linalg.norm(flat.project(local) - flat.project(rays), axis=2)
+    # einsum takes a third of the time of norm
+    along = np.einsum('ktc,ktc->kt', local, rays) > ALONG * np.sqrt(
+        np.einsum('ktc,ktc->kt', local, local))
+    off = flat.project(local) - pixels
+    error = np.sqrt(np.einsum('ktc,ktc->kt', off, off))
     return np.asarray(np.where(along & np.isfinite(error), error, np.inf))
 
 

@@ -153,7 +153,7 @@ def hour(pictures: Pictures, minutes: float) -> dict[str, Any]:
             memory.append(memory_mb(os.getpid()))
             started = time.perf_counter()
     return {'minutes': minutes, 'ms_by_minute': by_minute, 'mb_by_minute': memory,
-            'turns': len(detector.turns())}
+            'turns': len(detector.bank.turns())}
 
 
 def calibration(pictures: Pictures) -> dict[str, Any]:

@@ -195,7 +195,7 @@ def stopping_frames(stopping):
 
 def test_rendered_turn_is_found_and_the_stop_is_seen(stopping, stopping_frames):
     motions, detector = detect(stopping_frames)
-    turn, = detector.turns()
+    turn, = detector.bank.turns()
     assert abs(turn.center - stopping.turn_centers[0]) <= 5
     assert turn.prominence > 0.03
     step = np.linalg.norm(np.diff(stopping.poses[:, :3, 3], axis=0), axis=1)
@@ -227,7 +227,7 @@ def test_straight_drive_has_no_turns():
     drive = Drive(LENS, DriveSpec(turns=0, lead_m=35.0, moving_cars=3, seed=6))
     motions, detector = detect(drive.frames())
     assert len(motions) > 50
-    assert detector.turns() == ()
+    assert detector.bank.turns() == ()
     assert not any(motion.standing for motion in motions)
 
 
@@ -239,14 +239,14 @@ def test_parked_car_stands():
         motions, detector = detect(drive.frames())
         # before there is a triplet, points that jitter in the dark may go somewhere
         assert np.mean([motion.standing for motion in motions[6:]]) > 0.9
-        assert detector.turns() == () and detector.magnitude == 0
+        assert detector.bank.turns() == () and detector.magnitude == 0
 
 
 @pytest.mark.skipif(not KITTI.exists(), reason=f'no real drive at {KITTI}')
 def test_kitti03_sharp_turn_is_found():
     frames = (frame for frame in open_frames(str(KITTI)) if frame.index < 260)
     _, detector = detect(frames)
-    best = detector.turns()[0]
+    best = detector.bank.turns()[0]
     assert abs(best.center - 88) <= 8
     assert best.prominence > 0.03
     assert {66, 108} <= {frame.index for frame in best.frames}

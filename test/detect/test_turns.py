@@ -127,7 +127,7 @@ class Stream:
 
     def finish(self):
         self.emitted += self.detector.finish()
-        return self.detector.turns()
+        return self.detector.bank.turns()
 
 
 def hump(seconds: float, height: float, rate: float = 10.0) -> np.ndarray:
@@ -142,9 +142,9 @@ def quiet(seconds: float, rate: float = 10.0) -> np.ndarray:
 @pytest.mark.parametrize('rate', [5.0, 10.0, 12.5])
 def test_turn_has_three_seconds_on_either_side_at_any_rate(rate):
     stream = Stream(rate).feed(np.concatenate([quiet(10, rate), hump(5, 0.05, rate)]))
-    assert stream.detector.turns() == ()
+    assert stream.detector.bank.turns() == ()
     stream.feed(quiet(6, rate))
-    turn, = stream.detector.turns()
+    turn, = stream.detector.bank.turns()
     # reported once, with the prominence it had then
     assert [new.center for new in stream.emitted] == [turn.center]
     assert stream.emitted[0].frames == turn.frames
@@ -210,9 +210,9 @@ def test_merged_turn_is_never_longer_than_four_half_widths():
 
 def test_release_drops_the_frames_and_keeps_the_turn():
     stream = Stream().feed(quiet(10)).feed(hump(3, 0.03)).feed(quiet(1.7))
-    turn, = stream.detector.turns()
-    stream.detector.release(turn.center)
-    released, = stream.detector.turns()
+    turn, = stream.detector.bank.turns()
+    stream.detector.bank.release(turn.center)
+    released, = stream.detector.bank.turns()
     assert released.frames == () and released.images == turn.images == 61
     # what overlaps a released turn is trimmed, whichever is stronger
     stream.feed(hump(4, 0.06)).feed(quiet(10))
@@ -226,8 +226,8 @@ def test_a_turn_that_is_fixed_is_as_one_that_is_released_but_has_its_frames():
     turns = {}
     for choose in ('fix', 'release'):
         stream = Stream().feed(quiet(10)).feed(hump(3, 0.03)).feed(quiet(1.7))
-        turn, = stream.detector.turns()
-        getattr(stream.detector, choose)(turn.center)
+        turn, = stream.detector.bank.turns()
+        getattr(stream.detector.bank, choose)(turn.center)
         stream.feed(hump(4, 0.06)).feed(quiet(10))
         turns[choose] = stream.finish()
     outlines = [[(turn.center, turn.first, turn.last, turn.images) for turn in each]
@@ -263,7 +263,7 @@ def test_no_turn_spans_a_gap_that_the_stamps_do_not_show():
 
 def test_end_of_drive_completes_a_turn_with_what_is_there():
     stream = Stream().feed(quiet(10)).feed(hump(4, 0.05)).feed(quiet(0.5))
-    assert stream.detector.turns() == ()
+    assert stream.detector.bank.turns() == ()
     turn, = stream.finish()
     assert turn.last == stream.count - 1 < turn.center + 30
 
@@ -295,10 +295,10 @@ def test_memory_does_not_grow_with_the_drive():
     # the bank's ten turns of at most 121 frames, ten candidates of 61, the last seconds
     assert max(held) <= 10 * 121 + 10 * 61 + 91
     assert max(held[len(held) // 2:]) <= 1.3 * max(held[:len(held) // 2])
-    assert len(stream.detector.turns()) == 10
+    assert len(stream.detector.bank.turns()) == 10
     assert len(stream.detector.magnitudes()) <= 20000
-    for turn in stream.detector.turns():
-        stream.detector.release(turn.center)
+    for turn in stream.detector.bank.turns():
+        stream.detector.bank.release(turn.center)
     assert bank.frames_held() <= 91 + 10 * 61
 
 

@@ -13,7 +13,7 @@ from dashcalib_ros.config import Config, SceneConfig, TracksConfig
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
-from dashcalib_ros.reconstruct import adjust, build
+from dashcalib_ros.reconstruct import adjust, build, register
 from dashcalib_ros.reconstruct.adjust import Solver
 from dashcalib_ros.reconstruct.chain import absolute_pose, chain, relative_pose
 from dashcalib_ros.reconstruct.register import register_tracks
@@ -493,7 +493,7 @@ def test_registration_finds_the_exact_positions_and_repairs_drift(case):
         reference = 1  # the nearer one: of two depths the lower is the median
     drift[reference] = 0.0
     drifted = replace(tracks, xy=tracks.xy + drift)
-    found = register_tracks(drifted, structure, LENS, images, 7, 3.0)
+    found = register_tracks(drifted, structure, LENS, images)
     assert np.isfinite(found.xy).all()
     off = np.linalg.norm(found.xy - tracks.xy, axis=2)
     assert off[reference].max() < 1e-3
@@ -505,18 +505,19 @@ def test_registration_drops_what_does_not_look_like_the_reference():
     tracks, structure, images = registered_case(*CASES['translation'])
     xy = tracks.xy.copy()
     xy[1, :10] += [31.0, 23.0]
-    found = register_tracks(replace(tracks, xy=xy), structure, LENS, images, 7, 3.0)
+    found = register_tracks(replace(tracks, xy=xy), structure, LENS, images)
     assert np.isnan(found.xy[1, :10]).all()
     assert np.isfinite(found.xy[1, 10:]).all() and np.isfinite(found.xy[0]).all()
 
 
-def test_registration_drops_what_moves_too_far():
+def test_registration_drops_what_moves_too_far(monkeypatch):
     tracks, structure, images = registered_case(*CASES['translation'])
     xy = tracks.xy.copy()
     xy[1] += [1.2, 0.9]
     moved = replace(tracks, xy=xy)
-    assert np.isfinite(register_tracks(moved, structure, LENS, images, 7, 3.0).xy[1]).all()
-    assert np.isnan(register_tracks(moved, structure, LENS, images, 7, 1.0).xy[1]).all()
+    assert np.isfinite(register_tracks(moved, structure, LENS, images).xy[1]).all()
+    monkeypatch.setattr(register, 'MAX_SHIFT_PX', 1.0)
+    assert np.isnan(register_tracks(moved, structure, LENS, images).xy[1]).all()
 
 
 def test_registration_touches_only_what_the_structure_uses():
@@ -524,7 +525,7 @@ def test_registration_touches_only_what_the_structure_uses():
     used = structure.used.copy()
     used[1, ::2] = False
     used[:, 1] = False
-    found = register_tracks(tracks, replace(structure, used=used), LENS, images, 7, 3.0)
+    found = register_tracks(tracks, replace(structure, used=used), LENS, images)
     np.testing.assert_array_equal(np.isfinite(found.xy[:, :, 0]), used)
 
 
@@ -535,14 +536,14 @@ def test_registration_passes_over_an_image_that_only_unused_tracks_refer_to():
     # the first image is nobody's reference but, for want of another, theirs
     xy[0, :5] = np.nan
     found = register_tracks(
-        replace(tracks, xy=xy), replace(structure, used=used), LENS, images, 7, 3.0)
+        replace(tracks, xy=xy), replace(structure, used=used), LENS, images)
     assert np.isnan(found.xy[:, :5]).all() and np.isfinite(found.xy[:, 5:]).all()
 
 
 def test_registration_on_pictures_without_texture_keeps_nothing_wrong():
     tracks, structure, images = registered_case(*CASES['translation'])
     flat = [np.full_like(image, 90) for image in images]
-    found = register_tracks(tracks, structure, LENS, flat, 7, 3.0)
+    found = register_tracks(tracks, structure, LENS, flat)
     off = np.linalg.norm(found.xy - tracks.xy, axis=2)
     assert not (off > 1e-6).any()
 
