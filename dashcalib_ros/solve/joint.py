@@ -19,6 +19,7 @@ from dashcalib_ros.solve.focal import kinds_of_lenses, nearest_start, profile_ar
 from dashcalib_ros.solve.model_choice import (
     chosen_of,
     compared_with_others,
+    leaves_more,
     refitted,
     refitted_without_shutter,
     with_few_tracks,
@@ -104,11 +105,9 @@ def _with_field(first: Fit) -> Fit:
     A decentred lens bends the picture, too, and also where no track goes.
     """
     found = with_field(first)
-    wider = type(first.camera.widened())
-    if (found.used_field is None or first.config.model != AUTO
-            or isinstance(first.camera, wider)):
+    if found.used_field is None or first.config.model != AUTO or not leaves_more(first):
         return found
-    few = with_few_tracks(first)
+    few, wider = with_few_tracks(first), type(first.camera.widened())
     plain, decentred = refitted(few, type(first.camera)), refitted_without_shutter(few, wider)
     if plain is None or decentred is None or chosen_of([plain, decentred])[0] is plain:
         return found

@@ -37,7 +37,7 @@ def with_model_chosen(first: Fit) -> tuple[Fit, tuple[Candidate, ...]]:
     of the tracks; the one that is chosen is adjusted with all.
     """
     camera = first.camera
-    if len(first.scenes) < 2 or not _leaves_more(first):
+    if len(first.scenes) < 2 or not leaves_more(first):
         return first, ()
     models = larger_models(camera)
     few = with_few_tracks(first)
@@ -152,7 +152,7 @@ def refitted_without_shutter(first: Fit, model: type[Camera]) -> Fit | None:
     return None if is_rolling(left_s, sigma_s) else found
 
 
-def _leaves_more(result: Fit) -> bool:
+def leaves_more(result: Fit) -> bool:
     """Return whether errors are left with which a wider model predicts the turns better."""
     camera = result.camera
     if type(camera.widened()) is type(camera):

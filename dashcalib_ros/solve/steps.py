@@ -118,10 +118,11 @@ class Fit:
             scene, camera, loss_px, self._by_shared(scene),
             shift_prior(scene, noise, self.crops[scene.turn]) if self.crops
             else None) for scene in self.scenes)
-        left = LEFT_BY_FIELD if self.used_field is not None else 1.0
+        behind_field = self.used_field is not None
+        left = LEFT_BY_FIELD if behind_field else 1.0
         return Knowledge(
-            camera, turns, self._prior_of_all(),
-            floor_of(camera, noise_of(turns), self.used_field),
+            camera, turns, self._prior_of_all(), floor_of(camera, noise_of(turns)),
+            turns_err_alike=behind_field,
             one_turn_sigma=left * self.config.intrinsics.one_turn_sigma * camera.fx)
 
     def _by_shared(self, scene: Scene) -> Floats | None:
