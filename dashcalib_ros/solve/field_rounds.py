@@ -125,7 +125,7 @@ def _with_other(scene: Scene, before: Field, after: Field) -> Scene:
 def _problem(now: Fit, found: FoundField, loss_px: float) -> tuple[list[Normal], FieldProblem]:
     """Return the linearised problem of the lens and the field; loss_px: of the Cauchy loss."""
     noise = noise_in(now.scenes, now.camera, loss_px)
-    normals = [normal_equations(scene, now.camera, loss_px, found.columns(scene, now.camera))
+    normals = [normal_equations(scene, now.camera, loss_px, [found.further(now.camera)])
                for scene in now.scenes]
     return normals, FieldProblem(tuple(normal.cost.at_noise(noise) for normal in normals),
                                  wider_prior(now.camera, now.centred, now.config.intrinsics),

@@ -8,7 +8,7 @@ zoom.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -116,14 +116,26 @@ class ImagePrior:
         return np.asarray(own.covariance @ (own.score - mixed @ step))
 
 
-def turn_cost(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None = None,
+@dataclass(frozen=True)
+class Further:
+    """Further parameters that all turns share, beside the lens's: e of them.
+
+    columns: derivatives (n, 2, e) of the n used observations of a scene, in the order of their
+    images. sigmas: (e,) of their prior; inf: none.
+    """
+
+    columns: Callable[[Scene], Floats]
+    sigmas: Floats
+
+
+def turn_cost(scene: Scene, camera: Camera, loss_px: float, further: Sequence[Further] = (),
               images: ImagePrior | None = None) -> TurnCost:
     """Return what a scene knows of the camera, at the solution.
 
-    loss_px, by_shared: as normal_equations()'. images: what may differ between the images; None:
+    loss_px, further: as normal_equations()'. images: what may differ between the images; None:
     nothing.
     """
-    normal = normal_equations(scene, camera, loss_px, by_shared, by_image=images is not None)
+    normal = normal_equations(scene, camera, loss_px, further, by_image=images is not None)
     cost = normal.shared if images is None else images.eliminated(normal)
     return replace(normal.cost, hessian=cost.hessian, score=cost.score, by_track=cost.by_track)
 
@@ -140,16 +152,15 @@ def noise_in(scenes: Sequence[Scene], camera: Camera, loss_px: float) -> float:
     return squares / freedom
 
 
-def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None = None,
-                     by_image: bool = False) -> Normal:
+def normal_equations(scene: Scene, camera: Camera, loss_px: float,
+                     further: Sequence[Further] = (), by_image: bool = False) -> Normal:
     """Return the normal equations of a scene at the solution.
 
     loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply.
-    by_shared: (n, 2, e) derivatives of the n used observations, in the order of their images, by
-    e more parameters that all turns share. by_image: with the parameters of each image.
+    further: what turns share beside the lens. by_image: with the parameters of each image.
     """
     used = scene.structure.used
-    linear = _linearised(scene, camera, loss_px, by_shared, by_image)
+    linear = _linearised(scene, camera, loss_px, further, by_image)
     rows, columns = np.nonzero(used)
     keyframes, image = np.unique(rows, return_inverse=True)
     tracks, point = np.unique(columns, return_inverse=True)
@@ -192,7 +203,7 @@ class _Linear:
     weight: Floats
 
 
-def _linearised(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None,
+def _linearised(scene: Scene, camera: Camera, loss_px: float, further: Sequence[Further],
                 by_image: bool) -> _Linear:
     structure = scene.structure
     rows, columns = np.nonzero(structure.used)
@@ -209,10 +220,7 @@ def _linearised(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats 
         middle = (np.array(camera.image_size) - 1) / 2
         shift = np.broadcast_to(np.eye(2), (len(rows), 2, 2))
         parts += [shift, (projected - middle)[:, :, None]]
-    parts.append(by_camera)
-    if by_shared is not None:
-        parts.append(by_shared)
-    wide = np.concatenate(parts, axis=2)
+    wide = np.concatenate([*parts, by_camera, *(each.columns(scene) for each in further)], axis=2)
     return _Linear(wide * weight[:, None, None], by_local @ rotation * weight[:, None, None],
                    residual, weight)
 

@@ -10,6 +10,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import Prior
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
+from dashcalib_ros.solve.normal import Further
 from dashcalib_ros.solve.quadratic import Quadratic
 
 # rendered images without noise would make the loss cut off everything
@@ -78,16 +79,16 @@ def extra_sigma_of(camera: Camera) -> Floats:
 
 
 def wider_prior(camera: Camera, centred: Camera, config: IntrinsicsConfig,
-                sigmas: Sequence[float] = ()) -> Quadratic:
-    """Return the prior about the wider model's parameters, and e further ones, at unit noise.
+                further: Sequence[Further] = ()) -> Quadratic:
+    """Return the prior about the wider model's parameters, and further ones, at unit noise.
 
-    centred: the camera that the prior is about; camera: where the prior draws from. sigmas: (e,)
-    of the further ones.
+    centred: the camera that the prior is about; camera: where the prior draws from.
     """
     information = prior_information(centred, config)
-    further = 1 / np.square(np.r_[extra_sigma_of(camera), sigmas])
+    sigmas = np.concatenate([extra_sigma_of(camera), *(each.sigmas for each in further)])
     draws = information @ (prior_of(centred, config, 1.0).mean - camera.params)
-    return Quadratic.prior(information, further, np.r_[draws, np.zeros(len(further))])
+    return Quadratic.prior(information, 1 / np.square(sigmas),
+                           np.r_[draws, np.zeros(len(sigmas))])
 
 
 def floor_of(camera: Camera, noise: float) -> Floats:

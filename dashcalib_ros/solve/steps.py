@@ -34,10 +34,10 @@ from dashcalib_ros.solve.fixed_camera import (
     shift_prior,
 )
 from dashcalib_ros.solve.knowledge import Knowledge
-from dashcalib_ros.solve.normal import noise_in, turn_cost
+from dashcalib_ros.solve.normal import Further, noise_in, turn_cost
 from dashcalib_ros.solve.prior import bounds_of, floor_of, loss_px_of, prior_information, prior_of
 from dashcalib_ros.solve.quadratic import Quadratic, noise_of
-from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shift
+from dashcalib_ros.solve.shutter import readout, readout_parameter, remove_rolling_shutter
 
 ByTurn = Mapping[TurnId, Scene]
 Progress = Callable[[str, float], None]
@@ -115,7 +115,7 @@ class Fit:
         camera, loss_px = self.camera, self.solver.loss_px
         noise = noise_in(self.scenes, camera, loss_px) if self.crops else 0.0
         turns = tuple(turn_cost(
-            scene, camera, loss_px, self._by_shared(scene),
+            scene, camera, loss_px, self._further,
             shift_prior(scene, noise, self.crops[scene.turn]) if self.crops
             else None) for scene in self.scenes)
         behind_field = self.used_field is not None
@@ -125,23 +125,21 @@ class Fit:
             turns_err_alike=behind_field,
             one_turn_sigma=left * self.config.intrinsics.one_turn_sigma * camera.fx)
 
-    def _by_shared(self, scene: Scene) -> Floats | None:
-        """Return (n, 2, e) derivatives by the readout and by the directions of the field."""
-        columns = []
-        if self.readout_s:
-            columns.append(row_shift(scene, self.camera)[scene.structure.used][..., None])
-        if self.field is not None:
-            columns.append(self.field.columns(scene, self.camera))
-        return np.concatenate(columns, axis=-1) if columns else None
+    @property
+    def _further(self) -> list[Further]:
+        """Return what turns share beside the lens: the readout, the directions of the field."""
+        return ([readout_parameter(self.camera)] * bool(self.readout_s)
+                + ([] if self.field is None else [self.field.further(self.camera)]))
 
     def _prior_of_all(self) -> Quadratic:
         """Return the prior of the camera, of the readout, which has none, and of the field."""
-        further = score = np.zeros(1 if self.readout_s else 0)
+        precision = np.concatenate([np.zeros(0), *(1 / np.square(each.sigmas)
+                                                   for each in self._further)])
+        at = np.zeros(len(self.prior) + len(precision))
         if self.field is not None:
-            precision = np.full(self.field.basis.shape[1], self.field.sigma_px**-2.0)
-            further = np.r_[further, precision]
-            score = np.r_[score, -precision * self.field.directions]
-        return Quadratic.prior(self.prior, further, np.r_[np.zeros(len(self.prior)), score])
+            at[-self.field.basis.shape[1]:] = self.field.directions
+        return Quadratic.prior(self.prior, precision,
+                               -np.r_[np.zeros(len(self.prior)), precision] * at)
 
     def fixed_camera_tests(self, bent: bool = True) -> tuple[FixedCameraTest, ...]:
         """Return the tests whether the camera is a fixed one, the clearest that it is not first.
