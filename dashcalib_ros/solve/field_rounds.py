@@ -13,8 +13,7 @@ from dashcalib_ros.solve.fitting import retriangulate_all, with_points_settled
 from dashcalib_ros.solve.knowledge import is_clear
 from dashcalib_ros.solve.normal import Normal, noise_in, normal_equations
 from dashcalib_ros.solve.prior import loss_px_of, wider_prior
-from dashcalib_ros.solve.shutter import readout
-from dashcalib_ros.solve.steps import Fit, is_rolling, without_shutter
+from dashcalib_ros.solve.steps import Fit, is_rolling
 
 # px: of the loss in the rounds with a part of the tracks; a windscreen's 2 px would be cut off by
 # the usual one. With all tracks it is the usual one
@@ -38,11 +37,10 @@ def with_field(first: Fit) -> Fit:
         return first
     if not first.readout_s:
         return _with_field(first)
-    found = _with_field(without_shutter(first))
-    if found.used_field is None or is_rolling(*readout(
-            found.scenes, found.camera, found.solver.loss_px, found.prior)):
-        return first
-    return found
+    global_shutter = first.with_few_tracks().as_measured().retriangulated()
+    found = _with_field(replace(global_shutter.adjusted().retriangulated(),
+                                measured=first.measured))
+    return first if found.used_field is None or is_rolling(*found.readout_left) else found
 
 
 def _with_field(first: Fit) -> Fit:

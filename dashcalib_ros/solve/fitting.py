@@ -100,6 +100,11 @@ def subsample_tracks(scene: Scene, wanted: int) -> Scene:
                           used=structure.used[:, chosen]))
 
 
+def with_few_tracks(scene: Scene) -> Scene:
+    """Return the scene with a part of its tracks, enough for all but the result."""
+    return subsample_tracks(scene, FIRST_TRACKS)
+
+
 def with_poses_of(scene: Scene, part: Scene) -> Scene:
     """Return the scene with the poses and the camera of part, the same scene with fewer tracks."""
     structure = part.structure

@@ -20,11 +20,10 @@ from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.fitting import (
-    FIRST_TRACKS,
     explained_by,
     retriangulate_all,
-    subsample_tracks,
     with_better_poses,
+    with_few_tracks,
     with_poses_of,
 )
 from dashcalib_ros.solve.fixed_camera import (
@@ -88,6 +87,17 @@ class Fit:
         """Return the fit with its tracks triangulated anew; scenes without points are dropped."""
         return replace(self, scenes=retriangulate_all(self.scenes, self.camera, self.config.scene))
 
+    def with_few_tracks(self) -> Fit:
+        """Return the fit with a part of its tracks."""
+        return replace(self, scenes=list(map(with_few_tracks, self.scenes)),
+                       measured={turn: with_few_tracks(scene)
+                                 for turn, scene in self.measured.items()})
+
+    def as_measured(self) -> Fit:
+        """Return the fit with the effect of a rolling shutter in its tracks."""
+        scenes = [replace(scene, tracks=self.measured[scene.turn].tracks) for scene in self.scenes]
+        return replace(self, scenes=scenes, readout_s=0.0)
+
     def with_usual_loss(self) -> Fit:
         """Return the fit with the loss that its residuals ask for."""
         loss_px = loss_px_of(self.scenes, self.camera, self.config.intrinsics)
@@ -103,6 +113,11 @@ class Fit:
     def prior(self) -> Floats:
         """Return the prior's information (n, n) about the camera."""
         return prior_information(self.centred, self.config.intrinsics)
+
+    @property
+    def readout_left(self) -> tuple[float, float]:
+        """Return the readout that is still in the tracks, and its sigma, s."""
+        return readout(self.scenes, self.camera, self.solver.loss_px, self.prior)
 
     @property
     def used_field(self) -> Field | None:
@@ -146,10 +161,10 @@ class Fit:
 
         bent: False leaves out the local bend, which takes longer.
         """
-        scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in self.scenes]
         return fixed_camera_tests(
-            scenes, self.camera, self.centred, self.solver.loss_px, self.config.intrinsics,
-            self.crops, bent, bool(self.readout_s), self.field)
+            list(map(with_few_tracks, self.scenes)), self.camera, self.centred,
+            self.solver.loss_px, self.config.intrinsics, self.crops, bent, bool(self.readout_s),
+            self.field)
 
 
 def fit_one_focal_length(measured: ByTurn, start: Camera, config: Config, progress: Progress
@@ -161,15 +176,14 @@ def fit_one_focal_length(measured: ByTurn, start: Camera, config: Config, progre
     settings = config.intrinsics
     solver = Solver(config.scene.loss_px, config.scene.iterations)
     reach = (start.fx / FOCAL_REACH, start.fx * FOCAL_REACH)
-    few = [subsample_tracks(scene, FIRST_TRACKS) for scene in measured.values()]
+    few = list(map(with_few_tracks, measured.values()))
     camera = start
     for n in range(settings.rounds):
         progress('adjusting one focal length', n / settings.rounds)
         few, camera = adjust(few, camera, solver, 'one focal length', reach)
         few = retriangulate_all(few, camera, config.scene)
     kept = explained_by(few, measured, camera, config)
-    return Fit([subsample_tracks(scene, FIRST_TRACKS) for scene in kept], camera, camera, solver,
-               measured, config)
+    return Fit(list(map(with_few_tracks, kept)), camera, camera, solver, measured, config)
 
 
 def fit_roughly(first: Fit) -> Fit:
@@ -230,8 +244,7 @@ def _measured_again(fit: Fit) -> Fit:
     """Return the scenes triangulated anew, after the readout was measured once more."""
     if not fit.readout_s:
         return fit.retriangulated()
-    step_s, _ = readout(fit.scenes, fit.camera, fit.solver.loss_px, fit.prior)
-    return _without_rolling_shutter(fit, fit.readout_s + step_s)
+    return _without_rolling_shutter(fit, fit.readout_s + fit.readout_left[0])
 
 
 def _without_rolling_shutter(fit: Fit, readout_s: float) -> Fit:
@@ -239,14 +252,6 @@ def _without_rolling_shutter(fit: Fit, readout_s: float) -> Fit:
     moved = [remove_rolling_shutter(scene, fit.measured[scene.turn], fit.camera, readout_s)
              for scene in fit.scenes]
     return replace(fit, scenes=moved, readout_s=readout_s).retriangulated()
-
-
-def without_shutter(fit: Fit) -> Fit:
-    """Return the fit of a part of the tracks, these as they were measured, adjusted again."""
-    measured = {turn: subsample_tracks(scene, FIRST_TRACKS)
-                for turn, scene in fit.measured.items()}
-    scenes = [replace(scene, tracks=measured[scene.turn].tracks) for scene in fit.scenes]
-    return replace(fit, scenes=scenes, readout_s=0.0).retriangulated().adjusted().retriangulated()
 
 
 def _changed(before: Fit, after: Fit) -> float:
