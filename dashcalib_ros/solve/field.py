@@ -144,15 +144,13 @@ class FieldProblem:
         return Quadratic.together(self.turns)
 
     def _prior(self, sigma_px: float) -> Quadratic:
-        """Return the prior of the lens and of a field of this size."""
+        """Return the prior of the lens and of a field of this size; inf: none of the field."""
         return Quadratic.prior(self.lens.hessian, np.full(len(self.at), 1 / sigma_px**2),
                                np.r_[self.lens.score, -self.at / sigma_px**2])
 
     def _of_field(self, cost: Quadratic, inflation: float) -> Quadratic:
         """Return the cost about the field, from where there is none, the lens at its optimum."""
-        lens = Quadratic.prior(self.lens.hessian, np.zeros(len(self.at)),
-                               np.r_[self.lens.score, np.zeros(len(self.at))])
-        both = Quadratic.together([cost.at_noise(inflation), lens])
+        both = Quadratic.together([cost.at_noise(inflation), self._prior(np.inf)])
         return both.eliminated(len(self.lens.score)).moved(-self.at)
 
     def step(self, evidence: Evidence, narrow: int) -> Floats:
