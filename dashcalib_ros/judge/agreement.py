@@ -146,8 +146,10 @@ def with_right_angles(solution: Solution, more: int) -> float:
                            key=lambda n: shares[solution.scenes[n].turn])]
     another = replace(best, score=np.zeros_like(best.score))
     later = replace(known, turns=(*known.turns, *[another] * more))
-    own = replace(known, floor=np.zeros_like(known.floor)).own_covariance[0, 0]
+    own = replace(known, floor=np.zeros_like(known.floor),
+                  turns_err_alike=False).own_covariance[0, 0]
+    lasting = known.own_covariance[0, 0] - own
     # information grows, and all that makes turns differ goes down with it
     after = own * later.total.covariance[0, 0] / known.total.covariance[0, 0]
     step = float(later.step_to_wider_model[0])
-    return float(np.sqrt(after + step**2 + known.floor[0]**2) / solution.camera.fx)
+    return float(np.sqrt(after + step**2 + lasting) / solution.camera.fx)

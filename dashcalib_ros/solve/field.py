@@ -18,6 +18,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import TERMS, Field, field_terms
 from dashcalib_ros.camera.mapping import sensitivity, turned
 from dashcalib_ros.reconstruct.scene import Scene, projected_px
+from dashcalib_ros.solve.normal import Further
 from dashcalib_ros.solve.quadratic import Quadratic
 
 # px of 1000 px of width: sizes of the field among which the evidence chooses
@@ -59,10 +60,12 @@ class FoundField:
         one = displacements(pixels, camera.image_size, self.basis)
         return float(self.sigma_px * np.sqrt(np.mean(np.sum(one**2, axis=(1, 2)))))
 
-    def columns(self, scene: Scene, camera: Camera) -> Floats:
-        """Return (n, 2, f) derivatives of the used observations by the field's directions."""
+    def further(self, camera: Camera) -> Further:
+        """Return its directions as parameters that turns share."""
         # where the points project to: the errors of observations would correlate with the terms
-        return displacements(projected_px(scene, camera), camera.image_size, self.basis)
+        return Further(lambda scene: displacements(projected_px(scene, camera), camera.image_size,
+                                                   self.basis),
+                       np.full(self.basis.shape[1], self.sigma_px))
 
 
 def displacements(pixels: Floats, image_size: tuple[int, int], basis: Floats) -> Floats:
@@ -141,15 +144,13 @@ class FieldProblem:
         return Quadratic.together(self.turns)
 
     def _prior(self, sigma_px: float) -> Quadratic:
-        """Return the prior of the lens and of a field of this size."""
+        """Return the prior of the lens and of a field of this size; inf: none of the field."""
         return Quadratic.prior(self.lens.hessian, np.full(len(self.at), 1 / sigma_px**2),
                                np.r_[self.lens.score, -self.at / sigma_px**2])
 
     def _of_field(self, cost: Quadratic, inflation: float) -> Quadratic:
         """Return the cost about the field, from where there is none, the lens at its optimum."""
-        lens = Quadratic.prior(self.lens.hessian, np.zeros(len(self.at)),
-                               np.r_[self.lens.score, np.zeros(len(self.at))])
-        both = Quadratic.together([cost.at_noise(inflation), lens])
+        both = Quadratic.together([cost.at_noise(inflation), self._prior(np.inf)])
         return both.eliminated(len(self.lens.score)).moved(-self.at)
 
     def step(self, evidence: Evidence, narrow: int) -> Floats:

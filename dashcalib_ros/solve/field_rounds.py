@@ -9,25 +9,21 @@ import numpy as np
 from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.field import FieldProblem, FoundField, field_basis, without_field
-from dashcalib_ros.solve.fitting import retriangulate_all
+from dashcalib_ros.solve.fitting import retriangulate_all, with_points_settled
 from dashcalib_ros.solve.knowledge import is_clear
 from dashcalib_ros.solve.normal import Normal, noise_in, normal_equations
 from dashcalib_ros.solve.prior import loss_px_of, wider_prior
-from dashcalib_ros.solve.shutter import readout
-from dashcalib_ros.solve.steps import Fit, is_rolling, without_shutter
+from dashcalib_ros.solve.steps import Fit, is_rolling
 
-# px: of the loss in the first rounds; a windscreen's 2 px would be cut off by the usual one. In
-# the last rounds it is the usual one
-LOSSES = (2.0, 1.0, 0.5, 0.0, 0.0)
-# with all tracks
+# px: of the loss in the rounds with a part of the tracks; a windscreen's 2 px would be cut off by
+# the usual one. With all tracks it is the usual one
+LOSSES = (2.0, 1.0, 0.5)
 LAST_LOSSES = (0.0, 0.0)
 # of evidence; from here on a field counts in sigma. Sound lenses have -0.1 to 0.9
 DOUBT_NATS = 1.0
 # noise variances of a track by which turns that did not make a field must be predicted better:
 # half of what a lens model needs, as the evidence spoke for the field before (KITTI 07: 29)
 LEAST_GAIN = 15.0
-# relative change of the cost that ends an adjustment: another follows each
-ROUGH = 1e-3
 
 
 def with_field(first: Fit) -> Fit:
@@ -41,11 +37,10 @@ def with_field(first: Fit) -> Fit:
         return first
     if not first.readout_s:
         return _with_field(first)
-    found = _with_field(without_shutter(first))
-    if found.used_field is None or is_rolling(*readout(
-            found.scenes, found.camera, found.solver.loss_px, found.prior)):
-        return first
-    return found
+    global_shutter = first.with_few_tracks().as_measured().retriangulated()
+    found = _with_field(replace(global_shutter.adjusted().retriangulated(),
+                                measured=first.measured))
+    return first if found.used_field is None or is_rolling(*found.readout_left) else found
 
 
 def _with_field(first: Fit) -> Fit:
@@ -82,9 +77,9 @@ def _rounds(first: Fit, losses: Sequence[float]) -> Fit | None:
     now, config = first, first.config
     for least_px in losses:
         found, camera = _field_of(now), now.camera
-        loss_px = max(loss_px_of(now.scenes, camera, config.intrinsics), least_px)
         limits = replace(config.scene, error_px=max(config.scene.error_px, 2 * least_px))
-        normals, problem = _problem(now, found, loss_px)
+        now = _settled(now, least_px)
+        normals, problem = _problem(now, found, _loss_px(now, least_px))
         evidence = problem.evidence(camera.image_size[0])
         step = problem.step(evidence, len(camera.names()))
         field = Field(camera.image_size, found.field.coefficients
@@ -100,9 +95,18 @@ def _rounds(first: Fit, losses: Sequence[float]) -> Fit | None:
             return None
         now = replace(now, scenes=scenes, camera=camera, field=FoundField(
             field, found.basis, evidence.sigma_px, evidence.inflation))
-        # one step of all at once leaves poses behind, and the next one would go astray
-        now = replace(now, solver=replace(now.solver, loss_px=loss_px, tolerance=ROUGH)).adjusted()
-    return replace(now, solver=replace(now.solver, tolerance=first.solver.tolerance))
+    return _settled(now, least_px)
+
+
+def _loss_px(fit: Fit, least_px: float) -> float:
+    return max(loss_px_of(fit.scenes, fit.camera, fit.config.intrinsics), least_px)
+
+
+def _settled(fit: Fit, least_px: float) -> Fit:
+    """Return the fit with each point where its observations ask for it; poses are fixed."""
+    loss_px = _loss_px(fit, least_px)
+    return replace(fit, scenes=[with_points_settled(scene, fit.camera, loss_px)
+                                for scene in fit.scenes])
 
 
 def _field_of(fit: Fit) -> FoundField:
@@ -119,7 +123,7 @@ def _with_other(scene: Scene, before: Field, after: Field) -> Scene:
 def _problem(now: Fit, found: FoundField, loss_px: float) -> tuple[list[Normal], FieldProblem]:
     """Return the linearised problem of the lens and the field; loss_px: of the Cauchy loss."""
     noise = noise_in(now.scenes, now.camera, loss_px)
-    normals = [normal_equations(scene, now.camera, loss_px, found.columns(scene, now.camera))
+    normals = [normal_equations(scene, now.camera, loss_px, [found.further(now.camera)])
                for scene in now.scenes]
     return normals, FieldProblem(tuple(normal.cost.at_noise(noise) for normal in normals),
                                  wider_prior(now.camera, now.centred, now.config.intrinsics),

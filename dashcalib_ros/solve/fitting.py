@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.detect.turn import TurnId
@@ -21,6 +22,8 @@ FIRST_TRACKS = 200
 # of an adjustment with a fixed camera; it moves poses and points only, and is cheap
 ITERATIONS = 20
 ROUNDS = 3
+# of points with fixed poses: Gauss-Newton steps, and the damping of their blocks
+POINT_STEPS, POINT_DAMPING = 3, 1e-3
 # of a turn's observations; with fewer it is chained anew with the common camera
 WELL_EXPLAINED = 0.9
 # times a turn's cost with its own camera; above it, its own poses are tried, too
@@ -38,6 +41,49 @@ def retriangulate_all(scenes: Sequence[Scene], camera: Camera, config: SceneConf
     return [scene for scene in found if scene.structure.used.any()]
 
 
+def with_points_settled(scene: Scene, camera: Camera, loss_px: float) -> Scene:
+    """Return the scene with each used point where its observations ask for it; poses are fixed.
+
+    Triangulation is linear and knows no loss: joint steps from its points lead astray.
+    """
+    structure, used = scene.structure, scene.structure.used
+    rows, columns = np.nonzero(used)
+    tracks, point = np.unique(columns, return_inverse=True)
+    rotation, observed = structure.rotations[rows], scene.tracks.xy[rows, columns]
+
+    def local(points: Floats) -> Floats:
+        return np.asarray(np.einsum('nij,nj->ni', rotation, points[point])
+                          + structure.translations[rows])
+
+    def squares(points: Floats) -> Floats:
+        off = camera.project(local(points)) - observed
+        return np.asarray(np.sum(off**2, axis=1) / loss_px**2)
+
+    def summed(values: Floats) -> Floats:
+        columns = values.reshape(len(point), -1).T
+        sums = np.stack([np.bincount(point, column) for column in columns], axis=1)
+        return np.asarray(sums.reshape(-1, *values.shape[1:]), np.float64)
+
+    points = structure.points[tracks]
+    off = squares(points)
+    for _ in range(POINT_STEPS):
+        _, by_local, projected = camera.derivatives(local(points))
+        by_point, residual = by_local @ rotation, observed - projected
+        weighted = (by_point / (1 + off)[:, None, None]).transpose(0, 2, 1)
+        blocks = summed(weighted @ by_point)
+        damping = POINT_DAMPING * np.einsum('tii->ti', blocks)[:, :, None] * np.eye(3)
+        step = np.linalg.solve(blocks + damping, summed(weighted @ residual[:, :, None]))
+        moved = points + step[:, :, 0]
+        after = squares(moved)
+        # NaN, of a point that has gone behind a camera, is no gain
+        gains = summed(np.log1p(after)) < summed(np.log1p(off))
+        points = np.where(gains[:, None], moved, points)
+        off = np.where(gains[point], after, off)
+    found = structure.points.copy()
+    found[tracks] = points
+    return replace(scene, structure=replace(structure, points=found))
+
+
 def rechain(scene: Scene, camera: Camera, config: Config) -> Scene | None:
     """Return the scene chained anew from its tracks, None if no pair of images starts a chain."""
     return chain_scene(
@@ -52,6 +98,11 @@ def subsample_tracks(scene: Scene, wanted: int) -> Scene:
         scene, tracks=replace(scene.tracks, xy=scene.tracks.xy[:, chosen]),
         structure=replace(structure, points=structure.points[chosen],
                           used=structure.used[:, chosen]))
+
+
+def with_few_tracks(scene: Scene) -> Scene:
+    """Return the scene with a part of its tracks, enough for all but the result."""
+    return subsample_tracks(scene, FIRST_TRACKS)
 
 
 def with_poses_of(scene: Scene, part: Scene) -> Scene:

@@ -22,6 +22,7 @@ from dashcalib_ros.reconstruct.scene import Scene, projected_px
 from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.normal import (
     IMAGE,
+    Further,
     ImagePrior,
     Normal,
     normal_equations,
@@ -29,7 +30,7 @@ from dashcalib_ros.solve.normal import (
 )
 from dashcalib_ros.solve.prior import wider_prior
 from dashcalib_ros.solve.quadratic import Quadratic, noise_of
-from dashcalib_ros.solve.shutter import row_shift
+from dashcalib_ros.solve.shutter import readout_parameter
 
 Kind = Literal['shift', 'zoom', 'bend']
 
@@ -136,20 +137,15 @@ class Problem:
 
 
 def problem_of(scenes: Sequence[Scene], camera: Camera, centred: Camera, loss_px: float,
-               config: IntrinsicsConfig, by_shared: Sequence[Floats] = (),
-               sigmas: Sequence[float] = ()) -> Problem:
+               config: IntrinsicsConfig, further: Sequence[Further] = ()) -> Problem:
     """Return the linearised problem of scenes at their solution.
 
-    centred: the camera that priors are about. by_shared: for each scene (n, 2, e) derivatives of
-    its used observations by parameters that follow the wider model's; sigmas: (e,) of their
-    priors.
+    centred: the camera that priors are about. further: what turns share beside the wider model.
     """
-    normals = tuple(
-        normal_equations(scene, camera, loss_px, by_shared[n] if by_shared else None,
-                         by_image=True)
-        for n, scene in enumerate(scenes))
+    normals = tuple(normal_equations(scene, camera, loss_px, further, by_image=True)
+                    for scene in scenes)
     return Problem(tuple(scenes), normals, len(camera.names()),
-                   wider_prior(camera, centred, config, sigmas),
+                   wider_prior(camera, centred, config, further),
                    noise_of([normal.cost for normal in normals]))
 
 
@@ -207,21 +203,14 @@ def fixed_camera_tests(scenes: Sequence[Scene], camera: Camera, centred: Camera,
     bent: False leaves out the local bend. rolling: a rolling shutter was taken out: what is left
     of it counts as one still. found: the field that no lens model has: likewise.
     """
-    columns, sigmas = [], []
-    if rolling:
-        columns.append([row_shift(scene, camera)[scene.structure.used][..., None]
-                        for scene in scenes])
-        sigmas.append(READOUT_S)
+    further = [readout_parameter(camera, READOUT_S)] * rolling
     if found is not None:
-        columns.append([found.columns(scene, camera) for scene in scenes])
-        sigmas += [found.sigma_px] * found.basis.shape[1]
-    free = len(sigmas)
+        further.append(found.further(camera))
+    free = sum(len(each.sigmas) for each in further)
     if bent:
-        columns.append([_bends(scene, camera) for scene in scenes])
-        sigmas += [BEND_PX] * columns[-1][0].shape[-1]
-    problem = problem_of(scenes, camera, centred, loss_px, config,
-                         [np.concatenate(parts, axis=-1) for parts in zip(*columns, strict=True)],
-                         sigmas)
+        further.append(Further(lambda scene: _bends(scene, camera),
+                               np.full(2 * BENDS[0] * BENDS[1], BEND_PX)))
+    problem = problem_of(scenes, camera, centred, loss_px, config, further)
     count, lens = problem.own, len(camera.widened().names())
     wide = range(count, lens + free)
     shifts = shift_priors(problem, crops or {})

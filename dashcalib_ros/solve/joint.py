@@ -19,9 +19,9 @@ from dashcalib_ros.solve.focal import kinds_of_lenses, nearest_start, profile_ar
 from dashcalib_ros.solve.model_choice import (
     chosen_of,
     compared_with_others,
+    leaves_more,
     refitted,
     refitted_without_shutter,
-    with_few_tracks,
     with_model_chosen,
 )
 from dashcalib_ros.solve.prior import bounds_of, centre_pull
@@ -104,11 +104,9 @@ def _with_field(first: Fit) -> Fit:
     A decentred lens bends the picture, too, and also where no track goes.
     """
     found = with_field(first)
-    wider = type(first.camera.widened())
-    if (found.used_field is None or first.config.model != AUTO
-            or isinstance(first.camera, wider)):
+    if found.used_field is None or first.config.model != AUTO or not leaves_more(first):
         return found
-    few = with_few_tracks(first)
+    few, wider = first.with_few_tracks(), type(first.camera.widened())
     plain, decentred = refitted(few, type(first.camera)), refitted_without_shutter(few, wider)
     if plain is None or decentred is None or chosen_of([plain, decentred])[0] is plain:
         return found
@@ -151,7 +149,7 @@ def _best_of(begun: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
     best, tried = chosen(begun)
     if len(begun) == 1 or len(best.fit.scenes) < 2:
         return best, tried
-    few = with_few_tracks(best.fit)
+    few = best.fit.with_few_tracks()
     again = [replace(each, fit=replace(fit, measured=each.fit.measured)) for each in begun
              for model in dict.fromkeys([type(each.fit.camera), type(each.fit.camera.widened())])
              if (fit := refitted(few, model)) is not None]

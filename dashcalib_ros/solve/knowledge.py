@@ -11,7 +11,9 @@ picture. In each, the largest of three estimates counts:
   takes the place of the normal distribution, so that 2 sigma hold 95 %.
 
 The square of the step to the wider model is added: the error of a model that real lenses do not
-follow exactly. Where a field is left that no model has, camera_info is off by that, too.
+follow exactly. Where a field is left that no model has, camera_info is off by that, too; and the
+field takes up errors that all tracks of a place share in all turns: then the second estimate is
+not made smaller by the number of turns.
 """
 from __future__ import annotations
 
@@ -80,8 +82,9 @@ class Knowledge:
     turns: the cost of each turn. prior: at unit noise, of the p = n + e parameters that are free:
     the camera's, and what else turns share. floor: (n,) sigmas of systematic errors, which no
     number of turns averages out. systematic: by how much errors that tracks share inflate the
-    second estimate. one_turn_sigma: px by which fx differs between turns: a single one does not
-    show that.
+    second estimate. turns_err_alike: whether the errors of tracks are the same ones in all turns,
+    so that these do not average them out: a field takes up what all tracks of a place share.
+    one_turn_sigma: px by which fx differs between turns: a single one does not show that.
     """
 
     camera: Camera
@@ -89,6 +92,7 @@ class Knowledge:
     prior: Quadratic
     floor: Floats
     systematic: float = 1.0
+    turns_err_alike: bool = False
     one_turn_sigma: float = 0.0
 
     def of(self, places: Iterable[int]) -> Knowledge:
@@ -228,8 +232,10 @@ class Knowledge:
 
         Without what a single turn does not show.
         """
-        left = self.left[self.own]
-        return np.asarray(np.diag(self.floor**2) + np.outer(left, left) + self._largest_estimate())
+        left, block = self.left[self.own], np.ix_(self.own, self.own)
+        alike = (len(self.turns) - 1) * self.total.covariance_by_track[block]
+        return np.asarray(np.diag(self.floor**2) + np.outer(left, left) + self._largest_estimate()
+                          + self.turns_err_alike * alike)
 
     @property
     def covariance_between_turns(self) -> Floats:

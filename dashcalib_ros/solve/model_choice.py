@@ -18,9 +18,7 @@ from dashcalib_ros.camera import MODELS, Camera, calibrated_models, larger_model
 from dashcalib_ros.camera.mapping import as_model, mapping_error
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
-from dashcalib_ros.solve.fitting import FIRST_TRACKS, subsample_tracks
 from dashcalib_ros.solve.knowledge import is_clear
-from dashcalib_ros.solve.shutter import readout
 from dashcalib_ros.solve.solution import Candidate
 from dashcalib_ros.solve.steps import Fit, fit_all, is_rolling
 
@@ -37,10 +35,10 @@ def with_model_chosen(first: Fit) -> tuple[Fit, tuple[Candidate, ...]]:
     of the tracks; the one that is chosen is adjusted with all.
     """
     camera = first.camera
-    if len(first.scenes) < 2 or not _leaves_more(first):
+    if len(first.scenes) < 2 or not leaves_more(first):
         return first, ()
     models = larger_models(camera)
-    few = with_few_tracks(first)
+    few = first.with_few_tracks()
     found = [refitted(few, type(camera)),
              *(refitted_without_shutter(few, model) for model in models)]
     chosen, tried = chosen_of([result for result in found if result is not None])
@@ -57,7 +55,7 @@ def compared_with_others(asked: Fit) -> tuple[Candidate, ...]:
     """
     if len(asked.scenes) < 2:
         return ()
-    few = with_few_tracks(asked)
+    few = asked.with_few_tracks()
     camera = asked.camera
     larger = larger_models(camera)
     found = [refitted(few, type(camera))]
@@ -128,14 +126,6 @@ def chosen_of(results: Sequence[Fit]) -> tuple[Fit, tuple[Candidate, ...]]:
                                 key=lambda each: len(each[1].camera.names())))
 
 
-def with_few_tracks(fit: Fit) -> Fit:
-    """Return the fit with a part of its tracks."""
-    return replace(
-        fit, scenes=[subsample_tracks(scene, FIRST_TRACKS) for scene in fit.scenes],
-        measured={turn: subsample_tracks(scene, FIRST_TRACKS)
-                  for turn, scene in fit.measured.items()})
-
-
 def refitted_without_shutter(first: Fit, model: type[Camera]) -> Fit | None:
     """Return the result with another model and a global shutter; None where that is not enough.
 
@@ -144,15 +134,11 @@ def refitted_without_shutter(first: Fit, model: type[Camera]) -> Fit | None:
     """
     if not first.readout_s:
         return refitted(first, model)
-    scenes = [replace(scene, tracks=first.measured[scene.turn].tracks) for scene in first.scenes]
-    found = refitted(replace(first, scenes=scenes, readout_s=0.0), model)
-    if found is None:
-        return None
-    left_s, sigma_s = readout(found.scenes, found.camera, found.solver.loss_px, found.prior)
-    return None if is_rolling(left_s, sigma_s) else found
+    found = refitted(first.as_measured(), model)
+    return None if found is None or is_rolling(*found.readout_left) else found
 
 
-def _leaves_more(result: Fit) -> bool:
+def leaves_more(result: Fit) -> bool:
     """Return whether errors are left with which a wider model predicts the turns better."""
     camera = result.camera
     if type(camera.widened()) is type(camera):

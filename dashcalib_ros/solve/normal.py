@@ -8,7 +8,7 @@ zoom.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +30,7 @@ class Eliminated:
 
     keyframes: (k,), tracks: (t,) those that are used. pose_inverse: (6k, 6k) the inverse of the
     poses' block; pose_score: (6k,); pose_mixed: (6k, m). point_inverse: (t, 3, 3); point_score:
-    (t, 3); point_mixed: (t, 6k + m, 3).
+    (t, 3); point_mixed: (t, 3, 6k + m).
     """
 
     keyframes: Ints
@@ -47,7 +47,7 @@ class Eliminated:
         pose = self.pose_inverse @ (self.pose_score - self.pose_mixed @ step)
         both = np.concatenate([pose, step])
         shift = np.einsum('tij,tj->ti', self.point_inverse,
-                          self.point_score - both @ self.point_mixed)
+                          self.point_score - self.point_mixed @ both)
         turn, move = np.split(pose.reshape(-1, POSE), 2, axis=1)
         rotations, translations = structure.rotations.copy(), structure.translations.copy()
         rotations[self.keyframes] = _rotation(turn) @ rotations[self.keyframes]
@@ -116,14 +116,26 @@ class ImagePrior:
         return np.asarray(own.covariance @ (own.score - mixed @ step))
 
 
-def turn_cost(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None = None,
+@dataclass(frozen=True)
+class Further:
+    """Further parameters that all turns share, beside the lens's: e of them.
+
+    columns: derivatives (n, 2, e) of the n used observations of a scene, in the order of their
+    images. sigmas: (e,) of their prior; inf: none.
+    """
+
+    columns: Callable[[Scene], Floats]
+    sigmas: Floats
+
+
+def turn_cost(scene: Scene, camera: Camera, loss_px: float, further: Sequence[Further] = (),
               images: ImagePrior | None = None) -> TurnCost:
     """Return what a scene knows of the camera, at the solution.
 
-    loss_px, by_shared: as normal_equations()'. images: what may differ between the images; None:
+    loss_px, further: as normal_equations()'. images: what may differ between the images; None:
     nothing.
     """
-    normal = normal_equations(scene, camera, loss_px, by_shared, by_image=images is not None)
+    normal = normal_equations(scene, camera, loss_px, further, by_image=images is not None)
     cost = normal.shared if images is None else images.eliminated(normal)
     return replace(normal.cost, hessian=cost.hessian, score=cost.score, by_track=cost.by_track)
 
@@ -140,16 +152,15 @@ def noise_in(scenes: Sequence[Scene], camera: Camera, loss_px: float) -> float:
     return squares / freedom
 
 
-def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None = None,
-                     by_image: bool = False) -> Normal:
+def normal_equations(scene: Scene, camera: Camera, loss_px: float,
+                     further: Sequence[Further] = (), by_image: bool = False) -> Normal:
     """Return the normal equations of a scene at the solution.
 
     loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply.
-    by_shared: (n, 2, e) derivatives of the n used observations, in the order of their images, by
-    e more parameters that all turns share. by_image: with the parameters of each image.
+    further: what turns share beside the lens. by_image: with the parameters of each image.
     """
     used = scene.structure.used
-    linear = _linearised(scene, camera, loss_px, by_shared, by_image)
+    linear = _linearised(scene, camera, loss_px, further, by_image)
     rows, columns = np.nonzero(used)
     keyframes, image = np.unique(rows, return_inverse=True)
     tracks, point = np.unique(columns, return_inverse=True)
@@ -160,18 +171,14 @@ def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_shared: Fl
         POSE * image[:, None] + np.arange(POSE), poses + own * image[:, None] + np.arange(own),
         np.broadcast_to(poses + images + np.arange(shared), (len(rows), shared))], axis=1)
 
-    reduced, inverse, mixed = _eliminate_points(linear, where, point, POSE + own)
+    reduced, points = _eliminate_points(linear, where, point, POSE + own)
     pose_inverse = _pose_inverse(reduced[:poses, :poses])
     response = pose_inverse @ reduced[:poses, poses:]
     hessian = reduced[poses:, poses:] - reduced[:poses, poses:].T @ response
 
     # each track's score with its point at its optimum, then with the poses at theirs, too
-    pulls = (linear.residual[:, None] @ linear.wide)[:, 0]
-    point_score = _summed(linear.residual[:, None] @ linear.by_point, point)[:, 0]
-    track_score = np.zeros(mixed.shape[:2])
-    track_score[point[:, None], where[:, :POSE + own]] = pulls[:, :POSE + own]
-    track_score[:, where[0, POSE + own:]] = _summed(pulls[:, POSE + own:], point)
-    track_score -= (mixed @ (inverse @ point_score[:, :, None]))[:, :, 0]
+    at_optimum = (points.inverse @ points.score[:, :, None])[:, :, 0]
+    track_score = points.pull - (at_optimum[:, None] @ points.mixed)[:, 0]
     scores = track_score[:, poses:] - track_score[:, :poses] @ response
     noise = _squares_and_freedom(used, linear.residual, linear.weight, len(camera.names()))
     return Normal(
@@ -179,7 +186,7 @@ def normal_equations(scene: Scene, camera: Camera, loss_px: float, by_shared: Fl
                  lens=len(camera.widened().names())),
         images // IMAGE,
         Eliminated(keyframes, tracks, pose_inverse, track_score[:, :poses].sum(axis=0),
-                   reduced[:poses, poses:], inverse, point_score, mixed))
+                   reduced[:poses, poses:], points.inverse, points.score, points.mixed))
 
 
 @dataclass(frozen=True)
@@ -196,7 +203,7 @@ class _Linear:
     weight: Floats
 
 
-def _linearised(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats | None,
+def _linearised(scene: Scene, camera: Camera, loss_px: float, further: Sequence[Further],
                 by_image: bool) -> _Linear:
     structure = scene.structure
     rows, columns = np.nonzero(structure.used)
@@ -213,26 +220,33 @@ def _linearised(scene: Scene, camera: Camera, loss_px: float, by_shared: Floats 
         middle = (np.array(camera.image_size) - 1) / 2
         shift = np.broadcast_to(np.eye(2), (len(rows), 2, 2))
         parts += [shift, (projected - middle)[:, :, None]]
-    parts.append(by_camera)
-    if by_shared is not None:
-        parts.append(by_shared)
-    wide = np.concatenate(parts, axis=2)
+    wide = np.concatenate([*parts, by_camera, *(each.columns(scene) for each in further)], axis=2)
     return _Linear(wide * weight[:, None, None], by_local @ rotation * weight[:, None, None],
                    residual, weight)
 
 
+@dataclass(frozen=True)
+class _Points:
+    """The points' part of the normal equations.
+
+    inverse: (t, 3, 3) of their blocks. score: (t, 3). mixed: (t, 3, size) blocks with all else.
+    pull: (t, size) the scores of all else from the observations of each point.
+    """
+
+    inverse: Floats
+    score: Floats
+    mixed: Floats
+    pull: Floats
+
+
 def _eliminate_points(linear: _Linear, where: npt.NDArray[np.intp], point: npt.NDArray[np.intp],
-                      local: int) -> tuple[Floats, Floats, Floats]:
-    """Return the normal matrix after the points are eliminated (Schur).
+                      local: int) -> tuple[Floats, _Points]:
+    """Return the normal matrix after the points are eliminated (Schur), and their part of it.
 
     where: (n, c) rows of that matrix for an observation's derivatives, ascending in the first
-    column; those behind the first `local` are the same for all. point: (n,) its point. Also
-    returned, for back-substitution: (t, 3, 3) the inverses of the points' blocks, (t, size, 3) the
-    mixed blocks.
+    column; those behind the first `local` are the same for all. point: (n,) its point.
     """
-    wide, by_point = linear.wide, linear.by_point
-    size, points = int(where.max()) + 1, int(point.max()) + 1
-    own, shared = wide[:, :, :local], wide[:, :, local:]
+    wide, size, count = linear.wide, int(where.max()) + 1, int(point.max()) + 1
     normal = np.zeros((size, size))
     starts = np.flatnonzero(np.diff(where[:, 0], prepend=-1))
     ends = np.append(starts, len(where))[1:]
@@ -243,25 +257,29 @@ def _eliminate_points(linear: _Linear, where: npt.NDArray[np.intp], point: npt.N
         block = flat[:, :local].T @ flat
         normal[np.ix_(rows, where[start])] = block
         normal[np.ix_(where[start, local:], rows)] = block[:, local:].T
-    flat = shared.reshape(-1, shared.shape[2])
-    normal[np.ix_(where[0, local:], where[0, local:])] = flat.T @ flat
+    flat = wide.reshape(-1, wide.shape[2])
+    shared = where[0, local:]
+    normal[np.ix_(shared, shared)] = (flat.T @ flat)[local:, local:]
 
-    mixed = np.zeros((points, size, 3))
-    # a point is seen once in an image
-    mixed[point[:, None], where[:, :local]] = own.transpose(0, 2, 1) @ by_point
-    mixed[:, where[0, local:]] = _summed(shared.transpose(0, 2, 1) @ by_point, point)
-    blocks = _summed(by_point.transpose(0, 2, 1) @ by_point, point)
-    # a little damping, so that badly determined points have a finite inverse
-    damping = 1e-9 * np.trace(blocks, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    inverse = np.linalg.inv(blocks + damping + 1e-12 * np.eye(3))
-    return normal - np.tensordot(mixed @ inverse, mixed, axes=([0, 2], [0, 2])), inverse, mixed
-
-
-def _summed(values: Floats, point: npt.NDArray[np.intp]) -> Floats:
-    """Return (t, ...) the sums of values (n, ...) over the observations of each point."""
+    # the residual is one more column beside a point's three: its products are the scores
+    four = np.concatenate([linear.by_point, linear.residual[:, :, None]], axis=2)
+    mixed, blocks = np.zeros((count, 4, size)), np.zeros((count, 4, 4))
     order = np.argsort(point, kind='stable')
-    starts = np.flatnonzero(np.diff(point[order], prepend=-1))
-    return np.asarray(np.add.reduceat(values[order], starts))
+    sorted_four, sorted_shared = four[order], wide[:, :, local:][order]
+    ends = np.cumsum(np.bincount(point))
+    for n, (start, end) in enumerate(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)):
+        own = sorted_four[start:end].reshape(-1, 4).T
+        mixed[n, :, shared[0]:] = own @ sorted_shared[start:end].reshape(own.shape[1], -1)
+        blocks[n] = own @ own.T
+    # a point is seen once in an image
+    mixed[point[:, None], :, where[:, :local]] = wide[:, :, :local].transpose(0, 2, 1) @ four
+    # a little damping, so that badly determined points have a finite inverse
+    of_points = blocks[:, :3, :3]
+    damping = 1e-9 * np.trace(of_points, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    inverse = np.linalg.inv(of_points + damping + 1e-12 * np.eye(3))
+    scaled = (np.linalg.cholesky(inverse).transpose(0, 2, 1) @ mixed[:, :3]).reshape(-1, size)
+    return normal - scaled.T @ scaled, _Points(inverse, blocks[:, :3, 3], mixed[:, :3],
+                                               mixed[:, 3])
 
 
 def _pose_inverse(poses: Floats) -> Floats:

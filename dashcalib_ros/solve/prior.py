@@ -8,9 +8,9 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import Prior
-from dashcalib_ros.camera.field import Field
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
+from dashcalib_ros.solve.normal import Further
 from dashcalib_ros.solve.quadratic import Quadratic
 
 # rendered images without noise would make the loss cut off everything
@@ -25,9 +25,6 @@ FOCAL_FLOOR, CENTRE_FLOOR = 0.0005, 0.0003
 # of fx for each px^2 of noise: a video with few bits moves its contents with their blocks, in all
 # turns alike. H.264 with 0.03 bits per pixel was up to 1.2 % off, at 0.056 px^2
 NOISE_FLOOR = 0.1
-# of fx, the same behind a field: KITTI 03 and 07 are so far from true rotations; behind a field
-# smaller than this, in px, it is smaller
-FIELD_FLOOR, WHOLE_FIELD_PX = 0.0025, 0.1
 
 
 def prior_of(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
@@ -82,30 +79,25 @@ def extra_sigma_of(camera: Camera) -> Floats:
 
 
 def wider_prior(camera: Camera, centred: Camera, config: IntrinsicsConfig,
-                sigmas: Sequence[float] = ()) -> Quadratic:
-    """Return the prior about the wider model's parameters, and e further ones, at unit noise.
+                further: Sequence[Further] = ()) -> Quadratic:
+    """Return the prior about the wider model's parameters, and further ones, at unit noise.
 
-    centred: the camera that the prior is about; camera: where the prior draws from. sigmas: (e,)
-    of the further ones.
+    centred: the camera that the prior is about; camera: where the prior draws from.
     """
     information = prior_information(centred, config)
-    further = 1 / np.square(np.r_[extra_sigma_of(camera), sigmas])
+    sigmas = np.concatenate([extra_sigma_of(camera), *(each.sigmas for each in further)])
     draws = information @ (prior_of(centred, config, 1.0).mean - camera.params)
-    return Quadratic.prior(information, further, np.r_[draws, np.zeros(len(further))])
+    return Quadratic.prior(information, 1 / np.square(sigmas),
+                           np.r_[draws, np.zeros(len(sigmas))])
 
 
-def floor_of(camera: Camera, noise: float, field: Field | None = None) -> Floats:
+def floor_of(camera: Camera, noise: float) -> Floats:
     """Return the sigmas (n,) of systematic errors, which no number of turns averages out.
 
-    noise: variance of a residual, px^2. field: that was taken out of the tracks: what is left of
-    it is the same for all turns.
+    noise: variance of a residual, px^2.
     """
     floor = np.zeros(len(camera.names()))
-    left = 0.0
-    if field is not None:
-        size_px = float(np.sqrt(np.mean(field.over(camera)**2)))
-        left = FIELD_FLOOR * min(1.0, size_px / WHOLE_FIELD_PX)
-    floor[:2] = np.linalg.norm([FOCAL_FLOOR, left, NOISE_FLOOR * noise]) * camera.fx
+    floor[:2] = np.hypot(FOCAL_FLOOR, NOISE_FLOOR * noise) * camera.fx
     floor[2:4] = CENTRE_FLOOR * camera.image_size[0]
     return floor
 

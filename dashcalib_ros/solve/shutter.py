@@ -17,7 +17,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.knowledge import Knowledge
-from dashcalib_ros.solve.normal import turn_cost
+from dashcalib_ros.solve.normal import Further, turn_cost
 from dashcalib_ros.solve.quadratic import Quadratic
 
 # s; step of the central difference for a point's speed in the picture
@@ -52,6 +52,12 @@ def row_shift(scene: Scene, camera: Camera) -> Floats:
     return shift
 
 
+def readout_parameter(camera: Camera, sigma_s: float = np.inf) -> Further:
+    """Return the readout as a parameter that turns share. sigma_s: of its prior."""
+    return Further(lambda scene: row_shift(scene, camera)[scene.structure.used][..., None],
+                   np.array([sigma_s]))
+
+
 def readout(scenes: Sequence[Scene], camera: Camera, loss_px: float, prior: Floats
             ) -> tuple[float, float]:
     """Return the readout that is still left in the scenes, and its sigma, s.
@@ -60,13 +66,11 @@ def readout(scenes: Sequence[Scene], camera: Camera, loss_px: float, prior: Floa
     a readout. The sigma treats each track as one measurement, and is inf where nothing moves or
     the stamps give no speed.
     """
-    shifts = [row_shift(scene, camera) for scene in scenes]
-    if not any(shift.any() for shift in shifts):
+    turns = tuple(turn_cost(scene, camera, loss_px, [readout_parameter(camera)])
+                  for scene in scenes)
+    if not any(turn.hessian[-1, -1] for turn in turns):
         return 0.0, float(np.inf)
-    known = Knowledge(camera, tuple(
-        turn_cost(scene, camera, loss_px, shift[scene.structure.used][..., None])
-        for scene, shift in zip(scenes, shifts, strict=True)),
-        Quadratic.prior(prior, np.zeros(1)), np.zeros(len(prior)))
+    known = Knowledge(camera, turns, Quadratic.prior(prior, np.zeros(1)), np.zeros(len(prior)))
     # the camera is at its optimum: only the readout has a gradient
     score = np.sum([turn.score[-1] for turn in known.turns_at_optimum])
     return float(known.total.covariance[-1, -1] * score), known.readout_sigma

@@ -8,16 +8,14 @@ tracks are moved to where a fixed crop would have seen them, and all is adjusted
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.fixed_camera import READOUT_S, Crops, Problem, problem_of, shift_priors
 from dashcalib_ros.solve.normal import IMAGE
-from dashcalib_ros.solve.shutter import row_shift
+from dashcalib_ros.solve.shutter import readout_parameter, row_shift
 from dashcalib_ros.solve.steps import Fit
 
 # of the width; the longest step of a shift in one round
@@ -43,13 +41,10 @@ def without_stabiliser(given: Fit, rounds: int) -> Fit:
     now = replace(given, crops=crops)
     for _ in range(rounds):
         now = now.with_usual_loss()
-        shutter = [row_shift(scene, now.camera) for scene in now.scenes] if now.readout_s else []
-        problem = problem_of(now.scenes, now.camera, now.centred, now.solver.loss_px,
-                             now.config.intrinsics,
-                             [shift[scene.structure.used][..., None]
-                              for scene, shift in zip(now.scenes, shutter, strict=False)],
-                             [READOUT_S] * bool(shutter))
-        now, strength = _step(now, problem, shutter)
+        problem = problem_of(
+            now.scenes, now.camera, now.centred, now.solver.loss_px, now.config.intrinsics,
+            [readout_parameter(now.camera, READOUT_S)] * bool(now.readout_s))
+        now, strength = _step(now, problem)
         now = now.adjusted(problem.noise).retriangulated()
         if len(now.scenes) < len(given.scenes):
             return given
@@ -58,18 +53,18 @@ def without_stabiliser(given: Fit, rounds: int) -> Fit:
     return now.with_usual_loss()
 
 
-def _step(fit: Fit, problem: Problem, shutter: Sequence[Floats]) -> tuple[Fit, float]:
+def _step(fit: Fit, problem: Problem) -> tuple[Fit, float]:
     """Return what one Gauss-Newton step makes of the fit, and how clear the step is."""
-    camera = fit.camera
+    camera, rolling = fit.camera, bool(fit.readout_s)
     count, lens = problem.own, len(camera.widened().names())
-    shared = range(count, lens + bool(shutter))
+    shared = range(count, lens + rolling)
     priors = shift_priors(problem, fit.crops)
     moving = problem.solved(priors, shared)
     strength = moving.strength(problem.solved(None, shared))
     moving = problem.solved(priors, shared, max(strength, 1.0))
     longest = float(np.abs(np.concatenate(moving.images)).max())
     part = min(1.0, LONGEST_STEP * camera.image_size[0] / max(longest, 1e-9))
-    step_s = part * float(moving.shared[-1]) if shutter else 0.0
+    step_s = part * float(moving.shared[-1]) if rolling else 0.0
     scenes, crops = [], dict(fit.crops)
     for n, (scene, normal) in enumerate(zip(fit.scenes, problem.normals, strict=True)):
         step = np.zeros(len(normal.cost.score))
@@ -79,9 +74,9 @@ def _step(fit: Fit, problem: Problem, shutter: Sequence[Floats]) -> tuple[Fit, f
         crop[normal.eliminated.keyframes] = step[priors[n].free].reshape(2, -1).T
         crops[scene.turn] = crops[scene.turn] + crop
         moved = without_crops(scene, {scene.turn: crop})
-        if shutter:
+        if rolling:
             moved = replace(moved, tracks=replace(
-                moved.tracks, xy=moved.tracks.xy - step_s * shutter[n]))
+                moved.tracks, xy=moved.tracks.xy - step_s * row_shift(scene, camera)))
         scenes.append(replace(moved, structure=normal.eliminated.moved(scene.structure, step)))
     nearer = camera.with_params(camera.params + part * moving.shared[:count])
     if nearer.covers_picture():

@@ -20,11 +20,10 @@ from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.field import FoundField
 from dashcalib_ros.solve.fitting import (
-    FIRST_TRACKS,
     explained_by,
     retriangulate_all,
-    subsample_tracks,
     with_better_poses,
+    with_few_tracks,
     with_poses_of,
 )
 from dashcalib_ros.solve.fixed_camera import (
@@ -34,10 +33,10 @@ from dashcalib_ros.solve.fixed_camera import (
     shift_prior,
 )
 from dashcalib_ros.solve.knowledge import Knowledge
-from dashcalib_ros.solve.normal import noise_in, turn_cost
+from dashcalib_ros.solve.normal import Further, noise_in, turn_cost
 from dashcalib_ros.solve.prior import bounds_of, floor_of, loss_px_of, prior_information, prior_of
 from dashcalib_ros.solve.quadratic import Quadratic, noise_of
-from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shift
+from dashcalib_ros.solve.shutter import readout, readout_parameter, remove_rolling_shutter
 
 ByTurn = Mapping[TurnId, Scene]
 Progress = Callable[[str, float], None]
@@ -88,6 +87,17 @@ class Fit:
         """Return the fit with its tracks triangulated anew; scenes without points are dropped."""
         return replace(self, scenes=retriangulate_all(self.scenes, self.camera, self.config.scene))
 
+    def with_few_tracks(self) -> Fit:
+        """Return the fit with a part of its tracks."""
+        return replace(self, scenes=list(map(with_few_tracks, self.scenes)),
+                       measured={turn: with_few_tracks(scene)
+                                 for turn, scene in self.measured.items()})
+
+    def as_measured(self) -> Fit:
+        """Return the fit with the effect of a rolling shutter in its tracks."""
+        scenes = [replace(scene, tracks=self.measured[scene.turn].tracks) for scene in self.scenes]
+        return replace(self, scenes=scenes, readout_s=0.0)
+
     def with_usual_loss(self) -> Fit:
         """Return the fit with the loss that its residuals ask for."""
         loss_px = loss_px_of(self.scenes, self.camera, self.config.intrinsics)
@@ -105,6 +115,11 @@ class Fit:
         return prior_information(self.centred, self.config.intrinsics)
 
     @property
+    def readout_left(self) -> tuple[float, float]:
+        """Return the readout that is still in the tracks, and its sigma, s."""
+        return readout(self.scenes, self.camera, self.solver.loss_px, self.prior)
+
+    @property
     def used_field(self) -> Field | None:
         """Return the field that was taken out of the tracks, None without one."""
         return self.field.field if self.field is not None and self.field.used else None
@@ -115,42 +130,41 @@ class Fit:
         camera, loss_px = self.camera, self.solver.loss_px
         noise = noise_in(self.scenes, camera, loss_px) if self.crops else 0.0
         turns = tuple(turn_cost(
-            scene, camera, loss_px, self._by_shared(scene),
+            scene, camera, loss_px, self._further,
             shift_prior(scene, noise, self.crops[scene.turn]) if self.crops
             else None) for scene in self.scenes)
-        left = LEFT_BY_FIELD if self.used_field is not None else 1.0
+        behind_field = self.used_field is not None
+        left = LEFT_BY_FIELD if behind_field else 1.0
         return Knowledge(
-            camera, turns, self._prior_of_all(),
-            floor_of(camera, noise_of(turns), self.used_field),
+            camera, turns, self._prior_of_all(), floor_of(camera, noise_of(turns)),
+            turns_err_alike=behind_field,
             one_turn_sigma=left * self.config.intrinsics.one_turn_sigma * camera.fx)
 
-    def _by_shared(self, scene: Scene) -> Floats | None:
-        """Return (n, 2, e) derivatives by the readout and by the directions of the field."""
-        columns = []
-        if self.readout_s:
-            columns.append(row_shift(scene, self.camera)[scene.structure.used][..., None])
-        if self.field is not None:
-            columns.append(self.field.columns(scene, self.camera))
-        return np.concatenate(columns, axis=-1) if columns else None
+    @property
+    def _further(self) -> list[Further]:
+        """Return what turns share beside the lens: the readout, the directions of the field."""
+        return ([readout_parameter(self.camera)] * bool(self.readout_s)
+                + ([] if self.field is None else [self.field.further(self.camera)]))
 
     def _prior_of_all(self) -> Quadratic:
         """Return the prior of the camera, of the readout, which has none, and of the field."""
-        further = score = np.zeros(1 if self.readout_s else 0)
+        precision = np.concatenate([np.zeros(0), *(1 / np.square(each.sigmas)
+                                                   for each in self._further)])
+        at = np.zeros(len(self.prior) + len(precision))
         if self.field is not None:
-            precision = np.full(self.field.basis.shape[1], self.field.sigma_px**-2.0)
-            further = np.r_[further, precision]
-            score = np.r_[score, -precision * self.field.directions]
-        return Quadratic.prior(self.prior, further, np.r_[np.zeros(len(self.prior)), score])
+            at[-self.field.basis.shape[1]:] = self.field.directions
+        return Quadratic.prior(self.prior, precision,
+                               -np.r_[np.zeros(len(self.prior)), precision] * at)
 
     def fixed_camera_tests(self, bent: bool = True) -> tuple[FixedCameraTest, ...]:
         """Return the tests whether the camera is a fixed one, the clearest that it is not first.
 
         bent: False leaves out the local bend, which takes longer.
         """
-        scenes = [subsample_tracks(scene, FIRST_TRACKS) for scene in self.scenes]
         return fixed_camera_tests(
-            scenes, self.camera, self.centred, self.solver.loss_px, self.config.intrinsics,
-            self.crops, bent, bool(self.readout_s), self.field)
+            list(map(with_few_tracks, self.scenes)), self.camera, self.centred,
+            self.solver.loss_px, self.config.intrinsics, self.crops, bent, bool(self.readout_s),
+            self.field)
 
 
 def fit_one_focal_length(measured: ByTurn, start: Camera, config: Config, progress: Progress
@@ -162,15 +176,14 @@ def fit_one_focal_length(measured: ByTurn, start: Camera, config: Config, progre
     settings = config.intrinsics
     solver = Solver(config.scene.loss_px, config.scene.iterations)
     reach = (start.fx / FOCAL_REACH, start.fx * FOCAL_REACH)
-    few = [subsample_tracks(scene, FIRST_TRACKS) for scene in measured.values()]
+    few = list(map(with_few_tracks, measured.values()))
     camera = start
     for n in range(settings.rounds):
         progress('adjusting one focal length', n / settings.rounds)
         few, camera = adjust(few, camera, solver, 'one focal length', reach)
         few = retriangulate_all(few, camera, config.scene)
     kept = explained_by(few, measured, camera, config)
-    return Fit([subsample_tracks(scene, FIRST_TRACKS) for scene in kept], camera, camera, solver,
-               measured, config)
+    return Fit(list(map(with_few_tracks, kept)), camera, camera, solver, measured, config)
 
 
 def fit_roughly(first: Fit) -> Fit:
@@ -231,8 +244,7 @@ def _measured_again(fit: Fit) -> Fit:
     """Return the scenes triangulated anew, after the readout was measured once more."""
     if not fit.readout_s:
         return fit.retriangulated()
-    step_s, _ = readout(fit.scenes, fit.camera, fit.solver.loss_px, fit.prior)
-    return _without_rolling_shutter(fit, fit.readout_s + step_s)
+    return _without_rolling_shutter(fit, fit.readout_s + fit.readout_left[0])
 
 
 def _without_rolling_shutter(fit: Fit, readout_s: float) -> Fit:
@@ -240,14 +252,6 @@ def _without_rolling_shutter(fit: Fit, readout_s: float) -> Fit:
     moved = [remove_rolling_shutter(scene, fit.measured[scene.turn], fit.camera, readout_s)
              for scene in fit.scenes]
     return replace(fit, scenes=moved, readout_s=readout_s).retriangulated()
-
-
-def without_shutter(fit: Fit) -> Fit:
-    """Return the fit of a part of the tracks, these as they were measured, adjusted again."""
-    measured = {turn: subsample_tracks(scene, FIRST_TRACKS)
-                for turn, scene in fit.measured.items()}
-    scenes = [replace(scene, tracks=measured[scene.turn].tracks) for scene in fit.scenes]
-    return replace(fit, scenes=scenes, readout_s=0.0).retriangulated().adjusted().retriangulated()
 
 
 def _changed(before: Fit, after: Fit) -> float:

@@ -363,6 +363,18 @@ def test_the_largest_of_the_estimates_counts():
     np.testing.assert_allclose(sigma(*[part(1.0), part(-1.0)] * 4), calm / 2, rtol=1e-3)
 
 
+def test_turns_whose_tracks_err_alike_do_not_average_it_out():
+    def sigma(count: int, alike: bool) -> float:
+        parts = [TurnCost(1e4 * np.eye(9), np.full(9, score), 1e4 * np.eye(9), 100.0, 100.0, 9)
+                 for score in (1.0, -1.0) * (count // 2)]
+        found = replace(knowledge(parts), turns_err_alike=alike)
+        return float(np.sqrt(found.covariance[0, 0]))
+
+    assert sigma(8, False) == pytest.approx(sigma(2, False) / 2, rel=1e-3)
+    assert sigma(8, True) == pytest.approx(sigma(2, True), rel=1e-3)
+    assert sigma(2, True) == pytest.approx(0.01, rel=1e-3)
+
+
 def test_a_turn_without_information_adds_no_certainty():
     nothing = TurnCost(np.zeros((9, 9)), np.zeros(9), np.zeros((9, 9)), 1.0, 1.0, 9)
     something = TurnCost(1e4 * np.eye(9), np.ones(9), 1e4 * np.eye(9), 100.0, 100.0, 9)
@@ -391,6 +403,23 @@ def test_the_models_error_shows_in_sigma():
     assert (errors['p'][2:4] > 3 * errors['none'][2:4]).all()
     assert errors['k3'][5] > 3 * errors['none'][5]
     assert errors['none'][0] < 0.005 * LENS.fx
+
+
+def test_points_settle_where_their_observations_ask_for_them(good):
+    scene, camera = good.scenes[0], good.camera
+    rng = np.random.default_rng(0)
+    away = scene.structure.points * (1 + 0.005 * rng.normal(size=scene.structure.points.shape))
+    moved = replace(scene, structure=replace(scene.structure, points=away))
+    loss_px = 0.5
+
+    def cost(scene: Scene) -> float:
+        found = residuals_px(scene, camera)[scene.structure.used]
+        return float(np.log1p(np.sum(found**2, axis=1) / loss_px**2).sum())
+
+    settled = fitting.with_points_settled(moved, camera, loss_px)
+    assert cost(moved) > 1.5 * cost(scene)
+    assert cost(settled) < 1.001 * cost(scene)
+    np.testing.assert_array_equal(settled.structure.rotations, scene.structure.rotations)
 
 
 # the verdict
