@@ -123,7 +123,9 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
                'roll_right_deg': None if roll is None else roll[1],
                'height_m': None if height is None else height[1]},
         travel_px=(float(travel[0]), float(travel[1])),
-        travel_sigma_px=float(solution.px * np.radians(np.hypot(*sigma)) * camera.fx / np.sqrt(2)),
+        # on other roads it is elsewhere, however many places were averaged
+        travel_sigma_px=float(solution.px * camera.fx * np.radians(
+            np.hypot(np.hypot(*sigma) / np.sqrt(2), HEADING_FLOOR_DEG))),
         straight_m=metres, moved_s=moved_s)
 
 
