@@ -71,7 +71,8 @@ def with_points_settled(scene: Scene, camera: Camera, loss_px: float) -> Scene:
         by_point, residual = by_local @ rotation, observed - projected
         weighted = (by_point / (1 + off)[:, None, None]).transpose(0, 2, 1)
         blocks = summed(weighted @ by_point)
-        damping = POINT_DAMPING * np.einsum('tii->ti', blocks)[:, :, None] * np.eye(3)
+        # a badly determined point has a solution, too
+        damping = (POINT_DAMPING * np.einsum('tii->ti', blocks)[:, :, None] + 1e-12) * np.eye(3)
         step = np.linalg.solve(blocks + damping, summed(weighted @ residual[:, :, None]))
         moved = points + step[:, :, 0]
         after = squares(moved)

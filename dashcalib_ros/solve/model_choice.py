@@ -34,16 +34,11 @@ def with_model_chosen(first: Fit) -> tuple[Fit, tuple[Candidate, ...]]:
     Others are tried only where the first one leaves something for them to explain, and with a part
     of the tracks; the one that is chosen is adjusted with all.
     """
-    camera = first.camera
     if len(first.scenes) < 2 or not leaves_more(first):
         return first, ()
-    models = larger_models(camera)
-    few = first.with_few_tracks()
-    found = [refitted(few, type(camera)),
-             *(refitted_without_shutter(few, model) for model in models)]
-    chosen, tried = chosen_of([result for result in found if result is not None])
+    chosen, tried = chosen_of(_with_models(first, larger_models(first.camera)))
     model = type(chosen.camera)
-    if model is type(camera):
+    if model is type(first.camera):
         return first, tried
     return refitted_without_shutter(first, model) or first, tried
 
@@ -55,21 +50,24 @@ def compared_with_others(asked: Fit) -> tuple[Candidate, ...]:
     """
     if len(asked.scenes) < 2:
         return ()
-    few = asked.with_few_tracks()
     camera = asked.camera
-    larger = larger_models(camera)
-    found = [refitted(few, type(camera))]
-    if found[0] is None:
+    results = _with_models(asked, [model for model in calibrated_models()
+                                   if model is not type(camera)])
+    if not any(type(result.camera) is type(camera) for result in results):
         return ()
-    for model in calibrated_models():
-        if model is not type(camera):
-            fitted = refitted_without_shutter if model in larger else refitted
-            found.append(fitted(few, model))
-    chosen, tried = chosen_of([result for result in found if result is not None])
+    chosen, tried = chosen_of(results)
     # the result is adjusted with all tracks
     apart_px = mapping_error(camera, chosen.camera)
     return tuple(replace(each, apart_px=apart_px) if each.model == camera.model else each
                  for each in tried)
+
+
+def _with_models(fit: Fit, others: Sequence[type[Camera]]) -> list[Fit]:
+    """Return the fit with a part of its tracks, in its own model and in others that fit."""
+    few, larger = fit.with_few_tracks(), larger_models(fit.camera)
+    found = [(refitted_without_shutter if model in larger else refitted)(few, model)
+             for model in (type(fit.camera), *others)]
+    return [result for result in found if result is not None]
 
 
 def left_out_costs(fit: Fit, loss_px: float) -> dict[TurnId, float]:
