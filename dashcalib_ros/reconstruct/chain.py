@@ -97,7 +97,7 @@ def _initial_pair(rays: Floats, error_rad: float, seed: int
             if both.sum() >= MIN_SHARED:
                 moved = np.linalg.norm(rays[first, both] - rays[first + gap, both], axis=1)
                 # the spread of the motion, not the motion: a rotation moves all points alike
-                # percentile() takes ten times as long
+                # percentile() takes five times as long
                 low, high = np.interp((0.1, 0.9), np.linspace(0, 1, len(moved)), np.sort(moved))
                 candidates.append((float(both.sum()) * min(high - low, 0.2), first, first + gap))
     for _, first, second in sorted(candidates, reverse=True)[:5]:
