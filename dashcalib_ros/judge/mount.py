@@ -372,13 +372,26 @@ def _height(pairs: _Pairs, kept: Mask, way: Floats, down: Floats) -> tuple[float
     """
     points = pairs.points[kept]
     depth = points @ down
-    with np.errstate(invalid='ignore'):
-        aside = np.linalg.norm(np.cross(points, pairs.ahead[kept][:, None]), axis=-1)
-        near = (depth > 0) & (np.sqrt(np.maximum(aside**2 - depth**2, 0)) < LANE * depth)
+    with np.errstate(invalid='ignore', divide='ignore'):
+        across = np.linalg.norm(np.cross(points, pairs.ahead[kept][:, None]), axis=-1)
+        aside = np.sqrt(np.maximum(across**2 - depth**2, 0)) / depth
+        near = (depth > 0) & (aside < LANE)
     of_pair, place = np.nonzero(near & (way[kept] > 0)[:, None])
     if len(of_pair) < LEAST_ROAD_POINTS:
         return None
     logs = np.log(depth[of_pair, place] * way[kept][of_pair])
+    aside = aside[of_pair, place]
+    middle, weights = _most_common(logs)
+    # a kerb, parked cars or a wrong roll make the two halves differ: the sides are no road then
+    inner = aside < np.median(aside)
+    apart = _most_common(logs[inner])[0] - _most_common(logs[~inner])[0]
+    height, seen_in = float(np.exp(middle)), len(np.unique(of_pair[weights > 0.5]))
+    return height, height * float(np.linalg.norm(
+        [HEIGHT_FLOOR, ROAD_SPREAD / np.sqrt(max(seen_in, 1)), apart / 2]))
+
+
+def _most_common(logs: Floats) -> tuple[float, Floats]:
+    """Return the most common logarithm of a height, and the weight of each point (n,) in it."""
     low, high = np.percentile(logs, (5, 95))
     grid = np.linspace(low, high, 200)
     middle = float(grid[np.exp(-((grid[:, None] - logs) / ROAD_SPREAD)**2 / 2).sum(1).argmax()])
@@ -386,5 +399,4 @@ def _height(pairs: _Pairs, kept: Mask, way: Floats, down: Floats) -> tuple[float
     for _ in range(ROUNDS):
         weights = np.exp(-((logs - middle) / ROAD_SPREAD)**2 / 2)
         middle = float(weights @ logs / weights.sum())
-    height, seen_in = float(np.exp(middle)), len(np.unique(of_pair[weights > 0.5]))
-    return height, height * float(np.hypot(HEIGHT_FLOOR, ROAD_SPREAD / np.sqrt(max(seen_in, 1))))
+    return middle, weights

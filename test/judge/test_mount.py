@@ -34,14 +34,18 @@ def mounted(yaw_left, pitch_up, roll_right):
                                degrees=True).as_matrix() @ OPTICAL
 
 
-def pairs_of(mount, count=40, noise_px=0.2, still=0.0, seed=0):
-    """Drive straight on over a plane between houses; still: share of the points on the bonnet."""
+def pairs_of(mount, count=40, noise_px=0.2, still=0.0, seed=0, kerb_m=0.0):
+    """Drive straight on over a plane between houses; still: share of the points on the bonnet.
+
+    kerb_m: height of what is beside the lane.
+    """
     rng = np.random.default_rng(seed)
     collector = StraightCollector()
     for n in range(count):
         world = np.column_stack([rng.uniform(4, 40, 600), rng.uniform(-12, 12, 600),
                                  rng.uniform(0, 6, 600) - HEIGHT_M])
         world[:300, 1:] = np.column_stack([rng.uniform(-3, 3, 300), np.full(300, -HEIGHT_M)])
+        world[:300, 2] += kerb_m * (np.abs(world[:300, 1]) > 1.2)
         # nods from image to image, as a body does
         nod = Rotation.from_euler('y', rng.normal(0, 0.2), degrees=True).as_matrix()
         seen = []
@@ -103,6 +107,16 @@ def test_turns_alone_tell_all_angles(solution):
     # a crowned road of 2 % leans the car by 1.15 degrees in all turns alike
     assert 2 * found.sigma['roll_right_deg'] > 1.15
     assert found.straight_m == 0.0
+
+
+def test_a_kerb_that_is_taken_for_the_road_is_in_the_sigma_of_the_height(solution):
+    known = replace(solution, camera=LENS, scenes=())
+    level, high = (mount_of(pairs_of(mounted(0, 0, 0), kerb_m=kerb_m), None, known, 'accepted',
+                            at(SPEED)) for kerb_m in (0.0, 0.3))
+    # most of the points are on the kerb
+    assert high.height_m < HEIGHT_M - 0.15
+    assert abs(high.height_m - HEIGHT_M) < 3 * high.sigma['height_m']
+    assert high.sigma['height_m'] > 2 * level.sigma['height_m']
 
 
 def test_height_follows_the_speed_halfway(solution):
