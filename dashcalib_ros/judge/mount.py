@@ -380,11 +380,11 @@ def _height(pairs: _Pairs, kept: Mask, way: Floats, down: Floats) -> tuple[float
     if len(of_pair) < LEAST_ROAD_POINTS:
         return None
     logs = np.log(depth[of_pair, place] * way[kept][of_pair])
-    aside = aside[of_pair, place]
+    outwards = np.argsort(aside[of_pair, place])
     middle, weights = _most_common(logs)
     # a kerb, parked cars or a wrong roll make the two halves differ: the sides are no road then
-    inner = aside < np.median(aside)
-    apart = _most_common(logs[inner])[0] - _most_common(logs[~inner])[0]
+    inner, outer = np.array_split(logs[outwards], 2)
+    apart = _most_common(inner)[0] - _most_common(outer)[0]
     height, seen_in = float(np.exp(middle)), len(np.unique(of_pair[weights > 0.5]))
     return height, height * float(np.linalg.norm(
         [HEIGHT_FLOOR, ROAD_SPREAD / np.sqrt(max(seen_in, 1)), apart / 2]))
