@@ -2,8 +2,9 @@
 
 Yaw and pitch are those of the direction of travel: of pairs of images on straight stretches, and
 of each turn's path where it does not bend. Roll is that of the plane of the path where it does
-not bend (a body leans in bends), and of upright lines. Height is how far the road of the own lane
-lies below, where speed is known. What the sources say is averaged; sigma grows where they differ.
+not bend (a body leans in bends), and of upright lines. Height is that of a turn's path above the
+points over which the car drives, where speed is known. What the sources say is averaged; sigma
+grows where they differ.
 """
 from __future__ import annotations
 
@@ -18,12 +19,15 @@ from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.judge.calibration import MOVED_DEG, MOVED_SIGMAS, Mount
+from dashcalib_ros.judge.monitor import HEADING_SIGMA_DEG, PITCH_SIGMA_DEG
 from dashcalib_ros.reconstruct.heading import MAD, heading
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.solution import Solution
 
 # of a pair's poses: steps of Gauss-Newton, and the loss in px, narrowing to what tracks need
 STEPS, FIRST_PX, LAST_PX, NARROWING = 20, 3.0, 0.7, 0.8
+# m/s^2; a body that brakes or gathers speed nods: where the speed is known, it is left out
+STEADY_M_S2 = 1.0
 # radians; the farthest a step goes
 LONGEST_STEP = 0.1
 # degrees a second; beyond it a stretch is no straight one (openpilot's limit, too)
@@ -37,6 +41,8 @@ BLOCKS, LEAST_PAIRS = 12, 8
 # to point elsewhere on other roads (KITTI 03 by 0.5 between its ends), and beyond which single
 # pairs do not count
 LEAST_SIDE, PLACES_DEG, OUTLIER_DEG = 20, 0.15, 2.0
+# of the points of a pair, those that are enough to see that a camera was moved
+THINNED = 3
 # degrees of yaw and of pitch; with more it is weak. openpilot's spread on one car is as large
 ACCEPTED_DEG = 0.2
 # degrees; what no source is better than: slopes, crowns and bumps, between places
@@ -48,11 +54,10 @@ CROWN_DEG = 0.6
 LEAST_YAW_DEG, UNBENT = 30.0, 0.3
 # upright lines, and the loss in radians
 LEAST_LINES, LINE_LOSS = 100, 0.05
-# of the road's points: px of parallax, times the height to the side, of the logarithm of height
-LEAST_PARALLAX_PX, LANE, ROAD_SPREAD = 6.0, 2.5, 0.08
-LEAST_ROAD_POINTS = 60
-# of height: cambers, slopes and the load of the car. Three of KITTI's drives are 0 to 4 % off
-HEIGHT_FLOOR = 0.02
+# times the height to the side of the path: the road between the wheels; images that see a point
+ROADWAY, LEAST_SEEN, LEAST_ROAD_POINTS = 1.0, 3, 8
+# of height: what turns differ by, and what all may share: slopes, and the load of the car
+TURN_SCATTER, HEIGHT_FLOOR = 0.01, 0.01
 # m above the road, and m/s: where speed is unknown, straight_m assumes a camera that high
 USUAL_HEIGHT_M, USUAL_SPEED = 1.4, 10.0
 ROUNDS = 20
@@ -62,15 +67,11 @@ Speed = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class _Pairs:
-    """What n pairs say. ahead: (n, 3) direction of travel halfway; sigma_deg, rate_deg_s: (n,).
-
-    points: (n, POINTS, 3) in units of the way between both images; NaN where unknown.
-    """
+    """What n pairs say. ahead: (n, 3) direction of travel halfway; sigma_deg, rate_deg_s: (n,)."""
 
     ahead: Floats
     sigma_deg: Floats
     rate_deg_s: Floats
-    points: Floats
 
 
 def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str,
@@ -82,10 +83,15 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
     """
     camera = solution.camera
     pairs = _fitted(camera, _without_field(straights, solution))
-    kept = (np.abs(pairs.rate_deg_s) < STRAIGHT_DEG_S) & (pairs.sigma_deg < MOST_PAIR_SIGMA)
+    kept = _kept(pairs)
+    # where the speed is not known, a second is the unit
+    driven = speed or (lambda stamps_s: np.ones(len(stamps_s)))
+    before_s, apart_s = straights.stamps_s - straights.apart_s, straights.apart_s
+    kept &= np.abs(driven(straights.stamps_s) - driven(before_s)) < STEADY_M_S2 * apart_s
     roll = _roll(solution.scenes, lines, camera)
     scenes: Sequence[Scene] = solution.scenes
-    moved_s = _moved_s(pairs, kept, straights.stamps_s)
+    change = _moved(pairs, kept, straights.stamps_s)
+    moved_s = change and change[0]
     if moved_s is not None:
         # what was before is another mounting
         kept &= straights.stamps_s > moved_s
@@ -101,15 +107,8 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
     travel = resized_pixels(camera.project(ahead[None])[0], solution.px)
     own = np.degrees(solution.sigma[2:4] / solution.camera.params[:2])
     total = np.hypot(sigma, own)
-    # downwards, at a right angle to the direction of travel
-    down = _direction(np.array([0.0, 90.0]), turned)
-    down = down - ahead * float(down @ ahead)
-    down = down / np.linalg.norm(down)
-    # where the speed is not known, a second is the unit
-    halfway_s = straights.stamps_s - straights.apart_s / 2
-    way = straights.apart_s * (1.0 if speed is None else speed(halfway_s))
-    height = _height(pairs, kept, way, down)
-    metres = float(way[kept].sum() / 2)
+    height = _height(scenes, driven, _direction(np.array([angles[0], angles[1] + 90.0]), turned))
+    metres = float((apart_s * driven(before_s + apart_s / 2))[kept].sum() / 2)
     if speed is None:
         metres *= USUAL_SPEED if height is None else USUAL_HEIGHT_M / height[0]
         height = None
@@ -127,6 +126,18 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
         travel_sigma_px=float(solution.px * camera.fx * np.radians(
             np.hypot(np.hypot(*sigma) / np.sqrt(2), HEADING_FLOOR_DEG))),
         straight_m=metres, moved_s=moved_s)
+
+
+def moved(straights: Straights, camera: Camera) -> tuple[float, Floats] | None:
+    """Return when and by how much a camera was moved on the car; None where it was not.
+
+    That is a stamp, s, after which it points elsewhere, and (2,) degrees to the left and upwards.
+    straights: in the camera's pixels.
+    """
+    some = replace(straights, before=straights.before[:, ::THINNED],
+                   after=straights.after[:, ::THINNED])
+    pairs = _fitted(camera, some)
+    return _moved(pairs, _kept(pairs), straights.stamps_s)
 
 
 def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[str, ...]:
@@ -185,14 +196,8 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
     rotation = Rotation.from_matrix(turned)
     vector = rotation.as_rotvec()
     ahead = -(Rotation.from_rotvec(-vector / 2).apply(back))
-    # along a ray: first * depth, where its other ray passes it
-    across = np.cross(second, np.einsum('nij,npj->npi', turned, first))
-    square = np.maximum(np.sum(across**2, axis=-1), np.finfo(float).tiny)
-    depth = -np.sum(across * np.cross(second, back[:, None]), axis=-1) / square
-    known = seen & (depth > 0) & (np.sqrt(square) > LEAST_PARALLAX_PX * unit)
     return _Pairs(ahead * np.sign(ahead[:, 2:]), np.degrees(noise * np.sqrt(variance)),
-                  np.degrees(vector[:, 1]) / straights.apart_s,
-                  np.where(known[..., None], depth[..., None] * first, np.nan))
+                  np.degrees(vector[:, 1]) / straights.apart_s)
 
 
 def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
@@ -230,7 +235,8 @@ def _heading(pairs: _Pairs, kept: Mask, scenes: Sequence[Scene], roll: float
             level = _angles(_direction(np.array([found.yaw_deg, found.pitch_deg]), 0.0)[None],
                             roll)[0]
             values.append(level)
-            sigmas.append(np.array([found.yaw_sigma_deg, found.pitch_sigma_deg]))
+            sigmas.append(np.hypot([found.yaw_sigma_deg, found.pitch_sigma_deg],
+                                   [HEADING_SIGMA_DEG, PITCH_SIGMA_DEG]))
     if not values:
         return None
     both = [_averaged(np.array(values)[:, n], np.array(sigmas)[:, n], HEADING_FLOOR_DEG)
@@ -250,11 +256,13 @@ def _of_pairs(pairs: _Pairs, kept: Mask, roll: float) -> tuple[Floats, Floats]:
         (without - without.mean(axis=0))**2, axis=0))
 
 
-def _moved_s(pairs: _Pairs, kept: Mask, stamps_s: Floats) -> float | None:
-    """Return the stamp after which the camera points elsewhere, s; None where it does not.
+def _kept(pairs: _Pairs) -> Mask:
+    return np.asarray((np.abs(pairs.rate_deg_s) < STRAIGHT_DEG_S)
+                      & (pairs.sigma_deg < MOST_PAIR_SIGMA), bool)
 
-    The place where both sides differ most is asked with the sigmas of both.
-    """
+
+def _moved(pairs: _Pairs, kept: Mask, stamps_s: Floats) -> tuple[float, Floats] | None:
+    """Return what moved() does. The place where both sides differ most is asked."""
     places = np.flatnonzero(kept)
     if len(places) < 2 * LEAST_SIDE:
         return None
@@ -271,7 +279,7 @@ def _moved_s(pairs: _Pairs, kept: Mask, stamps_s: Floats) -> float | None:
     limit = np.maximum(MOVED_DEG, MOVED_SIGMAS * np.sqrt(its_sigma**2 + sigma**2 + floor**2))
     if (np.abs(after - before) <= limit).all():
         return None
-    return float(stamps_s[places[split - 1]])
+    return float(stamps_s[places[split - 1]]), after - before
 
 
 def _at_rest(angles: Floats, rate: Floats, weights: Floats) -> Floats:
@@ -330,22 +338,25 @@ def _roll(scenes: Sequence[Scene], lines: Lines | None, camera: Camera
 
 def _roll_of_path(scene: Scene) -> float | None:
     """Return the roll against the plane of a turn's path, where it does not bend, degrees."""
-    structure = scene.structure
-    rotations = structure.rotations[structure.registered]
     if abs(scene.yaw_deg) < LEAST_YAW_DEG:
         return None
-    centres = -np.einsum('kji,kj->ki', rotations, structure.translations[structure.registered])
+    rotations, centres = scene.structure.path()
     normal = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)[2][2]
     up = rotations @ normal
     up *= -np.sign(np.median(up[:, 1]))
-    steps = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)
-    length = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    bend = np.abs(steps[:, 0, 2]) / np.maximum(length, np.finfo(float).tiny)
+    bend = _bend(rotations, centres)
     at = np.concatenate([bend[:1], (bend[1:] + bend[:-1]) / 2, bend[-1:]])
     straight = at < UNBENT * at.max()
     if not straight.any():
         return None
     return float(np.median(np.degrees(np.arctan2(-up[straight, 0], -up[straight, 1]))))
+
+
+def _bend(rotations: Floats, centres: Floats) -> Floats:
+    """Return (n - 1,) how much a path bends from image to image, radians per unit of way."""
+    steps = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)
+    length = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    return np.asarray(np.abs(steps[:, 0, 2]) / np.maximum(length, np.finfo(float).tiny))
 
 
 def _roll_of_lines(lines: Lines, camera: Camera) -> float:
@@ -365,38 +376,46 @@ def _roll_of_lines(lines: Lines, camera: Camera) -> float:
     return float(np.degrees(np.arctan2(-up[0], -up[1])))
 
 
-def _height(pairs: _Pairs, kept: Mask, way: Floats, down: Floats) -> tuple[float, float] | None:
-    """Return the height above the road of the own lane and its sigma; None where it is not seen.
+def _height(scenes: Sequence[Scene], speed: Speed, down: Floats) -> tuple[float, float] | None:
+    """Return the height above the road, m, and its sigma; None where no turn shows it.
 
-    way: (n,) how far the car drove between a pair's images: the unit of its points.
+    down: (3,) in the camera's frame.
     """
-    points = pairs.points[kept]
-    depth = points @ down
-    with np.errstate(invalid='ignore', divide='ignore'):
-        across = np.linalg.norm(np.cross(points, pairs.ahead[kept][:, None]), axis=-1)
-        aside = np.sqrt(np.maximum(across**2 - depth**2, 0)) / depth
-        near = (depth > 0) & (aside < LANE)
-    of_pair, place = np.nonzero(near & (way[kept] > 0)[:, None])
-    if len(of_pair) < LEAST_ROAD_POINTS:
+    found = [each for scene in scenes if (each := _height_in_turn(scene, speed, down)) is not None]
+    if not found:
         return None
-    logs = np.log(depth[of_pair, place] * way[kept][of_pair])
-    outwards = np.argsort(aside[of_pair, place])
-    middle, weights = _most_common(logs)
-    # a kerb, parked cars or a wrong roll make the two halves differ: the sides are no road then
-    inner, outer = np.array_split(logs[outwards], 2)
-    apart = _most_common(inner)[0] - _most_common(outer)[0]
-    height, seen_in = float(np.exp(middle)), len(np.unique(of_pair[weights > 0.5]))
-    return height, height * float(np.linalg.norm(
-        [HEIGHT_FLOOR, ROAD_SPREAD / np.sqrt(max(seen_in, 1)), apart / 2]))
+    logs, sigmas = np.array(found).T
+    log, sigma = _averaged(logs, sigmas, TURN_SCATTER)
+    return float(np.exp(log)), float(np.exp(log) * np.hypot(sigma, HEIGHT_FLOOR))
 
 
-def _most_common(logs: Floats) -> tuple[float, Floats]:
-    """Return the most common logarithm of a height, and the weight of each point (n,) in it."""
-    low, high = np.percentile(logs, (5, 95))
-    grid = np.linspace(low, high, 200)
-    middle = float(grid[np.exp(-((grid[:, None] - logs) / ROAD_SPREAD)**2 / 2).sum(1).argmax()])
-    weights = np.ones(len(logs))
-    for _ in range(ROUNDS):
-        weights = np.exp(-((logs - middle) / ROAD_SPREAD)**2 / 2)
-        middle = float(weights @ logs / weights.sum())
-    return middle, weights
+def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, float] | None:
+    """Return the logarithm of the height of a path above the road under it, and its sigma."""
+    structure = scene.structure
+    rotations, centres = structure.path()
+    stamps_s = scene.tracks.stamps_ns[structure.registered] / 1e9
+    # in a bend the camera is faster than what measures the speed
+    bend, ways = _bend(rotations, centres), np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    straight = bend < UNBENT * bend.max()
+    metres = speed((stamps_s[1:] + stamps_s[:-1]) / 2) * np.diff(stamps_s)
+    if not metres[straight].sum() > 0:
+        return None
+    unit = metres[straight].sum() / ways[straight].sum()
+    ahead = np.gradient(centres, axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    down = (rotations.transpose(0, 2, 1) @ down).mean(axis=0)
+    seen = structure.used.sum(axis=0) >= LEAST_SEEN
+    offsets = structure.points[seen] - centres[:, None]
+    level = offsets - (offsets @ down)[..., None] * down
+    nearest = np.argmin(np.linalg.norm(level, axis=2), axis=0)
+    offset, ahead = offsets[nearest, np.arange(len(nearest))], ahead[nearest]
+    along = np.sum(offset * ahead, axis=1)
+    across = offset - along[:, None] * ahead
+    depth = across @ down
+    aside = np.linalg.norm(across - depth[:, None] * down, axis=1)
+    road = (depth > 0) & (aside < ROADWAY * depth) & (np.abs(along) < ways.max())
+    if road.sum() < LEAST_ROAD_POINTS:
+        return None
+    logs = np.log(depth[road] * unit)
+    middle = float(np.median(logs))
+    return middle, MAD * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))

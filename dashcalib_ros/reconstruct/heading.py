@@ -49,12 +49,10 @@ class Heading:
 
 def heading(scene: Scene) -> Heading | None:
     """Return the heading in a turn, None where too few keyframes are registered."""
-    structure = scene.structure
-    rotations = structure.rotations[structure.registered]
+    rotations, centres = scene.structure.path()
     if len(rotations) < LEAST_KEYFRAMES:
         return None
     from scipy.spatial.transform import Rotation
-    centres = -np.einsum('kji,kj->ki', rotations, structure.translations[structure.registered])
     turned = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec()
     # the direction of a step, in the camera's frame halfway through it
     halfway = Rotation.from_rotvec(turned / 2).as_matrix() @ rotations[:-1]
@@ -91,8 +89,7 @@ def roll_deg(scenes: Sequence[Scene]) -> float:
 def _open_below(scene: Scene, down: Floats) -> float:
     """Return the log of how much farther the deepest points spread than the highest ones."""
     structure = scene.structure
-    rotations = structure.rotations[structure.registered]
-    centres = -np.einsum('kji,kj->ki', rotations, structure.translations[structure.registered])
+    rotations, centres = structure.path()
     points = structure.points[structure.used.any(axis=0)]
     offsets = points[:, None] - centres
     far = np.linalg.norm(offsets, axis=2)

@@ -35,6 +35,11 @@ class Structure:
     registered: Mask
     used: Mask
 
+    def path(self) -> tuple[Floats, Floats]:
+        """Return the rotations (n, 3, 3) and the centres (n, 3) of the n registered images."""
+        rotations = self.rotations[self.registered]
+        return rotations, -np.einsum('kji,kj->ki', rotations, self.translations[self.registered])
+
 
 def triangulate(camera: Camera, rays: Floats, rotations: Floats, translations: Floats,
                 registered: Mask, error_px: float, min_angle_deg: float

@@ -184,8 +184,7 @@ def view_svg(scene: Scene, frame: int | None = None) -> str:
     structure, registered = scene.structure, scene.structure.registered
     if registered.sum() < 2:
         return ''
-    rotations = structure.rotations[registered]
-    centres = -np.einsum('kji,kj->ki', rotations, structure.translations[registered])
+    rotations, centres = structure.path()
     axes = _axes(rotations)
     path = centres @ axes
     points = structure.points[structure.used.any(axis=0)] @ axes
