@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dashcalib_ros import judge
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect import TurnId
@@ -72,12 +73,8 @@ class Questions:
         were read with the same camera before are not read again. progress: as for calibrate().
         Raises InputError where the camera is for pictures of another size.
         """
-        size, scale = self._asked.detection.size, self._asked.detection.scale
+        small, scale = self._small(camera), self._asked.detection.scale
         scenes, config = self._asked.scenes.all_scenes(), self._asked.scenes.config
-        if camera.image_size != size:
-            raise InputError(f'the camera in use is for pictures of another size: '
-                             f'{by(camera.image_size)}')
-        small = camera.resized(1 / scale.px, scale.size(size))
         if self._watched != small:
             self._watched, self._read = small, {}
         new = [scene for turn, scene in scenes.items() if turn not in self._read]
@@ -91,6 +88,25 @@ class Questions:
         # a stored turn that was driven again counts once
         return judge.watch((reading for turn, reading in sorted(self._read.items())
                       if turn.of_this_drive or turn in scenes), small, scaled, config.monitor)
+
+    def moved(self, camera: Camera, newest: int) -> tuple[float, Floats] | None:
+        """Return when and by how much the camera was moved on the car; None where it was not.
+
+        That is s before the newest image, and (2,) degrees to the left and upwards. newest: pairs
+        of images of straight driving that are asked. Raises InputError as watch() does.
+        """
+        straights = self._asked.detection.straights(newest)
+        found = self._run('straight stretches with the camera in use', None, judge.moved,
+                          straights, self._small(camera))
+        return found and (float(straights.stamps_s[-1] - found[0]), found[1])
+
+    def _small(self, camera: Camera) -> Camera:
+        """Return a camera of the resized pictures."""
+        size, scale = self._asked.detection.size, self._asked.detection.scale
+        if camera.image_size != size:
+            raise InputError(f'the camera in use is for pictures of another size: '
+                             f'{by(camera.image_size)}')
+        return camera.resized(1 / scale.px, scale.size(size))
 
     def _run(self, stage: str, progress: Progress | None, function: Callable[..., Any],
              *arguments: Any) -> Any:

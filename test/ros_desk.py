@@ -48,12 +48,13 @@ class Desk:
         return self.bench.until(spun)
 
     def give(self, level='accepted', complete=True, sigma=SIGMA, warnings=(), turns=(),
-             **changes):
+             mount=None, **changes):
         """Let the learner's thread come up with a calibration."""
         camera = dataclasses.replace(FIRST, **changes) if level != 'refused' else None
         calibration = Calibration(
             Verdict(level, () if level == 'accepted' else ('few turns',)), (320, 240), camera,
-            sigma if camera else None, turns, 10, 0.3, {}, {}, Config(), warnings=warnings)
+            sigma if camera else None, turns, 10, 0.3, {}, {}, Config(), warnings=warnings,
+            mount=mount)
         result = Result(calibration, complete, self.node._learner.bank)
         done = []
         self.node._later(lambda: self.node._on_result(result))

@@ -363,6 +363,10 @@ def test_a_camera_in_use_is_compared_with_stored_turns(tmp_path):
     with Calibrator(QUICK.replace({'turns.store': str(tmp_path)})) as calibrator:
         calibrator.push(pictures(1, 640, 360)[0])
         questions = Questions(calibrator)
+        # a single image shows no straight road
+        assert questions.moved(lens, 100) is None
+        with pytest.raises(InputError, match='of another size'):
+            questions.moved(replace(lens, image_size=(320, 180)), 100)
         assert questions.watch(lens, sigma).lens is None
         change, = questions.watch(replace(lens, fx=10 * lens.fx), sigma).changes
         assert change.kind == 'lens' and change.since == TurnId.stored(0)

@@ -12,7 +12,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detector import TurnDetector
 from dashcalib_ros.detect.edges import LineCollector, Lines
 from dashcalib_ros.detect.estimator import MotionEstimator, TrackedPoints
-from dashcalib_ros.detect.straights import Straights
+from dashcalib_ros.detect.straights import PAIRS, Straights
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
@@ -113,9 +113,14 @@ class Detection:
         """Return the upright lines of the drive so far, in the resized images."""
         return self._lines.lines().within(self.valid())
 
-    def straights(self) -> Straights:
-        """Return pairs of images of straight driving, in px of the resized images."""
-        return self._motion.straights()
+    @property
+    def straight_pairs(self) -> int:
+        """Return how many pairs of images of straight driving there are."""
+        return self._motion.straight_pairs
+
+    def straights(self, newest: int = PAIRS) -> Straights:
+        """Return pairs of images of straight driving, the newest, in px of the resized images."""
+        return self._motion.straights(newest)
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings for the user, one line each."""

@@ -16,7 +16,7 @@ from dashcalib_ros.detect.epipoles import epipoles_of, turning
 from dashcalib_ros.detect.mask import CELL, EgoMask
 from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
-from dashcalib_ros.detect.straights import STRAIGHT, StraightCollector, Straights
+from dashcalib_ros.detect.straights import PAIRS, STRAIGHT, StraightCollector, Straights
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.scale import shrink_image
@@ -184,9 +184,14 @@ class MotionEstimator:
         factor = np.float32(self._factor)
         return TrackedPoints(*(resized_pixels(xy, factor) for xy in (before, now)))
 
-    def straights(self) -> Straights:
-        """Return pairs of images of straight driving, in px of the full image."""
-        found, factor = self._straights.straights(), np.float32(self._factor)
+    @property
+    def straight_pairs(self) -> int:
+        """Return how many pairs of images of straight driving there are."""
+        return len(self._straights)
+
+    def straights(self, newest: int = PAIRS) -> Straights:
+        """Return pairs of images of straight driving, the newest, in px of the full image."""
+        found, factor = self._straights.straights(newest), np.float32(self._factor)
         return replace(found, before=resized_pixels(found.before, factor),
                        after=resized_pixels(found.after, factor))
 

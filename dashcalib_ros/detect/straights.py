@@ -58,9 +58,12 @@ class StraightCollector:
             self._found = self._found[::2]
             self._period_ns *= 2
 
-    def straights(self) -> Straights:
-        """Return the pairs so far."""
-        pairs = np.array([pair for *_, pair in self._found], np.float32)
-        pairs = pairs.reshape(-1, 2, POINTS, 2)
-        stamps, apart = np.array([each[:2] for each in self._found], float).reshape(-1, 2).T / 1e9
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def straights(self, newest: int = PAIRS) -> Straights:
+        """Return the pairs so far, or the newest of them."""
+        found = self._found[-newest:]
+        pairs = np.array([pair for *_, pair in found], np.float32).reshape(-1, 2, POINTS, 2)
+        stamps, apart = np.array([each[:2] for each in found], float).reshape(-1, 2).T / 1e9
         return Straights(pairs[:, 0], pairs[:, 1], stamps, apart)

@@ -5,7 +5,8 @@ turn by turn: scene and camera -> Reading; readings -> Monitor, which names chan
 """
 from dashcalib_ros.judge.calibration import Calibration, TurnSummary, Verdict
 from dashcalib_ros.judge.check import Check, check, with_faults, with_lines
-from dashcalib_ros.judge.monitor import Change, Monitor, Reading, watch
+from dashcalib_ros.judge.monitor import Change, Monitor, Reading, moved_text, watch
+from dashcalib_ros.judge.mount import moved
 from dashcalib_ros.judge.odometry import (
     Odometry,
     Poses,
@@ -17,5 +18,5 @@ from dashcalib_ros.judge.odometry import (
 )
 
 __all__ = ['Calibration', 'Change', 'Check', 'Monitor', 'Odometry', 'Poses', 'Reading',
-           'TurnSummary', 'Verdict', 'check', 'odometry', 'path_files', 'read_poses',
-           'track_poses', 'trivial_guess', 'watch', 'with_faults', 'with_lines']
+           'TurnSummary', 'Verdict', 'check', 'moved', 'moved_text', 'odometry', 'path_files',
+           'read_poses', 'track_poses', 'trivial_guess', 'watch', 'with_faults', 'with_lines']

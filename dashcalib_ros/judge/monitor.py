@@ -133,15 +133,20 @@ class Change:
     def __str__(self) -> str:
         since = f'since {self.since}'
         if self.kind == 'mount':
-            yaw, pitch = self.turned_deg
-            return (f'the camera points elsewhere {since}: by {abs(yaw):.1f} degrees to the '
-                    f'{"left" if yaw > 0 else "right"} and {abs(pitch):.1f} '
-                    f'{"up" if pitch > 0 else "down"}; its calibration stays right')
+            return moved_text(since, self.turned_deg)
         if not self.looks_like:
             return (f'the calibration does not explain the pictures {since}: is it another '
                     f'camera, or another part of its picture?')
         return (f'the calibration does not fit {since}, as if {", or ".join(self.looks_like)}; '
                 f'was the camera zoomed, focused anew or exchanged, or its picture cropped?')
+
+
+def moved_text(than: str, turned_deg: Sequence[float] | Floats) -> str:
+    """Return that a camera points elsewhere, with (2,) degrees to the left and upwards."""
+    yaw, pitch = turned_deg
+    return (f'the camera points elsewhere {than}: by {abs(yaw):.1f} degrees to the '
+            f'{"left" if yaw > 0 else "right"} and {abs(pitch):.1f} '
+            f'{"up" if pitch > 0 else "down"}; its calibration stays right')
 
 
 @dataclass(frozen=True)

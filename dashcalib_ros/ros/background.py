@@ -18,7 +18,7 @@ from dashcalib_ros.errors import DashcalibError, InputError, counted, one_line
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.motion import SensorBuffer
-from dashcalib_ros.judge import Calibration, Check, Monitor
+from dashcalib_ros.judge import Calibration, Check, Monitor, moved_text
 from dashcalib_ros.judge.agreement import outdated, turns_of_another_camera
 from dashcalib_ros.judge.conclude import CONTRADICTS
 from dashcalib_ros.questions import Questions
@@ -28,6 +28,9 @@ from dashcalib_ros.workers.memory import mapped_copy
 # s between two checks whether enough turns are built: scenes are finished without a push
 LOOK_S = 0.25
 LONGEST_BACK_OFF_S = 60.0
+# pairs of images of straight driving, each 0.3 s: when they are asked whether the camera was moved
+# on the car, and how many of them
+ASKED_EACH, ASKED = 30, 160
 NOTHING = Status(0, 0, 0, 0.0, 0.0, False)
 Action = Callable[[], None]
 
@@ -64,6 +67,14 @@ class Watched:
 
 
 @dataclass(frozen=True)
+class Moved:
+    """A camera in use was moved on the car, in words: straight stretches show it."""
+
+    camera: NamedCamera
+    text: str
+
+
+@dataclass(frozen=True)
 class Trouble:
     """A problem: its kind, for counting, and one line for the log."""
 
@@ -72,7 +83,7 @@ class Trouble:
 
 
 # a text is for the log
-News = Status | str | Trouble | Result | Watched
+News = Status | str | Trouble | Result | Watched | Moved
 # takes an image with its message's header, and what was found so far; it must not wait
 Show = Callable[[Any, GreyImage, Detection], None]
 
@@ -123,7 +134,8 @@ class _Bank:
     tried: the turns of the last calibration. told: those that the node knows of. requested: a
     calibration is to begin with the present turns. failures: of calibrations in a row.
     not_before: when the next one may begin, in s of time.monotonic(). read: the turns that were
-    compared with the camera in use. earlier: what those of the banks before said of it.
+    compared with the camera in use. earlier: what those of the banks before said of it. pairs: of
+    straight driving that were asked whether it was moved; moved: whether they said so.
     """
 
     number: int
@@ -137,6 +149,8 @@ class _Bank:
     not_before: float = 0.0
     read: frozenset[TurnId] = frozenset()
     earlier: Monitor | None = None
+    pairs: int = 0
+    moved: bool = False
 
 
 class Learner:
@@ -292,9 +306,29 @@ class Learner:
         self._note(bank, status)
         if self._watching is not self.watched:
             self._watching, self._monitor, bank.read = self.watched, None, frozenset()
-        turns = frozenset(status.reconstructed)
-        if self._watching is not None and not turns <= bank.read:
-            self._read(bank, self._watching, turns)
+            bank.moved = False
+        if self._watching is None:
+            return
+        try:
+            self._watch(bank, self._watching, frozenset(status.reconstructed))
+        except Exception as error:
+            if bank is self._now and not self._closed:
+                self._tell(Trouble('failed_watches', f'the drive could not be compared with the '
+                                                     f'calibration in use ({_named(error)}); the '
+                                                     f'next turn tries again'))
+
+    def _watch(self, bank: _Bank, camera: NamedCamera, turns: frozenset[TurnId]) -> None:
+        """Compare what is new with the camera in use."""
+        if not turns <= bank.read:
+            self._read(bank, camera, turns)
+        pairs = bank.calibrator.detection.straight_pairs
+        # a long drive thins them out
+        if not bank.moved and not 0 <= pairs - bank.pairs < ASKED_EACH:
+            bank.pairs = pairs
+            found = bank.questions.moved(camera.camera, ASKED)
+            if found is not None:
+                bank.moved = True
+                self._tell(Moved(camera, moved_text(f'than {found[0]:.0f} s ago', found[1])))
 
     def _read(self, bank: _Bank, camera: NamedCamera, turns: frozenset[TurnId]) -> None:
         """Compare turns that are new with the camera in use.
@@ -306,19 +340,12 @@ class Learner:
             bank.earlier = self._monitor
         # the same turns alone are not tried again
         bank.read |= turns
-        try:
-            found = bank.questions.watch(camera.camera, camera.sigma)
-            if bank.earlier is not None:
-                found = reduce(Monitor.after, found.readings, bank.earlier)
-            if found.lens and found.lens.confirmed and found.lens.since.of_this_drive:
-                # those of earlier drives are of the camera before the change
-                bank.calibrator.scenes.forget_stored()
-        except Exception as error:
-            if bank is self._now and not self._closed:
-                self._tell(Trouble('failed_watches', f'new turns could not be compared with the '
-                                                     f'calibration in use ({_named(error)}); the '
-                                                     f'next turn tries again'))
-            return
+        found = bank.questions.watch(camera.camera, camera.sigma)
+        if bank.earlier is not None:
+            found = reduce(Monitor.after, found.readings, bank.earlier)
+        if found.lens and found.lens.confirmed and found.lens.since.of_this_drive:
+            # those of earlier drives are of the camera before the change
+            bank.calibrator.scenes.forget_stored()
         self._monitor = found
         self._tell(Watched(camera, found))
 

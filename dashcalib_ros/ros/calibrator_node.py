@@ -14,6 +14,7 @@ from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros.background import Result, Watched
 from dashcalib_ros.ros.car import Mounting, text_of
@@ -181,15 +182,24 @@ class CalibratorNode(CameraNode):
             self._confirmed = True
             if calibration.mount is not None:
                 # the newest, as a camera may have been pushed
-                self._mounting.show(calibration.mount, self._kept.frame_id or '')
+                self._show_mount(calibration.mount, self._kept.frame_id or '')
 
     def _use(self, kept: Kept, confirmed: bool = True) -> CameraInfo:
         self._kept, self._stale, self._confirmed = kept, False, confirmed
         self._info = camera_info(kept.camera.camera, self._header(kept.frame_id or ''),
                                  self._core.rectified)
         self._latched.publish(self._info)
-        self._mounting.show(kept.mount, kept.frame_id or '')
+        self._show_mount(kept.mount, kept.frame_id or '')
         return self._info
+
+    def _show_mount(self, mount: Mount | None, frame_id: str) -> None:
+        """Publish a mounting, and tell where it is another one than the last, if nobody did."""
+        before = self._mounting.mount
+        if before and mount and mount.moved_from(before) and 'mount' not in self._changes():
+            self._log.info(f'the camera was moved on the car: {text_of(before)}; now '
+                           f'{text_of(mount)}')
+        self._moved = ''
+        self._mounting.show(mount, frame_id)
 
     def _drop(self) -> None:
         """Use no calibration, as at the start; the file stays where it is."""

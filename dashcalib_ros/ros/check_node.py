@@ -95,7 +95,7 @@ class CheckNode(CameraNode):
         """Forget the answer and the changes; the driver's camera stays."""
         # as another object: what is still said of the former one is out of date
         self._given = None if self._given is None else replace(self._given)
-        self._monitor = None
+        self._monitor, self._moved = None, ''
         self._found = NOT_YET
         if self._infos.current is not None:
             self._publish()

@@ -27,7 +27,7 @@ from dashcalib_ros.judge import Monitor, Verdict
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.result import check_camera_name
 from dashcalib_ros.report.wording import witness_texts
-from dashcalib_ros.ros.background import Learner, News, Result, Trouble, Watched
+from dashcalib_ros.ros.background import Learner, Moved, News, Result, Trouble, Watched
 from dashcalib_ros.ros.car import Sensors
 from dashcalib_ros.ros.diagnostics import ERROR, STALE, WARN, Complaints, Health, log_line
 from dashcalib_ros.ros.images import CURES, ImageInput, Intake, Source, since_text
@@ -88,6 +88,8 @@ class CameraNode(Node, ABC):
         self._wake = self.create_guard_condition(self._empty)
         # what turns say of the camera in use, None before they do
         self._monitor: Monitor | None = None
+        # in words, as straight stretches show it
+        self._moved = ''
         self._verdict: Verdict | None = None
         # what the car's own sensors say of the last calibration, in words
         self._witnesses: list[str] = []
@@ -267,6 +269,8 @@ class CameraNode(Node, ABC):
                 self._complaints.say(news.kind, news.text)
             case Watched():
                 self._on_watched(news)
+            case Moved():
+                self._on_moved(news)
             case Result():
                 self._on_result(news)
 
@@ -282,9 +286,19 @@ class CameraNode(Node, ABC):
         if 'lens' in known and 'lens' not in self._changes():
             self._log.info('the newest turns fit the calibration again')
 
+    def _on_moved(self, moved: Moved) -> None:
+        if moved.camera is self._trusted() and 'mount' not in self._changes():
+            self._moved = moved.text
+            self._log.info(moved.text)
+
     def _changes(self) -> dict[str, str]:
-        """Return the changes of the camera in use that two turns show, in words by their kind."""
-        return {each.kind: str(each) for each in self._monitor.changes} if self._monitor else {}
+        """Return the changes of the camera in use, in words by their kind.
+
+        Two turns or more show them, or straight stretches that it was moved on the car.
+        """
+        found = {'mount': self._moved} if self._moved else {}
+        return found | {each.kind: str(each) for each in (
+            self._monitor.changes if self._monitor else ())}
 
     def _on_result(self, result: Result) -> None:
         if result.bank != self._learner.bank:
@@ -302,7 +316,7 @@ class CameraNode(Node, ABC):
         """Tell the learner from how many turns to calibrate, and what to compare turns with."""
         learner, trusted = self._learner, self._trusted()
         if learner.watched is not trusted:
-            self._monitor = None
+            self._monitor, self._moved = None, ''
         learner.config, learner.goal = self._core, self._goal()
         learner.watched, learner.checked = trusted, self._checked()
 

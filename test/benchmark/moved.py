@@ -5,7 +5,8 @@
 
 Made pairs of images: noise of 0.3 px, a body that nods, streets of 20 to 80 m on each of which
 the car's yaw and pitch differ by 0.15 degrees (crowns and slopes), 200 to 800 m of straights; the
-camera is moved in a direction drawn at random, and the drive ends METRES later.
+camera is moved in a direction drawn at random, and the drive ends METRES later. The whole drive is
+asked, as a recorded one is, and its newest pairs again and again, as the node does.
 """
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ from test_mount import SPACING_S, SPEED, mounted, pairs_of
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.detect.straights import Straights
-from dashcalib_ros.judge.mount import mount_of
+from dashcalib_ros.judge.mount import mount_of, moved
+from dashcalib_ros.ros.background import ASKED, ASKED_EACH
 
 NOISE_PX, PLACE_DEG = 0.3, 0.15
 STREET_M, BEFORE_M = (20.0, 80.0), (200.0, 800.0)
@@ -51,6 +53,16 @@ def joined(parts: list[Straights]) -> Straights:
                      np.arange(len(apart)) * SPACING_S / 2, apart)
 
 
+def told_live(pairs: Straights) -> bool:
+    """Return whether the node says that the camera was moved."""
+    for end in range(ASKED_EACH, len(pairs) + 1, ASKED_EACH):
+        newest = slice(max(0, end - ASKED), end)
+        if moved(Straights(pairs.before[newest], pairs.after[newest], pairs.stamps_s[newest],
+                           pairs.apart_s[newest]), LENS):
+            return True
+    return False
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__,
@@ -60,26 +72,29 @@ def main() -> None:
     parser.add_argument('--metres', type=float, default=200.0)
     arguments = parser.parse_args()
     known = replace(solved(scenes_of(3)), camera=LENS, scenes=())
-    told, place, nothing = 0, [], 0
+    told, place, nothing, live, idle = 0, [], 0, 0, 0
     for seed in range(arguments.drives):
         rng = np.random.default_rng(seed)
         angles = rng.uniform(-3.0, 3.0, 2)
         way = rng.uniform(0.0, 2.0 * np.pi)
-        moved = angles + arguments.degrees * np.array([np.cos(way), np.sin(way)])
+        turned = angles + arguments.degrees * np.array([np.cos(way), np.sin(way)])
         before = drive(rng, rng.uniform(*BEFORE_M), angles)
         still = drive(rng, arguments.metres, angles)
-        after = drive(rng, arguments.metres, moved)
+        after = drive(rng, arguments.metres, turned)
         found, quiet = (mount_of(joined([*before, *then]), None, known, 'accepted', None)
                         for then in (after, still))
         assert found is not None and quiet is not None
         nothing += quiet.moved_s is not None
+        live += told_live(joined([*before, *after]))
+        idle += told_live(joined([*before, *still]))
         if found.moved_s is not None:
             told += 1
             count = sum(map(len, before)) - 1
             place.append(PAIR_M * abs(found.moved_s / (SPACING_S / 2) - count))
     print(f'{arguments.degrees:g} degrees, {arguments.metres:g} m after: told in {told} of '
           f'{arguments.drives}, {np.median(place or [np.nan]):.0f} m from the place in the median '
-          f'(worst {max(place, default=np.nan):.0f}); told for nothing in {nothing}')
+          f'(worst {max(place, default=np.nan):.0f}); told for nothing in {nothing}; '
+          f'by the node: {live}, for nothing {idle}')
 
 
 if __name__ == '__main__':

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from made_calibration import make_calibration
 from scipy.spatial.transform import Rotation
 from solving import LENS, scenes_of, solved
+from synthetic import KEYFRAME_S
 
+from dashcalib_ros import judge
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.straights import PAIRS, POINTS, StraightCollector, Straights
 from dashcalib_ros.input.scale import FULL_SIZE
@@ -34,18 +36,14 @@ def mounted(yaw_left, pitch_up, roll_right):
                                degrees=True).as_matrix() @ OPTICAL
 
 
-def pairs_of(mount, count=40, noise_px=0.2, still=0.0, seed=0, kerb_m=0.0):
-    """Drive straight on over a plane between houses; still: share of the points on the bonnet.
-
-    kerb_m: height of what is beside the lane.
-    """
+def pairs_of(mount, count=40, noise_px=0.2, still=0.0, seed=0):
+    """Drive straight on over a plane between houses; still: share of the points on the bonnet."""
     rng = np.random.default_rng(seed)
     collector = StraightCollector()
     for n in range(count):
         world = np.column_stack([rng.uniform(4, 40, 600), rng.uniform(-12, 12, 600),
                                  rng.uniform(0, 6, 600) - HEIGHT_M])
         world[:300, 1:] = np.column_stack([rng.uniform(-3, 3, 300), np.full(300, -HEIGHT_M)])
-        world[:300, 2] += kerb_m * (np.abs(world[:300, 1]) > 1.2)
         # nods from image to image, as a body does
         nod = Rotation.from_euler('y', rng.normal(0, 0.2), degrees=True).as_matrix()
         seen = []
@@ -87,16 +85,85 @@ def test_points_that_stay_do_not_spoil_it(solution):
     assert abs(found.yaw_left_deg - 2.0) < 0.15 and abs(found.pitch_up_deg - 1.0) < 0.15
 
 
-def test_height_needs_a_speed(solution):
-    known, pairs = replace(solution, camera=LENS, scenes=()), pairs_of(mounted(0.5, 0.5, 0.0))
-    without = mount_of(pairs, None, known, 'accepted', None)
+def on_road(scene, points=60, kerb_m=0.0, height_m=HEIGHT_M, unit=0.37):
+    """Return a made turn, in other units, that sees points of the road, some beside its path."""
+    rotations, centres = scene.structure.path()
+    rng = np.random.default_rng(len(centres))
+    at, beside = rng.integers(len(centres), size=points), rng.uniform(-4, 4, points)
+    road = centres[at] + beside[:, None] * rotations[at, 0]
+    road[:, 1] = height_m - kerb_m * (np.abs(beside) > 1.5)
+    structure = replace(scene.structure, points=unit * road, used=np.ones((len(centres), points),
+                                                                          bool),
+                        translations=unit * scene.structure.translations)
+    return replace(scene, structure=structure)
+
+
+def speed_in(scene):
+    """Return the speed of a made turn, which is the same everywhere, m/s."""
+    _, centres = scene.structure.path()
+    return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).max()) / KEYFRAME_S
+
+
+@pytest.fixture(scope='module')
+def height_in(solution):
+    """Return the function that returns the mount by scenes and a speed."""
+    none = StraightCollector().straights()
+    return lambda scenes, speed: mount_of(none, None, replace(solution, scenes=scenes),
+                                          'accepted', speed)
+
+
+def test_height_needs_a_speed_and_the_road(height_in):
+    scene = scenes_of(1)[0]
+    speed, seen = speed_in(scene), [on_road(scene)]
+    without = height_in(seen, None)
     assert without.height_m is None and without.sigma['height_m'] is None
-    found = mount_of(pairs, None, known, 'accepted', at(SPEED))
-    assert abs(found.height_m - HEIGHT_M) < 2 * found.sigma['height_m'] < 0.15
-    assert found.straight_m == pytest.approx(SPEED * SPACING_S / 2 * len(pairs), rel=0.3)
+    found = height_in(seen, at(speed))
+    assert found.height_m == pytest.approx(HEIGHT_M, rel=0.01)
+    assert 0.01 * HEIGHT_M < found.sigma['height_m'] < 0.02 * HEIGHT_M
     # an error of speed is one of height
-    fast = mount_of(pairs, None, known, 'accepted', at(SPEED * 4.0 / 3.6))
+    fast = height_in(seen, at(speed * 4.0 / 3.6))
     assert fast.height_m / found.height_m == pytest.approx(4.0 / 3.6)
+    assert height_in([on_road(scene, points=12)], at(speed)).height_m is None
+    assert height_in(seen, at(0.0)).height_m is None
+
+
+def test_kerbs_beside_the_path_are_no_road(height_in):
+    scene = scenes_of(1)[0]
+    found = height_in([on_road(scene, points=300, kerb_m=0.3)], at(speed_in(scene)))
+    assert found.height_m == pytest.approx(HEIGHT_M, rel=0.01)
+
+
+def test_the_speed_in_a_bend_does_not_count(height_in):
+    scene = scenes_of(1)[0]
+    speed, stamps_s = speed_in(scene), scene.tracks.stamps_ns / 1e9
+
+    def of_another_place(asked_s):
+        middle = np.abs(asked_s - stamps_s.mean()) < 0.2 * np.ptp(stamps_s)
+        return np.where(middle, 0.8 * speed, speed)
+
+    found = height_in([on_road(scene)], of_another_place)
+    assert found.height_m == pytest.approx(HEIGHT_M, rel=0.01)
+
+
+def test_heights_that_differ_make_sigma_larger(height_in):
+    scene = scenes_of(1)[0]
+    alike, apart = (height_in([on_road(scene), on_road(scene, height_m=other)],
+                              at(speed_in(scene))) for other in (HEIGHT_M, 1.06 * HEIGHT_M))
+    assert apart.height_m == pytest.approx(1.03 * HEIGHT_M, rel=0.01)
+    assert apart.sigma['height_m'] > 2 * alike.sigma['height_m']
+
+
+def test_pairs_of_a_braking_car_are_left_out(solution):
+    known = replace(solution, camera=LENS, scenes=())
+    steady, braking = (pairs_of(mounted(0.5, pitch, 0.0), count=30) for pitch in (1.0, -0.5))
+    drive = joined(steady, braking)
+    begins = drive.stamps_s[len(steady)] - SPACING_S
+
+    def slower(stamps_s):
+        return SPEED - 2.0 * np.maximum(stamps_s - begins, 0.0) % SPEED
+
+    found = mount_of(drive, None, known, 'accepted', slower)
+    assert abs(found.pitch_up_deg - 1.0) < 0.15 and found.moved_s is None
 
 
 def test_turns_alone_tell_all_angles(solution):
@@ -107,28 +174,6 @@ def test_turns_alone_tell_all_angles(solution):
     # a crowned road of 2 % leans the car by 1.15 degrees in all turns alike
     assert 2 * found.sigma['roll_right_deg'] > 1.15
     assert found.straight_m == 0.0
-
-
-def test_a_kerb_that_is_taken_for_the_road_is_in_the_sigma_of_the_height(solution):
-    known = replace(solution, camera=LENS, scenes=())
-    level, high = (mount_of(pairs_of(mounted(0, 0, 0), kerb_m=kerb_m), None, known, 'accepted',
-                            at(SPEED)) for kerb_m in (0.0, 0.3))
-    # most of the points are on the kerb
-    assert high.height_m < HEIGHT_M - 0.15
-    assert abs(high.height_m - HEIGHT_M) < 3 * high.sigma['height_m']
-    assert high.sigma['height_m'] > 2 * level.sigma['height_m']
-
-
-def test_height_follows_the_speed_halfway(solution):
-    # it brakes: a pair's second image is slower than the way between both says
-    known, pairs = replace(solution, camera=LENS, scenes=()), pairs_of(mounted(0.5, 0.5, 0.0))
-    at_second = {stamp - SPACING_S / 2: SPEED for stamp in pairs.stamps_s}
-
-    def braking(stamps_s):
-        return np.array([at_second.get(stamp, SPEED / 2) for stamp in stamps_s])
-
-    found = mount_of(pairs, None, known, 'accepted', braking)
-    assert abs(found.height_m - HEIGHT_M) < 2 * found.sigma['height_m']
 
 
 def test_nothing_seen_is_no_mount(solution):
@@ -260,6 +305,11 @@ def test_a_camera_that_is_moved_during_the_drive_begins_anew(solution, moved):
     found = mount_of(joined(first, then), None, known, 'accepted', None)
     assert found.moved_s == pytest.approx(first.stamps_s[-1], abs=3.0)
     assert abs(found.yaw_left_deg - moved[0]) < 0.3 and abs(found.pitch_up_deg - moved[1]) < 0.3
+    # with the camera in use alone, and fewer points
+    stamp_s, turned = judge.moved(joined(first, then), LENS)
+    assert abs(stamp_s - found.moved_s) <= 2.0
+    np.testing.assert_allclose(turned, [moved[0] - 0.5, moved[1] - 1.0], atol=0.3)
+    assert judge.moved(first, LENS) is None
     assert mount_of(first, None, known, 'accepted', None).moved_s is None
 
 

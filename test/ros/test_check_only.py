@@ -52,7 +52,7 @@ class Core:
     def __init__(self, config=None, mask=None, verbose=False, live=False, use_stored=True,
                  warn=None, inline=False, on_trouble=None, on_wait=None):
         self.ready, self.strangers, self.scenes = (), (), Scenes()
-        self.detection = SimpleNamespace(frames=1, start_s=0.0)
+        self.detection = SimpleNamespace(frames=1, start_s=0.0, straight_pairs=0)
         Core.newest = self
 
     def push(self, frame):

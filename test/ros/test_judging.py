@@ -5,6 +5,7 @@ since a camera that is bumped in the middle of a drive takes fifteen turns to sh
 """
 from __future__ import annotations
 
+import dataclasses
 import errno
 import os
 from pathlib import Path
@@ -23,10 +24,15 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import load_camera
-from dashcalib_ros.ros.background import Result
+from dashcalib_ros.ros.background import Moved, Result
 from dashcalib_ros.ros.store import Store, Whose
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
+
+MOUNT = Mount('accepted', (), 2.0, -1.0, None, None,
+              {'yaw_left_deg': 0.1, 'pitch_up_deg': 0.1, 'roll_right_deg': None,
+               'height_m': None}, (600.0, 170.0), 0.5, 300.0)
 
 
 def test_its_life_with_a_camera_that_is_bumped(make_desk):
@@ -257,6 +263,26 @@ dashcalib:
   sigma: {fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0, k1: 0.01, k2: 0.01}
   frame_id: camera
 """
+
+
+def test_a_camera_that_was_moved_since_the_last_calibration_is_told_once(make_desk, capfd):
+    desk = make_desk()
+    desk.give(mount=MOUNT)
+    desk.until(lambda: 'yaw to the left +2.00' in desk.bench.values['mounting'])
+    desk.give(mount=dataclasses.replace(MOUNT, yaw_left_deg=2.4))
+    assert 'the camera was moved' not in capfd.readouterr().err
+    desk.give(mount=dataclasses.replace(MOUNT, yaw_left_deg=-1.0))
+    desk.until(lambda: 'yaw to the left -1.00' in desk.bench.values['mounting'])
+    logged = capfd.readouterr().err
+    assert logged.count('the camera was moved on the car') == 1
+    assert desk.show() == 400.0
+    # straight stretches have told it already
+    trusted = desk.node._trusted()
+    desk.node._learner._tell(Moved(trusted, 'the camera points elsewhere'))
+    desk.until(lambda: desk.bench.values['change'] == 'the camera points elsewhere')
+    desk.give(mount=MOUNT)
+    desk.until(lambda: desk.bench.values['change'] == '')
+    assert 'the camera was moved' not in capfd.readouterr().err
 
 
 def test_contradictions_are_counted_over_short_trips(make_desk):

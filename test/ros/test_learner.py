@@ -23,6 +23,7 @@ from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros import background as room
 from dashcalib_ros.ros.background import (
     Learner,
+    Moved,
     Result,
     Trouble,
     Watched,
@@ -51,7 +52,7 @@ class Core:
         self.options = {'mask': mask, 'use_stored': use_stored, 'warn': warn,
                         'on_trouble': on_trouble}
         self.stored, self.pushed, self.done = (), [], []
-        self.ready, self.frames, self.calls = (), 0, 0
+        self.ready, self.frames, self.calls, self.pairs, self.asked = (), 0, 0, 0, []
         self.strangers, self.watched, self.checked = (), [], []
         self.hold, self.closed = threading.Event(), threading.Event()
         self.hold.set()
@@ -61,7 +62,7 @@ class Core:
 
     @property
     def detection(self):
-        return types.SimpleNamespace(frames=self.frames, start_s=0.0)
+        return types.SimpleNamespace(frames=self.frames, start_s=0.0, straight_pairs=self.pairs)
 
     def push(self, frame):
         self.frames += 1
@@ -131,6 +132,10 @@ class Asked:
         return watch((Reading(turn, ZERO, None, explained=turn not in self.core.strangers)
                       for turn in self.core.ready), camera, sigma, CONFIG.monitor)
 
+    def moved(self, camera, newest):
+        self.core.asked.append(self.core.pairs)
+        return (12.0, np.array([-1.0, 0.2])) if self.core.pairs > 70 else None
+
     def check(self, given, calibration, progress=None):
         self.core.checked.append(given)
         return Check('right', ('it fits',), 0.5, 1.0)
@@ -143,7 +148,7 @@ def desk(monkeypatch):
     monkeypatch.setattr(room, 'Questions', Asked)
     Core.made, Core.failures = [], []
     heard = types.SimpleNamespace(results=[], troubles=[], statuses=[], turns=[], begun=[],
-                                  shown=[], watched=[])
+                                  shown=[], watched=[], moved=[])
 
     def hear(news):
         match news:
@@ -153,7 +158,7 @@ def desk(monkeypatch):
                 (heard.begun if 'calibrating' in news else heard.turns).append(news)
             case _:
                 {Result: heard.results, Status: heard.statuses,
-                 Watched: heard.watched}[type(news)].append(news)
+                 Watched: heard.watched, Moved: heard.moved}[type(news)].append(news)
     heard.learner = Learner(CONFIG, 10, hear, lambda *shown: heard.shown.append(shown))
     yield heard
     heard.learner.close()
@@ -423,6 +428,25 @@ def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
     desk.learner.watched = dataclasses.replace(CAMERA, name='another')
     until(lambda: len(desk.watched) == 3)
     assert desk.watched[-1].monitor.lens is None
+
+
+def test_a_camera_that_is_moved_on_a_straight_road_is_told_once(desk):
+    core = Core.made[0]
+    core.pairs = 40
+    time.sleep(2 * room.LOOK_S)
+    assert not core.asked
+    desk.learner.watched = CAMERA
+    for pairs in (41, 75, 80, 200):
+        core.pairs = pairs
+        time.sleep(2 * room.LOOK_S)
+    assert core.asked == [41, 75] or core.asked == [40, 75]
+    [told] = desk.moved
+    assert told.camera is CAMERA and told.text.startswith(
+        'the camera points elsewhere than 12 s ago: by 1.0 degrees to the right and 0.2 up')
+    # another camera in use is asked anew
+    desk.learner.watched = dataclasses.replace(CAMERA, name='another')
+    core.pairs = 300
+    until(lambda: len(desk.moved) == 2)
 
 
 def test_turns_that_could_not_be_compared_are_told_and_tried_with_the_next(desk):
