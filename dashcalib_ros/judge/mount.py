@@ -332,7 +332,9 @@ def _roll(scenes: Sequence[Scene], lines: Lines | None, camera: Camera
         found.append(_roll_of_lines(lines, camera))
     if not found:
         return None
-    roll, sigma = _averaged(np.array(found), np.zeros(len(found)), ROLL_FLOOR_DEG)
+    # on a slope upright lines are off by it, and turns' paths are not: the odd ones out count less
+    odd = np.abs(np.array(found) - np.median(found))
+    roll, sigma = _averaged(np.array(found), odd / 2, ROLL_FLOOR_DEG)
     return roll, float(np.hypot(sigma, CROWN_DEG))
 
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_calibration import make_calibration
+from made_lines import made_lines
 from scipy.spatial.transform import Rotation
 from solving import LENS, scenes_of, solved
 from synthetic import KEYFRAME_S
@@ -102,6 +103,21 @@ def speed_in(scene):
     """Return the speed of a made turn, which is the same everywhere, m/s."""
     _, centres = scene.structure.path()
     return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).max()) / KEYFRAME_S
+
+
+def test_upright_lines_on_a_slope_do_not_outvote_the_turns(solution):
+    none, lines = StraightCollector().straights(), made_lines(LENS)
+    # a street up a hill: what is upright there leans by 3.4 degrees against the car
+    angle = np.radians(3.4)
+    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    centre = np.array([LENS.cx, LENS.cy])
+    leaning = replace(lines, points=((lines.points - centre) @ turned.T + centre).astype('f4'))
+    level, slope = (mount_of(none, seen, solution, 'accepted', None) for seen in (lines, leaning))
+    assert abs(slope.roll_right_deg - level.roll_right_deg) < 0.4
+    # alone against a single turn they may be right
+    alone = replace(solution, scenes=solution.scenes[:1])
+    found = mount_of(none, leaning, alone, 'accepted', None)
+    assert found.sigma['roll_right_deg'] > 1.0
 
 
 @pytest.fixture(scope='module')
