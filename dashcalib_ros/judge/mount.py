@@ -42,7 +42,7 @@ BLOCKS, LEAST_PAIRS = 12, 8
 # pairs do not count
 LEAST_SIDE, PLACES_DEG, OUTLIER_DEG = 20, 0.15, 2.0
 # of the points of a pair, those that are enough to see that a camera was moved
-THINNED = 3
+THINNED = 5
 # degrees of yaw and of pitch; with more it is weak. openpilot's spread on one car is as large
 ACCEPTED_DEG = 0.2
 # degrees; what no source is better than: slopes, crowns and bumps, between places

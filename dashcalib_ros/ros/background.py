@@ -30,7 +30,7 @@ LOOK_S = 0.25
 LONGEST_BACK_OFF_S = 60.0
 # pairs of images of straight driving, each 0.3 s: when they are asked whether the camera was moved
 # on the car, and how many of them
-ASKED_EACH, ASKED = 30, 160
+ASKED_EACH, ASKED = 30, 120
 NOTHING = Status(0, 0, 0, 0.0, 0.0, False)
 Action = Callable[[], None]
 
