@@ -16,8 +16,9 @@ from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.judge.agreement import earlier_of_another_camera, evidence_of
 from dashcalib_ros.judge.conclude import CONTRADICTS, Evidence, conclude, evidence_of_detection
 from dashcalib_ros.judge.witnesses import Asked, ask_sensors
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import Calibration
-from dashcalib_ros.selection import Progress, SceneSelection
+from dashcalib_ros.selection import STOOD, Progress, SceneSelection
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 
@@ -124,7 +125,7 @@ class Calibrator:
     def _solve_and_judge(self, tell: Progress, final: bool, started: float) -> Calibration:
         """Return the calibration from the turns that are selected now."""
         tell('reconstructing turns', 0.0)
-        scenes, config = self.scenes.wanted(tell, final), self.scenes.config
+        scenes, config = self._moving(tell, final), self.scenes.config
         solution: Solution | None = None
         asked = Asked()
         if scenes:
@@ -147,6 +148,17 @@ class Calibrator:
         # it takes a second or two, and a live drive goes on meanwhile
         found: Calibration = self.scenes.run(conclude, solution, evidence, config)
         return found
+
+    def _moving(self, tell: Progress, final: bool) -> list[Scene]:
+        """Return the best turns' scenes; of none of them do sensors say that the car stood."""
+        while True:
+            scenes, start_s = self.scenes.wanted(tell, final), self.detection.start_s
+            stream = (self._motion or SensorStream()).since(start_s)
+            stood = [scene.turn for scene in scenes if scene.turn.of_this_drive
+                     and stream.stood(*(scene.tracks.stamps_ns[[0, -1]] / 1e9 - start_s))]
+            if not stood:
+                return scenes
+            self.scenes.reject(dict.fromkeys(stood, STOOD))
 
     def _evidence(self, started: float, asked: Asked) -> Evidence:
         now = time.monotonic()

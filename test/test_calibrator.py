@@ -27,11 +27,12 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.recorded import calibrate
-from dashcalib_ros.selection import SceneSelection
+from dashcalib_ros.selection import STOOD, SceneSelection
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
@@ -117,6 +118,21 @@ def test_it_tells_of_its_turns(drive, result):
         picture = result.material.pictures[turn.id]
         assert picture.frame in result.material.scenes[turn.id].tracks.frames
         assert abs(picture.frame - turn.center) < 10 and picture.image.shape == (360, 640)
+
+
+def test_a_turn_during_which_the_car_stood_is_none(frames, result):
+    moving, phantom = result.turns
+    stamps_s = np.array([frame.stamp_ns for frame in frames]) / 1e9
+    speed = np.full((len(frames), 1), 8.0)
+    speed[phantom.first:phantom.last + 1] = 0.05
+    with limited(Calibrator(QUICK)) as calibrator:
+        calibrator.sense(SensorStream(speed=Samples(stamps_s - stamps_s[0], speed)))
+        for frame in frames:
+            calibrator.push(frame)
+        found = calibrator.calibrate()
+    assert {turn.id: turn.unused_because for turn in found.turns} == {
+        moving.id: None, phantom.id: STOOD}
+    assert found.verdict.level == 'weak'
 
 
 def test_one_thread_and_a_child_that_is_killed_change_nothing(frames, result):

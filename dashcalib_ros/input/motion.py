@@ -30,6 +30,8 @@ DAMAGED = 0.2
 FASTEST_TURN = 6.0
 # the same for the whole drive, by the 99th percentile, where single peaks do not count
 QUANTILE = 99.0
+# m/s; a car that is slower stands; a sensor that never says more does not know of driving
+STANDING_MPS, DRIVING_MPS = 0.3, 3.0
 # s over which positions tell a speed
 SPEED_OVER_S = 1.0
 
@@ -80,6 +82,14 @@ class SensorStream:
         """Return the streams that there are, by their names."""
         found = {kind: getattr(self, kind) for kind in NAMES}
         return {kind: samples for kind, samples in found.items() if samples is not None}
+
+    def stood(self, first_s: float, last_s: float) -> bool:
+        """Return whether the measured speed says that the car stood all that time."""
+        if self.speed is None or np.abs(self.speed.values).max() < DRIVING_MPS:
+            return False
+        stamps_s = self.speed.stamps_s
+        then = np.abs(self.speed.values[(stamps_s >= first_s) & (stamps_s <= last_s)])
+        return len(then) > 0 and bool(then.max() < STANDING_MPS)
 
     def shifted(self, later_s: float) -> SensorStream:
         """Return the same with later stamps."""

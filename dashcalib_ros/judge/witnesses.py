@@ -7,10 +7,11 @@ camera, b the sensor's bias and s its scale,
 
     phi = A (theta - b dt) / s
 
-All turns share A, b, s and the offset, which are found by generalised least squares: a gyro's
-noise adds up along a turn, that of the poses is of each keyframe alone, and how large each is the
-residuals say. How phi follows the camera's parameters is known from the solution's own normal
-equations: so a scale becomes a focal length.
+All turns share A, b, s, the offset and the pace of the clocks, by which the offset changes with
+time: it has a prior, and several turns measure it. They are found by generalised least squares: a
+gyro's noise adds up along a turn, that of the poses is of each keyframe alone, and how large each
+is the residuals say. How phi follows the camera's parameters is known from the solution's own
+normal equations: so a scale becomes a focal length.
 
 GPS has headings on the straights before and after a turn: the angle between them, with neither
 bias nor scale.
@@ -61,12 +62,15 @@ LEAST_EXPLAINED = 0.9
 DEGREES = (40.0, 80.0)
 # of a turn's angle: what pictures of real drives may be off in one turn, beyond their noise
 TURN_SIGMA = 0.0045
-# of time: what a rate that was given with --fps may be off, as the frames of two real drives are
-PACE = 0.005
+# of time, one sigma: what a rate that was given with --fps may be off, as the frames of two real
+# drives are; and sigmas beyond which a clock is not used
+PACE, LARGEST_PACE = 0.005, 2.0
 # s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
 LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
 # ratios of the poses' variance to the gyro's in a second, of which the likeliest is taken
 RATIOS = np.logspace(-4, 3, 22)
+# parameters of a gyro beside a camera
+UNKNOWNS = 9
 # steps of the fit, and those at which the noises are weighed anew
 STEPS, WEIGHED = 8, (1, 4)
 # sigmas; where a witness is farther off, it contradicts
@@ -80,9 +84,9 @@ LEAST_GPS_DEG = 30.0
 LEVER_M = 2.0
 # m of a straight at the least
 STRAIGHT_M = 8.0
-# times the sigma that the pictures leave of the angles; a gyro that knows them worse is a witness
-# only: one that is 3 % off, and does not say so, must not move an accepted camera
-WORTH = 1.0
+# sigma of a gyro's scale; one that is known worse is a witness only: a gyro that is 3 % off, and
+# does not say so, must not move an accepted camera
+KNOWN_SCALE = 0.015
 
 
 @dataclass(frozen=True)
@@ -117,10 +121,9 @@ def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s:
                  if len(used_keyframes(scene)) >= LEAST_KEYFRAMES
                  and (steps := steps_of(scene, solution, loss_px, start_s)) is not None]
         if stream.rate is not None:
-            fit = _with_clocks(turns, stream.rate)
+            fit = fit_to(turns, stream.rate)
             own = _own_scale(stream.rate, stream.position, config.motion.gyro_scale_sigma)
-            fit = None if fit is None else replace(
-                fit, inverse_scale=fit.inverse_scale * own.scale)
+            fit = None if fit is None else fit.scaled(own.scale)
             gyro, line = _gyro(fit, solution, own)
             lines += [own.contradiction, line]
             if fit is not None and gyro is not None and gyro.agrees:
@@ -163,7 +166,7 @@ def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnSca
 
 
 def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config) -> Solution | None:
-    """Return the solution with the gyro's angles as information; None where they have little.
+    """Return the solution with the gyro's angles as information; None where they are none.
 
     They are one more measurement of the camera's parameters (a Kalman update); then the turns'
     poses and points are adjusted anew with the camera that it leads to.
@@ -172,11 +175,11 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config) -> 
     along = solution.covariance @ fit.by_camera
     own = float(fit.by_camera @ along)
     known = float(fit.covariance[6, 6]) + gyro.sigma**2
-    if config.motion.use != 'information' or known > (WORTH * np.sqrt(own))**2:
+    if config.motion.use != 'information' or gyro.sigma > KNOWN_SCALE:
         return None
     gain = along / (own + known)
     camera = solution.camera.with_params(
-        solution.camera.params + gain * (1 - fit.inverse_scale))
+        solution.camera.params + gain * (1 - fit.gyro.inverse_scale))
     scenes = [scene_with(camera, scene, config) for scene in solution.scenes]
     if any(scene is None for scene in scenes):
         return None
@@ -190,7 +193,8 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness 
     if fit is None:
         return None, ('the gyro is not used: it has no samples during the turns, within 0.5 s of '
                       'their stamps')
-    if abs(fit.offset_s) >= LARGEST_OFFSET_S or not fit.explained >= LEAST_EXPLAINED:
+    gyro = fit.gyro
+    if abs(gyro.offset_s) >= LARGEST_OFFSET_S or not fit.explained >= LEAST_EXPLAINED:
         return None, (f'the gyro is not used: it does not turn as the pictures do (it explains '
                       f'{100 * max(fit.explained, 0.0):.0f} % of that): check that it is of this '
                       f'drive, and that its stamps are within 0.5 s of those of the pictures')
@@ -199,17 +203,18 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness 
                 'check its unit')
         return None, (f'the gyro is not used: its angles are {fit.scale:.3g} times those of the '
                       f'pictures: {cure}')
-    if fit.skew_s > LARGEST_SKEW_S:
+    if fit.skew_s > LARGEST_SKEW_S or abs(gyro.pace) > LARGEST_PACE * PACE:
+        apart = (f'turns are {1e3 * fit.skew_s:.0f} ms apart' if fit.skew_s > LARGEST_SKEW_S else
+                 f'they differ by {100 * gyro.pace:+.1f} % of time')
         return None, (f'the gyro is not used: its stamps and those of the pictures do not keep '
-                      f'pace (turns are {1e3 * fit.skew_s:.0f} ms apart): check --fps, and that '
-                      f'no images are missing')
+                      f'pace ({apart}): check --fps, and that no images are missing')
     sigmas = np.sqrt(np.diag(fit.covariance))
-    said = _witness(fit.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
+    said = _witness(gyro.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
     return replace(
-        said, time_offset_s=fit.offset_s, time_sigma_s=float(sigmas[7]),
-        camera_from_sensor=tuple(tuple(row) for row in fit.alignment.tolist()),
+        said, time_offset_s=gyro.offset_s, time_sigma_s=float(sigmas[7]),
+        camera_from_sensor=tuple(tuple(row) for row in gyro.alignment.tolist()),
         alignment_sigma_deg=float(np.degrees(np.sqrt(np.trace(fit.covariance[:3, :3])))),
-        bias_rad_s=tuple(fit.bias.tolist()), scale_by_gps=own.by_gps), ''
+        bias_rad_s=tuple(gyro.bias.tolist()), scale_by_gps=own.by_gps), ''
 
 
 def _witness(inverse_scale: float, sigma: float, own_sigma: float, by_camera: Floats,
@@ -242,18 +247,41 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class Fit:
-    """How a gyro and a camera fit together. parameters: as in the module's description.
+class Gyro:
+    """A gyro beside a camera. alignment, bias, inverse_scale: as in the module's description.
 
-    covariance: (8, 8) of the small rotation (3), bias (3), 1 / scale and offset. by_camera: (n,)
-    by how much 1 / scale follows the camera's parameters. explained: of the squared angles.
-    skew_s: between the turns' own offsets, where that is no chance; else 0.
+    offset_s: how late its stamps are at middle_s; pace: by how much more a second later.
     """
 
     alignment: Floats
     bias: Floats
     inverse_scale: float
     offset_s: float
+    middle_s: float
+    pace: float = 0.0
+
+    def when(self, stamps_s: Floats) -> Floats:
+        """Return the gyro's stamps of what happened at those of the pictures."""
+        return stamps_s + self.offset_s + self.pace * (stamps_s - self.middle_s)
+
+    def moved(self, step: Floats) -> Gyro:
+        """Return the gyro a step (9,) away; their order is that of Fit's covariance."""
+        offset = np.clip(self.offset_s + step[7], -2 * LARGEST_OFFSET_S, 2 * LARGEST_OFFSET_S)
+        return Gyro(_rotation(step[:3]) @ self.alignment, self.bias + step[3:6],
+                    float(self.inverse_scale + step[6]), float(offset), self.middle_s,
+                    float(self.pace + step[8]))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a gyro and a camera fit together.
+
+    covariance: (9, 9) of the small rotation (3), bias (3), 1 / scale, offset and pace. by_camera:
+    (n,) by how much 1 / scale follows the camera's parameters. explained: of the squared angles.
+    skew_s: between the turns' own offsets, where that is no chance; else 0.
+    """
+
+    gyro: Gyro
     covariance: Floats
     by_camera: Floats
     explained: float
@@ -262,7 +290,12 @@ class Fit:
     @property
     def scale(self) -> float:
         """Return the sensor's angles over the camera's."""
-        return 1 / self.inverse_scale
+        return 1 / self.gyro.inverse_scale
+
+    def scaled(self, own: float) -> Fit:
+        """Return the same for a gyro whose angles are known to be own times the true ones."""
+        return replace(self, gyro=replace(
+            self.gyro, inverse_scale=self.gyro.inverse_scale * own))
 
 
 def steps_of(scene: Scene, solution: Solution, loss_px: float, start_s: float) -> Steps:
@@ -289,12 +322,11 @@ def _turned(rotations: Floats) -> Floats:
         rotations[:-1] @ rotations[1:].transpose(0, 2, 1)).as_rotvec())
 
 
-def _covered(turn: Steps, stamps_s: Floats, offset: float) -> Steps | None:
+def _covered(turn: Steps, stamps_s: Floats, when: Floats) -> Steps | None:
     """Return the part of a turn for which there are samples; None where it is too short.
 
-    stamps_s: (n,) of a sensor whose clock is late by offset, s.
+    stamps_s: (n,) of the sensor; when: of the keyframes, on its clock.
     """
-    when = turn.stamps_s + offset
     gaps = np.flatnonzero(np.diff(stamps_s) > LONGEST_GAP_S)
     piece = np.searchsorted(stamps_s[gaps + 1], when, side='right')
     begins = np.r_[stamps_s[0], stamps_s[gaps + 1]][piece]
@@ -311,28 +343,13 @@ def fit_to(turns: Sequence[Steps], rate: Samples) -> Fit | None:
     """Return how a gyro fits to the turns, those parts of them for which it has samples."""
     angles, found = rate.integral, None
     for _ in range(2):
-        offset = 0.0 if found is None else found.offset_s
-        covered = [part for turn in turns
-                   if (part := _covered(turn, rate.stamps_s, offset)) is not None]
+        covered = [part for turn in turns if (part := _covered(
+            turn, rate.stamps_s,
+            turn.stamps_s if found is None else found.gyro.when(turn.stamps_s))) is not None]
         found = _fit_gyro(covered, angles)
-        if found is None or not abs(found.offset_s) < LARGEST_OFFSET_S:
+        if found is None or not abs(found.gyro.offset_s) < LARGEST_OFFSET_S:
             break
     return found
-
-
-def _with_clocks(turns: Sequence[Steps], rate: Samples) -> Fit | None:
-    """Return the fit with what clocks that do not keep pace add to the sigma of the scale.
-
-    Whole turns are hardly changed by that; those that an edge cuts are.
-    """
-    fit, other = (fit_to([replace(
-        turn, stamps_s=turn.stamps_s + pace * (turn.stamps_s - turn.stamps_s.mean()))
-        for turn in turns], rate) for pace in (0.0, PACE))
-    if fit is None or other is None:
-        return fit
-    covariance = fit.covariance.copy()
-    covariance[6, 6] += (other.inverse_scale - fit.inverse_scale)**2
-    return replace(fit, covariance=covariance)
 
 
 def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
@@ -346,33 +363,38 @@ def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
     start = min((_aligned(turns, angles, offset) for offset in
                  np.arange(-LARGEST_OFFSET_S, LARGEST_OFFSET_S + COARSE_S / 2, COARSE_S)),
                 key=lambda each: each[0])
-    _, alignment, inverse_scale, offset = start
-    bias, ratio = np.zeros(3), 1.0
+    gyro = Gyro(*start[1:], middle_s=float(np.mean(np.concatenate(
+        [turn.stamps_s for turn in turns]))))
+    ratio = 1.0
     for number in range(STEPS):
-        rows = [_linear(turn, angles, alignment, bias, inverse_scale, offset) for turn in turns]
+        rows = [_linear(turn, angles, gyro) for turn in turns]
         if number in WEIGHED:
             ratio = _likeliest_ratio(turns, rows)
         jacobian, residual, _ = _whitened(turns, rows, ratio)
-        step = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
-        alignment = _rotation(step[:3]) @ alignment
-        bias, inverse_scale = bias + step[3:6], inverse_scale + step[6]
-        offset = float(np.clip(offset + step[7], -2 * LARGEST_OFFSET_S, 2 * LARGEST_OFFSET_S))
-    rows = [_linear(turn, angles, alignment, bias, inverse_scale, offset) for turn in turns]
+        noise = float(residual @ residual) / max(len(residual) - UNKNOWNS, 1)
+        # the pace has a prior, one more measurement
+        weight = np.sqrt(noise) / PACE
+        gyro = gyro.moved(np.linalg.lstsq(
+            np.vstack([jacobian, weight * np.eye(UNKNOWNS)[-1]]),
+            np.r_[residual, -weight * gyro.pace], rcond=None)[0])
+    rows = [_linear(turn, angles, gyro) for turn in turns]
     jacobian, residual, follow = _whitened(turns, rows, ratio)
+    noise = float(residual @ residual) / max(len(residual) - UNKNOWNS, 1)
     hessian = jacobian.T @ jacobian
-    noise = float(residual @ residual) / max(len(residual) - hessian.shape[0], 1)
+    hessian[-1, -1] += noise / PACE**2
     covariance = noise * np.linalg.inv(hessian)
+    # which of the clocks is wrong is not known, nor whether it jumped: an angle may be off by that
+    covariance[6, 6] += (gyro.pace * gyro.inverse_scale)**2
     parts, rests = _by_turn(turns, jacobian), _by_turn(turns, residual)
     # what each turn alone would change of the scale and of the offset, all else as it is
-    variances = np.array([noise / np.sum(part[:, 6:]**2, axis=0) for part in parts])
-    alone = np.array([part[:, 6:].T @ rest / np.sum(part[:, 6:]**2, axis=0)
+    variances = np.array([noise / np.sum(part[:, 6:8]**2, axis=0) for part in parts])
+    alone = np.array([part[:, 6:8].T @ rest / np.sum(part[:, 6:8]**2, axis=0)
                       for part, rest in zip(parts, rests, strict=True)])
-    covariance[6, 6] += _between_turns(alone[:, 0], variances[:, 0], inverse_scale)
+    covariance[6, 6] += _between_turns(alone[:, 0], variances[:, 0], gyro.inverse_scale)
     clear = np.abs(alone[:, 1]) > SKEW_SIGMAS * np.sqrt(variances[:, 1])
     turned = np.concatenate([turn.turned for turn in turns])
     left = np.concatenate([row[1] for row in rows])
-    return Fit(alignment, bias, float(inverse_scale), offset, covariance,
-               np.linalg.solve(hessian, jacobian.T @ follow)[6],
+    return Fit(gyro, covariance, np.linalg.solve(hessian, jacobian.T @ follow)[6],
                1 - float(np.sum(left**2) / np.sum(turned**2)),
                float(np.max(np.abs(alone[:, 1]), where=clear, initial=0.0)))
 
@@ -390,8 +412,8 @@ def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:
 
 
 def _aligned(turns: Sequence[Steps], angles: Samples, offset: float
-             ) -> tuple[float, Floats, float, float]:
-    """Return what is left, the rotation, 1 / scale for an offset: a start, without bias."""
+             ) -> tuple[float, Floats, Floats, float, float]:
+    """Return what is left, and for an offset a start: rotation, no bias, 1 / scale, offset."""
     sensor = np.concatenate([_between(angles, turn.stamps_s + offset) for turn in turns])
     camera = np.concatenate([turn.turned for turn in turns])
     u, sizes, v = np.linalg.svd(camera.T @ sensor)
@@ -399,7 +421,7 @@ def _aligned(turns: Sequence[Steps], angles: Samples, offset: float
     rotation = u @ sign @ v
     gain = float(sizes @ np.diag(sign)) / max(float(np.sum(sensor**2)), 1e-12)
     left = float(np.sum((camera - gain * sensor @ rotation.T)**2))
-    return left, rotation, gain, float(offset)
+    return left, rotation, np.zeros(3), gain, float(offset)
 
 
 def _between(angles: Samples, stamps_s: Floats) -> Floats:
@@ -407,21 +429,21 @@ def _between(angles: Samples, stamps_s: Floats) -> Floats:
     return np.diff(angles.at(stamps_s), axis=0)
 
 
-def _linear(turn: Steps, angles: Samples, alignment: Floats, bias: Floats, inverse_scale: float,
-            offset: float) -> tuple[Floats, Floats]:
-    """Return (k - 1, 3, 8) derivatives of the prediction, and (k - 1, 3) what it leaves."""
-    when, apart = turn.stamps_s + offset, np.diff(turn.stamps_s)[:, None]
-    plain = (_between(angles, when) - bias * apart) @ alignment.T
-    predicted = inverse_scale * plain
-    by_offset = inverse_scale * (_between(angles, when + RATE_S) - _between(angles, when - RATE_S)
-                                 ) @ alignment.T / (2 * RATE_S)
-    jacobian = np.zeros((len(plain), 3, 8))
+def _linear(turn: Steps, angles: Samples, gyro: Gyro) -> tuple[Floats, Floats]:
+    """Return (k - 1, 3, 9) derivatives of the prediction, and (k - 1, 3) what it leaves."""
+    when, apart = gyro.when(turn.stamps_s), np.diff(turn.stamps_s)[:, None]
+    plain = (_between(angles, when) - gyro.bias * apart) @ gyro.alignment.T
+    predicted = gyro.inverse_scale * plain
+    rate = gyro.inverse_scale * (angles.at(when + RATE_S) - angles.at(when - RATE_S)
+                                 ) @ gyro.alignment.T / (2 * RATE_S)
+    jacobian = np.zeros((len(plain), 3, UNKNOWNS))
     # a small rotation w of the alignment moves the prediction p by w x p
     for axis, unit in enumerate(np.eye(3)):
         jacobian[:, :, axis] = np.cross(unit, predicted)
-    jacobian[:, :, 3:6] = -inverse_scale * apart[:, :, None] * alignment
+    jacobian[:, :, 3:6] = -gyro.inverse_scale * apart[:, :, None] * gyro.alignment
     jacobian[:, :, 6] = plain
-    jacobian[:, :, 7] = by_offset
+    jacobian[:, :, 7] = np.diff(rate, axis=0)
+    jacobian[:, :, 8] = np.diff(rate * (turn.stamps_s - gyro.middle_s)[:, None], axis=0)
     return jacobian, turn.turned - predicted
 
 
@@ -442,11 +464,11 @@ Rows = Sequence[tuple[Floats, Floats]]
 
 
 def _whitened(turns: Sequence[Steps], rows: Rows, ratio: float) -> tuple[Floats, Floats, Floats]:
-    """Return derivatives (m, 8), residuals (m,), and what the camera does to them (m, n)."""
+    """Return derivatives (m, 9), residuals (m,), and what the camera does to them (m, n)."""
     parts = []
     for turn, (jacobian, residual) in zip(turns, rows, strict=True):
         white = _whitening(turn, ratio)[0]
-        parts.append((np.einsum('ij,jac->iac', white, jacobian).reshape(-1, 8),
+        parts.append((np.einsum('ij,jac->iac', white, jacobian).reshape(-1, UNKNOWNS),
                       (white @ residual).reshape(-1),
                       np.einsum('ij,jac->iac', white, turn.follow).reshape(
                           -1, turn.follow.shape[2])))

@@ -1,10 +1,10 @@
 """What a gyro and GPS say of fx: rendered drives, and real ones with poses or sensors.
 
-    python test/benchmark/motion.py --data data
+    python test/benchmark/motion.py --data data --single 20
     python test/benchmark/motion.py --towns 40
 
 A gyro is made from true poses: 100 Hz, 0.1 deg/s/sqrt(Hz), bias 0.2 deg/s, 40 ms late, mounted at
-any angle.
+any angle; called calibrated to 0.1 %. A better one has 0.01 deg/s/sqrt(Hz), and 0.03 %.
 """
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import cv2
 import numpy as np
+from drives import pictures_of
 from made_motion import town
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -32,37 +33,65 @@ from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import Samples, SensorStream, local_metres
 from dashcalib_ros.judge.gyro_scale import scale_by_gps
 from dashcalib_ros.judge.verdict import judge
-from dashcalib_ros.judge.witnesses import ask_sensors
+from dashcalib_ros.judge.witnesses import Asked, ask_sensors
 from dashcalib_ros.solve.fitting import scene_with
 from dashcalib_ros.solve.solution import Solution
 
 DENSITY_DEG, BIAS_DEG, LATE_S, RATE_HZ = 0.1, 0.2, 0.04, 100.0
 LENS = Lens.of(960, 540, 75.0, -0.30, 0.10, (14.0, -9.0), 1.003)
 CALIBRATED = 0.001
+# of another gyro, that is not cheap; tracks of GPS for each drive
+BETTER_DEG, BETTER, TRACKS = 0.01, 0.0003, 5
 
 
-def gyro(times: Floats, rotations: Floats, seed: int, scale: float = 1.0) -> SensorStream:
-    """Return what a gyro measures. times: (n,) s; rotations: (n, 3, 3) camera to world."""
-    rng = np.random.default_rng(seed)
+@dataclasses.dataclass(frozen=True)
+class Poses:
+    """A camera's true poses. times: (n,) s; rotations: (n, 3, 3) to the world; places: (n, 3)."""
+
+    times: Floats
+    rotations: Floats
+    places: Floats
+
+
+def gyro(poses: Poses, seed: int, density_deg: float = DENSITY_DEG) -> SensorStream:
+    """Return what a gyro measures."""
+    rng, times = np.random.default_rng(seed), poses.times
     when = np.arange(times[0], times[-1], 1 / RATE_HZ)
-    spline = RotationSpline(times, Rotation.from_matrix(rotations))
+    spline = RotationSpline(times, Rotation.from_matrix(poses.rotations))
     half = 0.5 / RATE_HZ
     middle = np.clip(when, times[0] + half, times[-1] - half)
     rates = (spline(middle - half).inv() * spline(middle + half)).as_rotvec() * RATE_HZ
     mounting = Rotation.random(random_state=seed)
-    noise = rng.standard_normal(rates.shape) * DENSITY_DEG * np.sqrt(RATE_HZ)
+    noise = rng.standard_normal(rates.shape) * density_deg * np.sqrt(RATE_HZ)
     bias = BIAS_DEG * rng.standard_normal(3) / np.sqrt(3)
     return SensorStream(rate=Samples(
-        when + LATE_S, scale * mounting.apply(rates) + np.radians(bias + noise)))
+        when + LATE_S, mounting.apply(rates) + np.radians(bias + noise)))
 
 
-def rendered(seed: int, turns: int = 5) -> tuple[Iterable[Frame], SensorStream, Floats]:
-    """Return the frames of a rendered drive, its gyro, and its true positions by time (n, 4)."""
+@dataclasses.dataclass(frozen=True)
+class Driven:
+    """A drive that was solved by pictures alone. truth: fx, px. poses: None where not known."""
+
+    name: str
+    solution: Solution
+    start_s: float
+    verdict: str
+    truth: float
+    poses: Poses | None = None
+
+    def off(self, solution: Solution) -> str:
+        """Return by how much fx is off, and its sigma, %."""
+        return (f'{100 * (solution.camera.fx / self.truth - 1):+.2f} ± '
+                f'{100 * solution.sigma[0] / solution.camera.fx:.2f}')
+
+
+def rendered(name: str, seed: int, turns: int, cache: Path) -> Driven:
+    """Return a rendered drive with its true poses."""
     drive = Drive(LENS, DriveSpec(seed=seed, turns=turns))
     times = np.arange(-0.9, drive.times[-1] + 0.9, 0.005)
     poses = [drive.ride.camera_at(np.array([time + MARGIN_S])) for time in times]
-    places = np.column_stack([times, np.concatenate([place for _, place in poses])])
-    return drive.frames(), gyro(times, np.concatenate([turn for turn, _ in poses]), seed), places
+    return Driven(name, *solved(pictures_of(drive, cache)), LENS.fx, Poses(
+        times, *(np.concatenate(each) for each in zip(*poses, strict=True))))
 
 
 def solved(frames: Iterable[Frame]) -> tuple[Solution, float, str]:
@@ -75,39 +104,72 @@ def solved(frames: Iterable[Frame]) -> tuple[Solution, float, str]:
         return calibrator.solution, found.start_s, found.verdict.level
 
 
-def row(name: str, solution: Solution, start_s: float, stream: SensorStream, truth: float,
-        verdict: str) -> None:
-    """Print what the gyro says, calibrated and not, and of a camera that is 2 % off."""
-    config = Config().replace({'motion.gyro_scale_sigma': CALIBRATED})
-    asked = ask_sensors(solution, stream, start_s, config)
-    witnesses = asked.witnesses
-    for line in asked.unused:
-        print(f'{name}: {line}')
-    own = 100 * (solution.camera.fx / truth - 1)
-    for sensor, said in (('gyro', witnesses.gyro), ('gps', witnesses.gps)):
+def asked(drive: Driven, stream: SensorStream, solution: Solution | None = None,
+          scale_sigma: float = CALIBRATED) -> Asked:
+    """Ask the sensors of a drive, of its own solution or another one."""
+    config = Config().replace({'motion.gyro_scale_sigma': scale_sigma})
+    return ask_sensors(solution or drive.solution, stream, drive.start_s, config)
+
+
+def scaled(stream: SensorStream, scale: float) -> SensorStream:
+    """Return the same of a gyro that is so many times too fast, without GPS."""
+    assert stream.rate is not None
+    return SensorStream(rate=Samples(stream.rate.stamps_s, scale * stream.rate.values))
+
+
+def row(drive: Driven, stream: SensorStream, sensor: str = 'gyro',
+        scale_sigma: float = CALIBRATED) -> None:
+    """Print what the sensors say, calibrated, and what the result is with that."""
+    found = asked(drive, stream, scale_sigma=scale_sigma)
+    for line in found.unused:
+        print(f'{drive.name}: {line}')
+    informed = found.solution or drive.solution
+    verdict = judge(informed, Config().verdict, witnesses=found.witnesses).level
+    for kind, said in (('gyro', found.witnesses.gyro), ('GPS', found.witnesses.gps)):
         if said is None:
-            print(f'| {name} | {sensor} | nothing to say |')
             continue
+        own = 100 * (drive.solution.camera.fx / drive.truth - 1)
         time = ('' if said.time_offset_s is None or said.time_sigma_s is None else
                 f'{1e3 * said.time_offset_s:.1f} ± {1e3 * said.time_sigma_s:.1f}')
-        print(f'| {name} | {sensor} | {verdict} | {time} | {said.scale:.4f} ± '
-              f'{said.scale_sigma:.4f} | {own:+.2f} ± '
-              f'{100 * solution.sigma[0] / solution.camera.fx:.2f} | '
-              f'{own + said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} | {said.agrees} |')
-    informed = asked.solution
-    if informed is not None and informed.alone is not None:
-        print(f'  as information: {100 * (informed.camera.fx / truth - 1):+.2f} ± '
-              f'{100 * informed.sigma[0] / informed.camera.fx:.2f} %, '
-              f'{judge(informed, config.verdict, witnesses=witnesses).level}', flush=True)
+        print(f'| {drive.name}, {sensor if kind == "gyro" else kind} | {time} | {said.scale:.4f} '
+              f'± {said.scale_sigma:.4f} | {drive.off(drive.solution)}, {drive.verdict} | '
+              f'{own + said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} | '
+              f'{drive.off(informed)}, {verdict} |', flush=True)
+
+
+def harm(drive: Driven, stream: SensorStream) -> None:
+    """Print what sensors do that are off, and what they say of a camera that is."""
+    solution = drive.solution
+    unknown = asked(drive, scaled(stream, 1.03), scale_sigma=Config().motion.gyro_scale_sigma)
+    assert unknown.solution is not None
+    moved = abs(unknown.solution.camera.fx - solution.camera.fx) / solution.sigma[0]
     camera = solution.camera.with_focal(1.02 * solution.camera.fx)
     scenes = [scene_with(camera, scene, Config()) for scene in solution.scenes]
-    off = ask_sensors(dataclasses.replace(
-        solution, camera=camera, scenes=tuple(each for each in scenes if each is not None)),
-        dataclasses.replace(stream, position=None), start_s, config).witnesses
-    if off.gyro is not None:
-        print(f'  2 % too long: asked for {off.gyro.fx_percent:+.2f} ± '
-              f'{off.gyro.fx_sigma_percent:.2f} %, '
-              f'{abs(off.gyro.fx_percent) / off.gyro.fx_sigma_percent:.1f} sigma', flush=True)
+    longer = dataclasses.replace(
+        solution, camera=camera, scenes=tuple(each for each in scenes if each is not None))
+    said = [found.witnesses.gyro for found in (
+        asked(drive, scaled(stream, 1.03)), asked(drive, scaled(stream, 1.0), longer))]
+    told = ['' if each is None else
+            f'{abs(each.fx_percent) / each.fx_sigma_percent:.1f} sigma'
+            f'{"" if each.agrees else ", contradiction"}' for each in said]
+    by_gps = []
+    for jumps in (0.0, 0.05):
+        found = [] if drive.poses is None else [
+            asked(drive, SensorStream(position=fixes(drive.poses, 1.0, 3.0, jumps, seed)))
+            for seed in range(TRACKS)]
+        assert all(each.solution is solution for each in found)
+        agree = [each.witnesses.gps.agrees for each in found if each.witnesses.gps is not None]
+        by_gps.append(f'{len(agree)}, {agree.count(False)}')
+    print(f'| {drive.name} | {moved:.2f} | {" | ".join([*told, *by_gps])} |', flush=True)
+
+
+def fixes(poses: Poses, rate_hz: float, noise_m: float, jumps: float, seed: int) -> Samples:
+    """Return what GPS measures. jumps: share of the fixes that are off by 30 m."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(poses.times[0], poses.times[-1], 1 / rate_hz)
+    places = Samples(poses.times, poses.places).at(times)
+    noise = noise_m + 30 * (rng.random((len(times), 1)) < jumps)
+    return Samples(times, places + noise * rng.standard_normal(places.shape))
 
 
 def pictures(folder: Path, stamps: Iterable[float]) -> Iterator[Frame]:
@@ -149,46 +211,58 @@ def main() -> None:
     parser.add_argument('--data', type=Path)
     parser.add_argument('--seeds', type=int, default=3)
     parser.add_argument('--single', type=int, default=0, help='single turns that are rendered')
+    parser.add_argument('--cache', type=Path, default=Path('benchmark/pictures'),
+                        help='where rendered pictures are kept')
     args = parser.parse_args()
     if args.towns:
         towns(args.towns)
         return
-    print('| drive | sensor | verdict | offset ms | scale | fx by pictures, % | by it, % | agrees '
-          '|\n|---|---|---|---|---|---|---|---|')
+    drives = []
+    print('| drive | offset, ms | scale | fx by pictures, % | by it alone, % | the result, % |\n'
+          '|---|---|---|---|---|---|')
     for seed in range(1, args.seeds + 1):
-        frames, stream, places = rendered(seed)
-        solution, start_s, verdict = solved(frames)
-        rng = np.random.default_rng(seed)
-        for name, step, noise in (('5 Hz, 2 cm', 40, 0.02), ('1 Hz, 3 m', 200, 3.0)):
-            fixes = places[::step]
-            noisy = fixes[:, 1:] + noise * rng.standard_normal((len(fixes), 3))
-            row(f'rendered {seed}, GPS {name}', solution, start_s,
-                dataclasses.replace(stream, position=Samples(fixes[:, 0], noisy)), LENS.fx,
-                verdict)
+        drive = rendered(f'rendered {seed}', seed, 5, args.cache)
+        assert drive.poses is not None
+        drives.append((drive, gyro(drive.poses, seed)))
+        row(*drives[-1])
+        row(drive, gyro(drive.poses, seed, BETTER_DEG), 'a better gyro', BETTER)
+        row(drive, SensorStream(position=fixes(drive.poses, 5.0, 0.02, 0.0, seed)))
     for seed in range(100, 100 + args.single):
-        frames, stream, _ = rendered(seed, 1)
-        solution, start_s, verdict = solved(frames)
-        row(f'one turn {seed}', solution, start_s, stream, LENS.fx, verdict)
-    if args.data is None:
-        return
-    solution, start_s, verdict = solved(open_frames(args.data / 'kitti03' / 'bag'))
-    poses = np.loadtxt(args.data / 'kitti03' / 'poses.txt')
+        drive = rendered(f'one turn {seed}', seed, 1, args.cache)
+        assert drive.poses is not None
+        row(drive, gyro(drive.poses, seed))
+    if args.data is not None:
+        for drive, stream in real(args.data):
+            row(drive, stream)
+            drives.append((drive, stream))
+    print('\n| drive | gyro 3 % wrong: fx moves by, sigma | called calibrated | a camera 2 % too '
+          f'long | {TRACKS} tracks of 1 Hz, 3 m: speak, contradict | and jumps |\n'
+          '|---|---|---|---|---|---|')
+    for drive, stream in drives:
+        harm(drive, stream)
+
+
+def real(data: Path) -> Iterator[tuple[Driven, SensorStream]]:
+    """Yield real drives, solved, with gyros made of their poses, or their own sensors."""
+    poses = np.loadtxt(data / 'kitti03' / 'poses.txt')[:, 1:].reshape(-1, 3, 4)
     # the bag has its images at 10 Hz, and a pose for each of them
-    when = np.arange(len(poses)) / 10
-    row('kitti03', solution, start_s, gyro(when, poses[:, 1:].reshape(-1, 3, 4)[:, :, :3], 1),
-        718.2, verdict)
-    folder = args.data / 'kitti07'
+    made = poses_of(np.arange(len(poses)) / 10, poses)
+    yield Driven('kitti03', *solved(open_frames(data / 'kitti03' / 'bag')), 718.2, made), gyro(
+        made, 1)
+    folder = data / 'kitti07'
     when = table(folder / 'odom.csv')['stamp_s']
-    solution, start_s, verdict = solved(pictures(folder, when))
-    poses = np.loadtxt(folder / 'poses.txt').reshape(-1, 3, 4)
-    row('kitti07', solution, start_s, gyro(when, poses[:, :, :3], 1), 701.9, verdict)
-    folder = args.data / 'kitti_raw'
-    solution, start_s, verdict = solved(pictures(folder, table(folder / 'images.csv')['stamp_s']))
-    own = table(folder / 'oxts.csv')
-    row('kitti_raw, its own IMU and GPS', solution, start_s, SensorStream(
+    made = poses_of(when, np.loadtxt(folder / 'poses.txt').reshape(-1, 3, 4))
+    yield Driven('kitti07', *solved(pictures(folder, when)), 701.9, made), gyro(made, 1)
+    folder = data / 'kitti_raw'
+    when, own = table(folder / 'images.csv')['stamp_s'], table(folder / 'oxts.csv')
+    yield Driven('kitti_raw', *solved(pictures(folder, when)), 984.2439), SensorStream(
         rate=Samples(own['stamp_s'], np.stack([own[name] for name in ('wx', 'wy', 'wz')], axis=1)),
-        position=Samples(own['stamp_s'], local_metres(own['lat'], own['lon'], own['alt']))),
-        984.2439, verdict)
+        position=Samples(own['stamp_s'], local_metres(own['lat'], own['lon'], own['alt'])))
+
+
+def poses_of(times: Floats, poses: Floats) -> Poses:
+    """Return poses of KITTI, (n, 3, 4), whose y points down."""
+    return Poses(times, poses[:, :, :3], poses[:, [0, 2, 1], 3])
 
 
 if __name__ == '__main__':

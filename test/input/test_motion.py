@@ -11,6 +11,7 @@ from made_gopro import gopro
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.motion import (
+    Samples,
     SensorBuffer,
     SensorStream,
     local_metres,
@@ -269,3 +270,14 @@ def test_speed_is_measured_or_comes_from_positions():
     assert np.allclose(speeds_of(backwards).values, 3.0)
     assert speeds_of(sensor_stream({'position': (stamps[:2], places[:2])}, 'a test')) is None
     assert speeds_of(SensorStream()) is None
+
+
+def test_a_car_stood_only_where_its_speed_says_so_all_the_time():
+    stamps_s = np.arange(0.0, 30.0, 0.1)
+    speed = np.where((stamps_s > 10) & (stamps_s < 20), -0.1, 8.0)[:, None]
+    stream = SensorStream(speed=Samples(stamps_s, speed))
+    assert stream.stood(11.0, 19.0)
+    assert not stream.stood(9.0, 19.0) and not stream.stood(31.0, 40.0)
+    # odometry that is not wired, and none
+    dead = SensorStream(speed=Samples(stamps_s, 0 * speed))
+    assert not dead.stood(11.0, 19.0) and not SensorStream().stood(11.0, 19.0)

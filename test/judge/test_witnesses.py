@@ -13,7 +13,7 @@ from synthetic import LENS, synthetic_turn
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge.verdict import judge
-from dashcalib_ros.judge.witnesses import ask_sensors, fit_to, steps_of
+from dashcalib_ros.judge.witnesses import PACE, ask_sensors, fit_to, steps_of
 from dashcalib_ros.solve.fitting import scene_with
 
 TURNS = 4
@@ -112,9 +112,37 @@ def test_sigmas_hold(drive):
     turns = [steps_of(scene, solution, 0.3, START_S) for scene in solution.scenes]
     for seed in range(30):
         said = fit_to(turns, gyro(drive, density_deg=0.1, seed=seed).rate)
-        pulls.append([(said.offset_s - LATE_S) / np.sqrt(said.covariance[7, 7]),
-                      (said.inverse_scale - 1) / np.sqrt(said.covariance[6, 6])])
+        pulls.append([(said.gyro.offset_s - LATE_S) / np.sqrt(said.covariance[7, 7]),
+                      (said.gyro.inverse_scale - 1) / np.sqrt(said.covariance[6, 6]),
+                      said.gyro.pace / np.sqrt(said.covariance[8, 8])])
     assert (np.abs(pulls) < 2).mean(axis=0).min() >= 0.9
+
+
+@pytest.mark.parametrize('faster', [-0.003, 0.002])
+def test_the_pace_of_the_clocks_is_measured_by_several_turns(drive, faster):
+    solution, rate = drive[0], gyro(drive).rate
+    turns = [steps_of(scene, solution, 0.3, START_S) for scene in solution.scenes]
+    ran, plain = (fit_to(turns, Samples(rate.stamps_s * (1 + each), rate.values))
+                  for each in (faster, 0.0))
+    assert abs(ran.gyro.pace - faster) < 4 * np.sqrt(ran.covariance[8, 8]) < 0.001
+    # the pictures' clock or the gyro's is off: no angle is known better than that
+    for fit in (ran, plain):
+        assert abs(fit.scale - 1) < 4 * np.sqrt(fit.covariance[6, 6])
+    assert np.sqrt(ran.covariance[6, 6]) > abs(faster) > np.sqrt(plain.covariance[6, 6])
+
+
+def test_one_turn_has_the_prior_of_the_pace(drive):
+    rate = gyro(drive).rate
+    for turn in range(TURNS):
+        solution = alone(drive, turn)
+        steps = steps_of(solution.scenes[0], solution, 0.3, START_S)
+        assert np.sqrt(fit_to([steps], rate).covariance[8, 8]) < PACE
+
+
+def jumped(drive, later_s):
+    rate = gyro(drive).rate
+    return SensorStream(rate=Samples(
+        rate.stamps_s + later_s * ((rate.stamps_s > 50.0) & (rate.stamps_s < 70.0)), rate.values))
 
 
 @pytest.mark.parametrize(('stream', 'line'), [
@@ -122,8 +150,9 @@ def test_sigmas_hold(drive):
     (lambda drive: gyro(drive, unit=9.0), 'check its unit'),
     (lambda drive: gyro(drive).shifted(3.0), 'does not turn as the pictures do'),
     (lambda drive: gyro(drive).shifted(1e4), 'no samples during the turns'),
+    (lambda drive: jumped(drive, 0.15), 'do not keep pace (turns are'),
     (lambda drive: SensorStream(rate=Samples(
-        gyro(drive).rate.stamps_s * 1.002, gyro(drive).rate.values)), 'do not keep pace')])
+        1.011 * gyro(drive).rate.stamps_s - 0.55, gyro(drive).rate.values)), '+1.1 % of time')])
 def test_streams_that_do_not_fit_are_told_and_not_used(drive, stream, line):
     said, [found] = asked(drive, stream(drive))
     assert said is None and line in found and len(found.splitlines()) == 1
