@@ -7,6 +7,7 @@ several fixed focal lengths, and the one with the lowest cost over *all* observa
 """
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import replace
 
 import numpy as np
@@ -150,7 +151,8 @@ def _profile_trials(tracks: Tracks, turn: Turn, config: Config, model: type[Came
     """Return the scenes at focal lengths held fixed: every second one, then around the best.
 
     Each is adjusted once. Only the best and its neighbours are completed where they explain the
-    turn: what is far from the best costs as much time, and changes only how bad it is.
+    turn: what is far from the best costs as much time, and changes only how bad it is. So it is
+    not even begun where those on both sides of the best are worse.
     """
     settings, seed, ratios = config.scene, config.seed, model.focal_ratios
     observations = int(tracks.seen.sum())
@@ -178,14 +180,22 @@ def _profile_trials(tracks: Tracks, turn: Turn, config: Config, model: type[Came
     def found() -> dict[int, Scene]:
         return {n: scene for n, scene in begun.items() if scene is not None}
 
-    for n in range(1, len(ratios), 2):
-        begin(n)
-    while trials := found():
+    def promising(step: int, others: Set[int]) -> Set[int]:
+        """Return the best and those a step beside it; others, too, where it is not good."""
+        trials = found()
+        if not trials:
+            return others
         best = min(trials, key=lambda n: (_cost_of(trials[n]), n))
-        near = range(max(best - 1, 0), min(best + 2, len(ratios)))
-        wanted = set(near if _cost_of(trials[best]) <= GOOD_COST else [*near, *trials]) - completed
-        if not wanted:
-            break
+        near = {best - step, best, best + step} & set(range(len(ratios)))
+        return near if _cost_of(trials[best]) <= GOOD_COST else near | others
+
+    coarse = range(1, len(ratios), 2)
+    wanted: Set[int] = set(coarse[1:-1])
+    while wanted:
+        for n in sorted(wanted):
+            begin(n)
+        wanted = promising(2, set(coarse)) - begun.keys()
+    while wanted := promising(1, found().keys()) - completed:
         for n in sorted(wanted):
             complete(n)
     return {ratios[n]: scene for n, scene in found().items()}

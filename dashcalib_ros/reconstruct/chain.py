@@ -17,7 +17,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruct.colmap import pycolmap
-from dashcalib_ros.reconstruct.scene import Structure, triangulate
+from dashcalib_ros.reconstruct.scene import Structure, rays_of, triangulate
 from dashcalib_ros.reconstruct.tracks import Tracks
 
 # points that both images of the first pair see, at the least
@@ -43,7 +43,7 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
     error_px: largest reprojection error; generous, as the camera is only a guess.
     min_angle_deg: smaller triangulation angles give no point.
     """
-    rays = camera.rays(tracks.xy)
+    rays = rays_of(tracks, camera)
     # where the distortion folds over, pixels have no ray
     seen = np.isfinite(rays[:, :, 0])
     error_rad = error_px / camera.fx

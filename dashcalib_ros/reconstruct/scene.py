@@ -265,11 +265,19 @@ def truncated_cost(scene: Scene, camera: Camera, limit_px: float) -> float:
     return float(np.sum(errors[seen] ** 2) / max(int(seen.sum()), 1))
 
 
+def rays_of(tracks: Tracks, camera: Camera) -> Floats:
+    """Return (k, t, 3) unit viewing rays; NaN where a track is not seen, which most are not."""
+    seen = tracks.seen
+    rays = np.full((*seen.shape, 3), np.nan)
+    rays[seen] = camera.rays(tracks.xy[seen])
+    return rays
+
+
 def retriangulated(scene: Scene, camera: Camera, limit_px: float, min_angle_deg: float) -> Scene:
     """Return the scene with every track triangulated anew, also those that were not used."""
     structure = scene.structure
     points, used = triangulate(
-        camera, camera.rays(scene.tracks.xy), structure.rotations, structure.translations,
+        camera, rays_of(scene.tracks, camera), structure.rotations, structure.translations,
         structure.registered, limit_px, min_angle_deg)
     return replace(scene, structure=replace(structure, points=points, used=used), camera=camera)
 
