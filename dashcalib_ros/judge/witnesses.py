@@ -67,6 +67,9 @@ TURN_SIGMA = 0.0045
 PACE, LARGEST_PACE = 0.005, 2.0
 # s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
 LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
+# times what a turn's other steps leave; where an image is missing in a turn of 50 degrees or more
+# one step left 4.7 to 14 times that, and else 4.2 at the most
+LARGEST_JUMP = 4.5
 # ratios of the poses' variance to the gyro's in a second, of which the likeliest is taken
 RATIOS = np.logspace(-4, 3, 22)
 # parameters of a gyro beside a camera
@@ -203,11 +206,9 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness 
                 'check its unit')
         return None, (f'the gyro is not used: its angles are {fit.scale:.3g} times those of the '
                       f'pictures: {cure}')
-    if fit.skew_s > LARGEST_SKEW_S or abs(gyro.pace) > LARGEST_PACE * PACE:
-        apart = (f'turns are {1e3 * fit.skew_s:.0f} ms apart' if fit.skew_s > LARGEST_SKEW_S else
-                 f'they differ by {100 * gyro.pace:+.1f} % of time')
+    if fit.out_of_pace:
         return None, (f'the gyro is not used: its stamps and those of the pictures do not keep '
-                      f'pace ({apart}): check --fps, and that no images are missing')
+                      f'pace ({fit.out_of_pace}): check --fps, and that no images are missing')
     sigmas = np.sqrt(np.diag(fit.covariance))
     said = _witness(gyro.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
     return replace(
@@ -278,7 +279,8 @@ class Fit:
 
     covariance: (9, 9) of the small rotation (3), bias (3), 1 / scale, offset and pace. by_camera:
     (n,) by how much 1 / scale follows the camera's parameters. explained: of the squared angles.
-    skew_s: between the turns' own offsets, where that is no chance; else 0.
+    skew_s: between the turns' own offsets, where that is no chance; else 0. jump: what a step
+    leaves, over the RMS of the others of its turn.
     """
 
     gyro: Gyro
@@ -286,11 +288,23 @@ class Fit:
     by_camera: Floats
     explained: float
     skew_s: float
+    jump: float
 
     @property
     def scale(self) -> float:
         """Return the sensor's angles over the camera's."""
         return 1 / self.gyro.inverse_scale
+
+    @property
+    def out_of_pace(self) -> str:
+        """Return in words how the clocks are out of pace; '' where they are not."""
+        if self.skew_s > LARGEST_SKEW_S:
+            return f'turns are {1e3 * self.skew_s:.0f} ms apart'
+        if self.jump > LARGEST_JUMP:
+            return 'they jump within a turn'
+        if abs(self.gyro.pace) > LARGEST_PACE * PACE:
+            return f'they differ by {100 * self.gyro.pace:+.1f} % of time'
+        return ''
 
     def scaled(self, own: float) -> Fit:
         """Return the same for a gyro whose angles are known to be own times the true ones."""
@@ -393,10 +407,18 @@ def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
     covariance[6, 6] += _between_turns(alone[:, 0], variances[:, 0], gyro.inverse_scale)
     clear = np.abs(alone[:, 1]) > SKEW_SIGMAS * np.sqrt(variances[:, 1])
     turned = np.concatenate([turn.turned for turn in turns])
-    left = np.concatenate([row[1] for row in rows])
+    lefts = [np.linalg.norm(row[1], axis=1) for row in rows]
+    left = np.concatenate(lefts)
     return Fit(gyro, covariance, np.linalg.solve(hessian, jacobian.T @ follow)[6],
                1 - float(np.sum(left**2) / np.sum(turned**2)),
-               float(np.max(np.abs(alone[:, 1]), where=clear, initial=0.0)))
+               float(np.max(np.abs(alone[:, 1]), where=clear, initial=0.0)),
+               max(_largest(each) for each in lefts))
+
+
+def _largest(left: Floats) -> float:
+    """Return the largest of what a turn's steps (k,) leave over the RMS of the others."""
+    largest = float(left.max())
+    return largest / float(np.sqrt((np.sum(left**2) - largest**2) / (len(left) - 1)))
 
 
 def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:

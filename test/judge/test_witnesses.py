@@ -139,6 +139,18 @@ def test_one_turn_has_the_prior_of_the_pace(drive):
         assert np.sqrt(fit_to([steps], rate).covariance[8, 8]) < PACE
 
 
+def test_an_image_that_is_missing_within_a_turn_is_noticed(drive):
+    for scene in drive[0].scenes:
+        tracks = scene.tracks
+        # the images are given at a rate, and one of them is missing in the middle
+        late = np.arange(len(tracks.stamps_ns)) >= len(tracks.stamps_ns) // 2
+        scene = dataclasses.replace(scene, tracks=dataclasses.replace(
+            tracks, stamps_ns=tracks.stamps_ns - 100_000_000 * late))
+        solution = dataclasses.replace(drive[0], scenes=(scene,))
+        said, [line] = asked(drive, gyro(drive, density_deg=0.1), solution=solution)
+        assert said is None and 'they jump within a turn' in line
+
+
 def jumped(drive, later_s):
     rate = gyro(drive).rate
     return SensorStream(rate=Samples(
