@@ -78,6 +78,8 @@ UNKNOWNS = 9
 STEPS, WEIGHED = 8, (1, 4)
 # sigmas; where a witness is farther off, it contradicts
 CONTRADICTED = 3.0
+# the same for one turn, which a gyro alone confirms: farther off, it confirms nothing
+DOUBTED = 2.0
 
 # degrees by which the car may turn on what counts as a straight
 STRAIGHT_DEG = 1.5
@@ -130,7 +132,8 @@ def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s:
             gyro, line = _gyro(fit, solution, own)
             lines += [own.contradiction, line]
             if fit is not None and gyro is not None and gyro.agrees:
-                informed = _informed(solution, fit, own, config)
+                informed, line = _informed(solution, fit, own, config)
+                lines.append(line)
         if stream.position is not None:
             gps, line = _gps(turns, stream.position, solution)
             lines.append(line)
@@ -168,8 +171,9 @@ def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnSca
     return _OwnScale(1 + share * (scale - 1), sigma * float(np.sqrt(share)), found)
 
 
-def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config) -> Solution | None:
-    """Return the solution with the gyro's angles as information; None where they are none.
+def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
+              ) -> tuple[Solution | None, str]:
+    """Return the solution with the gyro's angles as information, or None and why not, if at all.
 
     They are one more measurement of the camera's parameters (a Kalman update); then the turns'
     poses and points are adjusted anew with the camera that it leads to.
@@ -179,16 +183,20 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config) -> 
     own = float(fit.by_camera @ along)
     known = float(fit.covariance[6, 6]) + gyro.sigma**2
     if config.motion.use != 'information' or gyro.sigma > KNOWN_SCALE:
-        return None
+        return None, ''
+    apart = abs(1 - fit.gyro.inverse_scale) / float(np.sqrt(own + known))
+    if len(solution.scenes) == 1 and apart > DOUBTED:
+        return None, (f'the gyro does not confirm the only turn, both differ by {apart:.1f} sigma: '
+                      f'check its scale, its clock and that it is of this drive')
     gain = along / (own + known)
     camera = solution.camera.with_params(
         solution.camera.params + gain * (1 - fit.gyro.inverse_scale))
     scenes = [scene_with(camera, scene, config) for scene in solution.scenes]
     if any(scene is None for scene in scenes):
-        return None
+        return None, ''
     moved = replace(solution, camera=camera, alone=solution,
                     scenes=tuple(scene for scene in scenes if scene is not None))
-    return with_doubt(moved, -np.outer(gain, along))
+    return with_doubt(moved, -np.outer(gain, along)), ''
 
 
 def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness | None, str]:

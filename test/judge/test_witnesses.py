@@ -244,6 +244,14 @@ def test_what_is_no_information_changes_nothing(drive):
         assert found.solution is solution and found.witnesses.gyro is not None
 
 
+def test_one_turn_is_not_moved_by_a_gyro_that_is_called_calibrated_and_is_not(drive):
+    for scale in (0.965, 1.035):
+        solution = alone(drive, 0)
+        found = ask_sensors(solution, gyro(drive, scale), START_S, CALIBRATED)
+        named = any('does not confirm' in line for line in found.unused)
+        assert found.solution is solution and (named or not found.witnesses.gyro.agrees)
+
+
 def test_a_gyro_hardly_moves_what_many_turns_know(drive):
     solution = drive[0]
     found = ask_sensors(solution, gyro(drive), START_S, CALIBRATED).solution
