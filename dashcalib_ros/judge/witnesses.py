@@ -186,7 +186,7 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
         return None, ''
     apart = abs(1 - fit.gyro.inverse_scale) / float(np.sqrt(own + known))
     if len(solution.scenes) == 1 and apart > DOUBTED:
-        return None, (f'the gyro does not confirm the only turn, both differ by {apart:.1f} sigma: '
+        return None, (f'the gyro does not confirm the only turn, it is {apart:.1f} sigma off: '
                       f'check its scale, its clock and that it is of this drive')
     gain = along / (own + known)
     camera = solution.camera.with_params(
