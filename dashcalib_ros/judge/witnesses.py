@@ -67,6 +67,9 @@ TURN_SIGMA = 0.0045
 PACE, LARGEST_PACE = 0.005, 2.0
 # s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
 LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
+# times what a turn's other steps leave; where an image is missing in a turn of 50 degrees or more
+# one step left 4.7 to 14 times that, and else 4.2 at the most
+LARGEST_JUMP = 4.5
 # ratios of the poses' variance to the gyro's in a second, of which the likeliest is taken
 RATIOS = np.logspace(-4, 3, 22)
 # parameters of a gyro beside a camera
@@ -75,6 +78,8 @@ UNKNOWNS = 9
 STEPS, WEIGHED = 8, (1, 4)
 # sigmas; where a witness is farther off, it contradicts
 CONTRADICTED = 3.0
+# the same for one turn, which a gyro alone confirms: farther off, it confirms nothing
+DOUBTED = 2.0
 
 # degrees by which the car may turn on what counts as a straight
 STRAIGHT_DEG = 1.5
@@ -127,7 +132,8 @@ def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s:
             gyro, line = _gyro(fit, solution, own)
             lines += [own.contradiction, line]
             if fit is not None and gyro is not None and gyro.agrees:
-                informed = _informed(solution, fit, own, config)
+                informed, line = _informed(solution, fit, own, config)
+                lines.append(line)
         if stream.position is not None:
             gps, line = _gps(turns, stream.position, solution)
             lines.append(line)
@@ -165,8 +171,9 @@ def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnSca
     return _OwnScale(1 + share * (scale - 1), sigma * float(np.sqrt(share)), found)
 
 
-def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config) -> Solution | None:
-    """Return the solution with the gyro's angles as information; None where they are none.
+def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
+              ) -> tuple[Solution | None, str]:
+    """Return the solution with the gyro's angles as information, or None and why not, if at all.
 
     They are one more measurement of the camera's parameters (a Kalman update); then the turns'
     poses and points are adjusted anew with the camera that it leads to.
@@ -176,16 +183,20 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config) -> 
     own = float(fit.by_camera @ along)
     known = float(fit.covariance[6, 6]) + gyro.sigma**2
     if config.motion.use != 'information' or gyro.sigma > KNOWN_SCALE:
-        return None
+        return None, ''
+    apart = abs(1 - fit.gyro.inverse_scale) / float(np.sqrt(own + known))
+    if len(solution.scenes) == 1 and apart > DOUBTED:
+        return None, (f'the gyro does not confirm the only turn, it is {apart:.1f} sigma off: '
+                      f'check its scale, its clock and that it is of this drive')
     gain = along / (own + known)
     camera = solution.camera.with_params(
         solution.camera.params + gain * (1 - fit.gyro.inverse_scale))
     scenes = [scene_with(camera, scene, config) for scene in solution.scenes]
     if any(scene is None for scene in scenes):
-        return None
+        return None, ''
     moved = replace(solution, camera=camera, alone=solution,
                     scenes=tuple(scene for scene in scenes if scene is not None))
-    return with_doubt(moved, -np.outer(gain, along))
+    return with_doubt(moved, -np.outer(gain, along)), ''
 
 
 def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness | None, str]:
@@ -203,11 +214,9 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness 
                 'check its unit')
         return None, (f'the gyro is not used: its angles are {fit.scale:.3g} times those of the '
                       f'pictures: {cure}')
-    if fit.skew_s > LARGEST_SKEW_S or abs(gyro.pace) > LARGEST_PACE * PACE:
-        apart = (f'turns are {1e3 * fit.skew_s:.0f} ms apart' if fit.skew_s > LARGEST_SKEW_S else
-                 f'they differ by {100 * gyro.pace:+.1f} % of time')
+    if fit.out_of_pace:
         return None, (f'the gyro is not used: its stamps and those of the pictures do not keep '
-                      f'pace ({apart}): check --fps, and that no images are missing')
+                      f'pace ({fit.out_of_pace}): check --fps, and that no images are missing')
     sigmas = np.sqrt(np.diag(fit.covariance))
     said = _witness(gyro.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
     return replace(
@@ -278,7 +287,8 @@ class Fit:
 
     covariance: (9, 9) of the small rotation (3), bias (3), 1 / scale, offset and pace. by_camera:
     (n,) by how much 1 / scale follows the camera's parameters. explained: of the squared angles.
-    skew_s: between the turns' own offsets, where that is no chance; else 0.
+    skew_s: between the turns' own offsets, where that is no chance; else 0. jump: what a step
+    leaves, over the RMS of the others of its turn.
     """
 
     gyro: Gyro
@@ -286,11 +296,23 @@ class Fit:
     by_camera: Floats
     explained: float
     skew_s: float
+    jump: float
 
     @property
     def scale(self) -> float:
         """Return the sensor's angles over the camera's."""
         return 1 / self.gyro.inverse_scale
+
+    @property
+    def out_of_pace(self) -> str:
+        """Return in words how the clocks are out of pace; '' where they are not."""
+        if self.skew_s > LARGEST_SKEW_S:
+            return f'turns are {1e3 * self.skew_s:.0f} ms apart'
+        if self.jump > LARGEST_JUMP:
+            return 'they jump within a turn'
+        if abs(self.gyro.pace) > LARGEST_PACE * PACE:
+            return f'they differ by {100 * self.gyro.pace:+.1f} % of time'
+        return ''
 
     def scaled(self, own: float) -> Fit:
         """Return the same for a gyro whose angles are known to be own times the true ones."""
@@ -393,10 +415,18 @@ def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
     covariance[6, 6] += _between_turns(alone[:, 0], variances[:, 0], gyro.inverse_scale)
     clear = np.abs(alone[:, 1]) > SKEW_SIGMAS * np.sqrt(variances[:, 1])
     turned = np.concatenate([turn.turned for turn in turns])
-    left = np.concatenate([row[1] for row in rows])
+    lefts = [np.linalg.norm(row[1], axis=1) for row in rows]
+    left = np.concatenate(lefts)
     return Fit(gyro, covariance, np.linalg.solve(hessian, jacobian.T @ follow)[6],
                1 - float(np.sum(left**2) / np.sum(turned**2)),
-               float(np.max(np.abs(alone[:, 1]), where=clear, initial=0.0)))
+               float(np.max(np.abs(alone[:, 1]), where=clear, initial=0.0)),
+               max(_largest(each) for each in lefts))
+
+
+def _largest(left: Floats) -> float:
+    """Return the largest of what a turn's steps (k,) leave over the RMS of the others."""
+    largest = float(left.max())
+    return largest / float(np.sqrt((np.sum(left**2) - largest**2) / (len(left) - 1)))
 
 
 def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:

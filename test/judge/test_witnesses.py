@@ -139,6 +139,18 @@ def test_one_turn_has_the_prior_of_the_pace(drive):
         assert np.sqrt(fit_to([steps], rate).covariance[8, 8]) < PACE
 
 
+def test_an_image_that_is_missing_within_a_turn_is_noticed(drive):
+    for scene in drive[0].scenes:
+        tracks = scene.tracks
+        # the images are given at a rate, and one of them is missing in the middle
+        late = np.arange(len(tracks.stamps_ns)) >= len(tracks.stamps_ns) // 2
+        scene = dataclasses.replace(scene, tracks=dataclasses.replace(
+            tracks, stamps_ns=tracks.stamps_ns - 100_000_000 * late))
+        solution = dataclasses.replace(drive[0], scenes=(scene,))
+        said, [line] = asked(drive, gyro(drive, density_deg=0.1), solution=solution)
+        assert said is None and 'they jump within a turn' in line
+
+
 def jumped(drive, later_s):
     rate = gyro(drive).rate
     return SensorStream(rate=Samples(
@@ -230,6 +242,14 @@ def test_what_is_no_information_changes_nothing(drive):
     for scale, config in ((1.0, CONFIG), (0.97, CONFIG), (1.2, CALIBRATED), (1.0, as_witness)):
         found = ask_sensors(solution, gyro(drive, scale), START_S, config)
         assert found.solution is solution and found.witnesses.gyro is not None
+
+
+def test_one_turn_is_not_moved_by_a_gyro_that_is_called_calibrated_and_is_not(drive):
+    for scale in (0.965, 1.035):
+        solution = alone(drive, 0)
+        found = ask_sensors(solution, gyro(drive, scale), START_S, CALIBRATED)
+        named = any('does not confirm' in line for line in found.unused)
+        assert found.solution is solution and (named or not found.witnesses.gyro.agrees)
 
 
 def test_a_gyro_hardly_moves_what_many_turns_know(drive):
