@@ -144,9 +144,11 @@ def test_one_thread_and_a_child_that_is_killed_change_nothing(frames, result):
     assert killed and same(result, again)
 
 
-def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way(frames, result):
+def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_and_a_turn_is_lost(frames, result):
     stages: dict[str, float] = {}
-    with limited(Calibrator(QUICK, live=True)) as calibrator:
+    told: list[str] = []
+    killed = 0
+    with limited(Calibrator(QUICK, live=True, on_trouble=told.append)) as calibrator:
         for frame in frames[:95]:
             status = calibrator.push(frame)
         assert status.frames == 95 and status.turns == 1
@@ -158,9 +160,17 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way(frames, resul
             calibrator.push(frame)
             # whatever waits, waits in the pool, whose queue has an end
             assert not any(turn.frames for turn in calibrator.turns())
+            if calibrator.status().turns == 2 and not killed:
+                [killed] = calibrator.scenes.child_pids()
+                os.kill(killed, signal.SIGKILL)
+        # the turn is tried again, and nobody waits for it
+        end = time.monotonic() + LIMIT_S
+        while calibrator.status().built < 2 and time.monotonic() < end:
+            time.sleep(0.1)
         late = calibrator.calibrate()
         pids = calibrator.scenes.child_pids()
         assert pids and all(os.getpriority(os.PRIO_PROCESS, pid) >= 10 for pid in pids)
+    assert len(told) == 1 and 'exit code -9' in told[0] and 'is tried again' in told[0]
     assert early.frames == 95 and early.verdict.level in ('weak', 'refused')
     assert any('only 1 of at least 2 turns' in reason for reason in early.verdict.reasons)
     assert 'reconstructing turns' in stages and len(stages) >= 4
@@ -194,24 +204,6 @@ def test_inline_and_in_child_processes_it_is_the_same(frames, result):
     inline: Calibration = pickle.loads(done.stdout)
     assert same(result, inline) and result.misfits == inline.misfits
     assert result.reprojection_error_px == inline.reprojection_error_px
-
-
-def test_a_turn_that_is_lost_is_told_and_tried_again(frames, result):
-    told: list[str] = []
-    killed = False
-    with limited(Calibrator(QUICK, live=True, on_trouble=told.append)) as calibrator:
-        for frame in frames:
-            calibrator.push(frame)
-            pids = calibrator.scenes.child_pids()
-            if pids and not killed:
-                os.kill(pids[0], signal.SIGKILL)
-                killed = True
-        # nobody waits for it
-        end = time.monotonic() + LIMIT_S
-        while calibrator.status().built < 2 and time.monotonic() < end:
-            time.sleep(0.1)
-        assert same(result, calibrator.calibrate())
-    assert len(told) == 1 and 'exit code -9' in told[0] and 'is tried again' in told[0]
 
 
 def test_close_ends_a_calibration_that_runs(frames):
