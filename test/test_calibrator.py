@@ -28,14 +28,19 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.questions import Questions
+from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.recorded import calibrate
 from dashcalib_ros.selection import SceneSelection
+from dashcalib_ros.solve import solve
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 LENS = Lens.of(640, 360, 80.0, -0.25, 0.06, offset=(6.0, -4.0))
+TRUE = Radial((640, 360), *LENS.truth.values())
+LONGER = TRUE.resized(1.03, TRUE.image_size)
 SPEC = DriveSpec(turns=(Turn(85.0), Turn(-80.0)), straight_m=20.0, lead_m=24.0, seed=3)
 # enough for this drive, and quick
 QUICK = Config().replace({
@@ -169,6 +174,8 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_with_a_turn_l
             # whatever waits, waits in the pool, whose queue has an end
             assert not any(turn.frames for turn in calibrator.turns())
         late = calibrator.calibrate()
+        questions = Questions(calibrator)
+        asked = [questions.check(lens, late) for lens in (TRUE, LONGER)]
         pids = calibrator.scenes.child_pids()
         assert pids and all(os.getpriority(os.PRIO_PROCESS, pid) >= 10 for pid in pids)
     assert len(told) == 1 and 'exit code -9' in told[0] and 'is tried again' in told[0]
@@ -177,6 +184,8 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_with_a_turn_l
     assert 'reconstructing turns' in stages and len(stages) >= 4
     assert all(0.0 <= done <= 1.0 for done in stages.values())
     assert same(result, late)
+    assert [each.answer for each in asked] == ['right', 'wrong']
+    assert asked[1].loss > abs(asked[0].loss)
     # the node writes no report
     assert late.material is None
     # no process is left behind
@@ -205,6 +214,22 @@ def test_inline_and_in_child_processes_it_is_the_same(frames, result):
     inline: Calibration = pickle.loads(done.stdout)
     assert same(result, inline) and result.misfits == inline.misfits
     assert result.reprojection_error_px == inline.reprojection_error_px
+
+
+def test_the_stages_by_hand_give_what_the_calibrator_gives(frames, result):
+    detection, valid = Detection(QUICK), {}
+    for frame in frames:
+        detection.push(frame)
+        # the mask is that of when a turn was found
+        valid = {turn.id: detection.valid() for turn in detection.turns()} | valid
+    detection.finish()
+    scenes = [reconstruct(turn, QUICK, valid[turn.id]) for turn in detection.turns()]
+    solution = solve([scene for scene in scenes if scene is not None], QUICK)
+    by_hand = conclude(solution, evidence_of_detection(detection, scenes), QUICK)
+    assert by_hand.verdict.level == result.verdict.level
+    # where numpy has more than one thread, sums come in another order
+    np.testing.assert_allclose(by_hand.camera.params, result.camera.params, rtol=1e-6)
+    assert [turn.center for turn in by_hand.turns] == [turn.center for turn in result.turns]
 
 
 def test_close_ends_a_calibration_that_runs(frames):
