@@ -168,13 +168,13 @@ def seen_by_spline(text, rays):
     return focal * (u + added) + centre
 
 
-PART = (320, 187)
+PART = (640, 375)
 
 
 @pytest.fixture(scope='module', params=('radial', 'brown', 'fisheye'))
 def bent(request):
     """Return a lens, the mrcal file of it with a field of 1 px, all pixels and these' rays."""
-    lens = cropped(EACH_MODEL[request.param], 0, 0, 640, 374).resized(0.5, PART)
+    lens = cropped(EACH_MODEL[request.param], 0, 0, *PART)
     field = a_field(PART, 1.0)
     pixels = np.stack(np.meshgrid(*map(np.arange, PART)), -1).reshape(-1, 2).astype(float)
     return lens, exported(lens, 'mrcal', field), pixels, lens.rays(field.ideal(pixels))
