@@ -17,6 +17,8 @@ from dashcalib_ros.solve.normal import turn_cost
 from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.solve.solution import Candidate
 
+pytestmark = pytest.mark.usefixtures('no_profile')
+
 WIDE = Fisheye(SIZE, 300.0, 300.6, 404.0, 221.0, 0.02, -0.008, 0.003, -0.0005)
 DECENTRED = Brown(SIZE, *LENS.params, 0.003, -0.003, 0.0)
 

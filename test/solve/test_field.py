@@ -16,7 +16,6 @@ from dashcalib_ros.cli import main
 from dashcalib_ros.judge.agreement import focal_alone
 from dashcalib_ros.judge.calibration import LensField
 from dashcalib_ros.report import load_calibration, result_json
-from dashcalib_ros.solve import focal
 from dashcalib_ros.solve.field import displacements, field_basis, without_field
 
 
@@ -35,11 +34,6 @@ def a_field(rms_px: float, seed: int = 3) -> Field:
 def behind(field: Field, scenes):
     return [dataclasses.replace(scene, tracks=dataclasses.replace(
         scene.tracks, xy=field.observed(scene.tracks.xy))) for scene in scenes]
-
-
-@pytest.fixture
-def no_profile(monkeypatch):
-    monkeypatch.setattr(focal, 'PROBES', (1.0,))
 
 
 def test_observed_is_the_inverse_of_ideal():
