@@ -319,7 +319,7 @@ def test_a_turn_that_is_played_in_a_loop_counts_once(drive, frames):
     around = [frame.image for frame in frames[max(drive.turn_centers[0] - 35, 0):
                                               drive.turn_centers[0] + 35]]
     with limited(Calibrator(QUICK.replace({'turns.wanted': 3}))) as calibrator:
-        for n, image in enumerate(3 * around):
+        for n, image in enumerate(2 * around):
             calibrator.push(Frame(n, frames[0].stamp_ns + n * 100_000_000, image))
         looped = calibrator.calibrate()
     assert looped.verdict.level != 'accepted' and looped.turns_used == 1

@@ -34,7 +34,7 @@ QUICK = {'turns__wanted': 2, 'scene__tracks': 200, 'scene__profile_tracks': 100,
 @pytest.fixture(scope='module')
 def rendered():
     """Return a drive with two turns, and all its frames."""
-    drive = Drive(LENS, DriveSpec(seed=0, turns=2, straight_m=20.0, lead_m=24.0))
+    drive = Drive(LENS, DriveSpec(seed=0, turns=2))
     return drive, list(drive.frames())
 
 

@@ -68,10 +68,6 @@ def test_the_basis_has_nothing_that_the_camera_can_do():
         assert np.abs(share).max() < 0.05
 
 
-def test_a_sound_lens_has_none(no_profile):
-    assert solved(scenes_of(4)).field is None
-
-
 def test_a_windscreen_is_found_and_the_lens_behind_it(no_profile):
     field = a_field(1.0)
     bent = behind(field, scenes_of(5, tracks=250, noise_px=0.15))

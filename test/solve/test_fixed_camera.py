@@ -58,7 +58,7 @@ def test_a_fixed_camera_departs_in_nothing():
     solution = solved(scenes_of(4))
     assert {each.kind for each in solution.fixed_camera} == {'shift', 'zoom', 'bend'}
     assert all(0.3 < each.strength < 1.7 and not each.clear for each in solution.fixed_camera)
-    assert not solution.crops
+    assert not solution.crops and solution.field is None
 
 
 def test_a_stabilised_video_is_found_and_taken_out():
