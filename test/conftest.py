@@ -22,9 +22,9 @@ def pytest_configure(config):
 
 
 # the files that take longest, the longest first: begun last, each would keep one core alone
-LONG_FILES = ('test_run.py', 'test_calibrator.py', 'test_pipeline.py', 'test_node.py',
-              'test_drive.py', 'test_judging.py', 'test_solve.py', 'test_install.py',
-              'test_docs_commands.py', 'test_example.py')
+LONG_FILES = ('test_run.py', 'test_calibrator.py', 'test_drive.py', 'test_child.py',
+              'test_pool.py', 'test_usage.py', 'test_node.py', 'test_judging.py', 'test_solve.py',
+              'test_choice.py', 'test_install.py', 'test_docs_commands.py', 'test_example.py')
 
 
 def pytest_collection_modifyitems(items):

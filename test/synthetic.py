@@ -160,14 +160,12 @@ def fold_radius(camera: Camera) -> float:
 
 def longest_runs(visible: np.ndarray) -> np.ndarray:
     """Return (k, t) with only each column's longest run of True: a track that is lost is lost."""
-    kept = np.zeros_like(visible)
-    for t in range(visible.shape[1]):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], visible[:, t].astype(int), [0]])))
-        if len(edges):
-            starts, ends = edges[::2], edges[1::2]
-            best = int(np.argmax(ends - starts))
-            kept[starts[best]:ends[best], t] = True
-    return kept
+    lengths = np.zeros(visible.shape, int)
+    for k, row in enumerate(visible):
+        # nothing is before the first row, and the last one is still 0
+        lengths[k] = (lengths[k - 1] + 1) * row
+    last, rows = lengths.argmax(axis=0), np.arange(len(visible))[:, None]
+    return (rows <= last) & (rows > last - lengths.max(axis=0))
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:

@@ -58,7 +58,7 @@ CANNOT_RUN = {
     'python docs/pictures.py': 'takes minutes, and writes into docs/',
     'python test/benchmark/': 'takes minutes to hours',
     'dashcalib batch s3://': 'needs a bucket and a cluster: test/fleet has both in memory',
-    'dashcalib demo': 'takes a minute: test/cli/test_run.py runs it; here it is only parsed',
+    'dashcalib demo': 'takes a minute: test/cli/test_run.py runs it with two turns',
 }
 SIZE = (1280, 720)
 CAMERA = Radial(SIZE, 800.0, 802.0, 645.0, 352.0, -0.3, 0.1)

@@ -1,4 +1,4 @@
-"""The four stages as functions, and what it takes to add a camera model."""
+"""The stages as functions, and what it takes to add a camera model."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from dashcalib_ros import Calibrator, Config
+from dashcalib_ros import Config
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import (
     MODELS,
@@ -22,16 +22,13 @@ from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
 from dashcalib_ros.detect.detection import Detection, detect
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
-from dashcalib_ros.questions import Questions
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.report import calibration_yaml, load_camera, result_dict
 from dashcalib_ros.solve import solve
 
 # one term is all that this lens has
 LENS = Lens.of(640, 360, 70.0, -0.18, 0.0, offset=(5.0, -3.0))
-TRUE = Radial((640, 360), *LENS.truth.values())
-LONGER = TRUE.resized(1.03, TRUE.image_size)
-SPEC = DriveSpec(turns=(Turn(80.0), Turn(-75.0)), straight_m=20.0, lead_m=24.0, seed=5)
+SPEC = DriveSpec(turns=(Turn(80.0), Turn(-75.0)), rate=6.0, straight_m=20.0, lead_m=24.0, seed=5)
 QUICK = Config().replace({
     'turns.wanted': 2, 'tracks.points': 350, 'scene.tracks': 250, 'scene.profile_tracks': 150,
     'scene.keyframes': 20, 'scene.profile_keyframes': 10, 'intrinsics.profile_tracks': 40})
@@ -77,17 +74,14 @@ def detection(frames):
     return detect(frames, QUICK)
 
 
-def calibrated(detection, config):
-    scenes = [reconstruct(turn, config, detection.valid()) for turn in detection.turns()]
-    solution = solve([scene for scene in scenes if scene is not None], config)
-    return conclude(solution, evidence_of_detection(detection, scenes), config)
-
-
 @pytest.fixture(scope='module')
 def found(detection):
     """What comes of a model that registers itself."""
     MODELS[OneTerm.model] = OneTerm
-    yield calibrated(detection, QUICK.replace({'model': 'one_term'}))
+    config = QUICK.replace({'model': 'one_term'})
+    scenes = [reconstruct(turn, config, detection.valid()) for turn in detection.turns()]
+    solution = solve([scene for scene in scenes if scene is not None], config)
+    yield conclude(solution, evidence_of_detection(detection, scenes), config)
     del MODELS[OneTerm.model]
 
 
@@ -120,32 +114,15 @@ def test_a_model_that_nobody_knows_is_a_config_error(detection):
         reconstruct(detection.turns()[0], QUICK.replace({'model': 'nonsense'}))
 
 
-def test_the_stages_give_what_the_calibrator_gives(frames, detection):
-    with Calibrator(QUICK) as calibrator:
-        for frame in frames:
-            calibrator.push(frame)
-        whole = calibrator.calibrate()
-        questions = Questions(calibrator)
-        asked = questions.check(TRUE, whole), questions.check(LONGER, whole)
-    # in a child process, as the calibration
-    assert [each.answer for each in asked] == ['right', 'wrong']
-    assert asked[1].loss > abs(asked[0].loss)
-    by_hand = calibrated(detection, QUICK)
-    assert whole.verdict.level == by_hand.verdict.level
-    # numpy has more than one thread here: sums come in another order
-    np.testing.assert_allclose(by_hand.camera.params, whole.camera.params, rtol=1e-6)
-    assert [turn.center for turn in whole.turns] == [turn.center for turn in by_hand.turns]
-
-
 def test_a_turn_in_the_last_seconds_of_a_drive_is_found(frames, detection):
     first = min(turn.center for turn in detection.turns())
     seen = Detection(QUICK)
     for frame in frames:
-        if frame.index > first + 22:
+        if frame.index > first + 13:
             break
         seen.push(frame)
     assert not seen.turns()
     seen.finish()
     [found] = seen.turns()
     # fewer samples follow: the median moves the peak a little
-    assert abs(found.center - first) <= 10
+    assert abs(found.center - first) <= 6

@@ -80,7 +80,7 @@ def test_users_mask_adds_to_it(drive, bare):
 def test_standing_and_straight_tell_nothing_above_the_horizon(drive, bare):
     assert observe([dataclasses.replace(bare[0], index=i, stamp_ns=i * 10**8)
                     for i in range(60)]) is None
-    street = Drive(LENS, DriveSpec(turns=0, lead_m=30.0, seed=4, timestamp=True))
+    street = Drive(LENS, DriveSpec(turns=0, duration_s=6.0, seed=4, timestamp=True))
     valid = observe(street.frames())
     assert valid is None or valid[:120].all()
 

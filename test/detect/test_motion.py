@@ -116,9 +116,8 @@ def test_thinning_is_not_by_count():
 
 
 @pytest.mark.parametrize(('shift_ns', 'after_gap'), [(-10**12, False), (1_400_000_000, True)])
-def test_clock_set_back_and_the_next_file_start_anew(shift_ns, after_gap):
-    drive = Drive(LENS, DriveSpec(turns=0, lead_m=20.0, seed=1))
-    frames = list(drive.frames(0, 14))
+def test_clock_set_back_and_the_next_file_start_anew(stopping_frames, shift_ns, after_gap):
+    frames = stopping_frames[:14]
     frames += [dataclasses.replace(f, index=f.index + 14, stamp_ns=f.stamp_ns + shift_ns,
                                    after_gap=after_gap and f.index == 0) for f in frames]
     estimator = MotionEstimator(MotionConfig())
@@ -153,9 +152,9 @@ def test_noise_alone_is_no_motion():
         assert not estimator.push(Frame(index, index * 10**8, image)).magnitude > 0
 
 
-def test_user_mask_must_fit_and_hides():
+def test_user_mask_must_fit_and_hides(stopping_frames):
     wrong = MotionEstimator(MotionConfig(), valid=np.ones((270, 479), bool))
-    frame = Drive(LENS, DriveSpec(turns=0, lead_m=20.0)).frame(0)
+    frame = stopping_frames[0]
     with pytest.raises(InputError, match=r'479x270.*480x270'):
         wrong.push(frame)
     valid = np.zeros((270, 480), bool)
@@ -224,22 +223,22 @@ def test_size_of_the_picture_hardly_matters(stopping_frames):
 
 
 def test_straight_drive_has_no_turns():
-    drive = Drive(LENS, DriveSpec(turns=0, lead_m=35.0, moving_cars=3, seed=6))
+    drive = Drive(LENS, DriveSpec(turns=0, duration_s=6.0, moving_cars=3, seed=6))
     motions, detector = detect(drive.frames())
     assert len(motions) > 50
     assert detector.bank.turns() == ()
     assert not any(motion.standing for motion in motions)
 
 
-def test_parked_car_stands():
-    day = Drive(LENS, DriveSpec(kind='parked', duration_s=3.0, moving_cars=4, seed=2))
-    night = Drive(LENS, dataclasses.replace(day.spec, night=True))
-    night.__dict__['town'] = day.town
-    for drive in (day, night):
-        motions, detector = detect(drive.frames())
-        # before there is a triplet, points that jitter in the dark may go somewhere
-        assert np.mean([motion.standing for motion in motions[6:]]) > 0.9
-        assert detector.bank.turns() == () and detector.magnitude == 0
+@pytest.mark.parametrize('night', [False, True])
+def test_parked_car_stands(stopping, night):
+    drive = Drive(LENS, DriveSpec(kind='parked', duration_s=3.0, moving_cars=4, seed=2,
+                                  turns=stopping.spec.turns, night=night))
+    drive.__dict__['town'] = stopping.town
+    motions, detector = detect(drive.frames())
+    # before there is a triplet, points that jitter in the dark may go somewhere
+    assert np.mean([motion.standing for motion in motions[6:]]) > 0.9
+    assert detector.bank.turns() == () and detector.magnitude == 0
 
 
 @pytest.mark.skipif(not KITTI.exists(), reason=f'no real drive at {KITTI}')

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,25 +14,25 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.agreement import earlier_of_another_camera
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve import focal, solve
+from dashcalib_ros.solve import solve
 
-
-@pytest.fixture(autouse=True)
-def no_profile(monkeypatch):
-    """Leave out the focal profile around the result, which takes most of the time."""
-    monkeypatch.setattr(focal, 'PROBES', (1.0,))
+pytestmark = pytest.mark.usefixtures('no_profile')
 
 
 def longer(by: float) -> Camera:
     return replace(LENS, fx=by * LENS.fx, fy=by * LENS.fy)
 
 
+@cache
+def five_turns(camera: Camera) -> list[Scene]:
+    ratio = camera.fx / LENS.fx
+    return scenes_of(5, camera, tracks=110,
+                     start=replace(START, fx=START.fx * ratio, fy=START.fy * ratio))
+
+
 def mixed(own: int, earlier: Camera) -> list[Scene]:
     """Return five turns, the first so many of this drive, the others of an earlier one."""
-    scenes = scenes_of(5, tracks=110)
-    before = scenes_of(5, earlier, tracks=110,
-                       start=replace(START, fx=START.fx * earlier.fx / LENS.fx,
-                                     fy=START.fy * earlier.fx / LENS.fx))
+    scenes, before = five_turns(LENS), five_turns(earlier)
     return scenes[:own] + [replace(scene, turn=TurnId.stored(n))
                            for n, scene in enumerate(before[own:])]
 
@@ -89,7 +90,7 @@ def test_a_camera_that_hangs_upside_down_now_is_another_one():
 
 def on_a_road(world: int, yaw: float) -> Scene:
     """Return a turn with a part of the points on the road, the others at any height above it."""
-    turn = synthetic_turn(LENS, yaw, tracks=2000, keyframes=14, world=world)
+    turn = synthetic_turn(LENS, yaw, tracks=1000, keyframes=14, world=world)
     height = turn.structure.points[:, 1]
     road, above = np.flatnonzero(height > 1.1), np.flatnonzero(height < 0)
     some = np.r_[road, above[:2 * len(road)]]

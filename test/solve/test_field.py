@@ -16,7 +16,6 @@ from dashcalib_ros.cli import main
 from dashcalib_ros.judge.agreement import focal_alone
 from dashcalib_ros.judge.calibration import LensField
 from dashcalib_ros.report import load_calibration, result_json
-from dashcalib_ros.solve import focal
 from dashcalib_ros.solve.field import displacements, field_basis, without_field
 
 
@@ -35,11 +34,6 @@ def a_field(rms_px: float, seed: int = 3) -> Field:
 def behind(field: Field, scenes):
     return [dataclasses.replace(scene, tracks=dataclasses.replace(
         scene.tracks, xy=field.observed(scene.tracks.xy))) for scene in scenes]
-
-
-@pytest.fixture
-def no_profile(monkeypatch):
-    monkeypatch.setattr(focal, 'PROBES', (1.0,))
 
 
 def test_observed_is_the_inverse_of_ideal():
@@ -72,10 +66,6 @@ def test_the_basis_has_nothing_that_the_camera_can_do():
         share = fields.T @ change / np.linalg.norm(fields, axis=0) / np.linalg.norm(change)
         # rotations are common to both, and small
         assert np.abs(share).max() < 0.05
-
-
-def test_a_sound_lens_has_none(no_profile):
-    assert solved(scenes_of(4)).field is None
 
 
 def test_a_windscreen_is_found_and_the_lens_behind_it(no_profile):

@@ -14,7 +14,6 @@ from dashcalib_ros.input.scale import FULL_SIZE
 from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve import focal
 from dashcalib_ros.solve.fixed_camera import fixed_camera_tests
 from dashcalib_ros.solve.normal import normal_equations
 from dashcalib_ros.solve.stabiliser import without_crops
@@ -24,10 +23,7 @@ SETTINGS = CONFIG.intrinsics
 KEPT = CONFIG.replace({'intrinsics.crop_rounds': 0})
 
 
-@pytest.fixture(autouse=True)
-def no_profile(monkeypatch):
-    """Leave out the focal profile around the result, which takes most of the time."""
-    monkeypatch.setattr(focal, 'PROBES', (1.0,))
+pytestmark = pytest.mark.usefixtures('no_profile')
 
 
 def moved(scenes: list[Scene], displacement) -> list[Scene]:
@@ -62,7 +58,7 @@ def test_a_fixed_camera_departs_in_nothing():
     solution = solved(scenes_of(4))
     assert {each.kind for each in solution.fixed_camera} == {'shift', 'zoom', 'bend'}
     assert all(0.3 < each.strength < 1.7 and not each.clear for each in solution.fixed_camera)
-    assert not solution.crops
+    assert not solution.crops and solution.field is None
 
 
 def test_a_stabilised_video_is_found_and_taken_out():

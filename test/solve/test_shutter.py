@@ -9,14 +9,9 @@ from solving import CONFIG, NOTHING, adjusted, scenes_of, solved, z_of
 from synthetic import LENS
 
 from dashcalib_ros.judge.verdict import judge
-from dashcalib_ros.solve import focal
 from dashcalib_ros.solve.shutter import readout, remove_rolling_shutter, row_shift
 
-
-@pytest.fixture(autouse=True)
-def no_profile(monkeypatch):
-    """Leave out the focal profile around the result, which takes most of the time."""
-    monkeypatch.setattr(focal, 'PROBES', (1.0,))
+pytestmark = pytest.mark.usefixtures('no_profile')
 
 
 @pytest.mark.parametrize('readout_s', [0.03, -0.02])

@@ -30,7 +30,7 @@ from dashcalib_ros.reconstruct.scene import (
     retriangulated,
     truncated_cost,
 )
-from dashcalib_ros.solve import fitting, focal, joint, steps
+from dashcalib_ros.solve import fitting, joint, steps
 from dashcalib_ros.solve import solve as solve_stage
 from dashcalib_ros.solve.fitting import misfits
 from dashcalib_ros.solve.focal import summed
@@ -42,12 +42,6 @@ from dashcalib_ros.solve.quadratic import Quadratic, TurnCost, noise_of
 from dashcalib_ros.solve.solution import Solution
 
 at, stored = TurnId.at, TurnId.stored
-
-
-@pytest.fixture
-def no_profile(monkeypatch):
-    """Leave out the focal profile around the result, which takes most of the time."""
-    monkeypatch.setattr(focal, 'PROBES', (1.0,))
 
 
 @pytest.fixture(scope='module')
