@@ -124,11 +124,10 @@ class Calibrator:
     def _solve_and_judge(self, tell: Progress, final: bool, started: float) -> Calibration:
         """Return the calibration from the turns that are selected now."""
         tell('reconstructing turns', 0.0)
-        scenes, config = self.scenes.wanted(tell, final), self.scenes.config
-        solution: Solution | None = None
-        asked = Asked()
+        solution: Solution | None
+        scenes, solution = self.scenes.wanted(tell, final, solve)
+        config, asked = self.scenes.config, Asked()
         if scenes:
-            solution = self.scenes.run(solve, scenes, config, progress=tell)
             if self._motion is not None:
                 tell('asking the motion sensors', 0.0)
                 asked = self.scenes.run(ask_sensors, solution, self._motion,
