@@ -406,12 +406,13 @@ def test_run_tries_a_child_that_dies_again(pool, tmp_path):
 
 def test_what_was_begun_runs_side_by_side_and_what_waits_can_be_dropped(pool, tmp_path):
     started = [tmp_path / name for name in ('first', 'second')]
-    begun = [pool.begin(child_tasks.sleep, 0.5, path) for path in started]
+    begun = [pool.begin(child_tasks.until, tmp_path / 'go', path) for path in started]
     wait_for(lambda: all(path.exists() and path.read_text() for path in started))
     assert started[0].read_text() != started[1].read_text()
     dropped = pool.begin(Path.touch, tmp_path / 'dropped')
     pool.drop(dropped)
-    assert [pool.result(call) for call in begun] == ['slept', 'slept']
+    (tmp_path / 'go').touch()
+    assert [pool.result(call) for call in begun] == ['seen', 'seen']
     told = []
     assert pool.result(pool.begin(child_tasks.count, 2, tells=True),
                        lambda stage, done: told.append(stage)) == 2
