@@ -125,11 +125,9 @@ class Calibrator:
     def _solve_and_judge(self, tell: Progress, final: bool, started: float) -> Calibration:
         """Return the calibration from the turns that are selected now."""
         tell('reconstructing turns', 0.0)
-        scenes, config = self._moving(tell, final), self.scenes.config
-        solution: Solution | None = None
-        asked = Asked()
+        scenes, solution = self._moving(tell, final)
+        config, asked = self.scenes.config, Asked()
         if scenes:
-            solution = self.scenes.run(solve, scenes, config, progress=tell)
             if self._motion is not None:
                 tell('asking the motion sensors', 0.0)
                 asked = self.scenes.run(ask_sensors, solution, self._motion,
@@ -149,15 +147,16 @@ class Calibrator:
         found: Calibration = self.scenes.run(conclude, solution, evidence, config)
         return found
 
-    def _moving(self, tell: Progress, final: bool) -> list[Scene]:
-        """Return the best turns' scenes; of none of them do sensors say that the car stood."""
+    def _moving(self, tell: Progress, final: bool) -> tuple[list[Scene], Solution | None]:
+        """Return the best turns, and their solution; of none do sensors say that the car stood."""
         while True:
-            scenes, start_s = self.scenes.wanted(tell, final), self.detection.start_s
+            scenes, solution = self.scenes.wanted(tell, final, solve)
+            start_s = self.detection.start_s
             stream = (self._motion or SensorStream()).since(start_s)
             stood = [scene.turn for scene in scenes if scene.turn.of_this_drive
                      and stream.stood(*(scene.tracks.stamps_ns[[0, -1]] / 1e9 - start_s))]
             if not stood:
-                return scenes
+                return scenes, solution
             self.scenes.reject(dict.fromkeys(stood, STOOD))
 
     def _evidence(self, started: float, asked: Asked) -> Evidence:

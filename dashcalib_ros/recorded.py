@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -142,11 +143,21 @@ def pushed(taker: Taker, source: FrameSource, mask: Mask | None) -> Iterator[int
 
     Raises InputError for a mask of another size.
     """
-    for number, frame in enumerate(source, 1):
+    for number, frame in enumerate(_read_ahead(source), 1):
         if number == 1:
             check_mask(mask, frame.size)
         taker.push(frame)
         yield number
+
+
+def _read_ahead(source: FrameSource) -> Iterator[Frame]:
+    """Yield every frame of the drive, while a thread decodes the next one."""
+    frames = iter(source)
+    with ThreadPoolExecutor(1) as reader:
+        coming = reader.submit(next, frames, None)
+        while (frame := coming.result()) is not None:
+            coming = reader.submit(next, frames, None)
+            yield frame
 
 
 def _valid(mask: MaskOrPath) -> Mask | None:

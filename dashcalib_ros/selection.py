@@ -18,6 +18,7 @@ from dashcalib_ros.workers.pool import ScenePool
 from dashcalib_ros.workers.worker import InlineWorker, Worker
 
 Progress = Callable[[str, float], None]
+Use = Callable[..., Any]
 
 # why a turn is not used, in words
 NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow enough points, or '
@@ -181,10 +182,11 @@ class SceneSelection:
             # one beside those that the workers have: the detection goes on, and none of them idles
             self._pool.wait(lambda: len(self._pool.unbuilt()) <= self.config.threads + 1)
 
-    def wanted(self, tell: Progress, final: bool) -> list[Scene]:
-        """Wait for the best turns' scenes and return them.
+    def wanted(self, tell: Progress, final: bool, use: Use) -> tuple[list[Scene], Any]:
+        """Wait for the best turns' scenes; return them, and what a function makes of them.
 
-        final: the drive is over. tell: is called with the stage and the share done. Raises what a
+        final: the drive is over. tell: is called with the stage and the share done. use: the
+        function is run in a worker, with the config; None where there is no scene. Raises what a
         worker raised, and WorkerError when closed meanwhile.
         """
         # wait for all turns, also those that are not used: the report must not depend on the
@@ -211,7 +213,7 @@ class SceneSelection:
             chosen = self.chosen() if ready_now else []
             self.store_new()
             if ready_now:
-                kept, repeated = self._without_repeated(chosen)
+                kept, repeated, result = self._used(chosen, use, tell)
                 if repeated:
                     # the next best turns take their places
                     self.warnings += [_repeated_text(turn, other)
@@ -220,15 +222,29 @@ class SceneSelection:
                                  for turn, other in repeated.items()})
                     continue
                 self._stored_before = self.stored()
-                return kept
+                return kept, result
 
-    def _without_repeated(self, scenes: list[Scene]) -> tuple[list[Scene], dict[TurnId, TurnId]]:
-        if len(scenes) < 2:
-            return scenes, {}
-        # in a worker: it takes seconds for many turns, and a live drive goes on meanwhile
-        found: tuple[list[Scene], dict[TurnId, TurnId]] = self.run(
-            without_repeated, scenes, self.config.scene.min_images)
-        return found
+    def _used(self, scenes: list[Scene], use: Use, tell: Progress
+              ) -> tuple[list[Scene], dict[TurnId, TurnId], Any]:
+        """Return the scenes that repeat no other, what those repeat, and what use makes of all.
+
+        Looking for repeated ones takes a second, and hardly ever finds one: meanwhile another
+        worker uses them all.
+        """
+        if not scenes:
+            return [], {}, None
+        pool = self._pool
+        looking = pool.begin(without_repeated, scenes, self.config.scene.min_images)
+        using = pool.begin(use, scenes, self.config, tells=True)
+        kept, repeated = pool.result(looking)
+        # of one that is repeated in part, the rest is kept
+        if repeated or any(len(one.tracks.frames) < len(other.tracks.frames)
+                           for one, other in zip(kept, scenes, strict=True)):
+            pool.drop(using)
+            if repeated:
+                return kept, repeated, None
+            using = pool.begin(use, kept, self.config, tells=True)
+        return kept, repeated, pool.result(using, tell)
 
     def widen(self) -> bool:
         """Use more turns, up to turns.at_most; return False if there are no more to use."""

@@ -47,6 +47,14 @@ def sleep(seconds, started=None):
     return 'slept'
 
 
+def until(flag, started):
+    """Write this process's id, and wait for a file."""
+    Path(started).write_text(str(os.getpid()))
+    while not Path(flag).exists():
+        time.sleep(0.01)
+    return 'seen'
+
+
 def compute(seconds):
     """Use the processor for so long."""
     end = time.process_time() + seconds

@@ -111,7 +111,7 @@ class Jobs:
 
 
 @dataclass(eq=False)
-class _Call:
+class Call:
     """A function that a worker is to run, and what came of it. news: progress not told yet."""
 
     function: Callable[..., Any]
@@ -158,8 +158,8 @@ class ScenePool:
         # guards all that follows; held only briefly
         self._changed = threading.Condition()
         self._changes = 0
-        # of run(), which wait for a worker: they have priority over turns
-        self._calls: deque[_Call] = deque()
+        # those that wait for a worker: they have priority over turns
+        self._calls: deque[Call] = deque()
         self._jobs = Jobs(queue)
         # all turns without a result, also those that a worker has now
         self._unbuilt: set[TurnId] = set()
@@ -228,20 +228,27 @@ class ScenePool:
 
     def run(self, function: Callable[..., Any], *arguments: Any,
             progress: Progress | None = None) -> Any:
-        """Run a function in the next free worker; try again if the worker dies.
+        """Run a function in the next free worker; see result()."""
+        return self.result(self.begin(function, *arguments, tells=progress is not None), progress)
+
+    def begin(self, function: Callable[..., Any], *arguments: Any, tells: bool = False) -> Call:
+        """Have a function run in the next free worker, for result(); tells: with progress."""
+        call = Call(function, arguments, tells)
+        with self._changed:
+            if not self._closed.is_set():
+                self._start()
+            self._calls.append(call)
+            self._notify()
+        return call
+
+    def result(self, call: Call, progress: Progress | None = None) -> Any:
+        """Wait for a function that was begun, and return its result; try again if a worker dies.
 
         progress: called in this thread. Raises what the function raises, and WorkerDiedError.
         """
         failures = 0
         while True:
-            call = _Call(function, arguments, progress is not None)
-            with self._changed:
-                if not self._closed.is_set():
-                    self._start()
-                self._calls.append(call)
-                self._notify()
-
-            def ended(call: _Call = call) -> bool:
+            def ended(call: Call = call) -> bool:
                 while call.news and progress is not None:
                     progress(*call.news.popleft())
                 return call.done
@@ -256,6 +263,13 @@ class ScenePool:
                 raise error
             self._on_trouble(str(error))
             self._pause(back_off_s(failures))
+            call = self.begin(call.function, *call.arguments, tells=call.tells)
+
+    def drop(self, call: Call) -> None:
+        """Have a function not run if it waits for a worker; its result is not wanted any more."""
+        with self._changed:
+            if call in self._calls:
+                self._calls.remove(call)
 
     def close(self) -> None:
         """End every worker; a run() in another thread raises, a wait() returns."""
@@ -309,7 +323,7 @@ class ScenePool:
             self._notify()
         return True
 
-    def _answer(self, worker: Worker, call: _Call) -> None:
+    def _answer(self, worker: Worker, call: Call) -> None:
         def tell(stage: str, share: float) -> None:
             call.news.append((stage, share))
             with self._changed:

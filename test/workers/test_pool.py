@@ -404,6 +404,22 @@ def test_run_tries_a_child_that_dies_again(pool, tmp_path):
     assert pool.run(child_tasks.add, 1, 2) == 3
 
 
+def test_what_was_begun_runs_side_by_side_and_what_waits_can_be_dropped(pool, tmp_path):
+    started = [tmp_path / name for name in ('first', 'second')]
+    begun = [pool.begin(child_tasks.until, tmp_path / 'go', path) for path in started]
+    wait_for(lambda: all(path.exists() and path.read_text() for path in started))
+    assert started[0].read_text() != started[1].read_text()
+    dropped = pool.begin(Path.touch, tmp_path / 'dropped')
+    pool.drop(dropped)
+    (tmp_path / 'go').touch()
+    assert [pool.result(call) for call in begun] == ['seen', 'seen']
+    told = []
+    assert pool.result(pool.begin(child_tasks.count, 2, tells=True),
+                       lambda stage, done: told.append(stage)) == 2
+    assert told == ['step 0', 'step 1'] and not dropped.done
+    assert not (tmp_path / 'dropped').exists()
+
+
 def test_close_while_others_wait(pool, monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build_slowly)
     solving, flag = tmp_path / 'solving', tmp_path / 'flag.10'
