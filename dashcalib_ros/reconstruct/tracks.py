@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
+from dashcalib_ros.arrays import Floats, GreyImage, Ints, Mask
 from dashcalib_ros.config import TracksConfig
 from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
 from dashcalib_ros.detect.turn import Turn
@@ -47,12 +47,13 @@ def track_turn(turn: Turn, config: TracksConfig, valid: Mask | None = None) -> T
 
     valid: (h, w), False where the ego vehicle is; None for everywhere.
     """
-    found = _keyframes([frame.image for frame in turn.frames], config, valid)
-    keyframes = [k for k, _, _ in found] or [0]
-    names = np.unique(np.concatenate([np.zeros(0, np.int64), *(ids for _, ids, _ in found)]))
+    images = [frame.image for frame in turn.frames]
+    ids, frames, xy = _follow(images, config, valid)
+    keyframes = _keyframes(ids, frames, xy, images[0].shape[1], config)
+    rows = np.isin(frames, keyframes)
+    names, columns = np.unique(ids[rows], return_inverse=True)
     table = np.full((len(keyframes), len(names), 2), np.nan)
-    for row, (_, ids, points) in zip(table, found, strict=False):
-        row[np.searchsorted(names, ids)] = points
+    table[np.searchsorted(keyframes, frames[rows]), columns] = xy[rows]
     table = table[:, _worth_keeping(table)]
     indices = np.array([turn.frames[k].index for k in keyframes], dtype=np.int64)
     stamps_ns = np.array([turn.frames[k].stamp_ns for k in keyframes], dtype=np.int64)
@@ -70,42 +71,57 @@ def thinned(tracks: Tracks, keyframes: int) -> Tracks:
                   tracks.stamps_ns[kept])
 
 
-def _keyframes(images: list[GreyImage], config: TracksConfig, valid: Mask | None
-               ) -> list[tuple[int, Ints, Floats32]]:
-    """Return each keyframe: its number among the images, its tracks (n,) and their xy (n, 2).
-
-    Each is chosen by how far the points moved since the last one: a standing car adds none. Points
-    are added in keyframes only: one that begins between them is seen no earlier in a keyframe.
-    """
-    width = images[0].shape[1]
-    ids, points = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+def _follow(images: list[GreyImage], config: TracksConfig, valid: Mask | None
+            ) -> tuple[Ints, Ints, Floats]:
+    """Return the observations as flat arrays: track (n,), image (n,), xy (n, 2)."""
+    ids = np.zeros(0, np.int64)
+    points = np.zeros((0, 2), np.float32)
     born = 0
-    found: list[tuple[int, Ints, Floats32]] = []
+    rows = []
     tracking = Tracking()
     for k, image in enumerate(images):
-        if len(points):
+        if k:
             points, trusted = follow_points(images[k - 1], image, points, tracking)
-            if valid is not None:
+            if valid is not None and len(points):
                 inside = np.round(points).astype(int)
                 trusted &= valid[np.clip(inside[:, 1], 0, image.shape[0] - 1),
                                  np.clip(inside[:, 0], 0, image.shape[1] - 1)]
             ids, points = ids[trusted], points[trusted]
-        if found:
-            _, last_ids, last = found[-1]
-            moved = np.linalg.norm(points - last[np.searchsorted(last_ids, ids)], axis=1)
-            survived = len(ids) >= KEYFRAME_OVERLAP * len(last_ids)
-            if survived and (len(ids) == 0
-                             or np.median(moved) < config.keyframe_motion * width):
-                continue
         if len(points) < 0.9 * config.points:
             corners = find_corners(image, points, config.points, valid)
             ids = np.concatenate([ids, born + np.arange(len(corners))])
             points = np.concatenate([points, corners])
             born += len(corners)
-        # the first pictures may be black
-        if found or len(ids):
-            found.append((k, ids, points))
-    return found
+        rows.append((ids, np.full(len(ids), k), points.astype(np.float64)))
+    tracks, frames, xy = (np.concatenate(column) for column in zip(*rows, strict=True))
+    return tracks, frames, xy
+
+
+def _keyframes(ids: Ints, frames: Ints, xy: Floats, width: int,
+               config: TracksConfig) -> Ints:
+    """Return the keyframes: each is chosen by how far the points moved since the last one.
+
+    A standing car adds none.
+    """
+    def observed(k: int) -> tuple[Ints, Floats]:
+        rows = frames == k
+        return ids[rows], xy[rows]
+
+    if len(frames) == 0:
+        return np.zeros(1, np.int64)
+    # the first pictures may be black
+    chosen = [int(frames[0])]
+    last_ids, last_xy = observed(chosen[0])
+    for k in range(chosen[0] + 1, int(frames.max()) + 1):
+        now_ids, now_xy = observed(k)
+        _, a, b = np.intersect1d(last_ids, now_ids, assume_unique=True, return_indices=True)
+        moved = np.linalg.norm(now_xy[b] - last_xy[a], axis=1)
+        survived = len(a) >= KEYFRAME_OVERLAP * len(last_ids)
+        if survived and (len(a) == 0 or np.median(moved) < config.keyframe_motion * width):
+            continue
+        chosen.append(k)
+        last_ids, last_xy = now_ids, now_xy
+    return np.array(chosen, dtype=np.int64)
 
 
 def _worth_keeping(table: Floats) -> Mask:
