@@ -17,7 +17,9 @@ PARTS = {
     'judge/calibration.py': {'from one turn alone, which nothing confirms'},
     'judge/conclude.py': {'…, with … times the error of a camera of its own'},
     'judge/agreement.py': {'…: fx to about … %'},
-    'judge/witnesses.py': {'write rad/s, not degrees a second'},
+    'judge/witnesses.py': {
+        'write rad/s, not degrees a second', 'turns are … ms apart', 'they jump within a turn',
+        'they differ by … % of time'},
     'judge/verdict.py': {
         'check its scale, its clock and that it is of this drive, and leave it away if it is '
         'wrong; else drive more turns',
