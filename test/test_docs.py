@@ -54,7 +54,7 @@ def test_the_readme_is_short():
 def test_each_figure_of_the_readme_names_its_commit():
     figures = (ROOT / 'README.md').read_text().partition('\n## Figures')[2].partition('\n## ')[0]
     rows = [line for line in figures.splitlines() if line.startswith('| ')][1:]
-    assert len(rows) == 6
+    assert len(rows) == 7
     for row in rows:
         assert re.search(
             r'\| \[[0-9a-f]{7}(, [0-9a-f]{7})*\]\(docs/(notebook/)?\w+\.md[^)]*\) \|$', row), row
