@@ -41,7 +41,7 @@ BLOCKS, LEAST_PAIRS = 12, 8
 # to point elsewhere on other roads (KITTI 03 by 0.5 between its ends), and beyond which single
 # pairs do not count
 LEAST_SIDE, PLACES_DEG, OUTLIER_DEG = 20, 0.15, 2.0
-# of the points of a pair, those that are enough to see that a camera was moved
+# every fifth point of a pair is enough to see that a camera was moved
 THINNED = 5
 # degrees of yaw and of pitch; with more it is weak. openpilot's spread on one car is as large
 ACCEPTED_DEG = 0.2
