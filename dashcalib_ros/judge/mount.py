@@ -398,9 +398,10 @@ def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, fl
     stamps_s = scene.tracks.stamps_ns[structure.registered] / 1e9
     # in a bend the camera is faster than what measures the speed
     bend, ways = _bend(rotations, centres), np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    straight = bend < UNBENT * bend.max()
     metres = speed((stamps_s[1:] + stamps_s[:-1]) / 2) * np.diff(stamps_s)
-    if not metres[straight].sum() > 0:
+    # before and after the sensor's samples the speed is 0
+    straight = (bend < UNBENT * bend.max()) & (metres > 0)
+    if not straight.any():
         return None
     unit = metres[straight].sum() / ways[straight].sum()
     ahead = np.gradient(centres, axis=0)

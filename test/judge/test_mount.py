@@ -161,6 +161,14 @@ def test_the_speed_in_a_bend_does_not_count(height_in):
     assert found.height_m == pytest.approx(HEIGHT_M, rel=0.01)
 
 
+def test_a_speed_that_begins_within_the_turn_gives_no_wrong_height(height_in):
+    scene = scenes_of(1)[0]
+    speed, stamps_s = speed_in(scene), scene.tracks.stamps_ns / 1e9
+    found = height_in([on_road(scene)],
+                      lambda asked_s: np.where(asked_s > stamps_s[2], speed, 0.0))
+    assert found.height_m == pytest.approx(HEIGHT_M, rel=0.01)
+
+
 def test_heights_that_differ_make_sigma_larger(height_in):
     scene = scenes_of(1)[0]
     alike, apart = (height_in([on_road(scene), on_road(scene, height_m=other)],
