@@ -14,7 +14,7 @@ from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.reconstruct.scene_file import Origin, StoredTurn
 from dashcalib_ros.turn_store import TurnStore
 from dashcalib_ros.workers.child import ChildWorker
-from dashcalib_ros.workers.pool import ScenePool
+from dashcalib_ros.workers.pool import Call, ScenePool
 from dashcalib_ros.workers.worker import InlineWorker, Worker
 
 Progress = Callable[[str, float], None]
@@ -57,6 +57,8 @@ class SceneSelection:
         self._warn = warn
         self._on_trouble = on_trouble
         self._closed = False
+        # live: what each worker does before the first turn
+        self._loading: list[Call] = []
         # the turns whose scenes were written to turns.store
         self._stored_turns: Set[TurnId] = frozenset()
         # where the ego vehicle is not, by turn
@@ -117,6 +119,8 @@ class SceneSelection:
                 ready.append(turn)
             if not (replace_failed and key in built and built[key] is None):
                 places -= 1
+        if ready and self._live and not self._loading:
+            self._loading = [self._pool.begin(_load) for _ in range(self.config.threads)]
         waiting = 0 if self._live or not more_to_come else WAITING
         for turn in ready[:max(len(ready) - waiting, 0)]:
             self._pool.submit(turn, self._valid[turn.id])
@@ -312,6 +316,15 @@ class SceneSelection:
     def _lost(self, text: str) -> None:
         self.warnings.append(text)
         self._on_trouble(text)
+
+
+def _load() -> None:
+    """Import what the last stages need: the result need not wait for it then."""
+    from scipy import special  # noqa: F401
+
+    import dashcalib_ros.judge.conclude
+    import dashcalib_ros.reconstruct.build
+    import dashcalib_ros.solve.joint  # noqa: F401
 
 
 def _repeated_text(turn: TurnId, other: TurnId) -> str:

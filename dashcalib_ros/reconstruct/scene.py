@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -189,7 +190,7 @@ class Scene:
         """Return by how much the camera turned about the axis of the turn, in degrees."""
         return float(np.ptp(self.yaws_deg))
 
-    @property
+    @cached_property
     def yaws_deg(self) -> Floats:
         """Return the yaw of each registered keyframe since the first one, degrees."""
         yaws = -np.degrees(self.turned @ main_axis(self.turned))

@@ -14,6 +14,8 @@ from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
 
 # factors of the resulting focal length at which the profile is evaluated
 PROBES = (0.8, 1.0, 1.25)
+# relative change of the cost that ends an adjustment: costs are compared to 5 %
+ROUGH = 1e-3
 
 
 def summed(profiles: Sequence[Profile]) -> Profile:
@@ -84,8 +86,9 @@ def _cost_at(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> fl
     moved = list(scenes)
     costs = [cost(moved, camera)]
     # the first residuals are large: the loss must be as wide, or it ignores them
-    for loss_px in (0.01 * camera.image_size[0], config.loss_px, config.loss_px):
-        moved, camera = adjust(moved, camera, Solver(loss_px, config.iterations), 'distortion')
+    for loss_px in (0.01 * camera.image_size[0], config.loss_px):
+        solver = Solver(loss_px, config.iterations, ROUGH)
+        moved, camera = adjust(moved, camera, solver, 'distortion')
         moved = [retriangulate(scene, camera, config) for scene in moved]
         costs.append(cost(moved, camera))
     return min(costs)

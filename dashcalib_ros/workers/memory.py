@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import ctypes
 import mmap
+import weakref
+from collections import deque
 from contextlib import suppress
 
 import numpy as np
@@ -41,8 +43,24 @@ def return_free_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
+# pages of copies that were freed: a drive needs new ones as fast as it frees them, and those of
+# the system cost ten times the copying
+_spare: deque[mmap.mmap] = deque(maxlen=4)
+
+
 def mapped_copy(image: GreyImage) -> GreyImage:
-    """Return a copy in pages of its own, which go back to the system when it is freed."""
-    copy = np.frombuffer(mmap.mmap(-1, image.nbytes), np.uint8).reshape(image.shape)
+    """Return a copy in pages of its own; when it is freed, the next copy has them, or the system.
+
+    A view of it keeps them.
+    """
+    try:
+        pages = _spare.pop()
+    except IndexError:
+        pages = mmap.mmap(-1, image.nbytes)
+    if len(pages) != image.nbytes:
+        pages = mmap.mmap(-1, image.nbytes)
+    owner = np.frombuffer(pages, np.uint8)
+    weakref.finalize(owner, _spare.append, pages).atexit = False
+    copy = owner.reshape(image.shape)
     copy[:] = image
     return copy

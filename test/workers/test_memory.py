@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from dashcalib_ros.workers.memory import mapped_copy
 
 ROOT = Path(__file__).parents[2]
 CODE = """
@@ -42,3 +45,16 @@ def test_kept_images_go_back_to_the_system_when_they_are_freed():
     assert kept['apart'] < 10 and kept['returned'] < 20
     if kept['in the heap'] < 60:
         pytest.skip('this C library gives memory back by itself')
+
+
+def test_pages_are_used_again_when_no_view_is_left():
+    first = mapped_copy(np.full((30, 40), 1, np.uint8))
+    view = first[10:20, ::2]
+    place = first.ctypes.data
+    del first
+    assert mapped_copy(np.full((30, 40), 2, np.uint8)).ctypes.data != place
+    assert (view == 1).all()
+    del view
+    places = {mapped_copy(np.full((30, 40), 3, np.uint8)).ctypes.data for _ in range(2)}
+    assert place in places
+    assert (mapped_copy(np.full((3, 4), 4, np.uint8)) == 4).all()
