@@ -14,11 +14,17 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.judge.agreement import earlier_of_another_camera, evidence_of
-from dashcalib_ros.judge.conclude import CONTRADICTS, Evidence, conclude, evidence_of_detection
+from dashcalib_ros.judge.conclude import (
+    CONTRADICTS,
+    STOOD,
+    Evidence,
+    conclude,
+    evidence_of_detection,
+)
 from dashcalib_ros.judge.witnesses import Asked, ask_sensors
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import Calibration
-from dashcalib_ros.selection import STOOD, Progress, SceneSelection
+from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 

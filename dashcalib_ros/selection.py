@@ -25,7 +25,6 @@ NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow en
             'the car hardly moved')
 ALONE = 'this drive has no turn that could agree with it'
 OTHER_CAMERA = 'the turns of this drive are of another camera'
-STOOD = 'the car stood, its speed says: what turned were others, or the camera alone'
 # turns that wait in memory for better ones; of KITTI 03 five are reconstructed then, not eight
 WAITING = 3
 

@@ -29,12 +29,12 @@ from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
+from dashcalib_ros.judge.conclude import STOOD, conclude, evidence_of_detection
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.recorded import calibrate
-from dashcalib_ros.selection import STOOD, SceneSelection
+from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve import solve
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
@@ -135,8 +135,13 @@ def test_a_turn_during_which_the_car_stood_is_none(frames, result):
         for frame in frames:
             calibrator.push(frame)
         found = calibrator.calibrate()
+        # the same pictures, with a car that never moved there
+        calibrator.sense(SensorStream(speed=Samples(
+            np.append(stamps_s - stamps_s[0], 1e3), np.append(0 * speed, [[8.0]], axis=0))))
+        none = calibrator.calibrate(final=False)
     assert {turn.id: turn.unused_because for turn in found.turns} == {
         moving.id: None, phantom.id: STOOD}
+    assert none.verdict.reasons[0].startswith('the car stood during all')
     assert found.verdict.level == 'weak'
 
 

@@ -49,6 +49,7 @@ from dashcalib_ros.solve.solution import Solution, cross_validation
 # why turns are not used
 CONTRADICTS = 'the camera of the other turns does not explain it'
 NOT_NEEDED = 'more prominent turns were enough'
+STOOD = 'the car stood, its speed says: what turned were others, or the camera alone'
 
 # result.json has their versions: a result's last digits depend on them
 PACKAGES = (
@@ -252,6 +253,10 @@ def _verdict_without_solution(evidence: Evidence) -> Verdict:
         what = ('no turn was found: the car stood or drove straight on, or the pictures show too '
                 'little')
         cure = 'record a drive with turns at crossings, in daylight'
+    elif evidence.left_out and set(evidence.left_out.values()) == {STOOD}:
+        what = (f'the car stood during all that look like turns ({len(evidence.turns)}), its '
+                f'speed says')
+        cure = 'drive through turns, or leave a speed away that is wrong'
     else:
         what = (f'none of the {len(evidence.turns)} turns could be reconstructed: the pictures '
                 f'are too dark or blurred, or the camera turned without moving')
