@@ -239,6 +239,9 @@ class SceneSelection:
         pool = self._pool
         looking = pool.begin(without_repeated, scenes, self.config.scene.min_images)
         using = pool.begin(use, scenes, self.config, tells=True)
+        if not self._live:
+            # this process has nothing else to do
+            _load()
         kept, repeated = pool.result(looking)
         # of one that is repeated in part, the rest is kept
         if repeated or any(len(one.tracks.frames) < len(other.tracks.frames)
@@ -320,6 +323,7 @@ class SceneSelection:
 def _load() -> None:
     """Import what the last stages need: the result need not wait for it then."""
     from scipy import special  # noqa: F401
+    from scipy.spatial import transform  # noqa: F401
 
     import dashcalib_ros.judge.conclude
     import dashcalib_ros.reconstruct.build

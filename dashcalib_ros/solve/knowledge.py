@@ -259,9 +259,10 @@ class Knowledge:
 
     def _largest_estimate(self) -> Floats:
         root, count = np.linalg.cholesky(self.total.covariance), len(self.own)
-        # the readout, if there is one, moves nothing in the picture of a camera that stands
-        flat = sensitivity(self.camera)[0].reshape(-1, count) @ root[:count]
-        _, _, modes = np.linalg.svd(flat, full_matrices=False)
+        # what turns share beside the camera moves nothing in the picture of one that stands. The
+        # picture has as many directions as the camera has parameters: a triangle has them, too
+        triangle = np.linalg.qr(sensitivity(self.camera)[0].reshape(-1, count), mode='r')
+        _, _, modes = np.linalg.svd(triangle @ root[:count])
         basis = root @ modes.T
         back = modes @ np.linalg.inv(root)
         by_track = back @ self.total.covariance_by_track @ back.T
