@@ -1,4 +1,4 @@
-"""What the car knows of its own motion: streams of a gyro, a speed, positions and headings.
+"""What the car knows of its own motion: streams of a gyro, a speed and positions.
 
 A stream's stamps are seconds since the drive's first image, on the sensor's own clock: how far
 that is off is found later, from the turns (judge/witnesses.py). A stream that cannot be used is
@@ -7,8 +7,9 @@ None, and a warning says why: it never costs the calibration.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,8 @@ QUANTILE = 99.0
 STANDING_MPS, DRIVING_MPS = 0.3, 3.0
 # s over which positions tell a speed
 SPEED_OVER_S = 1.0
+# of NavSatStatus; -2 is unknown
+NO_FIX = -1
 
 
 @dataclass(frozen=True)
@@ -60,15 +63,14 @@ class SensorStream:
     """What sensors say of a drive; each None where there is none of its kind.
 
     rate: (n, 3) rad/s about the sensor's own three axes, in any mounting. speed: (n, 1) m/s.
-    position: (n, 3) m, east, north and up from the first. heading: (n, 1) rad, left positive.
-    Stamps: s since the drive's first image; absolute: since 1970, as bags and GPX have them.
+    position: (n, 3) m, east, north and up from the first. Stamps: s since the drive's first
+    image; absolute: since 1970, as bags and GPX have them.
     warnings: what was left out, one line each.
     """
 
     rate: Samples | None = None
     speed: Samples | None = None
     position: Samples | None = None
-    heading: Samples | None = None
     warnings: tuple[str, ...] = ()
     absolute: bool = False
 
@@ -131,8 +133,7 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
     return SensorStream(**found, warnings=tuple(warnings), absolute=absolute)
 
 
-NAMES = {'rate': 'angular rates', 'speed': 'speeds', 'position': 'positions',
-         'heading': 'headings'}
+NAMES = {'rate': 'angular rates', 'speed': 'speeds', 'position': 'positions'}
 
 
 def _cleaned(stamps_s: Floats, values: Floats, kind: str) -> tuple[Samples | None, str]:
@@ -190,6 +191,25 @@ def speeds_of(stream: SensorStream) -> Samples | None:
     return Samples((stamps_s + passed / 2)[known], (way[known] / passed[known])[:, None])
 
 
+def values_in(message: Any, option: str) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Yield the kinds of values in a message of ROS 1 or 2, as SensorBuffer takes them.
+
+    option: gps, imu or odom, by the message's type. A GPS without a fix says nothing.
+    """
+    if option == 'gps':
+        place = (message.latitude, message.longitude, message.altitude)
+        if message.status.status != NO_FIX and np.isfinite(place[:2]).all():
+            yield 'position', place
+    elif option == 'imu':
+        rate = message.angular_velocity
+        yield 'rate', (rate.x, rate.y, rate.z)
+    else:
+        twist = message.twist
+        twist = getattr(twist, 'twist', twist)
+        yield 'odom_rate', (twist.angular.x, twist.angular.y, twist.angular.z)
+        yield 'speed', (float(np.hypot(twist.linear.x, twist.linear.y)),)
+
+
 class SensorBuffer:
     """The newest samples of a bag's or a node's sensors: add() them as they come, stream() to ask.
 
@@ -203,17 +223,20 @@ class SensorBuffer:
         self._length = length
 
     def add(self, kind: str, stamp_s: float, values: Sequence[float]) -> None:
-        """Take a sample. kind: rate, speed, position or heading; stamp_s: since 1970."""
+        """Take a sample. kind: as values_in() yields it; stamp_s: since 1970."""
         kept = self._kept.setdefault(kind, deque(maxlen=self._length))
         kept.append((stamp_s, tuple(values)))
 
-    def arrays(self) -> dict[str, tuple[Floats, Floats]]:
-        """Return the stamps (n,) and values (n, d) of each kind."""
+    def stream(self, what: str = 'the topic') -> SensorStream:
+        """Return what there is; what: where it comes from, for warnings."""
         # a thread may add meanwhile
-        found = {kind: list(kept) for kind, kept in tuple(self._kept.items())}
-        return {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
-                for kind, rows in found.items() if rows}
-
-    def stream(self) -> SensorStream:
-        """Return what there is."""
-        return sensor_stream(self.arrays(), 'the topic', absolute=True)
+        kept = {kind: list(rows) for kind, rows in tuple(self._kept.items())}
+        found = {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
+                 for kind, rows in kept.items()}
+        if 'odom_rate' in found:
+            # a gyro is better than what odometry makes of it
+            found.setdefault('rate', found.pop('odom_rate'))
+        if 'position' in found:
+            stamps_s, places = found['position']
+            found['position'] = stamps_s, local_metres(*places.T)
+        return sensor_stream(found, what, absolute=True)

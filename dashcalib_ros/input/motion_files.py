@@ -19,6 +19,7 @@ from dashcalib_ros.input.motion import (
     SensorStream,
     local_metres,
     sensor_stream,
+    values_in,
 )
 from dashcalib_ros.input.source import os_error
 from dashcalib_ros.limits import check_file, irregular_entry, read_text
@@ -244,37 +245,13 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None]) -> Senso
         for record in bag.records(tuple(topics), lambda _: None) if topics else ():
             try:
                 message = record.message()
-                values = list(_of_message(message, topics[record.topic]))
+                values = list(values_in(message, topics[record.topic]))
                 stamp = message.header.stamp
                 stamp_s = int(stamp.sec) + int(stamp.nanosec) / 1e9 or record.receive_ns / 1e9
             except (InputError, AttributeError, TypeError, ValueError):
                 continue  # a damaged message is as one that is missing
             for kind, value in values:
                 samples.add(kind, stamp_s, value)
-    arrays = samples.arrays()
-    if not arrays and not warnings:
-        return None
-    if 'odom_rate' in arrays:
-        arrays.setdefault('rate', arrays.pop('odom_rate'))
-        arrays.pop('odom_rate', None)
-    if 'position' in arrays:
-        stamps, rows = arrays['position']
-        arrays['position'] = stamps, local_metres(*rows.T)
-    stream = sensor_stream(arrays, 'the bag', absolute=True)
-    return replace(stream, warnings=(*warnings, *stream.warnings))
-
-
-def _of_message(message: Any, option: str) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Yield the kinds of values in a message."""
-    if option == 'gps':
-        fixed = message.status.status >= 0
-        yield 'position', ((message.latitude, message.longitude, message.altitude) if fixed
-                           else (np.nan,) * 3)
-    elif option == 'imu':
-        rate = message.angular_velocity
-        yield 'rate', (rate.x, rate.y, rate.z)
-    else:
-        twist = message.twist
-        twist = getattr(twist, 'twist', twist)
-        yield 'odom_rate', (twist.angular.x, twist.angular.y, twist.angular.z)
-        yield 'speed', (twist.linear.x,)
+    stream = samples.stream('the bag')
+    lines = (*warnings, *stream.warnings)
+    return None if stream.empty and not lines else replace(stream, warnings=lines)

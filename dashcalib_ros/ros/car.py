@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
-from dashcalib_ros.input.motion import local_metres
+from dashcalib_ros.input.motion import values_in
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.ros.parameters import OVERRIDES, latched
 from dashcalib_ros.ros.settings import NodeConfig
@@ -32,8 +33,6 @@ LISTEN_S = 2.0
 UNKNOWN = math.pi**2 / 3
 # best effort also receives from reliable publishers; a second of a fast gyro
 SENSOR = QoSProfile(depth=400, reliability=ReliabilityPolicy.BEST_EFFORT)
-# of NavSatStatus; -2 is unknown
-NO_FIX = -1
 Take = Callable[[str, float, Sequence[float]], None]
 
 
@@ -145,33 +144,17 @@ class Sensors:
     """Subscribes the sensors that are named, and passes on what they say."""
 
     def __init__(self, node: Node, own: NodeConfig, take: Take) -> None:
-        """take: called with a kind of SensorStream's, the stamp in s and the values."""
-        self._take = take
-        self._first: tuple[float, float, float] | None = None
-        for topic, kind, callback in ((own.imu_topic, Imu, self._imu),
-                                      (own.odom_topic, Odometry, self._odometry),
-                                      (own.fix_topic, NavSatFix, self._fix)):
+        """take: called as SensorBuffer.add(): with a kind, the stamp in s and the values."""
+        for topic, kind, option in ((own.imu_topic, Imu, 'imu'),
+                                    (own.odom_topic, Odometry, 'odom'),
+                                    (own.fix_topic, NavSatFix, 'gps')):
             if topic:
-                node.create_subscription(kind, topic, callback, SENSOR)
-
-    def _imu(self, message: Any) -> None:
-        rate = message.angular_velocity
-        self._take('rate', _stamp_s(message), (rate.x, rate.y, rate.z))
-
-    def _odometry(self, message: Any) -> None:
-        speed = message.twist.twist.linear
-        self._take('speed', _stamp_s(message), (float(np.hypot(speed.x, speed.y)),))
-
-    def _fix(self, message: Any) -> None:
-        if message.status.status == NO_FIX:
-            return
-        now = (message.latitude, message.longitude, message.altitude)
-        if not np.isfinite(now[:2]).all():
-            return
-        self._first = self._first or now
-        place = local_metres(*np.array([self._first, now]).T)[1]
-        self._take('position', _stamp_s(message), tuple(place.tolist()))
+                node.create_subscription(kind, topic, partial(_pass_on, take, option), SENSOR)
 
 
-def _stamp_s(message: Any) -> float:
-    return float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
+def _pass_on(take: Take, option: str, message: Any) -> None:
+    stamp_s = float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
+    for kind, values in values_in(message, option):
+        # odometry is asked for its speed only
+        if kind != 'odom_rate':
+            take(kind, stamp_s, values)
