@@ -11,13 +11,12 @@ from collections import Counter
 from collections.abc import Collection, Generator, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path, PurePath
 from typing import Any
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.bag_read import Damage, Record, message_counts, records
-from dashcalib_ros.input.decode import BitDepth, decode, message_size
+from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.source import (
     METADATA,
     FrameSource,
@@ -217,7 +216,7 @@ def _choose(path: Path, bag: Bag, name: str | None) -> Topic:
     if name is not None:
         found = [topic for topic in images if topic.name.strip('/') == name.strip('/')]
         if not found:
-            raise InputError(f'{path} has no image topic {name!r}: choose {_listing(bag, images)}')
+            raise InputError(f'{path} has no image topic {name!r}: choose {_listing(images)}')
         images = found
     filled = [topic for topic in images if topic.count]
     if not filled:
@@ -225,30 +224,10 @@ def _choose(path: Path, bag: Bag, name: str | None) -> Topic:
                          f'Record again')
     if len(filled) > 1:
         raise InputError(f'{path} has {len(filled)} image topics: choose one with --topic: '
-                         f'{_listing(bag, filled)}')
+                         f'{_listing(filled)}')
     return filled[0]
 
 
-def _listing(bag: Bag, topics: list[Topic]) -> str:
-    sizes = _sizes(bag, topics)
-    return '; '.join(
-        f'{topic.name} ({topic.msgtype.rpartition("/")[2]}, {topic.count} images'
-        f'{", " + sizes[topic.name] if topic.name in sizes else ""})' for topic in topics)
-
-
-def _sizes(bag: Bag, topics: list[Topic]) -> dict[str, str]:
-    """Return the size of each topic's first image, as far as they come early in the bag."""
-    missing = {topic.name for topic in topics if topic.count}
-    sizes: dict[str, str] = {}
-    for record in islice(bag.records(tuple(missing), lambda _: None), 1000):
-        if record.topic not in missing:
-            continue
-        missing.discard(record.topic)
-        try:
-            width, height = message_size(record.message())
-            sizes[record.topic] = f'{width}x{height}'
-        except InputError:
-            pass  # it is listed without a size
-        if not missing:
-            break
-    return sizes
+def _listing(topics: list[Topic]) -> str:
+    return '; '.join(f'{topic.name} ({topic.msgtype.rpartition("/")[2]}, {topic.count} images)'
+                     for topic in topics)

@@ -160,8 +160,8 @@ def two_cameras(tmp_path):
 
 def test_several_image_topics_are_listed(tmp_path):
     line = fails('2 image topics: choose one with --topic', two_cameras(tmp_path))
-    assert '/left (Image, 4 images, 64x48)' in line
-    assert '/right/compressed (CompressedImage, 3 images, 32x24)' in line
+    assert '/left (Image, 4 images)' in line
+    assert '/right/compressed (CompressedImage, 3 images)' in line
     assert '/words' not in line
 
 
