@@ -2,9 +2,7 @@
 from __future__ import annotations
 
 import os
-import shutil
 import sys
-import textwrap
 from contextlib import suppress
 from typing import Any
 
@@ -46,15 +44,6 @@ def write_stdout(text: str) -> None:
         _discard(sys.stdout, STDOUT)
         raise OutputError(f'cannot write to stdout: {error.strerror or error}; send the output '
                           f'to another place') from error
-
-
-def folded(line: str) -> str:
-    """Return a line for stderr: broken between words for a terminal, as it is for a pipe."""
-    if sys.stderr is None or sys.stderr.closed or not sys.stderr.isatty():
-        return line
-    width = shutil.get_terminal_size().columns
-    return textwrap.fill(line, max(width, 20), subsequent_indent='  ', break_long_words=False,
-                         break_on_hyphens=False)
 
 
 def write_stderr(line: str) -> None:

@@ -21,7 +21,7 @@ from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.engine import Engine, LocalEngine, RayEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
 from dashcalib_ros.fleet.storage import joined, remove, write
-from dashcalib_ros.standard_streams import folded, write_stderr
+from dashcalib_ros.standard_streams import write_stderr
 from dashcalib_ros.workers.child import ChildWorker
 
 # problems that are shown; the table has all
@@ -41,9 +41,9 @@ def batch(args: argparse.Namespace) -> int:
     progress = _Progress(sum(len(each.rows) for each in cameras), Screen(args.quiet),
                          Stages(args.quiet))
     if not args.quiet:  # before workers start, which takes a while
-        write_stderr(folded(
+        write_stderr(
             f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(cameras), "camera")}; '
-            f'Ctrl-C keeps what is done in {args.out}, and the same command goes on'))
+            f'Ctrl-C keeps what is done in {args.out}, and the same command goes on')
     engine = _engine(args, config)
     try:
         with progress.stages:

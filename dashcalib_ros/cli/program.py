@@ -13,7 +13,7 @@ from typing import Any
 
 from dashcalib_ros.cli.arguments import BAD_INPUT, COMMANDS, INTERRUPTED, PROGRAM, make_parser
 from dashcalib_ros.errors import DashcalibError
-from dashcalib_ros.standard_streams import folded, open_closed_streams, write_stderr
+from dashcalib_ros.standard_streams import open_closed_streams, write_stderr
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -75,7 +75,7 @@ def handling(handler: Any, *signals: signal.Signals) -> Iterator[None]:
 
 
 def _fail(message: str, code: int = BAD_INPUT) -> int:
-    write_stderr(folded(f'{PROGRAM}: error: {" ".join(message.split())}'))
+    write_stderr(f'{PROGRAM}: error: {" ".join(message.split())}')
     return code
 
 

@@ -22,7 +22,7 @@ from rich.progress import (
 )
 
 from dashcalib_ros.errors import OutputError
-from dashcalib_ros.standard_streams import folded, write_stderr, write_stdout
+from dashcalib_ros.standard_streams import write_stderr, write_stdout
 
 PIPE_WIDTH = 80  # columns where there is no terminal
 EVERY_S = 10.0  # where there is no terminal, progress is told so often
@@ -65,7 +65,7 @@ class Screen:
 def warn(lines: Iterable[str]) -> None:
     """Print warnings on stderr, one line each."""
     for line in lines:
-        write_stderr(folded(f'dashcalib: warning: {" ".join(line.split())}'))
+        write_stderr(f'dashcalib: warning: {" ".join(line.split())}')
 
 
 class Stages:

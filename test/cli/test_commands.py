@@ -32,7 +32,6 @@ from dashcalib_ros.demo.drive import Drive
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import ConfigError, WorkerError
-from dashcalib_ros.standard_streams import folded
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
 
@@ -214,16 +213,6 @@ def test_in_a_pipe_progress_is_a_line_from_time_to_time(fake, drive, monkeypatch
     for n in range(100):
         stages.show('reading', n / 100)
     assert len(capsys.readouterr().err.splitlines()) == 10
-
-
-def test_long_lines_are_broken_between_words_on_a_terminal_only(monkeypatch):
-    line = 'dashcalib: error: ' + 'words and words ' * 12 + '/a/path/' + 'x' * 90
-    assert folded(line) == line
-    monkeypatch.setattr('sys.stderr.isatty', lambda: True, raising=False)
-    monkeypatch.setenv('COLUMNS', '80')
-    lines = folded(line).splitlines()
-    assert len(lines) > 3 and ' '.join(map(str.strip, lines)) == line
-    assert max(map(len, lines[:-1])) <= 80
 
 
 def test_flags_win_over_set_which_wins_over_the_file(fake, drive, tmp_path):
