@@ -231,10 +231,7 @@ COMMANDS = {
         'dashcalib_ros.cli.run', 'find the turns of a drive, without calibrating',
         'Lists the turns that a calibration would choose from, best first.',
         'dashcalib turns drive.mp4 --start 60 --duration 300', (
-            INPUT, *DRIVE, JSON, NO_PROGRESS,
-            # they were taken here before, and change nothing
-            ('--seed', {'type': int, 'help': argparse.SUPPRESS}),
-            ('--verbose', {**FLAG, 'help': argparse.SUPPRESS}))),
+            INPUT, *DRIVE, JSON, NO_PROGRESS)),
     'demo': Command(
         'dashcalib_ros.cli.run', 'render a drive, calibrate it, compare with the truth',
         'Renders a drive with a known lens into a ROS 2 bag, calibrates that and compares the '
