@@ -320,15 +320,15 @@ class Config:
         return cls().replace(flat)
 
 
-def describe(fleet: bool = False) -> Iterator[tuple[str, dataclasses.Field[Any]]]:
+def describe() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
     """Yield (full name, field) of every setting, those for experts after the others.
 
-    fleet: with those of FleetConfig, for which one drive, and the node, have no use.
-    field.metadata has reason, minimum, maximum, choices, pattern and expert.
+    Not those of FleetConfig: one drive, and the node, have no use for them. field.metadata has
+    reason, minimum, maximum, choices, pattern and expert.
     """
     for wanted in (False, True):
         for name, spec, _ in _settings(Config()):
-            if spec.metadata['expert'] is wanted and (fleet or not name.startswith('fleet.')):
+            if spec.metadata['expert'] is wanted and not name.startswith('fleet.'):
                 yield name, spec
 
 

@@ -14,11 +14,12 @@ from dashcalib_ros.config import (
     MotionConfig,
     TurnsConfig,
     VerdictConfig,
+    _settings,
     describe,
 )
 from dashcalib_ros.errors import ConfigError
 
-SPECS = dict(describe(fleet=True))
+SPECS = {name: spec for name, spec, _ in _settings(Config())}
 
 
 def test_defaults_are_inside_their_ranges_and_not_on_the_edge_of_types():

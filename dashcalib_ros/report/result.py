@@ -221,11 +221,10 @@ TEXT_LENGTH = 400
 
 
 def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
-                     created: str | None = None, frame_id: str | None = None) -> str:
+                     created: str | None = None) -> str:
     """Return the YAML text of an accepted or weak calibration, at full precision.
 
     created: the time, as ISO 8601 text; without it, the same calibration gives the same text.
-    frame_id: of the images, where it is known.
     Raises ConfigError for a camera name that the drivers would refuse, ValueError without
     intrinsics.
     """
@@ -233,9 +232,7 @@ def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
     if calibration.camera is None or not np.isfinite(calibration.camera.params).all():
         raise ValueError('a calibration without finite intrinsics has no calibration.yaml')
     document = _document(calibration.camera, camera_name, calibration.config.rectified)
-    own = _provenance(calibration, created)
-    return yaml_text({**document, 'dashcalib': own if frame_id is None
-                      else {**own, 'frame_id': frame_id}})
+    return yaml_text({**document, 'dashcalib': _provenance(calibration, created)})
 
 
 def camera_info_yaml(camera: Camera) -> str:
