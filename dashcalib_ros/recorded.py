@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect import Turn
+from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, read_mask
@@ -30,6 +30,8 @@ from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
+# what frames are pushed into
+Taker = Calibrator | Detection
 
 
 def calibrate(path: Paths, fps: float | None = None,
@@ -71,16 +73,7 @@ def check(given: Camera, path: Paths, fps: float | None = None,
     """Say whether a camera explains a recorded drive.
 
     given: a Radial, Brown, Rational or Fisheye of the drive's pictures, such as
-    load_camera('camera.yaml').camera.
-    path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
-    of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
-    fps: images per second of a folder (default 10), or instead of what a video says.
-    config: the settings; None: Config().
-    topic: the image topic of a bag; needed only when it has several.
-    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
-    mask: what is not to be used: a picture's path, black there, or an array (height, width), 0 or
-    False there.
-    progress: called with the stage's name and the share done, 0 to 1.
+    load_camera('camera.yaml').camera. The others are calibrate()'s.
 
     Returns a Check: its answer is 'right', 'wrong' or 'cannot tell', with reasons. Raises
     InputError for what cannot be read, ConfigError for a bad setting, WorkerError where a child
@@ -126,16 +119,6 @@ def _fed(source: FrameSource, config: Config | None, mask: MaskOrPath, tell: Pro
         for frames in pushed(calibrator, source, valid):
             tell('reading', min(frames / source.count, 1.0) if source.count else 0.0)
         yield calibrator
-
-
-class Taker(Protocol):
-    """What frames are pushed into: a Calibrator or a Detection."""
-
-    def push(self, frame: Frame) -> object:
-        """Take the next frame."""
-
-    def turns(self) -> tuple[Turn, ...]:
-        """Return the turns found so far."""
 
 
 def pushed(taker: Taker, source: FrameSource, mask: Mask | None) -> Iterator[int]:
