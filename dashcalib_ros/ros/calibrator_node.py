@@ -16,8 +16,9 @@ from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report.wording import mount_text, mounts_text
 from dashcalib_ros.ros.background import Result, Watched
-from dashcalib_ros.ros.car import Mounting, text_of
+from dashcalib_ros.ros.car import Mounting
 from dashcalib_ros.ros.diagnostics import ERROR, OK, WARN, Health, log_line
 from dashcalib_ros.ros.images import Source
 from dashcalib_ros.ros.node import CameraNode
@@ -196,8 +197,7 @@ class CalibratorNode(CameraNode):
         """Publish a mounting, and tell where it is another one than the last, if nobody did."""
         before = self._mounting.mount
         if before and mount and mount.moved_from(before) and 'mount' not in self._changes():
-            self._log.info(f'the camera was moved on the car: {text_of(before)}; now '
-                           f'{text_of(mount)}')
+            self._log.info(mounts_text(mount, before))
         self._moved = ''
         self._mounting.show(mount, frame_id)
 
@@ -277,7 +277,7 @@ class CalibratorNode(CameraNode):
             'file': self._store.path,
             'camera_info published': self._sent,
             'contradictions': self._contradictions,
-            'mounting': text_of(mount) if mount else 'unknown'})
+            'mounting': mount_text(mount) if mount else 'unknown'})
 
     def _on_tick(self) -> None:
         super()._on_tick()

@@ -21,6 +21,7 @@ from std_msgs.msg import Header
 
 from dashcalib_ros.input.motion import values_in
 from dashcalib_ros.judge.calibration import Mount
+from dashcalib_ros.report.wording import mount_text
 from dashcalib_ros.ros.parameters import OVERRIDES, latched
 from dashcalib_ros.ros.settings import NodeConfig
 
@@ -80,7 +81,7 @@ class Mounting:
             self._sent = mount
             self._transforms.publish(self._kind(transforms=[self._transform(mount, frame)]))
             self._node.get_logger().info(f'static transform {self._own.base_frame} -> {frame}: '
-                                         f'{text_of(mount)}')
+                                         f'{mount_text(mount)}')
 
     def _prepare(self) -> None:
         try:
@@ -131,13 +132,6 @@ def differs(mount: Mount, other: Mount) -> bool:
     """Return whether a mounting is another one than before, or knows its roll now."""
     return (mount.moved_from(other)
             or (mount.roll_right_deg is None) != (other.roll_right_deg is None))
-
-
-def text_of(mount: Mount) -> str:
-    """Return the angles in one line, for /diagnostics and the log."""
-    roll = '' if mount.roll_right_deg is None else f', roll {mount.roll_right_deg:+.2f}'
-    return (f'{mount.verdict}: yaw to the left {mount.yaw_left_deg:+.2f}, pitch upwards '
-            f'{mount.pitch_up_deg:+.2f}{roll} degrees')
 
 
 class Sensors:
