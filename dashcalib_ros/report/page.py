@@ -37,7 +37,6 @@ from dashcalib_ros.report.wording import (
     number,
     optional,
     parameter_rows,
-    removed_effects,
     run_facts,
 )
 from dashcalib_ros.solve.knowledge import SigmaMap
@@ -65,7 +64,7 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
     return template('report.html').render(
         c=c, title=f'Calibration of {c.input_name}' if c.input_name else 'Calibration',
         headline=ADVICE[c.verdict.level], figures=key_figures(c), steps=next_steps(c),
-        checks=checks(c), parameters=parameter_rows(c), removed=removed_effects(c),
+        checks=checks(c), parameters=parameter_rows(c),
         truth=[] if against is None else _truth_rows(against),
         truth_px='' if against is None else optional(against.mapping_px, 2, ' px'),
         snippets=_snippets(c, calibration_file),
@@ -76,7 +75,6 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
         evidence=[*evidence_of(c, mask_id), *field_of(c)], mounting=mounting_of(c),
         facts=run_facts(c),
         mask='' if mask is None else mask_data_uri(mask), mask_id=MASK_ID,
-        masked=0.0 if c.mask is None else 100 * (1 - float(np.mean(c.mask))),
         changed={key: value for key, value in settings.items() if value != defaults[key]},
         settings=_text(settings), versions=_text(c.versions))
 

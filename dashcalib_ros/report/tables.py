@@ -4,7 +4,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-import numpy as np
 from rich import box
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -12,7 +11,6 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
 from dashcalib_ros.report.compare import (
     Comparison,
@@ -21,16 +19,7 @@ from dashcalib_ros.report.compare import (
     difference_row,
     unseen_text,
 )
-from dashcalib_ros.report.wording import (
-    lines_text,
-    mount_text,
-    number,
-    optional,
-    parameter_rows,
-    removed_effects,
-    stored_text,
-    witness_texts,
-)
+from dashcalib_ros.report.wording import number, optional, parameter_rows, run_facts
 
 # columns between two of a table
 APART = 3
@@ -52,13 +41,9 @@ def summary(calibration: Calibration) -> RenderableType:
         parts.append(TextTable(('', 'estimate', 'sigma', 'relative'), parameter_rows(c)))
         if c.caveat:
             parts.append(Text(f'{c.caveat}\n'))
-    if c.mount is not None:
-        parts.append(Text(f'mounting {mount_text(c.mount)}'))
     if c.turns:
         parts.append(TextTable(TURNS, [_turn_row(turn, c.start_s) for turn in c.turns]))
-    parts.append(Text(_facts(c)))
-    parts += [Text(text) for text in witness_texts(c.witnesses)]
-    return Group(*parts)
+    return Group(*parts, *(Text(f'{name}: {text}') for name, text in run_facts(c)))
 
 
 def conclusion(verdict: Verdict) -> RenderableType:
@@ -134,25 +119,3 @@ class TextTable:
 
 def _width(column: Sequence[str]) -> int:
     return max(map(cell_len, column))
-
-
-def _facts(c: Calibration) -> str:
-    used = sum(turn.used for turn in c.turns)
-    facts = [counted(c.frames, 'frame'), f'{used} of {counted(len(c.turns), "turn")} used']
-    if c.camera is not None:
-        facts.append(f'{c.camera.model} model')
-    if c.stored_turns:
-        facts.append(stored_text(c.stored_turns))
-    if c.reprojection_error_px is not None:
-        facts.append('reprojection error ' + optional(c.reprojection_error_px, 3, ' px'))
-    if c.sigma_px is not None:
-        facts.append(f'sigma {c.sigma_px.rms:.2f} px over the picture, {c.sigma_px.worst:.2f} px '
-                     'at the worst')
-    facts += [text for _, text in removed_effects(c)]
-    if c.straight_lines is not None:
-        facts.append(lines_text(c.straight_lines))
-    if c.mask is not None:
-        facts.append(f'{100 * (1 - float(np.mean(c.mask))):.0f} % masked as ego vehicle')
-    if 'total' in c.timing:
-        facts.append(f'{c.timing["total"]:.1f} s')
-    return ', '.join(facts)

@@ -2,21 +2,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.detect import Bend
-from dashcalib_ros.errors import counted
 from dashcalib_ros.judge import Calibration, TurnSummary
 from dashcalib_ros.judge.agreement import focal_disagreement, leverages
-from dashcalib_ros.judge.calibration import (
-    Mount,
-    StoredTurnSummary,
-    Witnesses,
-)
+from dashcalib_ros.judge.calibration import Mount, Witnesses
 from dashcalib_ros.judge.verdict import (
     flat_profile,
     one_turn_dominates,
@@ -64,30 +57,6 @@ def digits_of(name: str) -> int:
         return 2
     # the coefficients of higher terms, and of a lens that is decentred, are small
     return 4 if name in ('k1', 'k2') else 6
-
-
-def stored_text(turns: Sequence[StoredTurnSummary]) -> str:
-    """Return how many turns of earlier drives were used."""
-    used = sum(turn.used for turn in turns)
-    return f'{used} of {counted(len(turns), "stored turn")} used'
-
-
-def removed_effects(c: Calibration) -> list[tuple[str, str]]:
-    """Return what was found and taken out, each with its name: a shutter, a stabiliser."""
-    found = []
-    if c.rolling_shutter is not None:
-        found.append(('Shutter', f'rolling shutter of {c.rolling_shutter.readout_ms:.1f} ± '
-                                 f'{c.rolling_shutter.sigma_ms:.1f} ms found and removed'))
-    if c.stabiliser is not None:
-        found.append(('Stabiliser', f'picture stabilised by up to {c.stabiliser.largest_px:.0f} '
-                                    'px, found and removed'))
-    return found
-
-
-def lines_text(lines: Bend) -> str:
-    """Return a line about what straight lines say of the distortion."""
-    return (f'{lines.lines} upright lines, bent by {lines.bend_px:.2f} px: k1 off by '
-            f'{lines.k1:+.4f} ± {lines.sigma:.4f}')
 
 
 def mounts_text(mount: Mount, other: Mount) -> str:
@@ -210,17 +179,35 @@ def next_steps(c: Calibration) -> list[str]:
 
 
 def run_facts(c: Calibration) -> list[tuple[str, str]]:
-    """Return what else is to be said of the run."""
+    """Return what else is to be said of the run: a name, and a text."""
     facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
+    for name, turns in (('turns', c.turns), ('turns of earlier drives', c.stored_turns)):
+        if turns:
+            facts.append((name, f'{sum(turn.used for turn in turns)} of {len(turns)} used'))
+    if c.camera is not None:
+        facts.append(('lens model', c.camera.model))
     if c.reprojection_error_px is not None:
         facts.append(('reprojection error', f'{c.reprojection_error_px:.2f} px'))
+    if c.sigma_px is not None:
+        facts.append(('sigma over the picture',
+                      f'{c.sigma_px.rms:.2f} px RMS, {c.sigma_px.worst:.2f} px at the worst'))
+    if c.rolling_shutter is not None:
+        facts.append(('rolling shutter', f'{c.rolling_shutter.readout_ms:.1f} ± '
+                                         f'{c.rolling_shutter.sigma_ms:.1f} ms, removed'))
+    if c.stabiliser is not None:
+        facts.append(('stabiliser', f'moved the picture by up to {c.stabiliser.largest_px:.0f} '
+                                    'px, removed'))
     if c.straight_lines is not None:
-        facts.append(('straight lines', lines_text(c.straight_lines)))
+        lines = c.straight_lines
+        facts.append(('straight lines', f'{lines.lines} upright ones, bent by '
+                                        f'{lines.bend_px:.2f} px: k1 off by {lines.k1:+.4f} ± '
+                                        f'{lines.sigma:.4f}'))
+    if c.mask is not None and not c.mask.all():
+        facts.append(('not used', f'{100 * (1 - float(np.mean(c.mask))):.1f} % of the picture, '
+                                  f'which moves with the car (bonnet, pillar, burnt-in text)'))
     if c.mount is not None:
         facts.append(('mounting', mount_text(c.mount)))
     facts += [('motion sensor', text) for text in witness_texts(c.witnesses)]
-    if c.stored_turns:
-        facts.append(('earlier drives', stored_text(c.stored_turns)))
     times = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in c.timing.items())
     return [*facts, ('time', times)] if times else facts
 

@@ -157,7 +157,7 @@ def test_stored_turns_have_plots_and_no_picture(drawn):
 def test_what_was_removed_is_told():
     text = report_html(make_calibration('weak', rolling_shutter=Shutter(20.1, 0.4),
                                         stabiliser=Stabiliser(31.0)))
-    assert 'rolling shutter of 20.1 ± 0.4 ms' in text and 'by up to 31 px' in text
+    assert '20.1 ± 0.4 ms, removed' in text and 'by up to 31 px' in text
 
 
 def test_the_truth_is_compared_where_it_is_known(drawn):

@@ -29,7 +29,7 @@ def test_stored_turns_are_apart_as_they_count_no_frames_of_this_input():
         'misfit': 0.9, 'unused_because': None, 'reprojection_error_px': 0.37}]
     assert len(result['turns']) == 2 and calibration.turns_used == 2
     page = report_html(calibration)
-    assert '1 of 1 stored turn used' in page and '0.37 px' in page
+    assert 'turns of earlier drives</td><td>1 of 1 used' in page and '0.37 px' in page
     assert result_dict(make_calibration())['stored_turns'] == []
 
 

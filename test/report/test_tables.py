@@ -31,9 +31,9 @@ def test_the_terminal_shows_estimate_sigma_and_turns():
     assert any(re.search(r'k1\s+-0\.3630\s+± 0\.0040\s+1\.10 %', line) for line in lines)
     assert any(re.search(r'8\.8\s+58 to 118\s+91\.5\s+30 of 31\s+0\.46\s+yes', line)
                for line in lines)
-    assert '300 frames, 1 of 2 turns used' in text
+    assert 'images: 300 of 1242 × 375 px' in text and 'turns: 1 of 2 used' in text
     assert 'from one turn alone, which nothing confirms' in text
-    assert '20 % masked' in ' '.join(text.split())
+    assert 'not used: 20.0 % of the picture' in text
     assert '\x1b' not in text
     # a bag's stamps are times of day; those of turns are told from the start on
     late = [dataclasses.replace(turn, stamp_s=turn.stamp_s + 1.7e9) for turn in calibration.turns]
