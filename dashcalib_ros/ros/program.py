@@ -14,20 +14,18 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
-from dashcalib_ros.errors import ConfigError, DashcalibError
+from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.ros.calibrator_node import CalibratorNode
 from dashcalib_ros.ros.check_node import CheckNode
 from dashcalib_ros.ros.node import CameraNode, SetupError
-from dashcalib_ros.standard_streams import write_stderr
 from dashcalib_ros.workers.memory import reuse_image_buffers
 
-FAILED = 2
 # s; the wait after a failed callback doubles from the first to the second while all fail
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.01, 1.0
 
 
 def run(argv: Sequence[str], lifecycle: bool, stopped: Callable[[], bool]) -> int:
-    """Run the node: 0 when it was asked to stop, 2 when its parameters are wrong.
+    """Run the node until it is asked to stop; return 0. Raises DashcalibError.
 
     argv: ROS's arguments. lifecycle: it waits for configure and activate. stopped: returns whether
     a signal asked for the end.
@@ -45,10 +43,9 @@ def run(argv: Sequence[str], lifecycle: bool, stopped: Callable[[], bool]) -> in
         # a context that is shut down in the middle of a call makes rclpy raise nearly anything,
         # which may look like a wrong parameter
         if not stopped():
-            if not isinstance(error, (DashcalibError, ParameterException)):
-                raise
-            write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
-            return FAILED
+            if isinstance(error, ParameterException):
+                raise ConfigError(str(error)) from error
+            raise
     finally:
         if node is not None:
             node.close()
