@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -55,32 +55,19 @@ def check_pixels(width: int, height: int, what: str = 'an image') -> None:
         raise InputError(f'{what} says it is {width}x{height}, {TOO_LARGE}: make it smaller')
 
 
-def irregular_entry(path: Path) -> str:
-    """Return what a path is instead of a regular file, '' if it is one; raises OSError."""
-    try:
-        mode = path.stat().st_mode
-    except FileNotFoundError:
-        if path.is_symlink():
-            return 'a link to nothing'
-        raise
-    except ValueError as error:  # a name with a zero byte in it
-        raise FileNotFoundError(2, 'No such file or directory', str(path)) from error
-    kinds: dict[str, Callable[[int], bool]] = {
-        'a folder': stat.S_ISDIR, 'a named pipe': stat.S_ISFIFO, 'a socket': stat.S_ISSOCK,
-        'a device': lambda m: stat.S_ISCHR(m) or stat.S_ISBLK(m)}
-    return next((kind for kind, fits in kinds.items() if fits(mode)), '')
-
-
 def check_file(path: Path, what: str = '', limit: int | None = None) -> None:
     """Raise InputError unless this is a regular file, of `limit` bytes at the most; or OSError.
 
     what: the file's name in errors. Reading a pipe would block, and a device has no end.
     """
-    kind = irregular_entry(path)
-    if kind:
-        raise InputError(f'cannot read {what or path}: it is {kind}, no regular file; check the '
-                         f'path')
-    if limit is not None and path.stat().st_size > limit:
+    try:
+        about = path.stat()
+    except ValueError as error:  # a name with a zero byte in it
+        raise FileNotFoundError(2, 'No such file or directory', str(path)) from error
+    if not stat.S_ISREG(about.st_mode):
+        raise InputError(f'cannot read {what or path}: it is no regular file, but a folder, a '
+                         f'pipe or a device; check the path')
+    if limit is not None and about.st_size > limit:
         raise _too_large(what or str(path), limit)
 
 

@@ -38,7 +38,7 @@ PARTS = {
         'a part of the bag unpacks to more than … MB',
         'the index does not lead to all messages'},
     'input/bag_storage.py': {
-        '… images; how many are lost is not known', '… (…, … images…)',
+        '… images; how many are lost is not known',
         '… of … images; … are lost', '… of … images; none is lost',
         "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again or record it again'},

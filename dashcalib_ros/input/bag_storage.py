@@ -27,7 +27,7 @@ from dashcalib_ros.input.source import (
     is_bag_file,
 )
 from dashcalib_ros.input.stamps import StampGate
-from dashcalib_ros.limits import YAML_BYTES, check_file, irregular_entry, parse_yaml, read_text
+from dashcalib_ros.limits import YAML_BYTES, check_file, parse_yaml, read_text
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
@@ -78,12 +78,12 @@ def open_bag(path: Path) -> Bag:
         topics, indexed = _topics_of((path,), path)
         return Bag((path,), topics, indexed, ())
     names = sorted((file.name for file in path.iterdir() if is_bag_file(file.name)), key=by_name)
-    skipped = {name: what for name in names if (what := irregular_entry(path / name))}
+    skipped = [name for name in names if not (path / name).is_file()]
     present = tuple(path / name for name in names if name not in skipped)
     warnings = []
     if skipped:
-        listing = first_of([f'{name} is {what}' for name, what in skipped.items()])
-        warnings = [f'{len(skipped)} entries of {path} were skipped: {listing}']
+        warnings = [f'{len(skipped)} entries of {path} were skipped, which are no regular files: '
+                    f'{first_of(skipped)}']
     listed, promised = _metadata(path / METADATA)
     files = tuple(file for file in listed if file in present)
     if files:

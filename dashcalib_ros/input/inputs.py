@@ -29,7 +29,7 @@ from dashcalib_ros.input.source import (
     is_bag_file,
     os_error,
 )
-from dashcalib_ros.limits import PICTURE_BYTES, check_file, irregular_entry, read_file
+from dashcalib_ros.limits import PICTURE_BYTES, check_file, read_file
 
 # not whatever FFmpeg takes: it would play a text file
 VIDEO_SUFFIXES = frozenset(
@@ -237,7 +237,7 @@ def fits_bag(path: Path) -> bool:
     """Return whether a path is a bag, by its name or by what is in the folder."""
     if path.is_dir():
         return any(entry.name == METADATA
-                   or (is_bag_file(entry.name) and not irregular_entry(entry))
+                   or (is_bag_file(entry.name) and entry.is_file())
                    for entry in path.iterdir())
     return is_bag_file(path.name)
 

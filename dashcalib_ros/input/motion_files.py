@@ -22,7 +22,7 @@ from dashcalib_ros.input.motion import (
     values_in,
 )
 from dashcalib_ros.input.source import os_error
-from dashcalib_ros.limits import check_file, irregular_entry, read_text
+from dashcalib_ros.limits import check_file, read_text
 
 # of a CSV or GPX: ten hours of a gyro at 100 Hz
 MOTION_BYTES = 2**29
@@ -182,7 +182,7 @@ def _oxts(folder: Path) -> SensorStream:
         raise InputError(f'{inner / "data"} has {len(files)} records: give a whole KITTI drive')
     rows = np.full((len(files), OXTS_VALUES), np.nan)
     for row, file in zip(rows, files, strict=True):
-        if irregular_entry(file):
+        if not file.is_file():
             continue
         values = _table([read_text(file, OXTS_BYTES).strip().replace(' ', ',')], OXTS_VALUES)
         row[:] = values[0] if len(values) else np.nan
