@@ -20,10 +20,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
@@ -275,8 +273,10 @@ class Gyro:
 
     def moved(self, step: Floats) -> Gyro:
         """Return the gyro a step (9,) away; their order is that of Fit's covariance."""
+        from scipy.spatial.transform import Rotation
         offset = np.clip(self.offset_s + step[7], -2 * LARGEST_OFFSET_S, 2 * LARGEST_OFFSET_S)
-        return Gyro(_rotation(step[:3]) @ self.alignment, self.bias + step[3:6],
+        turned = Rotation.from_rotvec(step[:3]).as_matrix()
+        return Gyro(turned @ self.alignment, self.bias + step[3:6],
                     float(self.inverse_scale + step[6]), float(offset), self.middle_s,
                     float(self.pace + step[8]))
 
@@ -519,11 +519,6 @@ def _likeliest_ratio(turns: Sequence[Steps], rows: Rows) -> float:
         logs = sum(_whitening(turn, ratio)[1] for turn in turns)
         return len(residual) / 2 * float(np.log(max(squares, 1e-300))) + 3 * logs
     return float(min(RATIOS, key=badness))
-
-
-def _rotation(turned: npt.NDArray[Any]) -> Floats:
-    from scipy.spatial.transform import Rotation
-    return np.asarray(Rotation.from_rotvec(turned).as_matrix())
 
 
 @dataclass(frozen=True)
