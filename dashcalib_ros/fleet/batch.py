@@ -9,7 +9,6 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import metadata
 from typing import Any
 
 from dashcalib_ros.config import Config
@@ -20,6 +19,7 @@ from dashcalib_ros.fleet.engine import DiedError, Engine, Task
 from dashcalib_ros.fleet.fuse import fuse
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.storage import is_url, joined, read, remove, write
+from dashcalib_ros.judge.conclude import versions
 from dashcalib_ros.report import write_results
 from dashcalib_ros.report.files import ACCEPTED, WEAK
 
@@ -202,11 +202,7 @@ def solved_file(camera: str, make: str, clips: Sequence[tuple[str, str, str]], c
     Other clips, other settings and another version of this package have another one.
     """
     settings = {key: value for key, value in config.flat().items() if key != 'threads'}
-    try:
-        version = metadata.version('dashcalib_ros')
-    except metadata.PackageNotFoundError:
-        version = ''
-    key = hash_of([solved.FORMAT, version, camera, make, clips, settings])
+    key = hash_of([solved.FORMAT, versions()['dashcalib_ros'], camera, make, clips, settings])
     return f'solved/{key[:2]}/{key}.json'
 
 

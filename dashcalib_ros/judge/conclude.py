@@ -119,7 +119,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         turns=tuple(_summary(turn, scenes.get(turn.id), evidence, solution)
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
         frames=evidence.frames, reprojection_error_px=None, timing=evidence.timing,
-        versions=_versions(), config=config, warnings=evidence.warnings + evidence.asked.unused,
+        versions=versions(), config=config, warnings=evidence.warnings + evidence.asked.unused,
         magnitudes=evidence.magnitudes, mask=_of_size(evidence.mask, evidence.image_size),
         stored_turns=tuple(_stored_summary(turn, scenes[turn.scene.turn], evidence, solution)
                            for turn in evidence.stored),
@@ -345,11 +345,12 @@ def _details(solution: Solution) -> dict[str, Any]:
     return details
 
 
-def _versions() -> dict[str, str]:
-    versions = {'python': platform.python_version()}
+def versions() -> dict[str, str]:
+    """Return those of PACKAGES, and Python's, by name."""
+    found = {'python': platform.python_version()}
     for name in PACKAGES:
         try:
-            versions[name] = metadata.version(name)
+            found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            versions[name] = 'unknown'
-    return versions
+            found[name] = 'unknown'
+    return found
