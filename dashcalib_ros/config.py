@@ -8,6 +8,7 @@ YAML and as a ROS parameter. Values are checked when a Config is made: one that 
 """
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import functools
@@ -298,9 +299,11 @@ class Config:
                 hint = f': did you mean {near[0]}?' if near else f'; there are {", ".join(known)}'
                 raise ConfigError(f'unknown setting {name!r}{hint}')
             section, _, key = name.rpartition('.')
-            # an integer is a fine float, and a fine text: YAML reads 13 as one
-            if isinstance(known[name].default, (float, str)) and _is_exact(value):
-                value = float(value) if isinstance(known[name].default, float) else str(value)
+            # an integer is a fine float, and a fine text: YAML reads 13 as one, and 1e-3 as a text
+            kind = type(known[name].default)
+            if kind in (float, str) and (isinstance(value, str) or _is_exact(value)):
+                with contextlib.suppress(ValueError):
+                    value = kind(value)
             (nested.setdefault(section, {}) if section else top)[key] = value
         for section, values in nested.items():
             top[section] = dataclasses.replace(getattr(self, section), **values)

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,7 +28,6 @@ FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads
          'segmentation': ('mask.segmentation',), 'model': ('model',),
          'speed': ('mount.speed_kmh',), 'mount': ('mount.enabled',),
          'gyro_scale_sigma': ('motion.gyro_scale_sigma',)}
-EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+')  # 1e-3, a word to YAML 1.1
 
 
 def read_config(args: argparse.Namespace) -> Config:
@@ -53,7 +51,7 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
             raise ConfigError(f'--set needs KEY=VALUE (turns.wanted=4), not {shortened(pair)!r}')
         what = f'--set {shortened(pair)}: the value'
         try:
-            changes[key.strip()] = _numbers(parse_yaml(text, what))
+            changes[key.strip()] = parse_yaml(text, what)
         except InputError as error:
             raise ConfigError(f'{error}; write a plain number, true or false') from error
     return changes
@@ -70,15 +68,7 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     if not isinstance(data, Mapping):
         raise ConfigError(f'the configuration {path} has no settings; '
                           'write lines like turns.wanted: 4')
-    return {key: _numbers(value) for key, value in data.items()}
-
-
-def _numbers(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _numbers(item) for key, item in value.items()}
-    if isinstance(value, str) and EXPONENT.fullmatch(value):
-        return float(value)
-    return value
+    return data
 
 
 def open_drive(args: argparse.Namespace) -> tuple[FrameSource, Mask | None]:
