@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -217,29 +216,21 @@ def optional(value: float | None, digits: int, unit: str = '') -> str:
     return '-' if value is None or not math.isfinite(value) else f'{value:.{digits}f}{unit}'
 
 
-@dataclass(frozen=True)
-class Check:
-    """One of the verdict's conditions, in words. passed: whether this drive meets it."""
+def checks(calibration: Calibration) -> list[tuple[str, str, str, bool]]:
+    """Return the verdict's conditions that can be put in a number, those of the evidence first.
 
-    name: str
-    found: str
-    needed: str
-    passed: bool
-
-
-def checks(calibration: Calibration) -> list[Check]:
-    """Return the conditions that can be put in a number, those of the evidence first."""
+    Each in words, what this drive has, what is needed, and whether it has it.
+    """
     needed = calibration.config.verdict
     count, yaw = calibration.turns_used, calibration.yaw_deg
-    found = [Check('turns used', f'{count}', f'at least {needed.min_turns}',
-                   count >= needed.min_turns),
-             Check('yaw of these turns together', f'{yaw:.0f}°',
-                   f'at least {needed.min_yaw_deg:.0f}°', yaw >= needed.min_yaw_deg)]
+    found = [('turns used', f'{count}', f'at least {needed.min_turns}', count >= needed.min_turns),
+             ('yaw of these turns together', f'{yaw:.0f}°',
+              f'at least {needed.min_yaw_deg:.0f}°', yaw >= needed.min_yaw_deg)]
     solution = None if calibration.material is None else calibration.material.solution
     if solution is None:
         return found
     share = max(leverages(solution).values(), default=1.0)
-    return found + [Check(name, value, limit, rule(solution, needed) is None)
+    return found + [(name, value, limit, rule(solution, needed) is None)
                     for name, value, limit, rule in (
         ('rise of the error when the focal length is 20 % off',
          f'{100 * max(profile_contrast(solution), 0.0):.1f} %',
