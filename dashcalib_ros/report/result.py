@@ -176,8 +176,6 @@ def plain_values(value: Any) -> Any:
         return {str(key): plain_values(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain_values(item) for item in value]
-    if isinstance(value, (set, frozenset)):
-        return sorted((plain_values(item) for item in value), key=str)
     return str(value)
 
 
