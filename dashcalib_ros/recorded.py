@@ -73,7 +73,16 @@ def check(given: Camera, path: Paths, fps: float | None = None,
     """Say whether a camera explains a recorded drive.
 
     given: a Radial, Brown, Rational or Fisheye of the drive's pictures, such as
-    load_camera('camera.yaml').camera. The others are calibrate()'s.
+    load_camera('camera.yaml').camera.
+    path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
+    of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
+    fps: images per second of a folder (default 10), or instead of what a video says.
+    config: the settings; None: Config().
+    topic: the image topic of a bag; needed only when it has several.
+    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
+    mask: what is not to be used: a picture's path, black there, or an array (height, width), 0 or
+    False there.
+    progress: called with the stage's name and the share done, 0 to 1.
 
     Returns a Check: its answer is 'right', 'wrong' or 'cannot tell', with reasons. Raises
     InputError for what cannot be read, ConfigError for a bad setting, WorkerError where a child
