@@ -245,7 +245,7 @@ def test_what_is_no_information_changes_nothing(drive):
 
 
 def test_one_turn_is_not_moved_by_a_gyro_that_is_called_calibrated_and_is_not(drive):
-    for scale in (0.97, 1.03):
+    for scale in (0.975, 1.025):
         solution = alone(drive, 0)
         found = ask_sensors(solution, gyro(drive, scale), START_S, CALIBRATED)
         named = any('does not confirm' in line for line in found.unused)
