@@ -75,22 +75,6 @@ def start_node(tmp_path, ros_context):
 
 
 @pytest.fixture
-def end_of_node(ros_context, capfd, monkeypatch, tmp_path_factory):
-    """Run a node that should end by itself; return its exit code and what it printed."""
-    from ros_bench import arguments_of
-
-    from dashcalib_ros.ros.program import run
-
-    def end(*arguments, **parameters):
-        # its file stays its own until this process ends
-        monkeypatch.setenv('HOME', str(tmp_path_factory.mktemp('home')))
-        code = run(arguments_of(*arguments, **parameters), False, lambda: False)
-        return code, ''.join(capfd.readouterr())
-
-    return end
-
-
-@pytest.fixture
 def make_bench(ros_context):
     """Make benches that are closed after the test."""
     from ros_bench import Bench

@@ -296,8 +296,9 @@ def test_the_node_takes_it_as_a_parameter(start_node, tmp_path):
     start_node(mask__segmentation=path, mask__segmentation_classes=13).wait_for('learning')
 
 
-def test_the_node_refuses_a_bad_model_with_one_line(end_of_node, tmp_path):
+def test_the_node_refuses_a_bad_model_with_one_line(start_node, tmp_path):
     path = pixel_model(tmp_path / 'model.onnx', classes=19, vehicle=13)
     for given, words in ((path, 'set mask.segmentation_classes'), ('none.onnx', 'check the path')):
-        code, text = end_of_node(mask__segmentation=given)
-        assert code == 2 and words in text and len(text.splitlines()) == 1, text
+        node = start_node(mask__segmentation=given)
+        assert node.process.wait(20) == 2
+        assert words in node.text and len(node.text.splitlines()) == 1, node.text

@@ -16,6 +16,7 @@ from ros_bench import (
     COMMAND,
     OURS,
     REPOSITORY,
+    SOON,
     START,
     NodeProcess,
     image_message,
@@ -51,9 +52,10 @@ def test_qos_is_overridden_in_the_running_node(start_node, make_bench):
     ('qos_overrides./camera_info.publisher.reliability:=perfect', 'best_effort'),
     ('qos_overrides./camera_inf.publisher.depth:=3', 'did you mean qos_overrides./camera_info'),
 ])
-def test_an_override_that_there_is_not_ends_it(end_of_node, override, words):
-    code, text = end_of_node('-p', override)
-    assert code == 2 and words in text and len(text.splitlines()) == 1, text
+def test_an_override_that_there_is_not_ends_it(start_node, override, words):
+    node = start_node('-p', override)
+    assert node.process.wait(SOON) == 2
+    assert words in node.text and len(node.text.splitlines()) == 1, node.text
 
 
 # missing images ------------------------------------------------------------------------------

@@ -346,9 +346,10 @@ def test_services_say_why_not(plain):
     ({'turns__half_widht': 3}, 'did you mean turns.half_width?'),
     ({'of_another_node': 3}, 'name that node in the file'),
 ])
-def test_a_bad_parameter_ends_it_with_one_line(end_of_node, parameters, words):
-    code, text = end_of_node(**parameters)
-    assert code == 2 and words in text and len(text.splitlines()) == 1, text
+def test_a_bad_parameter_ends_it_with_one_line(start_node, parameters, words):
+    node = start_node(**parameters)
+    assert node.process.wait(SOON) == 2
+    assert words in node.text and len(node.text.splitlines()) == 1, node.text
 
 
 def test_a_mask_of_another_size_ends_it_at_the_first_image(start_node, make_bench, tmp_path):
