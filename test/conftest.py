@@ -22,15 +22,26 @@ def pytest_configure(config):
 
 
 # the files that take longest, the longest first: begun last, each would keep one core alone
-LONG_FILES = ('test_run.py', 'test_calibrator.py', 'test_drive.py', 'test_child.py',
-              'test_pool.py', 'test_usage.py', 'test_node.py', 'test_judging.py', 'test_solve.py',
-              'test_choice.py', 'test_install.py', 'test_docs_commands.py', 'test_example.py')
+LONG_FILES = ('test_calibrator.py', 'test_node.py', 'test_run.py', 'test_drive.py',
+              'test_solve.py', 'test_example.py', 'test_child.py', 'test_style.py',
+              'test_choice.py', 'test_pool.py', 'test_usage.py', 'test_judging.py',
+              'test_engine.py', 'test_docs_commands.py', 'test_install.py')
 
 
 def pytest_collection_modifyitems(items):
     """Put the long files first; each file's tests stay in their order."""
     ranks = {name: rank for rank, name in enumerate(LONG_FILES)}
     items.sort(key=lambda item: ranks.get(item.path.name, len(ranks)))
+
+
+@pytest.fixture(scope='session')
+def shared_drive(tmp_path_factory):
+    """A drive with two turns; the workers of a run share its pictures."""
+    from shared_drive import SharedDrive
+    folder = tmp_path_factory.getbasetemp()
+    if 'PYTEST_XDIST_WORKER' in os.environ:
+        folder = folder.parent
+    return SharedDrive(folder / 'shared_drive.npy')
 
 
 @pytest.fixture(scope='module')

@@ -17,12 +17,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from shared_drive import LENS, ONE_TURN, OTHER_TURN, QUICK, SharedDrive
 from synthetic import synthetic_turn
 
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
-from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, WorkerError
@@ -39,20 +39,14 @@ from dashcalib_ros.solve import solve
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
-LENS = Lens.of(640, 360, 80.0, -0.25, 0.06, offset=(6.0, -4.0))
 TRUE = Radial((640, 360), *LENS.truth.values())
 LONGER = TRUE.resized(1.03, TRUE.image_size)
-SPEC = DriveSpec(turns=(Turn(85.0), Turn(-80.0)), straight_m=20.0, lead_m=24.0, seed=3)
-# enough for this drive, and quick
-QUICK = Config().replace({
-    'turns.wanted': 2, 'tracks.points': 350, 'scene.tracks': 250, 'scene.profile_tracks': 150,
-    'scene.keyframes': 20, 'scene.profile_keyframes': 10, 'intrinsics.profile_tracks': 40})
 LIMIT_S = 300.0
 
 
 @pytest.fixture(scope='session')
-def drive() -> Drive:
-    return Drive(LENS, SPEC)
+def drive(shared_drive) -> SharedDrive:
+    return shared_drive
 
 
 @pytest.fixture(scope='session')
@@ -110,7 +104,7 @@ def test_it_finds_the_lens(drive, frames, result):
 def test_it_tells_of_its_turns(drive, result):
     assert len(result.turns) == 2 and all(turn.used for turn in result.turns)
     for turn, center, angle in zip(result.turns, drive.turn_centers, (85.0, 80.0), strict=True):
-        assert abs(turn.center - center) <= 8
+        assert abs(turn.center - center) <= 5
         assert turn.first <= turn.center <= turn.last
         assert turn.yaw_deg == pytest.approx(angle, abs=8.0)
         assert 0.8 * turn.images < turn.registered <= turn.images <= 20
@@ -122,7 +116,7 @@ def test_it_tells_of_its_turns(drive, result):
         assert turn.unused_because is None
         picture = result.material.pictures[turn.id]
         assert picture.frame in result.material.scenes[turn.id].tracks.frames
-        assert abs(picture.frame - turn.center) < 10 and picture.image.shape == (360, 640)
+        assert abs(picture.frame - turn.center) < 6 and picture.image.shape == (360, 640)
 
 
 def test_a_turn_during_which_the_car_stood_is_none(frames, result):
@@ -175,9 +169,9 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_with_a_turn_l
     stages: dict[str, float] = {}
     told: list[str] = []
     with limited(Calibrator(QUICK, live=True, on_trouble=told.append)) as calibrator:
-        for frame in frames[:95]:
+        for frame in frames[:ONE_TURN]:
             status = calibrator.push(frame)
-        assert status.frames == 95 and status.turns == 1
+        assert status.frames == ONE_TURN and status.turns == 1
         end = time.monotonic() + LIMIT_S
         # a child that only loads is not missed
         while not told and time.monotonic() < end:
@@ -191,7 +185,7 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_with_a_turn_l
         assert calibrator.status().built == 1
         assert calibrator.status().reconstructed == calibrator.status().ready
         assert calibrator.status().yaw_deg == pytest.approx(85.0, abs=8.0)
-        for frame in frames[95:]:
+        for frame in frames[ONE_TURN:]:
             calibrator.push(frame)
             # whatever waits, waits in the pool, whose queue has an end
             assert not any(turn.frames for turn in calibrator.turns())
@@ -201,7 +195,7 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_with_a_turn_l
         pids = calibrator.scenes.child_pids()
         assert pids and all(os.getpriority(os.PRIO_PROCESS, pid) >= 10 for pid in pids)
     assert len(told) == 1 and 'exit code -9' in told[0] and 'is tried again' in told[0]
-    assert early.frames == 95 and early.verdict.level in ('weak', 'refused')
+    assert early.frames == ONE_TURN and early.verdict.level in ('weak', 'refused')
     assert any('only 1 of at least 2 turns' in reason for reason in early.verdict.reasons)
     assert 'reconstructing turns' in stages and len(stages) >= 4
     assert all(0.0 <= done <= 1.0 for done in stages.values())
@@ -265,7 +259,7 @@ def test_close_ends_a_calibration_that_runs(frames):
             outcome.append(error)
 
     with limited(calibrator):
-        for frame in frames[:95]:
+        for frame in frames[:ONE_TURN]:
             calibrator.push(frame)
         thread = threading.Thread(target=calibrate, daemon=True)
         thread.start()
@@ -311,14 +305,14 @@ def test_two_short_drives_add_up(drive, frames, tmp_path):
     store.mirror({TurnId.at(0): StoredTurn(garbage(), 5.0, 0.9)})
     assert len(list(folder.iterdir())) == 1
 
-    first = calibrated(frames[:95], config)
+    first = calibrated(frames[:ONE_TURN], config)
     assert first.verdict.level == 'weak' and first.turns_used == 1
     assert any('only 1 of at least 2 turns' in reason for reason in first.verdict.reasons)
     # the joint adjustment rejects what does not fit, and it is gone from the disk
     assert [turn.used for turn in first.stored_turns] == [False]
     assert len(list(folder.iterdir())) == 1
 
-    half = later(frames[75:], 86400.0)
+    half = later(frames[OTHER_TURN:], 86400.0)
     second = calibrated(half, config)
     assert len(second.turns) == len(second.stored_turns) == 1 and second.turns_used == 2
     assert not any('turns' in reason for reason in second.verdict.reasons), second.verdict
@@ -338,11 +332,11 @@ def test_two_short_drives_add_up(drive, frames, tmp_path):
 
 
 def test_a_turn_that_is_played_in_a_loop_counts_once(drive, frames):
-    around = [frame.image for frame in frames[max(drive.turn_centers[0] - 35, 0):
-                                              drive.turn_centers[0] + 35]]
+    around = [frame.image for frame in frames[drive.turn_centers[0] - 21:
+                                              drive.turn_centers[0] + 21]]
     with limited(Calibrator(QUICK.replace({'turns.wanted': 3}))) as calibrator:
         for n, image in enumerate(2 * around):
-            calibrator.push(Frame(n, frames[0].stamp_ns + n * 100_000_000, image))
+            calibrator.push(Frame(n, drive.stamp_ns(n), image))
         looped = calibrator.calibrate()
     assert looped.verdict.level != 'accepted' and looped.turns_used == 1
     assert any('only 1 of at least 2 turns' in text for text in looped.verdict.reasons)
@@ -356,9 +350,9 @@ def test_a_stored_turn_of_another_camera_is_told_and_stays(frames, tmp_path):
     lens = Radial((640, 360), 460.0, 460.0, 319.5, 179.5, -0.1)
     store = TurnStore(str(tmp_path), 10, 3.0, pytest.fail)
     store.load(Origin((640, 360)))
-    stranger = StoredTurn(synthetic_turn(lens).scene(lens), 5.0, 0.001)
+    stranger = StoredTurn(synthetic_turn(lens, tracks=150).scene(lens), 5.0, 0.001)
     store.mirror({TurnId.at(0): stranger})
-    result = calibrated(frames[:95], config)
+    result = calibrated(frames[:ONE_TURN], config)
     assert result.verdict.level != 'accepted' and result.turns[0].used, result.verdict
     # of two turns nobody can tell which one is odd
     assert any('another camera' in reason for reason in result.verdict.reasons), result.verdict
@@ -517,7 +511,7 @@ def test_a_turn_that_the_end_of_a_file_cuts_is_whole_unless_images_are_lost(driv
 
     whole = sorted((turn.center, turn.first, turn.last) for turn in result.turns)
     assert whole[0][1] < cut < whole[0][2] and turns(0, len(frames)) == whole
-    assert not any(first < cut <= last for _, first, last in turns(5, cut + 45))
+    assert not any(first < cut <= last for _, first, last in turns(3, cut + 27))
 
 
 def test_a_folder_is_calibrated_in_one_call(tmp_path):
@@ -555,8 +549,8 @@ def test_a_picture_that_stands(frames):
 
 def test_a_drive_without_a_turn(drive, frames):
     """It ends before the first turn; test/detect has longer ones."""
-    straight = frames[:drive.turn_centers[0] - 15]
-    assert len(straight) > 25 and 'no turn was found' in refused(straight)
+    straight = frames[:drive.turn_centers[0] - 9]
+    assert len(straight) > 16 and 'no turn was found' in refused(straight)
 
 
 def test_a_change_of_size_is_named(frames):

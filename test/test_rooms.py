@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import subprocess
 import sys
@@ -42,6 +43,7 @@ def room_of(path: Path) -> str:
     return parts[0] if len(parts) > 1 else path.stem
 
 
+@functools.cache
 def imports(path: Path) -> list[tuple[str, int]]:
     """Return every module that a file imports, anywhere in it, with its line.
 

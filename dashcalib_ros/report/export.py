@@ -24,7 +24,6 @@ from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.report.camera_file import EQUIDISTANT, RATIONAL, TERMS
 from dashcalib_ros.report.result import camera_info_yaml
-from dashcalib_ros.report.splined import splined_lens
 
 # a resized picture's columns and rows may round differently by so much
 ROUNDING_PX = 1.0
@@ -130,6 +129,8 @@ def _mrcal(camera: Camera, field: Field | None = None) -> str:
         d = camera.ros_distortion()
         name, lens = f'LENSMODEL_OPENCV{len(d)}', np.array([*camera.params[:4], *d])
     else:
+        # it takes half a second to load
+        from dashcalib_ros.report.splined import splined_lens
         name, lens = splined_lens(camera, field)
     values = ', '.join(repr(float(value)) for value in lens)
     width, height = camera.image_size

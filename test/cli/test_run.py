@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,22 +19,10 @@ from processes import processes_of
 from waiting import wait_for
 
 from dashcalib_ros.camera import Radial, camera_of
-from dashcalib_ros.demo import Drive, demo_drive
 from dashcalib_ros.report import NamedCamera, compare, load_camera
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 COMMAND = (sys.executable, '-m', 'dashcalib_ros.cli')
-# the same, but a demo of two turns: to render five takes a minute
-SHORT = {'turns': 2, 'straight_m': 20.0, 'lead_m': 24.0}
-SHORT_COMMAND = (sys.executable, '-c', f"""
-import sys
-from dataclasses import replace
-from dashcalib_ros import demo
-from dashcalib_ros.cli import main
-whole = demo.demo_drive
-demo.demo_drive = lambda seed: demo.Drive(whole(seed).lens, replace(whole(seed).spec, **{SHORT}))
-sys.exit(main())
-""")
 
 
 def dashcalib(*args, env=None, command=COMMAND):
@@ -43,35 +31,48 @@ def dashcalib(*args, env=None, command=COMMAND):
 
 
 @pytest.fixture(scope='module')
-def demo(tmp_path_factory):
-    """Run the demo once; return the finished process and its folder, which has the bag, too."""
+def demo(shared_drive, tmp_path_factory):
+    """Run the demo once; return the finished process and its folder, which has the bag, too.
+
+    On a drive that is rendered already, of two turns: to render five takes a minute.
+    """
+    command = (sys.executable, '-c', f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parents[1])!r})
+from pathlib import Path
+from shared_drive import SharedDrive
+from dashcalib_ros import demo
+from dashcalib_ros.cli import main
+demo.demo_drive = lambda seed: SharedDrive(Path({str(shared_drive.path)!r}), bonnet=True,
+                                           timestamp=True)
+sys.exit(main())
+""")
     out = tmp_path_factory.mktemp('demo') / 'demo'
     # numpy with as many threads as it likes, as users have it
     env = {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES}
-    return dashcalib('demo', '--out', out, '--keep-bag', env=env, command=SHORT_COMMAND), out
+    return dashcalib('demo', '--out', out, '--keep-bag', env=env, command=command), out
 
 
 @pytest.fixture(scope='module')
-def rendered(demo):
-    """Return the demo's drive and its bag."""
-    whole = demo_drive(0)
-    return Drive(whole.lens, replace(whole.spec, **SHORT)), demo[1] / 'bag'
+def bag(demo):
+    """Return the demo's bag."""
+    return demo[1] / 'bag'
 
 
 @pytest.fixture(scope='module')
-def calibrated(rendered, tmp_path_factory):
+def calibrated(bag, tmp_path_factory):
     """Calibrate the bag once; return the finished process and the output folder."""
     out = tmp_path_factory.mktemp('out') / 'calibration'
-    return dashcalib('run', rendered[1], '--out', out), out
+    return dashcalib('run', bag, '--out', out), out
 
 
-def test_the_demo_s_bag_is_accepted_and_close_to_the_truth(rendered, calibrated):
+def test_the_demo_s_bag_is_accepted_and_close_to_the_truth(shared_drive, calibrated):
     done, out = calibrated
     assert done.returncode == 0, done.stdout + done.stderr
     assert sorted(p.name for p in out.iterdir()) == [
         'calibration.yaml', 'report.html', 'result.json']
     estimate = load_camera(out / 'calibration.yaml')
-    truth = camera_of(Radial.model, estimate.image_size, list(rendered[0].truth.values()))
+    truth = camera_of(Radial.model, estimate.image_size, list(shared_drive.truth.values()))
     rows = {d.name: d for d in compare(estimate, NamedCamera('truth', truth)).differences}
     assert abs(rows['fx'].percent) < 0.5
     assert abs(rows['cx'].percent) < 0.6
@@ -89,14 +90,14 @@ def test_a_pipe_gets_plain_text_and_the_verdict_first(calibrated):
     assert 'dashcalib: error' not in done.stderr
 
 
-def test_the_result_is_complete(rendered, calibrated):
+def test_the_result_is_complete(bag, calibrated):
     result = json.loads((calibrated[1] / 'result.json').read_text('utf-8'))
     assert sum(turn['used'] for turn in result['turns']) >= 2
     assert all(turn['first'] <= turn['center'] <= turn['last'] for turn in result['turns'])
     assert set(result['timing']) >= {'detect', 'calibrate', 'total'}
     assert set(result['sigma']) == {'fx', 'fy', 'cx', 'cy', 'k1', 'k2'}
     assert all(sigma > 0 for sigma in result['sigma'].values())
-    assert str(rendered[1]) in result['input'] or rendered[1].name in result['input']
+    assert str(bag) in result['input'] or bag.name in result['input']
 
 
 def test_the_same_input_and_seed_give_the_same_result(demo, calibrated):
@@ -107,8 +108,8 @@ def test_the_same_input_and_seed_give_the_same_result(demo, calibrated):
         assert first[key] == second[key], key
 
 
-def test_turns_lists_those_that_a_run_would_use(rendered, calibrated):
-    done = dashcalib('turns', rendered[1], '--json')
+def test_turns_lists_those_that_a_run_would_use(bag, calibrated):
+    done = dashcalib('turns', bag, '--json')
     assert done.returncode == 0, done.stderr
     turns = json.loads(done.stdout)['turns']
     prominences = [turn['prominence'] for turn in turns]
@@ -149,9 +150,9 @@ def test_too_little_to_work_with_is_told_without_a_traceback(tmp_path, count, si
 
 @pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
 @pytest.mark.parametrize('children', [0, 1], ids=['reading', 'reconstructing'])
-def test_a_signal_ends_it_whole(rendered, tmp_path, name, children):
+def test_a_signal_ends_it_whole(bag, tmp_path, name, children):
     """While it reads, or while a child reconstructs a turn."""
-    process = subprocess.Popen([*COMMAND, 'run', rendered[1], '--out', tmp_path / 'out'],
+    process = subprocess.Popen([*COMMAND, 'run', bag, '--out', tmp_path / 'out'],
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)
     try:

@@ -55,8 +55,8 @@ def results(tmp_path):
 
 @pytest.mark.parametrize('command', [[], ['run'], ['turns'], ['demo'], ['compare'],
                                      ['export']])
-def test_help_names_the_exit_codes(command):
-    done = dashcalib(*command, '--help')
+def test_help_names_the_exit_codes(here, command):
+    done = here(*command, '--help')
     assert (done.returncode, done.stderr) == (0, '')
     assert done.stdout.startswith('usage: dashcalib')
     text = ' '.join(done.stdout.split())
@@ -67,8 +67,8 @@ def test_help_names_the_exit_codes(command):
     assert max(map(len, done.stdout.splitlines())) <= 80
 
 
-def test_an_unknown_argument_names_the_help_of_its_command():
-    done = dashcalib('demo', 'extra')
+def test_an_unknown_argument_names_the_help_of_its_command(here):
+    done = here('demo', 'extra')
     assert_one_line_error(done)
     assert 'extra; see dashcalib demo --help' in done.stderr
 
@@ -135,8 +135,8 @@ def test_compare_shows_the_difference(results):
     assert '\x1b' not in done.stdout
 
 
-def test_compare_as_json(results):
-    done = dashcalib('compare', results / 'a/calibration.yaml', results / 'truth.json', '--json')
+def test_compare_as_json(here, results):
+    done = here('compare', results / 'a/calibration.yaml', results / 'truth.json', '--json')
     assert (done.returncode, done.stderr) == (0, '')
     data = json.loads(done.stdout)
     assert data['parameters']['fx']['difference'] == pytest.approx(7)
@@ -146,7 +146,7 @@ def test_compare_as_json(results):
 
 
 def test_export_prints_or_writes_a_camera_file(here, results):
-    printed = dashcalib('export', results / 'a', '--to', 'colmap')
+    printed = here('export', results / 'a', '--to', 'colmap')
     assert (printed.returncode, printed.stderr) == (0, '')
     assert re.search(r'^1 OPENCV 1242 375 721\.', printed.stdout, re.MULTILINE)
     out = results / 'cameras.txt'
@@ -229,14 +229,14 @@ def commands(results):
     for index in range(4):
         cv2.imwrite(str(results / 'drive' / f'{index}.png'), np.full((48, 64), 60, np.uint8))
     drive = (results / 'drive', '--fps', 10)
-    return {'help': ['--help'], 'version': ['--version'],
+    return {'help': ['--help'],
             'compare': ['compare', results / 'a', results / 'truth.json'],
             'turns': ['turns', *drive], 'run': ['run', *drive, '--out', results / 'out'],
             'error': ['compare', results / 'a', results / 'missing']}
 
 
 @pytest.mark.parametrize(('redirection', 'words'), [('>&-', CLOSED), ('>/dev/full', FULL)])
-@pytest.mark.parametrize('name', ['help', 'version', 'compare', 'turns'])
+@pytest.mark.parametrize('name', ['help', 'compare', 'turns'])
 def test_a_result_that_cannot_be_shown_is_one_line(commands, name, redirection, words):
     done = redirected(redirection, *commands[name])
     assert (done.returncode, done.stderr) == (2, f'dashcalib: error: {words}\n')
@@ -252,7 +252,7 @@ def test_a_run_whose_files_are_written_ends_with_its_verdict(commands, results, 
 
 @pytest.mark.parametrize('redirection', ['2>&-', '2>/dev/full'])
 @pytest.mark.parametrize(('name', 'code'), [
-    ('help', 0), ('version', 0), ('compare', 0), ('turns', 0), ('run', 3), ('error', 2)])
+    ('help', 0), ('turns', 0), ('run', 3), ('error', 2)])
 def test_without_stderr_the_outcome_is_the_same(here, commands, name, code, redirection):
     done = redirected(redirection, *commands[name])
     assert (done.returncode, done.stderr) == (code, '')
@@ -261,7 +261,7 @@ def test_without_stderr_the_outcome_is_the_same(here, commands, name, code, redi
 
 
 @pytest.mark.parametrize(('name', 'code'), [
-    ('help', 2), ('version', 2), ('compare', 2), ('turns', 2), ('run', 3), ('error', 2)])
+    ('help', 2), ('turns', 2), ('run', 3), ('error', 2)])
 @pytest.mark.parametrize('redirection', ['>&- 2>&-', '<&- >&- 2>&-'])
 def test_without_any_stream_the_exit_code_tells(commands, name, code, redirection):
     assert redirected(redirection, *commands[name]).returncode == code

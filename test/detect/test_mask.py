@@ -4,11 +4,12 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from dashcalib_ros.config import MaskConfig, MotionConfig
-from dashcalib_ros.demo import Drive, DriveSpec, Lens, Turn
+from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.detect import MotionEstimator
 from dashcalib_ros.detect.mask import EgoMask
 from dashcalib_ros.input import Frame
@@ -26,20 +27,14 @@ def observe(frames, valid=None, **mask):
 
 
 @pytest.fixture(scope='module')
-def drive() -> Drive:
-    spec = DriveSpec(turns=(Turn(80.0, 10.0), Turn(-90.0, 9.0)), seed=4, straight_m=12.0,
-                     lead_m=16.0)
-    return Drive(LENS, spec)
+def bare(shared_drive) -> list[Frame]:
+    return [dataclasses.replace(frame, image=cv2.resize(
+        frame.image, LENS.size, interpolation=cv2.INTER_AREA)) for frame in shared_drive.frames()]
 
 
-@pytest.fixture(scope='module')
-def bare(drive) -> list[Frame]:
-    return list(drive.frames())
-
-
-def dressed(drive, bare, **changes) -> tuple[list[Frame], Drive]:
+def dressed(bare, **changes) -> tuple[list[Frame], Drive]:
     """Return the same drive behind a windscreen."""
-    other = Drive(drive.lens, dataclasses.replace(drive.spec, **changes))
+    other = Drive(LENS, DriveSpec(**changes))
     frames = []
     for frame in bare:
         image = frame.image.astype(np.float32)
@@ -48,8 +43,8 @@ def dressed(drive, bare, **changes) -> tuple[list[Frame], Drive]:
     return frames, other
 
 
-def test_bonnet_pillar_and_text_are_found(drive, bare):
-    frames, other = dressed(drive, bare, bonnet=True, pillar=True, timestamp=True)
+def test_bonnet_pillar_and_text_are_found(bare):
+    frames, other = dressed(bare, bonnet=True, pillar=True, timestamp=True)
     hidden = ~observe(frames)
     truth = other.overlay.mask
     assert (hidden & truth).sum() > 0.9 * truth.sum()
@@ -65,8 +60,8 @@ def test_no_vehicle_no_mask(bare):
     assert valid is None or valid.mean() > 0.99
 
 
-def test_users_mask_adds_to_it(drive, bare):
-    frames, _ = dressed(drive, bare, bonnet=True)
+def test_users_mask_adds_to_it(bare):
+    frames, _ = dressed(bare, bonnet=True)
     user = np.ones((270, 480), bool)
     user[100:150, 200:300] = False
     both = observe(frames, user)
@@ -77,7 +72,7 @@ def test_users_mask_adds_to_it(drive, bare):
     assert observe(frames[:20], enabled=False) is None
 
 
-def test_standing_and_straight_tell_nothing_above_the_horizon(drive, bare):
+def test_standing_and_straight_tell_nothing_above_the_horizon(bare):
     assert observe([dataclasses.replace(bare[0], index=i, stamp_ns=i * 10**8)
                     for i in range(60)]) is None
     street = Drive(LENS, DriveSpec(turns=0, duration_s=6.0, seed=4, timestamp=True))

@@ -13,10 +13,8 @@ from solving import CONFIG, scenes_of, solved
 from synthetic import LENS, SIZE
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.input import Frame
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
 from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import judge
@@ -98,9 +96,8 @@ def test_the_files_tell_what_lines_say():
 
 
 @pytest.fixture(scope='module')
-def frames():
-    drive = Drive(Lens.of(640, 360, 70.0, -0.2), DriveSpec(turns=1, rate=5.0, seed=2))
-    return list(drive.frames(0, 12))
+def frames(shared_drive):
+    return list(shared_drive.frames(0, 12))
 
 
 def detection_of(frames):
@@ -113,11 +110,11 @@ def detection_of(frames):
 def test_a_drive_gathers_lines_twice_a_second(frames):
     lines = detection_of(frames).lines()
     assert len(lines) > 20
-    assert set(np.round((lines.stamps_s - frames[0].stamp_ns / 1e9) % 0.6, 3)) <= {0.0, 0.6}
+    assert set(np.round((lines.stamps_s - frames[0].stamp_ns / 1e9) % 0.5, 3)) <= {0.0, 0.5}
 
 
 def test_a_standing_car_gathers_none(frames):
-    still = [Frame(n, n * 200_000_000, frames[0].image) for n in range(12)]
+    still = [replace(frame, image=frames[0].image) for frame in frames]
     # whether a car stands is known from the second picture on
     assert len(set(detection_of(still).lines().stamps_s)) <= 1
 

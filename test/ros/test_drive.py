@@ -18,24 +18,22 @@ from ros_bench import (
 )
 from sensor_msgs.msg import Imu
 from sensor_msgs.srv import SetCameraInfo
+from shared_drive import ONE_TURN, OTHER_TURN
 from synthetic import LENS as SYNTHETIC_LENS
 from synthetic import synthetic_turn
 
-from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 
-LENS = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
 # few points: what is tested is the node, the core has tests of its own
 QUICK = {'turns__wanted': 2, 'scene__tracks': 200, 'scene__profile_tracks': 100,
          'tracks__points': 300, 'queue_size': 300}
 
 
 @pytest.fixture(scope='module')
-def rendered():
+def rendered(shared_drive):
     """Return a drive with two turns, and all its frames."""
-    drive = Drive(LENS, DriveSpec(seed=0, turns=2))
-    return drive, list(drive.frames())
+    return shared_drive, list(shared_drive.frames())
 
 
 def test_it_ends_cleanly_while_children_work(start_node, make_bench, rendered):
@@ -213,7 +211,7 @@ def test_diagnostics_tell_an_operator_everything(driven):
     assert int(values['received']) >= len(driven.drive)
     assert values['dropped'] == '0'
     assert float(values['sigma fx (px)']) > 0
-    assert values['published'].startswith('fx 4')
+    assert values['published'].startswith('fx 38')
 
 
 def test_reset_takes_everything_back(driven):
@@ -239,7 +237,6 @@ def test_turns_outlive_the_node_and_add_up(start_node, make_bench, rendered, tmp
     drive, frames = rendered
     folder, camera = tmp_path / 'turns', make_bench()
     options = {**QUICK, 'turns__store': folder}
-    middle = sum(drive.turn_centers) // 2
 
     def send(part):
         for frame in part:
@@ -248,7 +245,7 @@ def test_turns_outlive_the_node_and_add_up(start_node, make_bench, rendered, tmp
 
     node = start_node(**options)
     camera.connect(node)
-    send(frames[:middle])
+    send(frames[:ONE_TURN])
     camera.until(lambda: list(folder.glob('*.npz')), 90.0, 'a stored turn', node)
     assert node.stop() == 0
 
@@ -263,11 +260,11 @@ def test_turns_outlive_the_node_and_add_up(start_node, make_bench, rendered, tmp
 
     node = start_node(**options)
     camera.connect(node)
-    send(frames[middle:middle + 1])
+    send(frames[OTHER_TURN:OTHER_TURN + 1])
     camera.until(lambda: camera.count('turns stored') == 1, node=node)
     # it gives nothing before a turn of this drive agrees with it
     assert camera.count('turns found') == 1 and camera.count('turns built') == 0
-    send(frames[middle + 1:])
+    send(frames[OTHER_TURN + 1:])
     camera.until(lambda: camera.values['state'] == 'calibrated', 120.0, 'a calibration', node)
     assert abs(camera.latched[-1].k[0] / drive.truth['fx'] - 1) < 0.02
     # its turns are used up: the next opinion is one of its own

@@ -152,6 +152,16 @@ def test_what_no_lens_has_is_set_aside(store, keys, value, sealed):
     assert mine.load() is None
 
 
+@pytest.mark.parametrize(('text', 'words'), [
+    ('{{{ no yaml', 'camera.yaml is ignored: .* write it anew'), ('', 'is no camera calibration')])
+def test_a_file_that_is_none_is_ignored_and_stays(store, text, words):
+    mine = store()
+    mine.path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        mine.load()
+    assert mine.path.read_text() == text
+
+
 @pytest.mark.parametrize(('keys', 'value'), [
     (('camera_matrix', 'data', 0), 740.0), (('distortion_coefficients', 'data', 0), -0.3),
     (('dashcalib', 'sigma', 'fx'), 1e-9), (('image_height',), 376),

@@ -211,6 +211,7 @@ def test_arrays_travel_beside_the_pickle_and_can_be_written_to(child):
 
 @pytest.fixture
 def impatient(monkeypatch) -> None:
+    monkeypatch.setattr(child_module, 'LOOK_S', 0.5)
     monkeypatch.setattr(child_module, 'LOOKS_TO_REPORT', 2)
     monkeypatch.setattr(child_module, 'LOOKS_TO_KILL', 4)
 
@@ -222,9 +223,9 @@ def test_a_child_that_is_stopped_is_told_of_and_ended(impatient, size):
     try:
         pid = child.call(child_tasks.pid)
         os.kill(pid, signal.SIGSTOP)
-        with pytest.raises(WorkerDiedError, match=f'process {pid} used no processor time for 4 s'):
+        with pytest.raises(WorkerDiedError, match=f'process {pid} used no processor time for 2 s'):
             child.call(child_tasks.echo, np.zeros(size))
-        assert len(told) == 1 and f'process {pid} used no processor time for 2 s' in told[0]
+        assert len(told) == 1 and f'process {pid} used no processor time for 1 s' in told[0]
         assert not is_running(pid)
         assert child.call(child_tasks.add, 1, 2) == 3
     finally:
@@ -236,7 +237,7 @@ def test_a_child_that_works_long_is_left_alone(impatient):
     child = ChildWorker(on_trouble=told.append)
     try:
         # longer than a hung one would live
-        assert child.call(child_tasks.compute, 7.0) == 'computed'
+        assert child.call(child_tasks.compute, 3.0) == 'computed'
         assert told == []
     finally:
         child.close()
@@ -262,12 +263,12 @@ import os, signal, sys, threading, time
 sys.path[:0] = [{test!r}, {root!r}]
 import child_tasks
 from dashcalib_ros.workers import child as child_module
-child_module.LOOKS_TO_REPORT, child_module.LOOKS_TO_KILL = 2, 4
+child_module.LOOK_S, child_module.LOOKS_TO_REPORT, child_module.LOOKS_TO_KILL = 0.5, 2, 4
 told = []
 child = child_module.ChildWorker(on_trouble=told.append)
 child.call(child_tasks.pid)
 print(child.pid, flush=True)
-print(child.call(child_tasks.compute, 3.0), told, flush=True)
+print(child.call(child_tasks.compute, 1.0), told, flush=True)
 """
 
 
@@ -279,7 +280,7 @@ def test_a_parent_that_was_stopped_itself_blames_nobody(tmp_path):
     try:
         assert int(parent.stdout.readline())
         os.killpg(parent.pid, signal.SIGSTOP)
-        time.sleep(6.0)
+        time.sleep(3.0)
         os.killpg(parent.pid, signal.SIGCONT)
         assert parent.stdout.readline() == 'computed []\n'
         assert parent.wait(LIMIT_S) == 0
