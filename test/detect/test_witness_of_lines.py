@@ -88,7 +88,7 @@ def test_the_files_tell_what_lines_say():
         'lines': 500, 'groups': 12, 'bend_px': 0.4, 'k1': -0.03, 'sigma': 0.002,
         'camera_sigma': 0.001, 'picture_px': 8.0}
     assert result_dict(make_calibration())['straight_lines'] is None
-    text = '500 upright lines, bent by 0.40 px: k1 off by -0.0300 ± 0.0020'
+    text = '500 upright ones, bent by 0.40 px: k1 off by -0.0300 ± 0.0020'
     assert text in report_html(calibration)
     console = Console(width=400, record=True, file=io.StringIO())
     console.print(summary(calibration))
