@@ -58,6 +58,10 @@ class SceneSelection:
         self._closed = False
         # live: what each worker does before the first turn
         self._loading: list[Call] = []
+        if live:
+            # nothing else runs during an import: while images come, some would be lost
+            _load_judging()
+            from scipy import optimize  # noqa: F401
         # the turns whose scenes were written to turns.store
         self._stored_turns: Set[TurnId] = frozenset()
         # where the ego vehicle is not, by turn
@@ -119,7 +123,7 @@ class SceneSelection:
             if not (replace_failed and key in built and built[key] is None):
                 places -= 1
         if ready and self._live and not self._loading:
-            self._loading = [self._pool.begin(_load) for _ in range(self.config.threads)]
+            self._loading = [self._pool.begin(_load_all) for _ in range(self.config.threads)]
         waiting = 0 if self._live or not more_to_come else WAITING
         for turn in ready[:max(len(ready) - waiting, 0)]:
             self._pool.submit(turn, self._valid[turn.id])
@@ -241,7 +245,7 @@ class SceneSelection:
         using = pool.begin(use, scenes, self.config, tells=True)
         if not self._live:
             # this process has nothing else to do
-            _load()
+            _load_judging()
         kept, repeated = pool.result(looking)
         # of one that is repeated in part, the rest is kept
         if repeated or any(len(one.tracks.frames) < len(other.tracks.frames)
@@ -320,12 +324,17 @@ class SceneSelection:
         self._on_trouble(text)
 
 
-def _load() -> None:
-    """Import what the last stages need: the result need not wait for it then."""
+def _load_judging() -> None:
+    """Import what judges a result: it takes half a second."""
     from scipy import special  # noqa: F401
     from scipy.spatial import transform  # noqa: F401
 
-    import dashcalib_ros.judge.conclude
+    import dashcalib_ros.judge.conclude  # noqa: F401
+
+
+def _load_all() -> None:
+    """Import what a child needs until the result, COLMAP too."""
+    _load_judging()
     import dashcalib_ros.reconstruct.build
     import dashcalib_ros.solve.joint  # noqa: F401
 

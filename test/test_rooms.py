@@ -207,6 +207,14 @@ def test_colmap_is_loaded_where_it_is_used():
     assert loaded_by(code, 'pycolmap', 'pyceres') == {'pycolmap', 'pyceres'}
 
 
+def test_a_live_calibrator_loads_nothing_large_while_images_come():
+    # an import in the node's process keeps it from receiving: images were lost that way
+    code = 'from dashcalib_ros.calibrator import Calibrator\nCalibrator(live=True).close()'
+    wanted = {'scipy.special', 'scipy.spatial.transform', 'scipy.optimize',
+              'dashcalib_ros.judge.conclude'}
+    assert loaded_by(code, *wanted, 'pycolmap', 'pyceres') == wanted
+
+
 def test_the_package_alone_loads_no_opencv():
     assert loaded_by('import dashcalib_ros', 'cv2', 'scipy', 'numpy') == set()
 
