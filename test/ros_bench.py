@@ -27,11 +27,14 @@ SECOND = 10**9
 # ns; stamp of the first image
 START = 1_767_614_400 * SECOND
 COMMAND = [sys.executable, '-m', 'dashcalib_ros.ros']
-# the same with diagnostics ten times a second, which tests wait for again and again
+# the same with diagnostics ten times a second, which tests wait for again and again, and without
+# loading at the start what few of them need
 QUICK_COMMAND = [sys.executable, '-c', """
 import sys
+from dashcalib_ros import selection
 from dashcalib_ros.ros import node, main
 node.PERIOD_S = 0.1
+selection._load_judging = lambda: None
 sys.exit(main())
 """]
 
