@@ -229,14 +229,14 @@ def commands(results):
     for index in range(4):
         cv2.imwrite(str(results / 'drive' / f'{index}.png'), np.full((48, 64), 60, np.uint8))
     drive = (results / 'drive', '--fps', 10)
-    return {'help': ['--help'],
+    return {'help': ['--help'], 'version': ['--version'],
             'compare': ['compare', results / 'a', results / 'truth.json'],
             'turns': ['turns', *drive], 'run': ['run', *drive, '--out', results / 'out'],
             'error': ['compare', results / 'a', results / 'missing']}
 
 
 @pytest.mark.parametrize(('redirection', 'words'), [('>&-', CLOSED), ('>/dev/full', FULL)])
-@pytest.mark.parametrize('name', ['help', 'compare', 'turns'])
+@pytest.mark.parametrize('name', ['help', 'version', 'compare', 'turns'])
 def test_a_result_that_cannot_be_shown_is_one_line(commands, name, redirection, words):
     done = redirected(redirection, *commands[name])
     assert (done.returncode, done.stderr) == (2, f'dashcalib: error: {words}\n')
@@ -252,7 +252,7 @@ def test_a_run_whose_files_are_written_ends_with_its_verdict(commands, results, 
 
 @pytest.mark.parametrize('redirection', ['2>&-', '2>/dev/full'])
 @pytest.mark.parametrize(('name', 'code'), [
-    ('help', 0), ('turns', 0), ('run', 3), ('error', 2)])
+    ('help', 0), ('version', 0), ('compare', 0), ('turns', 0), ('run', 3), ('error', 2)])
 def test_without_stderr_the_outcome_is_the_same(here, commands, name, code, redirection):
     done = redirected(redirection, *commands[name])
     assert (done.returncode, done.stderr) == (code, '')
@@ -261,7 +261,7 @@ def test_without_stderr_the_outcome_is_the_same(here, commands, name, code, redi
 
 
 @pytest.mark.parametrize(('name', 'code'), [
-    ('help', 2), ('turns', 2), ('run', 3), ('error', 2)])
+    ('help', 2), ('version', 2), ('compare', 2), ('turns', 2), ('run', 3), ('error', 2)])
 @pytest.mark.parametrize('redirection', ['>&- 2>&-', '<&- >&- 2>&-'])
 def test_without_any_stream_the_exit_code_tells(commands, name, code, redirection):
     assert redirected(redirection, *commands[name]).returncode == code

@@ -171,7 +171,7 @@ def seen_by_spline(text, rays):
 PART = (640, 375)
 
 
-@pytest.fixture(scope='module', params=('brown', 'fisheye'))
+@pytest.fixture(scope='module', params=('radial', 'brown', 'fisheye'))
 def bent(request):
     """Return a lens, the mrcal file of it with a field of 1 px, all pixels and these' rays."""
     lens = cropped(EACH_MODEL[request.param], 0, 0, *PART)

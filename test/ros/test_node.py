@@ -40,8 +40,8 @@ from dashcalib_ros.report import load_camera
 # -- the end ----------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('signals', [
-    (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGINT)],
-    ids=['SIGTERM', 'two SIGINT', 'both'])
+    (signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT),
+    (signal.SIGTERM, signal.SIGINT)], ids=['SIGINT', 'SIGTERM', 'two SIGINT', 'both'])
 def test_it_ends_cleanly_while_it_collects(start_node, make_bench, signals):
     node, camera = start_node(command=COMMAND), make_bench()
     camera.connect(node)

@@ -29,8 +29,9 @@ def wide_scenes(count: int, tracks: int = 220):
             for world, yaw in enumerate((80.0, -70.0, 85.0, -90.0)[:count])]
 
 
-def test_a_decentred_lens_is_found():
-    found = solved(scenes_of(3, extra=(0.003, -0.003, 0.0)))
+@pytest.mark.parametrize('count', [3, 5])
+def test_a_decentred_lens_is_found(count):
+    found = solved(scenes_of(count, extra=(0.003, -0.003, 0.0)))
     assert type(found.camera) is Brown
     assert mapping_error(found.camera, DECENTRED) < 1.0
     assert mapping_error(found.camera, DECENTRED) < 2.5 * found.picture.rms
