@@ -14,7 +14,7 @@ from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.reconstruct.scene_file import Origin, StoredTurn
 from dashcalib_ros.turn_store import TurnStore
 from dashcalib_ros.workers.child import ChildWorker
-from dashcalib_ros.workers.pool import Call, ScenePool
+from dashcalib_ros.workers.pool import ScenePool
 from dashcalib_ros.workers.worker import InlineWorker, Worker
 
 Progress = Callable[[str, float], None]
@@ -56,12 +56,11 @@ class SceneSelection:
         self._warn = warn
         self._on_trouble = on_trouble
         self._closed = False
-        # live: what each worker does before the first turn
-        self._loading: list[Call] = []
+        # live: whether the workers were told to load what they need
+        self._loading = False
         if live:
             # nothing else runs during an import: while images come, some would be lost
             _load_judging()
-            from scipy import optimize  # noqa: F401
         # the turns whose scenes were written to turns.store
         self._stored_turns: Set[TurnId] = frozenset()
         # where the ego vehicle is not, by turn
@@ -123,7 +122,9 @@ class SceneSelection:
             if not (replace_failed and key in built and built[key] is None):
                 places -= 1
         if ready and self._live and not self._loading:
-            self._loading = [self._pool.begin(_load_all) for _ in range(self.config.threads)]
+            self._loading = True
+            for _ in range(self.config.threads):
+                self._pool.begin(_load_all)
         waiting = 0 if self._live or not more_to_come else WAITING
         for turn in ready[:max(len(ready) - waiting, 0)]:
             self._pool.submit(turn, self._valid[turn.id])
@@ -326,7 +327,7 @@ class SceneSelection:
 
 def _load_judging() -> None:
     """Import what judges a result: it takes half a second."""
-    from scipy import special  # noqa: F401
+    from scipy import optimize, special  # noqa: F401
     from scipy.spatial import transform  # noqa: F401
 
     import dashcalib_ros.judge.conclude  # noqa: F401

@@ -18,6 +18,9 @@ from dashcalib_ros.reconstruct.scene import Scene, projected_px
 
 # no lens has a coefficient beyond this: the scene has diverged
 MAX_DISTORTION = 1.0
+# relative change of the cost that ends an adjustment which another one follows, or whose cost is
+# only compared
+ROUGH = 1e-3
 # cosine (88 degrees): COLMAP's fisheye models project nothing from beside or behind the camera
 IN_FRONT = 0.035
 

@@ -16,7 +16,7 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.detect.turn import Turn, TurnId
-from dashcalib_ros.reconstruct.adjust import Free, Solver, adjust
+from dashcalib_ros.reconstruct.adjust import ROUGH, Free, Solver, adjust
 from dashcalib_ros.reconstruct.chain import chain
 from dashcalib_ros.reconstruct.register import register_tracks
 from dashcalib_ros.reconstruct.scene import (
@@ -33,8 +33,6 @@ from dashcalib_ros.reconstruct.tracks import Tracks, thinned, track_turn
 WIDE = 0.5
 # how often a chain that does not reach all images is built anew, at the most
 COMPLETIONS = 2
-# relative change of the cost that ends an adjustment, where another follows
-ROUGH = 1e-3
 # columns and rows in which tracks are to be seen in each keyframe
 GRID = (6, 3)
 # a turn with fewer tracks is not tried

@@ -204,14 +204,10 @@ class Scene:
         It is the sum of the steps since the first one, each in the camera's own frame: a car turns
         about one axis of it, the vertical, which is (0, 1, 0) where the pictures are upright.
         """
+        from scipy.spatial.transform import Rotation
         rotations = self.structure.rotations[self.structure.registered]
-        steps = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)
-        # of a step by an angle, the difference to its inverse is 2 sin of it times the axis
-        across = np.stack([steps[:, 2, 1] - steps[:, 1, 2], steps[:, 0, 2] - steps[:, 2, 0],
-                           steps[:, 1, 0] - steps[:, 0, 1]], axis=1) / 2
-        sine, cosine = np.linalg.norm(across, axis=1), (np.trace(steps, axis1=1, axis2=2) - 1) / 2
-        vectors = across * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-12))[:, None]
-        return np.concatenate([np.zeros((1, 3)), np.cumsum(vectors, axis=0)])
+        steps = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps.as_rotvec(), axis=0)])
 
     @property
     def explained(self) -> float:

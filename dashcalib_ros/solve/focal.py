@@ -8,14 +8,12 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
-from dashcalib_ros.reconstruct.adjust import Solver, adjust
+from dashcalib_ros.reconstruct.adjust import ROUGH, Solver, adjust
 from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
 from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
 
 # factors of the resulting focal length at which the profile is evaluated
 PROBES = (0.8, 1.0, 1.25)
-# relative change of the cost that ends an adjustment: costs are compared to 5 %
-ROUGH = 1e-3
 
 
 def summed(profiles: Sequence[Profile]) -> Profile:

@@ -259,8 +259,8 @@ class Knowledge:
 
     def _largest_estimate(self) -> Floats:
         root, count = np.linalg.cholesky(self.total.covariance), len(self.own)
-        # what turns share beside the camera moves nothing in the picture of one that stands. The
-        # picture has as many directions as the camera has parameters: a triangle has them, too
+        # a readout or a field, if there is one, moves nothing in the picture of a camera that
+        # stands. QR's triangle has the same directions as the many rows of pixels, and is small
         triangle = np.linalg.qr(sensitivity(self.camera)[0].reshape(-1, count), mode='r')
         _, _, modes = np.linalg.svd(triangle @ root[:count])
         basis = root @ modes.T

@@ -43,15 +43,15 @@ def return_free_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-# pages of copies that were freed: a drive needs new ones as fast as it frees them, and those of
-# the system cost ten times the copying
+# pages of copies that were freed. New ones from the system take ten times as long as the copying,
+# and a drive needs some as fast as it frees others
 _spare: deque[mmap.mmap] = deque(maxlen=4)
 
 
 def mapped_copy(image: GreyImage) -> GreyImage:
-    """Return a copy in pages of its own; when it is freed, the next copy has them, or the system.
+    """Return a copy in pages of its own.
 
-    A view of it keeps them.
+    Once the copy and its views are freed, the next copy uses its pages, or the system gets them.
     """
     try:
         pages = _spare.pop()
