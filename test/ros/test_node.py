@@ -111,11 +111,13 @@ def test_a_kept_fisheye_is_published_with_the_view_that_is_wanted_now(start_node
 
 
 @pytest.mark.parametrize(('text', 'words'), [
+    ('{{{ no yaml', 'dashcam.yaml is ignored'),
+    ('', 'is no camera calibration'),
     (CAMERA_FILE.format(width=320), 'no accepted calibration of this node'),
     (CAMERA_FILE.format(width=640) + OURS, 'it is for 640x240'),
     ((CAMERA_FILE.format(width=320) + OURS).replace('frame_id: camera', 'frame_id: rear'),
      "in frame 'rear'"),
-], ids=['foreign', 'other size', 'other frame'])
+], ids=['corrupt', 'empty', 'foreign', 'other size', 'other frame'])
 def test_a_file_that_does_not_fit_is_ignored_with_a_warning(start_node, make_bench, tmp_path,
                                                             text, words):
     path = keep_file(tmp_path, text)
