@@ -77,7 +77,7 @@ STEPS, WEIGHED = 8, (1, 4)
 # sigmas; where a witness is farther off, it contradicts
 CONTRADICTED = 3.0
 # the same for one turn, which a gyro alone confirms: farther off, it confirms nothing. Of gyros
-# that are 3 % wrong and called calibrated, 2 sigmas let one in six pass, and these none of 80
+# that are 3 % wrong and called calibrated, 2 sigmas let 12 of 80 pass, and these none
 DOUBTED = 1.25
 
 # degrees by which the car may turn on what counts as a straight
