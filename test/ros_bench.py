@@ -27,12 +27,14 @@ SECOND = 10**9
 # ns; stamp of the first image
 START = 1_767_614_400 * SECOND
 COMMAND = [sys.executable, '-m', 'dashcalib_ros.ros']
-# the same with diagnostics ten times a second, which tests wait for again and again, and without
-# loading at the start what few of them need
+# the same with diagnostics ten times a second, which tests wait for again and again, with a queue
+# that a machine busy with other tests does not overrun, and without loading at the start what few
+# of them need
 QUICK_COMMAND = [sys.executable, '-c', """
 import sys
 from dashcalib_ros import selection
-from dashcalib_ros.ros import node, main
+from dashcalib_ros.ros import images, node, main
+images.DEPTH = 50
 node.PERIOD_S = 0.1
 selection._load_judging = lambda: None
 sys.exit(main())
