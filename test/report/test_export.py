@@ -173,10 +173,11 @@ PART = (640, 375)
 
 @pytest.fixture(scope='module', params=('radial', 'brown', 'fisheye'))
 def bent(request):
-    """Return a lens, the mrcal file of it with a field of 1 px, all pixels and these' rays."""
+    """Return a lens, the mrcal file of it with a field of 1 px, pixels to the rim, their rays."""
     lens = cropped(EACH_MODEL[request.param], 0, 0, *PART)
     field = a_field(PART, 1.0)
-    pixels = np.stack(np.meshgrid(*map(np.arange, PART)), -1).reshape(-1, 2).astype(float)
+    places = (np.append(np.arange(0.0, size - 1, 3), size - 1) for size in PART)
+    pixels = np.stack(np.meshgrid(*places), -1).reshape(-1, 2)
     return lens, exported(lens, 'mrcal', field), pixels, lens.rays(field.ideal(pixels))
 
 

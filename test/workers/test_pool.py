@@ -223,7 +223,7 @@ def test_a_turn_is_built_in_two_halves(monkeypatch, tmp_path, live, done):
     pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=9 if live else None)
     try:
         pool.submit(turn(5, hold), None)
-        wait_for((tmp_path / 'hold.5').exists)
+        wait_for(lambda: (tmp_path / 'hold.5').exists() and (tmp_path / 'hold.5').read_text())
         use(monkeypatch, child_tasks.draft)
         for center, images in ((10, 3), (20, 9), (30, 5)):
             pool.submit(filmed(center, images, log), None)
