@@ -75,9 +75,8 @@ class SceneSelection:
         self._stored_before: tuple[StoredTurn, ...] = ()
 
         def child() -> Worker:
-            # when the number of turns is odd, the last one can use all cores
-            threads = 1 if live else config.threads
-            return ChildWorker(live, verbose, threads, on_trouble)
+            # the last turn, and a drive's only one, can use all cores
+            return ChildWorker(live, verbose, config.threads, on_trouble)
 
         self._pool = ScenePool(config, InlineWorker if inline else child,
                                queue=turns.wanted if live else None, on_lost=self._lost,
