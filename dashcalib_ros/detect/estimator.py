@@ -107,7 +107,7 @@ class MotionEstimator:
         self._period_ns = 1e9 / config.rate
         # a small window, as this runs on every image; one pixel of the coarsest level is 8 px of
         # the picture, enough for the motion in a sharp turn
-        self._tracking = Tracking(window=9, levels=3, steps=12, step_px=0.02, border=5)
+        self._tracking = Tracking(window=(9, 9), levels=3, steps=12, step_px=0.02, border=5)
         self._shape: tuple[int, int] | None = None
         self._straights = StraightCollector()
         self._reset()

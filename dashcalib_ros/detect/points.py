@@ -17,12 +17,13 @@ FORWARD_BACKWARD_PX = 0.5
 class Tracking:
     """Options of the tracking; the defaults are those of a reconstruction.
 
-    window: px, side of the Lucas-Kanade window. levels: of the pyramid, above the full picture.
+    window: px, (width, height) of the Lucas-Kanade window. OpenCV takes eight columns at once, and
+    what is left one by one. levels: of the pyramid, above the full picture.
     steps, step_px: the iteration ends after this many steps, or with a step this short.
     border: px; points nearer to it are dropped: where the window leaves the picture, they drift.
     """
 
-    window: int = 21
+    window: tuple[int, int] = (24, 18)
     levels: int = 4
     steps: int = 10
     step_px: float = 0.03
@@ -74,7 +75,7 @@ def follow_points(before: GreyImage, after: GreyImage, points: Floats32, trackin
     # cv2's stubs have wrong types for this function
     flow: Any = cv2.calcOpticalFlowPyrLK
     ends = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, tracking.steps, tracking.step_px
-    settings = {'winSize': (tracking.window, tracking.window), 'criteria': ends}
+    settings = {'winSize': tracking.window, 'criteria': ends}
     moved, ahead, _ = flow(before, after, points, None, maxLevel=tracking.levels, **settings)
     x, y, border = moved[:, 0], moved[:, 1], tracking.border
     trusted = np.asarray(

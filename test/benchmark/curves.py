@@ -56,8 +56,8 @@ def over_turns(frames: Iterable[Frame], counts: Sequence[int], seed: int,
     """Solve with so many turns each, best first; a turn's scene is built for the first only."""
     config = Config(seed=seed).replace({'turns.wanted': 1, 'turns.at_most': 1})
     detection = detect(frames, config)
-    scenes, _ = reconstructed(detection, detection.turns(), config)
-    return {count: summarised(solved(detection, scenes[:count], config)[0], truth)
+    scenes = reconstructed(detection, detection.turns(), config)
+    return {count: summarised(solved(detection, scenes[:count], config), truth)
             for count in sorted(counts)}
 
 

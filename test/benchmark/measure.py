@@ -31,6 +31,7 @@ from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.solve import solve
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ScenePool
+from dashcalib_ros.workers.worker import Progress
 
 KEYS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')
 # of all models; k1 and k2 of a fisheye are not those of the others
@@ -119,6 +120,49 @@ def memory_mb(pid: int) -> float:
     return total / 1024
 
 
+def processor_s(pid: int | None = None) -> float:
+    """Return the processor time of a process and its children, also of those that ended, s.
+
+    pid: of the process, this one by default.
+    """
+    pid, ticks = pid or os.getpid(), 0
+    for member in (pid, *_descendants(pid)):
+        with contextlib.suppress(OSError):
+            fields = Path(f'/proc/{member}/stat').read_text().rpartition(')')[2].split()
+            ticks += sum(map(int, fields[11:15]))
+    return ticks / os.sysconf('SC_CLK_TCK')
+
+
+def unit_s() -> float:
+    """Return the processor time of a fixed piece of work, s: COLMAP's SIFT of 40 pictures.
+
+    One machine is half as fast again from one hour to the next; in units, figures compare. It is
+    run in a process of its own, with one thread.
+    """
+    outcome = isolated(_sift)
+    if outcome.failure:
+        raise RuntimeError(outcome.failure)
+    return float(outcome.value)
+
+
+def _sift() -> float:
+    import zlib  # noqa: F401  before pycolmap
+
+    import cv2
+    import numpy as np
+    import pycolmap
+    pycolmap.logging.minloglevel = 2
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    sift, rng = pycolmap.Sift(options, pycolmap.Device.cpu), np.random.default_rng(0)
+    pictures = [cv2.GaussianBlur(rng.integers(0, 256, (240, 320), np.uint8), (0, 0), 3.0)
+                for _ in range(40)]
+    before = time.process_time()
+    for picture in pictures:
+        sift.extract(picture)
+    return time.process_time() - before
+
+
 def _descendants(pid: int) -> list[int]:
     children: dict[int, list[int]] = {}
     for stat in Path('/proc').glob('[0-9]*/stat'):
@@ -134,13 +178,14 @@ def _descendants(pid: int) -> list[int]:
 class Stopwatch:
     """Seconds by the stage that is under way; the first one has begun."""
 
-    def __init__(self, stage: str) -> None:
+    def __init__(self, stage: str, clock: Callable[[], float] = time.perf_counter) -> None:
         self.seconds: dict[str, float] = {}
-        self._stage, self._since = stage, time.perf_counter()
+        self._clock = clock
+        self._stage, self._since = stage, clock()
 
     def enter(self, stage: str, share: float = 0.0) -> None:
         """Begin another stage; takes what a calibration's progress is told."""
-        now = time.perf_counter()
+        now = self._clock()
         self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
         self._stage, self._since = stage, now
 
@@ -164,10 +209,8 @@ def calibrate(frames: Iterable[Frame], config: Config) -> tuple[Calibration, dic
     return result, {name: round(value, 2) for name, value in seconds.items()}
 
 
-def reconstructed(detection: Detection, turns: Sequence[Turn], config: Config
-                  ) -> tuple[list[Scene], float]:
-    """Return the scenes of these turns, and the seconds they took: processes start cold."""
-    started = time.perf_counter()
+def reconstructed(detection: Detection, turns: Sequence[Turn], config: Config) -> list[Scene]:
+    """Return the scenes of these turns, the best first; processes start cold."""
     pool = ScenePool(config, lambda: ChildWorker(threads=config.threads))
     try:
         for turn in turns:
@@ -176,23 +219,20 @@ def reconstructed(detection: Detection, turns: Sequence[Turn], config: Config
         built = pool.scenes()
     finally:
         pool.close()
-    # the best first, as they were given
-    found = [scene for turn in turns if (scene := built[turn.id]) is not None]
-    return found, time.perf_counter() - started
+    return [scene for turn in turns if (scene := built[turn.id]) is not None]
 
 
-def solved(detection: Detection, scenes: Sequence[Scene], config: Config
-           ) -> tuple[Calibration, dict[str, float]]:
-    """Return what these scenes say together, and the seconds of each stage."""
-    watch = Stopwatch('start')
+def solved(detection: Detection, scenes: Sequence[Scene], config: Config,
+           tell: Progress = lambda stage, share: None) -> Calibration:
+    """Return what these scenes say together; tell: is called as each stage begins."""
     worker = ChildWorker()
     try:
-        solution = worker.call(solve, scenes, config, progress=watch.enter)
+        solution = worker.call(solve, scenes, config, progress=tell)
+        tell('judging', 0.0)
+        return conclude(solution, evidence_of_detection(detection, scenes), config)
     finally:
+        # its processor time counts for the stages as long as it lives
         worker.close()
-    watch.enter('end')
-    evidence = evidence_of_detection(detection, scenes)
-    return conclude(solution, evidence, config), watch.seconds
 
 
 def errors(estimate: Mapping[str, Any], truth: Mapping[str, Any],

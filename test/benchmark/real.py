@@ -76,7 +76,7 @@ def measured(drive: Recorded, data: Path, seed: int) -> dict[str, Any]:
                               config)
     px = detection.scale.px
     turns = detection.turns()[:config.turns.wanted]
-    scenes, _ = reconstructed(detection, turns, config)
+    scenes = reconstructed(detection, turns, config)
     whole = solve(scenes, config)
     calibration = conclude(whole, evidence_of_detection(detection, scenes), config)
     row: dict[str, Any] = {'verdict': calibration.verdict.level, 'turns': len(scenes),

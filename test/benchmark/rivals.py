@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import tempfile
 import time
 import zlib  # noqa: F401  before pycolmap
@@ -40,6 +39,7 @@ from measure import (
     isolated,
     load,
     parser_with,
+    processor_s,
     reconstructed,
     save,
     solved,
@@ -166,19 +166,13 @@ def _window(frames: tuple[Frame, ...]) -> Turn:
 
 
 def _ours(task: Task, detection: Detection, turns: Sequence[Turn]) -> dict[str, Any]:
-    before = _cpu_s()
-    scenes, scenes_s = reconstructed(detection, turns, task.config)
-    result, solving_s = solved(detection, scenes, task.config)
-    return {'seconds': scenes_s + sum(solving_s.values()), 'cpu_s': _cpu_s() - before,
+    before, began = processor_s(), time.monotonic()
+    scenes = reconstructed(detection, turns, task.config)
+    result = solved(detection, scenes, task.config)
+    return {'seconds': time.monotonic() - began, 'cpu_s': processor_s() - before,
             'images': sum(len(scene.tracks.frames) for scene in scenes),
             'registered': sum(int(scene.structure.registered.sum()) for scene in scenes),
             **summarised(result, task.truth)}
-
-
-def _cpu_s() -> float:
-    """Return the processor time of this process and of its children that ended, s."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(each.ru_utime + each.ru_stime for each in used)
 
 
 def _colmap(task: Task, windows: Sequence[Turn], globally: bool = False) -> dict[str, Any]:
@@ -195,7 +189,7 @@ def _colmap(task: Task, windows: Sequence[Turn], globally: bool = False) -> dict
         for frame in task.frames:
             if frame.index in names:
                 cv2.imwrite(str(root / 'images' / f'{frame.index:06}.png'), frame.image)
-        marks, before = [time.monotonic()], _cpu_s()
+        marks, before = [time.monotonic()], processor_s()
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = 'RADIAL'
         pycolmap.extract_features(database, root / 'images', reader_options=reader,
@@ -211,7 +205,7 @@ def _colmap(task: Task, windows: Sequence[Turn], globally: bool = False) -> dict
         mapping = pycolmap.global_mapping if globally else pycolmap.incremental_mapping
         models = mapping(database, root / 'images', root / 'sparse')
         marks.append(time.monotonic())
-    row: dict[str, Any] = {'seconds': marks[-1] - marks[0], 'cpu_s': _cpu_s() - before,
+    row: dict[str, Any] = {'seconds': marks[-1] - marks[0], 'cpu_s': processor_s() - before,
                            'images': len(names), 'models': [],
                            'stages': {'extract': marks[1] - marks[0],
                                       'match': marks[2] - marks[1], 'map': marks[3] - marks[2]}}

@@ -1,20 +1,24 @@
 #!/usr/bin/env python3
-"""Where time goes, on this machine; ratios to JPEG decoding make it comparable with others.
+"""Where time goes, on this machine; in units of a fixed piece of work it compares with others.
 
-    python test/benchmark/speed.py [detection] [calibration] [length] [turns] [hour]
-                                   [--minutes 60] [--cache DIR] [--out DIR]
+    python test/benchmark/speed.py [command] [calibration] [length] [turns] [detection] [hour]
+                                   [--data DIR] [--minutes 60] [--cache DIR] [--out DIR]
 
+command: `dashcalib run` on KITTI 03's bag, from the file to the result. calibration: five turns of
+a rendered drive, stage by stage. length, turns: the whole of dashcalib on the same drive once,
+twice and four times over, and with 2 to 8 turns wanted; a long drive is a short one there and back
+again, so that no cut is in it. All these in seconds, processor seconds, and units: the processor
+time of COLMAP's SIFT of 40 pictures, measured before and after each.
 detection: frames per second of a 30 fps camera on one core, by image size, thinning included and
 decoding apart; what tracking, epipoles and the rest take of it; JPEG decoding of the same frames.
-hour: cost per frame in the first and the last minute, and memory, of detection over an hour.
-calibration: turns, then scenes and each step of the adjustment. length, turns: the whole of
-dashcalib, time and memory, on the same drive once, twice and four times over, and with 2 to 8
-turns wanted. A long drive is a short one there and back again, so that no cut is in it. Parts
+hour: cost per frame in the first and the last minute, and memory, of detection over an hour. Parts
 take turns in a process each, not side by side. Writes DIR/speed.json and DIR/speed.md.
 """
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -36,10 +40,12 @@ from measure import (
     load,
     memory_mb,
     parser_with,
+    processor_s,
     reconstructed,
     save,
     solved,
     table,
+    unit_s,
 )
 
 from dashcalib_ros import Config
@@ -55,9 +61,10 @@ FIVE_TURNS = Setting('five turns', DEMO, replace(STREET, bonnet=True, timestamp=
 EIGHT_TURNS = Setting('eight turns', DEMO, replace(STREET, turns=8))
 RATE = 30.0
 # the estimator's methods, by what they do; one that is gone is not listed
-PARTS = {'track': '_follow', 'epipoles': '_magnitude',
+METHODS = {'track': '_follow', 'epipoles': '_magnitude',
          'new points': '_replenish', 'ego vehicle': '_look_for_ego'}
 PERIOD_S = 60.0
+PARTS = ('command', 'calibration', 'length', 'turns', 'detection', 'hour')
 
 
 def there_and_back(images: Sequence[Any], count: int, rate: float) -> Iterator[Frame]:
@@ -121,7 +128,7 @@ def _timed(work: Callable[[], Any]) -> dict[str, float]:
         return call
 
     owner = estimator.MotionEstimator
-    for name, attribute in PARTS.items():
+    for name, attribute in METHODS.items():
         if hasattr(owner, attribute):
             kept[attribute] = getattr(owner, attribute)
             setattr(owner, attribute, clocked(name, kept[attribute]))
@@ -156,23 +163,39 @@ def hour(pictures: Pictures, minutes: float) -> dict[str, Any]:
             'turns': len(detector.bank.turns())}
 
 
+def command(bag: Path) -> dict[str, Any]:
+    """Run the command on a bag."""
+    with tempfile.TemporaryDirectory() as folder:
+        began, before = time.perf_counter(), processor_s()
+        done = subprocess.run([sys.executable, '-m', 'dashcalib_ros.cli', 'run', str(bag),
+                               '--out', folder], capture_output=True, text=True, check=False)
+        return {'seconds': time.perf_counter() - began, 'cpu_s': processor_s() - before,
+                'verdict': done.stdout.partition('\n')[0].removeprefix('verdict: ')}
+
+
 def calibration(pictures: Pictures) -> dict[str, Any]:
     """Reconstruct and solve five turns, stage by stage, all processes starting cold."""
     config = Config()
-    watch = Stopwatch('pictures')
+    images = list(pictures)
+    watches = Stopwatch('detection'), Stopwatch('detection', processor_s)
+
+    def enter(stage: str, share: float = 0.0) -> None:
+        for watch in watches:
+            watch.enter(stage)
+
     detection = Detection(config)
-    for frame in pictures:
-        watch.enter('detection')
+    for frame in images:
         detection.push(frame)
-        watch.enter('pictures')
     detection.finish()
-    turns = detection.turns()[:config.turns.wanted]
-    scenes, scenes_s = reconstructed(detection, turns, config)
-    result, solving_s = solved(detection, scenes, config)
-    stages_s = {'reconstructing turns': scenes_s, **solving_s}
-    return {'detect_s': watch.seconds['detection'], 'stages_s': stages_s,
-            'total_s': sum(stages_s.values()), 'verdict': result.verdict.level,
-            'turns': sum(turn.used for turn in result.turns)}
+    enter('reconstructing turns')
+    scenes = reconstructed(detection, detection.turns()[:config.turns.wanted], config)
+    enter('starting a process')
+    result = solved(detection, scenes, config, enter)
+    enter('end')
+    return {'stages': {stage: [watch.seconds[stage] for watch in watches]
+                       for stage in watches[0].seconds},
+            'seconds': sum(watches[0].seconds.values()), 'cpu_s': sum(watches[1].seconds.values()),
+            'verdict': result.verdict.level, 'used': sum(turn.used for turn in result.turns)}
 
 
 def whole(pictures: Pictures, times: int, turns: int) -> dict[str, Any]:
@@ -182,49 +205,78 @@ def whole(pictures: Pictures, times: int, turns: int) -> dict[str, Any]:
     frames = (replace(frame, image=np.asarray(cv2.imdecode(frame.image, 0), np.uint8))
               for frame in there_and_back(images, times * len(images), 10.0))
     config = Config().replace({'turns.wanted': turns, 'turns.at_most': turns})
+    before = processor_s()
     result, seconds = calibrate(frames, config)
-    return {'times': times, 'wanted': turns, 'frames': result.frames, 'seconds': seconds,
+    return {'times': times, 'wanted': turns, 'frames': result.frames,
+            'seconds': seconds['total'], 'cpu_s': processor_s() - before,
             'used': sum(turn.used for turn in result.turns), 'verdict': result.verdict.level}
 
 
-def measure(parts: Sequence[str], minutes: float, cache: Path) -> dict[str, Any]:
-    """Return what was measured, by part."""
+def measure(part: str, minutes: float, cache: Path, data: Path | None) -> dict[str, Any]:
+    """Return what was measured, by row."""
     found: dict[str, Any] = {}
 
-    def row(function: Callable[..., Any], setting: Setting, *arguments: Any) -> dict[str, Any]:
-        pictures = pictures_of(drive_of(setting, 0), cache)
-        complain(f'{function.__name__} {setting.name} {" ".join(map(str, arguments))}')
-        outcome = isolated(function, pictures, *arguments)
+    def add(name: str, function: Callable[..., Any], *arguments: Any) -> None:
+        complain(f'{part}: {name}')
+        before = unit_s()
+        outcome = isolated(function, *arguments)
         if outcome.failure:
             complain(outcome.failure)
-        return {'failure': outcome.failure, 'peak_mb': outcome.peak_mb, **(outcome.value or {})}
+        found[name] = {'failure': outcome.failure, 'peak_mb': outcome.peak_mb,
+                       'unit_s': (before + unit_s()) / 2, **(outcome.value or {})}
 
-    if 'detection' in parts:
-        found['detection'] = {size.name: row(detection, size, 60.0) for size in SIZES}
-    if 'hour' in parts:
-        found['hour'] = row(hour, replace(SIZES[0], name='640x480'), minutes)
-    if 'calibration' in parts:
-        found['calibration'] = row(calibration, FIVE_TURNS)
-    if 'length' in parts:
-        found['length'] = [row(whole, FIVE_TURNS, times, 5) for times in (1, 2, 4)]
-    if 'turns' in parts:
-        found['turns'] = [row(whole, EIGHT_TURNS, 1, turns) for turns in (2, 5, 8)]
+    def pictures(setting: Setting) -> Pictures:
+        return pictures_of(drive_of(setting, 0), cache)
+
+    if part == 'command' and data is not None:
+        add('`dashcalib run`, KITTI 03', command, data / 'kitti03' / 'bag')
+    if part == 'calibration':
+        add('five turns, 960x540', calibration, pictures(FIVE_TURNS))
+    if part == 'length':
+        for times, name in ((1, 'a drive of five turns'), (2, 'twice as long'),
+                            (4, 'four times as long')):
+            add(name, whole, pictures(FIVE_TURNS), times, 5)
+    if part == 'turns':
+        for turns in (2, 5, 8):
+            add(f'{turns} of eight turns', whole, pictures(EIGHT_TURNS), 1, turns)
+    if part == 'detection':
+        for size in SIZES:
+            add(size.name, detection, pictures(size), 60.0)
+    if part == 'hour':
+        add('640x480', hour, pictures(SIZES[0]), minutes)
     return found
 
 
 def report(found: dict[str, Any]) -> str:
     """Return what was measured as Markdown tables."""
-    parts = []
-    if rows := found.get('detection'):
-        names = list(dict.fromkeys(name for row in rows.values()
-                                   for name in row.get('parts_ms', {})))
+    parts, lines = [], []
+    rows = {part: {name: row for name, row in found.get(part, {}).items() if not row['failure']}
+            for part in PARTS}
+    for part in ('command', 'calibration', 'length', 'turns'):
+        for name, row in rows[part].items():
+            times = {f'{name}; {row["verdict"]}': (row['seconds'], row['cpu_s']),
+                     **{f'of these: {stage}': each
+                        for stage, each in row.get('stages', {}).items()}}
+            for n, (text, (seconds, cpu_s)) in enumerate(times.items()):
+                lines.append([text, f'{seconds:.1f}', f'{cpu_s:.1f}',
+                              f'{cpu_s / row["unit_s"]:.2f}',
+                              '' if n else f'{row["peak_mb"]:.0f}'])
+    if lines:
+        units = [row['unit_s'] for part in rows.values() for row in part.values()]
+        parts.append(f'A unit, the SIFT of 40 pictures, took {min(units):.2f} to '
+                     f'{max(units):.2f} CPU s.\n\n'
+                     + table(['', 's', 'CPU s', 'units', 'MB'], lines))
+    if detections := rows['detection']:
+        names = list(dict.fromkeys(name for row in detections.values()
+                                   for name in row['parts_ms']))
         parts.append('Detection of a 30 fps camera on one core, ms per camera frame.\n\n' + table(
-            ['', 'frames/s', 'ms', *names, 'JPEG decode, ms', 'times JPEG decode'],
-            [[size, f'{row["fps"]:.0f}', f'{row["ms"]:.2f}',
+            ['', 'frames/s', 'units per 1000 frames', 'ms', *names, 'JPEG decode, ms',
+             'times JPEG decode'],
+            [[size, f'{row["fps"]:.0f}', f'{row["ms"] / row["unit_s"]:.2f}', f'{row["ms"]:.2f}',
               *(f'{row["parts_ms"].get(name, 0.0):.2f}' for name in names),
               f'{row["decode_ms"]:.2f}', f'{row["of_decode"]:.2f}']
-             for size, row in rows.items() if not row['failure']]))
-    if (row := found.get('hour')) and not row['failure']:
+             for size, row in detections.items()]))
+    for row in rows['hour'].values():
         ms, mb = row['ms_by_minute'], row['mb_by_minute']
         parts.append(table(
             [f'detection, {row["minutes"]:.0f} min at 10 fps, 640x480', 'first minute',
@@ -233,38 +285,25 @@ def report(found: dict[str, Any]) -> str:
               f'{max(ms):.2f}'],
              ['MB', f'{mb[0]:.0f}', f'{mb[min(1, len(mb) - 1)]:.0f}', f'{mb[-1]:.0f}',
               f'{max(mb):.0f}']]))
-    if (row := found.get('calibration')) and not row['failure']:
-        stages = {'detection': row['detect_s'], **row['stages_s'],
-                  'from turns to result': row['total_s']}
-        parts.append(table([f'{row["turns"]} turns, 960x540, {row["verdict"]}', 's'],
-                           [[name, f'{value:.1f}'] for name, value in stages.items()]))
-    for name in ('length', 'turns'):
-        if rows := [row for row in found.get(name, ()) if not row['failure']]:
-            parts.append(table(
-                ['drive', 'turns wanted', 'used', 'frames', 's', 'ms per frame', 'MB'],
-                [[f'{row["times"]} times', str(row['wanted']), str(row['used']),
-                  str(row['frames']), f'{row["seconds"]["total"]:.1f}',
-                  f'{1000 * row["seconds"]["total"] / row["frames"]:.0f}',
-                  f'{row["peak_mb"]:.0f}'] for row in rows]))
     return '\n\n'.join(parts)
 
 
 def main() -> None:
     """Measure what is asked for."""
-    every = ('detection', 'calibration', 'length', 'turns', 'hour')
-    parser = parser_with(__doc__, 'cache', 'out', 'docs')
+    parser = parser_with(__doc__, 'data', 'cache', 'out', 'docs')
     parser.add_argument('parts', nargs='*', metavar='PART',
-                        help=f'of {", ".join(every)}; default: all')
+                        help=f'of {", ".join(PARTS)}; default: all')
     parser.add_argument('--minutes', type=float, default=60.0, help='of the long drive')
     arguments = parser.parse_args()
-    if unknown := set(arguments.parts) - set(every):
-        parser.error(f'there is no part {", ".join(sorted(unknown))}; choose of {every}')
+    if unknown := set(arguments.parts) - set(PARTS):
+        parser.error(f'there is no part {", ".join(sorted(unknown))}; choose of {PARTS}')
     path = arguments.out / 'speed.json'
     found = load(path)
     with tempfile.TemporaryDirectory() as passing:
-        for part in arguments.parts or every:
-            found |= measure([part], arguments.minutes, arguments.cache or Path(passing))
-            found |= {'cores': os.cpu_count(), 'commit': commit()}
+        for part in arguments.parts or PARTS:
+            found |= {part: measure(part, arguments.minutes, arguments.cache or Path(passing),
+                                    arguments.data),
+                      'cores': os.cpu_count(), 'commit': commit()}
             save(path, found)
     text = report(found)
     (arguments.out / 'speed.md').write_text(f'{found["cores"]} cores.\n\n{text}\n')
