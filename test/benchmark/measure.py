@@ -120,13 +120,10 @@ def memory_mb(pid: int) -> float:
     return total / 1024
 
 
-def processor_s(pid: int | None = None) -> float:
-    """Return the processor time of a process and its children, also of those that ended, s.
-
-    pid: of the process, this one by default.
-    """
-    pid, ticks = pid or os.getpid(), 0
-    for member in (pid, *_descendants(pid)):
+def processor_s() -> float:
+    """Return the processor time of this process and its children, also of those that ended, s."""
+    ticks = 0
+    for member in (os.getpid(), *_descendants(os.getpid())):
         with contextlib.suppress(OSError):
             fields = Path(f'/proc/{member}/stat').read_text().rpartition(')')[2].split()
             ticks += sum(map(int, fields[11:15]))
