@@ -152,7 +152,7 @@ class Viewed:
 def recorded_view(name: str, recording: Path, truth_path: Path) -> Viewed:
     """Return a view of a recorded drive. truth_path: of its calibration, without distortion."""
     truth: Mapping[str, Any] = json.loads(truth_path.read_text())
-    own = Lens(**{key: truth[key] for key in Lens.__dataclass_fields__})
+    own = Lens(**{key: truth[key] for key in Lens.__dataclass_fields__ if key in truth})
     return Viewed(BY_VIEW[name], open_frames(recording), own)
 
 
