@@ -23,7 +23,7 @@ class Tracking:
     border: px; points nearer to it are dropped: where the window leaves the picture, they drift.
     """
 
-    window: tuple[int, int] = (24, 18)
+    window: tuple[int, int] = (24, 21)
     levels: int = 4
     steps: int = 10
     step_px: float = 0.03
