@@ -62,7 +62,7 @@ EIGHT_TURNS = Setting('eight turns', DEMO, replace(STREET, turns=8))
 RATE = 30.0
 # the estimator's methods, by what they do; one that is gone is not listed
 METHODS = {'track': '_follow', 'epipoles': '_magnitude',
-         'new points': '_replenish', 'ego vehicle': '_look_for_ego'}
+           'new points': '_replenish', 'ego vehicle': '_look_for_ego'}
 PERIOD_S = 60.0
 PARTS = ('command', 'calibration', 'length', 'turns', 'detection', 'hour')
 
