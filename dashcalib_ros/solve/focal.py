@@ -3,14 +3,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.reconstruct.adjust import ROUGH, Solver, adjust
+from dashcalib_ros.reconstruct.build import chain_scene
 from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
-from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
+from dashcalib_ros.solve.fitting import retriangulate, subsample_tracks
 
 # factors of the resulting focal length at which the profile is evaluated
 PROBES = (0.8, 1.0, 1.25)
@@ -52,20 +54,28 @@ def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
                    config: Config) -> Profile:
     """Return the cost with the focal length fixed at PROBES times the result, all else adjusted.
 
-    Each probe is an adjustment that starts from the result, with a part of the tracks. If the
-    coarse profile has its minimum outside the probes, that focal length is probed too, with scenes
-    chained anew: of the two, the one that explains more observations is right.
+    Each probe is an adjustment that starts from the result, with a part of the tracks. The least
+    triangulation angle is the same in pixels for all: at a fixed angle a shorter focal length
+    would have more points, and explain more observations only for that. If the coarse profile has
+    its minimum outside the probes, that focal length is probed too, with scenes chained anew: of
+    the two, the one that explains more observations is right.
     """
+    def angled(fixed: Camera) -> SceneConfig:
+        least = config.scene.min_angle_deg * camera.fx / fixed.fx
+        return replace(config.scene, min_angle_deg=least)
+
     few = [subsample_tracks(scene, config.intrinsics.profile_tracks) for scene in scenes]
     width = camera.image_size[0]
     costs = {}
     for probe in PROBES:
         fixed = camera.with_focal(camera.fx * probe)
-        costs[fixed.fx / width] = _cost_at(few, fixed, config.scene)
+        costs[fixed.fx / width] = _cost_at(few, fixed, angled(fixed))
     if not PROBES[0] < coarse.best * width / camera.fx < PROBES[-1]:
         fixed = type(camera).centred(camera.image_size, coarse.best * width)
-        anew = [rechain(scene, fixed, config) or scene for scene in few]
-        costs[coarse.best] = _cost_at(anew, fixed, config.scene)
+        settings = angled(fixed)
+        anew = [chain_scene(scene.tracks, scene.turn, fixed, scene.profile, settings, config.seed)
+                or scene for scene in few]
+        costs[coarse.best] = _cost_at(anew, fixed, settings)
     ratios = sorted(costs)
     observations = sum(int(scene.tracks.seen.sum()) for scene in few)
     return Profile(np.array(ratios), np.array([costs[ratio] for ratio in ratios]), observations)

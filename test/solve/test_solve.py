@@ -33,7 +33,7 @@ from dashcalib_ros.reconstruct.scene import (
 from dashcalib_ros.solve import fitting, joint, steps
 from dashcalib_ros.solve import solve as solve_stage
 from dashcalib_ros.solve.fitting import misfits
-from dashcalib_ros.solve.focal import summed
+from dashcalib_ros.solve.focal import profile_around, summed
 from dashcalib_ros.solve.joint import solve
 from dashcalib_ros.solve.knowledge import Knowledge, scatter_between_turns
 from dashcalib_ros.solve.normal import noise_in, turn_cost
@@ -506,6 +506,17 @@ def test_sigma_too_large(good, relative, level):
     wide[0, 0] = (relative * good.camera.fx)**2
     found, reasons = levels(replace(good, covariance=wide))
     assert found == level and ('the focal length is known' in reasons) == (level != 'accepted')
+
+
+def test_points_at_small_angles_do_not_speak_for_a_shorter_focal_length():
+    """With it all angles are larger, so that more of them would be above a fixed least angle."""
+    config = CONFIG.replace({'scene.min_angle_deg': 10.0})
+    scene = fitting.retriangulate(synthetic_turn().scene(LENS), LENS, config.scene)
+    assert 0.4 < np.mean(scene.structure.used.any(axis=0)) < 0.6
+    ratio = LENS.fx / SIZE[0]
+    coarse = Profile(ratio * np.array([0.9, 1.0, 1.1]), np.array([2.0, 1.0, 2.0]), 1000)
+    shorter, result, _ = profile_around([scene], LENS, coarse, config).costs
+    assert shorter > 1.1 * result
 
 
 @pytest.mark.parametrize('others, level', [(0.5, 'accepted'), (0.01, 'weak')])
