@@ -85,10 +85,9 @@ def with_points_settled(scene: Scene, camera: Camera, loss_px: float) -> Scene:
     return replace(scene, structure=replace(structure, points=found))
 
 
-def rechain(scene: Scene, camera: Camera, config: Config) -> Scene | None:
+def rechain(scene: Scene, camera: Camera, config: SceneConfig, seed: int) -> Scene | None:
     """Return the scene chained anew from its tracks, None if no pair of images starts a chain."""
-    return chain_scene(
-        scene.tracks, scene.turn, camera, scene.profile, config.scene, config.seed)
+    return chain_scene(scene.tracks, scene.turn, camera, scene.profile, config, seed)
 
 
 def subsample_tracks(scene: Scene, wanted: int) -> Scene:
@@ -123,7 +122,7 @@ def is_far(scene: Scene, camera: Camera) -> bool:
 def adapted_to(scene: Scene, camera: Camera, config: Config) -> Scene:
     """Return the scene with this camera, chained anew if its own camera was far from it."""
     if is_far(scene, camera):
-        anew = rechain(scene, camera, config)
+        anew = rechain(scene, camera, config.scene, config.seed)
         if anew is not None:
             return anew
     return retriangulate(scene, camera, config.scene)
@@ -148,7 +147,7 @@ def explained_by(scenes: Sequence[Scene], measured: Mapping[TurnId, Scene], came
 
 def _rechained(scene: Scene, camera: Camera, config: Config) -> Scene:
     """Return the scene chained anew with a camera that is nearly right, else triangulated anew."""
-    anew = rechain(scene, camera, config)
+    anew = rechain(scene, camera, config.scene, config.seed)
     return (retriangulate(scene, camera, config.scene) if anew is None
             else _readjusted(anew, camera, config.scene))
 
@@ -222,8 +221,7 @@ def scene_with(camera: Camera, scene: Scene, config: Config) -> Scene | None:
     width = camera.image_size[0]
     generous = replace(config.scene, error_px=max(config.scene.error_px,
                                                   config.scene.chain_error * width))
-    anew = (rechain(scene, camera, replace(config, scene=generous)) if is_far(scene, camera)
-            else None)
+    anew = rechain(scene, camera, generous, config.seed) if is_far(scene, camera) else None
     found = [_with_fixed(camera, each, generous, config)
              for each in (scene, anew) if each is not None]
     return min((each for each in found if each is not None), default=None,

@@ -10,9 +10,8 @@ import numpy as np
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.reconstruct.adjust import ROUGH, Solver, adjust
-from dashcalib_ros.reconstruct.build import chain_scene
 from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
-from dashcalib_ros.solve.fitting import retriangulate, subsample_tracks
+from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
 
 # factors of the resulting focal length at which the profile is evaluated
 PROBES = (0.8, 1.0, 1.25)
@@ -60,7 +59,7 @@ def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
     its minimum outside the probes, that focal length is probed too, with scenes chained anew: of
     the two, the one that explains more observations is right.
     """
-    def angled(fixed: Camera) -> SceneConfig:
+    def settings_at(fixed: Camera) -> SceneConfig:
         least = config.scene.min_angle_deg * camera.fx / fixed.fx
         return replace(config.scene, min_angle_deg=least)
 
@@ -69,12 +68,11 @@ def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
     costs = {}
     for probe in PROBES:
         fixed = camera.with_focal(camera.fx * probe)
-        costs[fixed.fx / width] = _cost_at(few, fixed, angled(fixed))
+        costs[fixed.fx / width] = _cost_at(few, fixed, settings_at(fixed))
     if not PROBES[0] < coarse.best * width / camera.fx < PROBES[-1]:
         fixed = type(camera).centred(camera.image_size, coarse.best * width)
-        settings = angled(fixed)
-        anew = [chain_scene(scene.tracks, scene.turn, fixed, scene.profile, settings, config.seed)
-                or scene for scene in few]
+        settings = settings_at(fixed)
+        anew = [rechain(scene, fixed, settings, config.seed) or scene for scene in few]
         costs[coarse.best] = _cost_at(anew, fixed, settings)
     ratios = sorted(costs)
     observations = sum(int(scene.tracks.seen.sum()) for scene in few)
