@@ -58,7 +58,9 @@ def driven(ros_context, rendered, tmp_path_factory):
     home = tmp_path_factory.mktemp('driven')
     seen = Driven()
     seen.drive, seen.frames = rendered
-    seen.node = NodeProcess(home, commit=True, commit_timeout=SOON, imu_topic='/imu', **QUICK)
+    # other tests keep the machine busy: a queue of 5 images would overrun
+    seen.node = NodeProcess(home, '-p', 'qos_overrides./image_raw.subscription.depth:=50',
+                            commit=True, commit_timeout=SOON, imu_topic='/imu', **QUICK)
     seen.bench = bench = Bench(ros_context)
     seen.committed = []
     seen.gyro = bench.node.create_publisher(Imu, '/imu', 400)
