@@ -2,11 +2,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Set
+from dataclasses import replace
 from typing import Any
 
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect import TurnId
+from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.reconstruct.repeated import without_repeated
@@ -14,6 +15,7 @@ from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.reconstruct.scene_file import Origin, StoredTurn
 from dashcalib_ros.turn_store import TurnStore
 from dashcalib_ros.workers.child import ChildWorker
+from dashcalib_ros.workers.memory import in_a_file
 from dashcalib_ros.workers.pool import ScenePool
 from dashcalib_ros.workers.worker import InlineWorker, Worker
 
@@ -56,13 +58,15 @@ class SceneSelection:
         self._warn = warn
         self._on_trouble = on_trouble
         self._closed = False
-        # live: whether the workers were told to load what they need
+        # whether the workers were told to load what they need
         self._loading = False
         if live:
             # nothing else runs during an import: while images come, some would be lost
             _load_judging()
         # the turns whose scenes were written to turns.store
         self._stored_turns: Set[TurnId] = frozenset()
+        # the turns whose pictures are in files
+        self._in_a_file: set[TurnId] = set()
         # where the ego vehicle is not, by turn
         self._valid: dict[TurnId, Mask | None] = {}
         # why turns were taken out
@@ -120,14 +124,26 @@ class SceneSelection:
                 ready.append(turn)
             if not (replace_failed and key in built and built[key] is None):
                 places -= 1
-        if ready and self._live and not self._loading:
+        if ready and not self._loading:
             self._loading = True
             for _ in range(self.config.threads):
-                self._pool.begin(_load_all)
+                self._pool.begin(_load_all if self._live else _load_solving)
         waiting = 0 if self._live or not more_to_come else WAITING
-        for turn in ready[:max(len(ready) - waiting, 0)]:
+        due = ready[:max(len(ready) - waiting, 0)]
+        for turn in due:
             self._pool.submit(turn, self._valid[turn.id])
             self._detection.release(turn.center)
+        if not self._live:
+            for key in turns.keys() - self._in_a_file - {turn.id for turn in due}:
+                self._set_aside(turns[key])
+
+    def _set_aside(self, turn: Turn) -> None:
+        """Move the pictures of a turn that waits out of the memory."""
+        images = in_a_file([frame.image for frame in turn.frames])
+        self._detection.exchange(turn.center, tuple(
+            replace(frame, image=image)
+            for frame, image in zip(turn.frames, images, strict=True)))
+        self._in_a_file.add(turn.id)
 
     def chosen(self) -> list[Scene]:
         """Return the scenes that a calibration would use now, best first."""
@@ -332,11 +348,16 @@ def _load_judging() -> None:
     import dashcalib_ros.judge.conclude  # noqa: F401
 
 
-def _load_all() -> None:
-    """Import what a child needs until the result, COLMAP too."""
-    _load_judging()
+def _load_solving() -> None:
+    """Import what a child needs until the solution, COLMAP too; SciPy is for one child only."""
     import dashcalib_ros.reconstruct.build
     import dashcalib_ros.solve.joint  # noqa: F401
+
+
+def _load_all() -> None:
+    """Import what a child of a live drive needs until the result."""
+    _load_judging()
+    _load_solving()
 
 
 def _repeated_text(turn: TurnId, other: TurnId) -> str:

@@ -119,6 +119,20 @@ def test_it_tells_of_its_turns(drive, result):
         assert abs(picture.frame - turn.center) < 6 and picture.image.shape == (360, 640)
 
 
+def test_the_pictures_of_a_turn_that_waits_are_in_a_file(frames):
+    given = {frame.index: frame.image for frame in frames}
+    with limited(Calibrator(QUICK)) as calibrator:
+        for frame in frames:
+            calibrator.push(frame)
+            if waiting := calibrator.turns():
+                break
+    shown = waiting[0].frames
+    assert len(shown) > 10
+    for frame in shown:
+        assert np.array_equal(frame.image, given[frame.index])
+        assert given[frame.index].flags.writeable and not frame.image.flags.writeable
+
+
 def test_a_turn_during_which_the_car_stood_is_none(frames, result):
     moving, phantom = result.turns
     stamps_s = np.array([frame.stamp_ns for frame in frames]) / 1e9

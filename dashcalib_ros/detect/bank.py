@@ -143,6 +143,12 @@ class TurnBank:
                 kept.turn = dataclasses.replace(
                     kept.turn, frames=(), released_images=kept.turn.images)
 
+    def exchange(self, center: int, frames: tuple[Frame, ...]) -> None:
+        """Take the same frames, stored in another way, for those of a turn that is fixed."""
+        for kept in self._kept:
+            if kept.turn.center == center:
+                kept.turn = dataclasses.replace(kept.turn, frames=frames)
+
     def _enter(self, candidate: _Candidate) -> list[Turn]:
         """Put a turn into the bank; turns that overlap are merged, trimmed or dropped."""
         assert candidate.prominence is not None

@@ -96,6 +96,10 @@ class Detection:
         """Drop a turn's frames, once they are handed over."""
         self._turns.bank.release(center)
 
+    def exchange(self, center: int, frames: tuple[Frame, ...]) -> None:
+        """Take the same frames, stored in another way, for those of a turn."""
+        self._turns.bank.exchange(center, frames)
+
     def magnitudes(self) -> Floats:
         """Return (n, 2): stamp in s and filtered turning magnitude, decimated."""
         return self._turns.magnitudes()

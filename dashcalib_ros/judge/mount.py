@@ -181,10 +181,9 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
         errors, slopes, tangents = _epipolar(turned, back, first, second)
         loss = unit * max(LAST_PX, FIRST_PX * NARROWING**step)
         weights = seen / (1 + (errors / loss)**2)
-        hessian = (np.einsum('np,npi,npj->nij', weights, slopes, slopes)
-                   + np.finfo(float).eps * np.eye(5))
-        score = np.einsum('np,npi,np->ni', weights, slopes, errors)
-        change = -np.linalg.solve(hessian, score[..., None])[..., 0]
+        weighted = (weights[..., None] * slopes).transpose(0, 2, 1)
+        hessian = weighted @ slopes + np.finfo(float).eps * np.eye(5)
+        change = -np.linalg.solve(hessian, weighted @ errors[..., None])[..., 0]
         length = np.maximum(np.linalg.norm(change, axis=1), np.finfo(float).tiny)
         change *= np.minimum(1.0, LONGEST_STEP / length)[:, None]
         turned = Rotation.from_rotvec(change[:, :3]).as_matrix() @ turned
@@ -206,7 +205,7 @@ def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
 
     The error is the angle between a ray and the epipolar plane, averaged over both images.
     """
-    moved = np.einsum('nij,npj->npi', turned, first)
+    moved = first @ turned.transpose(0, 2, 1)
     normal = np.cross(back[:, None], moved)
     other = np.cross(second, back[:, None])
     size = np.maximum(np.sqrt((np.sum(normal**2, -1) + np.sum(other**2, -1)) / 2), 1e-3)
@@ -214,8 +213,8 @@ def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
     aside = np.cross(back, np.where(np.abs(back[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     aside /= np.linalg.norm(aside, axis=1)[:, None]
     tangents = np.stack([aside, np.cross(back, aside)], axis=1)
-    slopes = np.concatenate([np.cross(moved, other), np.einsum(
-        'nki,npi->npk', tangents, np.cross(moved, second))], axis=-1)
+    slopes = np.concatenate([np.cross(moved, other),
+                             np.cross(moved, second) @ tangents.transpose(0, 2, 1)], axis=-1)
     return errors, slopes / size[..., None], tangents
 
 

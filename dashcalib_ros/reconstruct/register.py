@@ -52,7 +52,7 @@ def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
             structure.used[k] & (scale < MAX_SCALE) & (scale > 1 / MAX_SCALE))
         if len(wanted) == 0:
             continue
-        found, good = _align(_smooth(image), tracks.xy[k, wanted], scale[wanted],
+        found, good = _align(_doubled(image), tracks.xy[k, wanted], scale[wanted],
                              template[wanted], steps[wanted], grid)
         shift = np.linalg.norm(found - tracks.xy[k, wanted], axis=1)
         good &= (shift < MAX_SHIFT_PX) | (reference[wanted] == k)
@@ -74,19 +74,24 @@ def _reference_rows(used: Mask, depth: Floats) -> Ints:
     return np.asarray(order[middle, np.arange(used.shape[1])], np.int64)
 
 
-def _smooth(image: GreyImage) -> Floats32:
-    # made twice, for a reference and for what is aligned: kept, those of a whole turn would take a
-    # third of a child's memory
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8), np.float32)
+def _doubled(image: GreyImage) -> Floats32:
+    """Return the image, smoothed, at twice the resolution: see _sample().
 
-
-def _sample(image: Floats32, xy: Floats) -> Floats32:
-    """Return (n, p) intensities at positions (n, 2, p).
-
-    Lanczos: OpenCV's cubic kernel shifts the picture by up to 0.05 px between the pixels.
+    Made twice, for a reference and for what is aligned: kept, those of a whole turn would be half
+    of a child's memory.
     """
-    where = xy.astype(np.float32)
-    return np.asarray(cv2.remap(image, where[:, 0], where[:, 1], cv2.INTER_LANCZOS4,
+    return np.asarray(cv2.pyrUp(cv2.GaussianBlur(image, (0, 0), 0.5).astype(np.float32)))
+
+
+def _sample(doubled: Floats32, xy: Floats32) -> Floats32:
+    """Return (n, p) intensities at positions (n, 2, p), in px of the image before it was doubled.
+
+    OpenCV rounds positions to 1/32 px, and its cubic kernel shifts the picture by up to 0.05 px.
+    Between the pixels of a doubled image linear interpolation is off by 0.004 px, Lanczos by 0.008
+    in the single one, at ten times the time (docs/notebook/lessons.md).
+    """
+    where = 2 * xy
+    return np.asarray(cv2.remap(doubled, where[:, 0], where[:, 1], cv2.INTER_LINEAR,
                                 borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
@@ -104,11 +109,12 @@ def _templates(tracks: Tracks, reference: Ints,
         rows = np.flatnonzero((reference == k) & np.isfinite(tracks.xy[k, :, 0]))
         if len(rows) == 0:
             continue  # all of them are tracks that the structure does not use
-        centre, image = tracks.xy[k, rows][:, :, None] + grid.T, _smooth(images[k])
+        centre = tracks.xy[k, rows].astype(np.float32)[:, :, None] + grid.T
+        image = _doubled(images[k])
         template[rows] = _sample(image, centre)
-        for axis, kernel in enumerate(((1, 0), (0, 1))):
-            slope = cv2.Sobel(image, cv2.CV_32F, *kernel, ksize=3, scale=1 / 8)
-            gradient[rows, :, axis] = _sample(np.asarray(slope, np.float32), centre)
+        for axis, ahead in enumerate(np.array([[[0.5], [0]], [[0], [0.5]]], np.float32)):
+            gradient[rows, :, axis] = _sample(image, centre + ahead) - _sample(
+                image, centre - ahead)
     contrast = np.maximum(template.std(axis=1, keepdims=True), 1e-3)
     template = (template - template.mean(axis=1, keepdims=True)) / contrast
     gradient /= contrast[:, :, None]
@@ -129,8 +135,9 @@ def _align(image: Floats32, start: Floats, scale: Floats, template: Floats32, st
     numbers, centre = np.arange(len(start)), start
     linear = scale[:, None, None] * np.eye(2)
     for _ in range(ITERATIONS):
-        patch = _sample(image, linear[:, :, :1] * grid[:, 0] + linear[:, :, 1:] * grid[:, 1]
-                        + centre[:, :, None])
+        affine = linear.astype(np.float32)
+        patch = _sample(image, affine[:, :, :1] * grid[:, 0] + affine[:, :, 1:] * grid[:, 1]
+                        + centre[:, :, None].astype(np.float32))
         patch -= patch.mean(axis=1, keepdims=True)
         patch /= np.maximum(np.sqrt(np.mean(patch * patch, axis=1, keepdims=True)), 1e-3)
         correlation = np.mean(patch * template, axis=1)

@@ -264,13 +264,16 @@ def _eliminate_points(linear: _Linear, where: npt.NDArray[np.intp], point: npt.N
     # the residual is one more column beside a point's three: its products are the scores
     four = np.concatenate([linear.by_point, linear.residual[:, :, None]], axis=2)
     mixed, blocks = np.zeros((count, 4, size)), np.zeros((count, 4, 4))
-    order = np.argsort(point, kind='stable')
-    sorted_four, sorted_shared = four[order], wide[:, :, local:][order]
-    ends = np.cumsum(np.bincount(point))
-    for n, (start, end) in enumerate(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)):
-        own = sorted_four[start:end].reshape(-1, 4).T
-        mixed[n, :, shared[0]:] = own @ sorted_shared[start:end].reshape(own.shape[1], -1)
-        blocks[n] = own @ own.T
+    order, seen = np.argsort(point, kind='stable'), np.bincount(point)
+    first = np.cumsum(seen) - seen
+    for times in np.unique(seen):
+        # points that are seen equally often, all at once
+        same = np.flatnonzero(seen == times)
+        theirs = order[first[same][:, None] + np.arange(times)]
+        own = four[theirs].reshape(len(same), -1, 4).transpose(0, 2, 1)
+        mixed[same, :, shared[0]:] = own @ wide[theirs, :, local:].reshape(
+            len(same), own.shape[2], -1)
+        blocks[same] = own @ own.transpose(0, 2, 1)
     # a point is seen once in an image
     mixed[point[:, None], :, where[:, :local]] = wide[:, :, :local].transpose(0, 2, 1) @ four
     # a little damping, so that badly determined points have a finite inverse

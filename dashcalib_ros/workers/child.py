@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol, cast
 
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.workers.memory import return_free_memory
+from dashcalib_ros.workers.memory import forget_file_pages, return_free_memory
 from dashcalib_ros.workers.worker import THREAD_VARIABLES, Progress, WorkerDiedError
 
 # not `-m`: it would import from the current folder first, and a random.py may lie there
@@ -112,6 +112,7 @@ class ChildWorker:
             send(_WatchedPipe(process, process.stdin, select.POLLOUT, self._on_trouble), request)
         except (OSError, ValueError) as error:
             raise _died(process) from error
+        forget_file_pages()
         answers = _WatchedPipe(process, process.stdout, select.POLLIN, self._on_trouble)
         while True:
             try:

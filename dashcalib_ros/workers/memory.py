@@ -5,13 +5,17 @@ costs the system new pages, three times over (received, converted, grey): a thir
 processor time. Kept in the heap they are reused; but then those that wait in a turn for seconds
 lie among small blocks, and are never returned by themselves. So the node copies these out of it,
 and every process returns free pages after each turn.
+
+Offline, the pictures of turns that wait for better ones, or for being needed, lie in a file.
 """
 from __future__ import annotations
 
 import ctypes
 import mmap
+import tempfile
 import weakref
 from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -64,3 +68,32 @@ def mapped_copy(image: GreyImage) -> GreyImage:
     copy = owner.reshape(image.shape)
     copy[:] = image
     return copy
+
+
+# pages of files that hold images
+_in_files: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+
+
+def in_a_file(images: Sequence[GreyImage]) -> list[GreyImage]:
+    """Return the images, read-only, in a temporary file, which ends with them.
+
+    They stay in memory where the disk has no room.
+    """
+    try:
+        with tempfile.TemporaryFile() as file:
+            for image in images:
+                file.write(image.tobytes())
+            file.flush()
+            pages = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError):
+        return list(images)
+    _in_files.add(pages)
+    ends = np.cumsum([0, *(image.nbytes for image in images)])
+    return [np.frombuffer(pages, np.uint8, image.nbytes, start).reshape(image.shape)
+            for image, start in zip(images, ends, strict=False)]
+
+
+def forget_file_pages() -> None:
+    """Drop what was read from the files of images: the next look at them reads it again."""
+    for pages in list(_in_files):
+        pages.madvise(mmap.MADV_DONTNEED)

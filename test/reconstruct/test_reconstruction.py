@@ -497,8 +497,9 @@ def test_registration_finds_the_exact_positions_and_repairs_drift(case):
     assert np.isfinite(found.xy).all()
     off = np.linalg.norm(found.xy - tracks.xy, axis=2)
     assert off[reference].max() < 1e-3
-    # cv2.remap's cubic interpolation alone is 0.05 px off between the pixels
-    assert np.percentile(np.delete(off, reference, axis=0), 90) < 0.045 and off.max() < 0.07
+    # cv2.remap's cubic interpolation alone is 0.05 px off between the pixels, Lanczos 0.02
+    assert np.percentile(np.delete(off, reference, axis=0), 90) < 0.035 and off.max() < 0.05
+    assert np.median(np.delete(off, reference, axis=0)) < 0.016
 
 
 def test_registration_drops_what_does_not_look_like_the_reference():
