@@ -22,13 +22,13 @@ def pytest_configure(config):
 
 
 # the files that take longest, the longest first: begun last, each would keep one core alone
-LONG_FILES = ('test_node.py', 'test_calibrator.py', 'test_run.py', 'test_drive.py',
-              'test_solve.py', 'test_example.py', 'test_motion.py', 'test_usage.py',
-              'test_choice.py', 'test_witnesses.py', 'test_segmentation.py', 'test_child.py',
-              'test_docs_commands.py', 'test_style.py', 'test_judging.py', 'test_pool.py',
-              'test_fixed_camera.py', 'test_around.py', 'test_export.py', 'test_mount.py',
-              'test_field.py', 'test_batch.py', 'test_mask.py', 'test_reconstruction.py',
-              'test_engine.py', 'test_install.py')
+LONG_FILES = ('test_node.py', 'test_calibrator.py', 'test_drive.py', 'test_child.py',
+              'test_run.py', 'test_judging.py', 'test_pool.py', 'test_docs_commands.py',
+              'test_around.py', 'test_solve.py', 'test_learner.py', 'test_usage.py',
+              'test_engine.py', 'test_example.py', 'test_choice.py', 'test_style.py',
+              'test_segmentation.py', 'test_field.py', 'test_fixed_camera.py', 'test_install.py',
+              'test_witnesses.py', 'test_export.py', 'test_pipeline.py', 'test_shutter.py',
+              'test_preview.py')
 
 
 def pytest_collection_modifyitems(items):
