@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from dashcalib_ros.arrays import Floats, Ints, Mask
+from dashcalib_ros.arrays import Floats, Floats32, Ints, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.reconstruct.scene import Scene, Structure, residuals_px
 from dashcalib_ros.solve.quadratic import Quadratic, TurnCost
@@ -30,7 +30,7 @@ class Eliminated:
 
     keyframes: (k,), tracks: (t,) those that are used. pose_inverse: (6k, 6k) the inverse of the
     poses' block; pose_score: (6k,); pose_mixed: (6k, m). point_inverse: (t, 3, 3); point_score:
-    (t, 3); point_mixed: (t, 3, 6k + m).
+    (t, 3); point_mixed: (t, 3, 6k + m), which is large, so in single precision.
     """
 
     keyframes: Ints
@@ -40,7 +40,7 @@ class Eliminated:
     pose_mixed: Floats
     point_inverse: Floats
     point_score: Floats
-    point_mixed: Floats
+    point_mixed: Floats32
 
     def moved(self, structure: Structure, step: Floats) -> Structure:
         """Return the structure at its optimum (of the linearised problem) after a step (m,)."""
@@ -186,7 +186,8 @@ def normal_equations(scene: Scene, camera: Camera, loss_px: float,
                  lens=len(camera.widened().names())),
         images // IMAGE,
         Eliminated(keyframes, tracks, pose_inverse, track_score[:, :poses].sum(axis=0),
-                   reduced[:poses, poses:], points.inverse, points.score, points.mixed))
+                   reduced[:poses, poses:], points.inverse, points.score,
+                   points.mixed.astype(np.float32)))
 
 
 @dataclass(frozen=True)

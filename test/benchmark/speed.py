@@ -16,6 +16,7 @@ take turns in a process each, not side by side. Writes DIR/speed.json and DIR/sp
 """
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -32,6 +33,7 @@ import numpy as np
 from documents import write_table
 from drives import DEMO, FULL_HD, NARROW, STREET, VGA, Pictures, Setting, drive_of, pictures_of
 from measure import (
+    SAMPLE_S,
     Stopwatch,
     calibrate,
     commit,
@@ -164,13 +166,19 @@ def hour(pictures: Pictures, minutes: float) -> dict[str, Any]:
 
 
 def command(bag: Path) -> dict[str, Any]:
-    """Run the command on a bag."""
+    """Run the command on a bag; peak_mb is without this process, which has COLMAP loaded."""
     with tempfile.TemporaryDirectory() as folder:
-        began, before = time.perf_counter(), processor_s()
-        done = subprocess.run([sys.executable, '-m', 'dashcalib_ros.cli', 'run', str(bag),
-                               '--out', folder], capture_output=True, text=True, check=False)
-        return {'seconds': time.perf_counter() - began, 'cpu_s': processor_s() - before,
-                'verdict': done.stdout.partition('\n')[0].removeprefix('verdict: ')}
+        began, before, peak = time.perf_counter(), processor_s(), 0.0
+        with subprocess.Popen([sys.executable, '-m', 'dashcalib_ros.cli', 'run', str(bag),
+                               '--out', folder], stdout=subprocess.PIPE,
+                              stderr=subprocess.DEVNULL, text=True) as process:
+            while process.poll() is None:
+                peak = max(peak, memory_mb(process.pid))
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(SAMPLE_S)
+            seconds, said = time.perf_counter() - began, process.communicate()[0]
+        return {'seconds': seconds, 'cpu_s': processor_s() - before, 'peak_mb': peak,
+                'verdict': said.partition('\n')[0].removeprefix('verdict: ')}
 
 
 def calibration(pictures: Pictures) -> dict[str, Any]:
