@@ -134,7 +134,8 @@ class SceneSelection:
             self._pool.submit(turn, self._valid[turn.id])
             self._detection.release(turn.center)
         if not self._live:
-            for key in turns.keys() - self._in_a_file - {turn.id for turn in due}:
+            held = {key for key, turn in turns.items() if turn.frames}
+            for key in held - self._in_a_file - {turn.id for turn in due}:
                 self._set_aside(turns[key])
 
     def _set_aside(self, turn: Turn) -> None:
