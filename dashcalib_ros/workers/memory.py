@@ -70,8 +70,9 @@ def mapped_copy(image: GreyImage) -> GreyImage:
     return copy
 
 
-# pages of files that hold images
-_in_files: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+# pages of files that hold images, by id(); its valuerefs() may be called while another thread adds
+# some, which a WeakSet does not allow
+_in_files: weakref.WeakValueDictionary[int, mmap.mmap] = weakref.WeakValueDictionary()
 
 
 def in_a_file(images: Sequence[GreyImage]) -> list[GreyImage]:
@@ -87,13 +88,17 @@ def in_a_file(images: Sequence[GreyImage]) -> list[GreyImage]:
             pages = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError):
         return list(images)
-    _in_files.add(pages)
-    ends = np.cumsum([0, *(image.nbytes for image in images)])
+    _in_files[id(pages)] = pages
+    starts = np.cumsum([0, *(image.nbytes for image in images)])[:-1]
     return [np.frombuffer(pages, np.uint8, image.nbytes, start).reshape(image.shape)
-            for image, start in zip(images, ends, strict=False)]
+            for image, start in zip(images, starts, strict=True)]
 
 
 def forget_file_pages() -> None:
-    """Drop what was read from the files of images: the next look at them reads it again."""
-    for pages in list(_in_files):
-        pages.madvise(mmap.MADV_DONTNEED)
+    """Drop what was read from the files of images: the next look at them reads it again.
+
+    Any thread may call it.
+    """
+    for reference in _in_files.valuerefs():
+        if (pages := reference()) is not None:
+            pages.madvise(mmap.MADV_DONTNEED)

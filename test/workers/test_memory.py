@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,26 @@ def test_images_in_a_file_are_the_same():
     for image, other in zip(images, stored, strict=True):
         assert np.array_equal(image, other) and not other.flags.writeable
     assert in_a_file([]) == []
+
+
+def test_pages_are_forgotten_while_another_thread_stores_images():
+    before, ended = sys.getswitchinterval(), threading.Event()
+
+    def store():
+        while not ended.is_set():
+            kept = [in_a_file([np.zeros((2, 2), np.uint8)]) for _ in range(20)]
+            del kept
+
+    sys.setswitchinterval(1e-6)
+    thread = threading.Thread(target=store)
+    thread.start()
+    try:
+        for _ in range(5000):
+            forget_file_pages()
+    finally:
+        ended.set()
+        thread.join()
+        sys.setswitchinterval(before)
 
 
 def test_images_stay_in_memory_where_the_disk_is_full(monkeypatch):
