@@ -87,8 +87,8 @@ def _sample(doubled: Floats32, xy: Floats32) -> Floats32:
     """Return (n, p) intensities at positions (n, 2, p), in px of the image before it was doubled.
 
     OpenCV rounds positions to 1/32 px, and its cubic kernel shifts the picture by up to 0.05 px.
-    Between the pixels of a doubled image linear interpolation is off by 0.004 px, Lanczos by 0.008
-    in the single one, at ten times the time (docs/notebook/lessons.md).
+    Linear interpolation in the doubled image is off by 0.004 px. Lanczos in the original image is
+    off by 0.008 px, and takes ten times as long (docs/notebook/lessons.md).
     """
     where = 2 * xy
     return np.asarray(cv2.remap(doubled, where[:, 0], where[:, 1], cv2.INTER_LINEAR,
