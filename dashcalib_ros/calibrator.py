@@ -83,7 +83,7 @@ class Calibrator:
         """
         config = config or Config()
         searched(config.model)  # raises ConfigError for one that there is not
-        self.detection = Detection(config, mask)
+        self.detection = Detection(config, mask, beside=not live)
         self.scenes = SceneSelection(config, self.detection, live, verbose, use_stored, warn,
                                      inline, on_trouble, on_wait)
         self._live = live

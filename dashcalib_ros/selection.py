@@ -62,7 +62,7 @@ class SceneSelection:
         self._loading = False
         if live:
             # nothing else runs during an import: while images come, some would be lost
-            _load_judging()
+            _load_more()
         # the turns whose scenes were written to turns.store
         self._stored_turns: Set[TurnId] = frozenset()
         # the turns whose pictures are in files
@@ -342,9 +342,8 @@ class SceneSelection:
 
 
 def _load_judging() -> None:
-    """Import what judges a result: it takes half a second."""
-    from scipy import optimize, special  # noqa: F401
-    from scipy.spatial import transform  # noqa: F401
+    """Import what judges a result: it takes 0.2 s."""
+    from scipy import special  # noqa: F401
 
     import dashcalib_ros.judge.conclude  # noqa: F401
 
@@ -355,9 +354,16 @@ def _load_solving() -> None:
     import dashcalib_ros.solve.joint  # noqa: F401
 
 
-def _load_all() -> None:
-    """Import what a child of a live drive needs until the result."""
+def _load_more() -> None:
+    """Import what judges a result, and what may be needed for it: it takes half a second."""
+    from scipy import optimize  # noqa: F401
+    from scipy.spatial import transform  # noqa: F401
     _load_judging()
+
+
+def _load_all() -> None:
+    """Import what a child of a live drive may need until the result."""
+    _load_more()
     _load_solving()
 
 

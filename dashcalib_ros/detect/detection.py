@@ -32,8 +32,8 @@ class Detection:
     first. frames: how many there were. standing: the car stands now.
     """
 
-    def __init__(self, config: Config, mask: Mask | None = None) -> None:
-        """mask: (h, w), False where the ego vehicle is."""
+    def __init__(self, config: Config, mask: Mask | None = None, beside: bool = False) -> None:
+        """mask: (h, w), False where the ego vehicle is. beside: lines are sought in a thread."""
         self._mask = mask
         if mask is not None:
             mask = Scale.of((mask.shape[1], mask.shape[0]), config).mask(mask)
@@ -45,7 +45,7 @@ class Detection:
         self.standing = False
         self._config = config
         self._motion = MotionEstimator(config.motion, config.mask, mask)
-        self._lines = LineCollector(config.lines)
+        self._lines = LineCollector(config.lines, beside)
         # more turns than wanted replace those without a scene; --turns may be above the capacity
         self._turns = TurnDetector(replace(
             config.turns, capacity=max(config.turns.capacity, config.turns.wanted)))

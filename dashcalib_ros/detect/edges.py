@@ -8,6 +8,8 @@ Nothing is known of the camera here, so an edge may be curved, but not by more t
 """
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -148,30 +150,42 @@ def _smooth(across: Floats) -> Mask:
     return np.asarray(np.sqrt(np.mean(rest**2, axis=1)) <= SMOOTH_PX)
 
 
+def _longest_edges(image: GreyImage) -> Floats32:
+    """Return the points (n, KNOTS, 2) of at most MOST edges."""
+    points = upright_edges(image)
+    height = points[:, -1, 1] - points[:, 0, 1]
+    return points[np.sort(np.argsort(-height, kind='stable')[:MOST])]
+
+
 class LineCollector:
     """Searches a picture every period; keeps points of edges only, never a picture."""
 
-    def __init__(self, config: LinesConfig) -> None:
+    def __init__(self, config: LinesConfig, beside: bool = False) -> None:
+        """beside: a thread searches a picture until the next one comes."""
         self._config = config
         self._period_ns = PERIOD_S * 1e9
-        self._found: list[tuple[int, Floats32]] = []
+        self._thread = ThreadPoolExecutor(1) if beside else None
+        # stamps, and what returns the points, once they are found
+        self._found: list[tuple[int, Callable[[], Floats32]]] = []
 
     def push(self, image: GreyImage, stamp_ns: int) -> None:
         """Take a picture of the moving car; it is searched if the last one is long enough ago."""
         if self._found and 0 <= stamp_ns - self._found[-1][0] < self._period_ns:
             return
-        points = upright_edges(image)
-        if len(points) > MOST:
-            height = points[:, -1, 1] - points[:, 0, 1]
-            points = points[np.sort(np.argsort(-height, kind='stable')[:MOST])]
-        self._found.append((stamp_ns, points))
+        if self._thread is None:
+            points = _longest_edges(image)
+            self._found.append((stamp_ns, lambda: points))
+        else:
+            for _, last in self._found[-1:]:
+                last()
+            self._found.append((stamp_ns, self._thread.submit(_longest_edges, image).result))
         if len(self._found) > self._config.images:
             self._found = self._found[::2]
             self._period_ns *= 2
 
     def lines(self) -> Lines:
         """Return the lines found so far."""
-        none = np.zeros((0, KNOTS, 2), np.float32)
-        return Lines(np.concatenate([none, *(points for _, points in self._found)]),
+        found = [np.zeros((0, KNOTS, 2), np.float32), *(points() for _, points in self._found)]
+        return Lines(np.concatenate(found),
                      np.repeat([stamp_ns / 1e9 for stamp_ns, _ in self._found],
-                               [len(points) for _, points in self._found]))
+                               [len(points) for points in found[1:]]))

@@ -16,6 +16,7 @@ from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import sensitivity
+from dashcalib_ros.camera.rotation import rotation_matrices
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
@@ -189,10 +190,9 @@ class Mount:
         The car's x points ahead, y to the left, z upwards; the camera's z ahead, x to the right, y
         downwards. An unknown roll counts as 0.
         """
-        from scipy.spatial.transform import Rotation
-        turned = Rotation.from_euler('ZYX', [
-            self.yaw_left_deg, -self.pitch_up_deg, self.roll_right_deg or 0.0], degrees=True)
-        return np.asarray(turned.as_matrix() @ OPTICAL)
+        roll, pitch, yaw = rotation_matrices(np.radians(np.diag([
+            self.roll_right_deg or 0.0, -self.pitch_up_deg, self.yaw_left_deg])))
+        return np.asarray(yaw @ pitch @ roll @ OPTICAL)
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:

@@ -16,6 +16,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import resized_pixels
+from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.judge.calibration import MOVED_DEG, MOVED_SIGMAS, Mount
@@ -167,7 +168,6 @@ def _without_field(straights: Straights, solution: Solution) -> Straights:
 
 def _fitted(camera: Camera, straights: Straights) -> _Pairs:
     """Return the poses of all pairs at once: robust Gauss-Newton from straight ahead."""
-    from scipy.spatial.transform import Rotation
     first, second = (camera.rays(np.asarray(each, np.float64))
                      for each in (straights.before, straights.after))
     seen = np.asarray(np.isfinite(first).all(axis=-1) & np.isfinite(second).all(axis=-1), bool)
@@ -186,15 +186,14 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
         change = -np.linalg.solve(hessian, weighted @ errors[..., None])[..., 0]
         length = np.maximum(np.linalg.norm(change, axis=1), np.finfo(float).tiny)
         change *= np.minimum(1.0, LONGEST_STEP / length)[:, None]
-        turned = Rotation.from_rotvec(change[:, :3]).as_matrix() @ turned
+        turned = rotation_matrices(change[:, :3]) @ turned
         back = back + np.einsum('nk,nki->ni', change[:, 3:], tangents)
         back /= np.linalg.norm(back, axis=1)[:, None]
     noise = MAD * np.array([np.median(np.abs(row[valid])) if valid.any() else np.inf
                             for row, valid in zip(errors, seen, strict=True)])
     variance = np.linalg.inv(hessian)[:, [3, 4], [3, 4]].mean(axis=1)
-    rotation = Rotation.from_matrix(turned)
-    vector = rotation.as_rotvec()
-    ahead = -(Rotation.from_rotvec(-vector / 2).apply(back))
+    vector = rotation_vectors(turned)
+    ahead = -(rotation_matrices(-vector / 2) @ back[:, :, None])[:, :, 0]
     return _Pairs(ahead * np.sign(ahead[:, 2:]), np.degrees(noise * np.sqrt(variance)),
                   np.degrees(vector[:, 1]) / straights.apart_s)
 

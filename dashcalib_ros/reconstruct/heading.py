@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
 
 # rounds of reweighting; ten drives changed by less than 0.01 degrees after the fifth
@@ -52,10 +53,9 @@ def heading(scene: Scene) -> Heading | None:
     rotations, centres = scene.structure.path()
     if len(rotations) < LEAST_KEYFRAMES:
         return None
-    from scipy.spatial.transform import Rotation
-    turned = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec()
+    turned = rotation_vectors(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
     # the direction of a step, in the camera's frame halfway through it
-    halfway = Rotation.from_rotvec(turned / 2).as_matrix() @ rotations[:-1]
+    halfway = rotation_matrices(turned / 2) @ rotations[:-1]
     steps = np.diff(centres, axis=0)
     lengths = np.maximum(np.linalg.norm(steps, axis=1), np.finfo(float).tiny)
     ahead = np.einsum('kij,kj->ki', halfway, steps) / lengths[:, None]

@@ -10,6 +10,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, GreyImage, Mask, Pixels
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.rotation import rotation_vectors
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.reconstruct.tracks import Tracks
 
@@ -204,10 +205,9 @@ class Scene:
         It is the sum of the steps since the first one, each in the camera's own frame: a car turns
         about one axis of it, the vertical, which is (0, 1, 0) where the pictures are upright.
         """
-        from scipy.spatial.transform import Rotation
         rotations = self.structure.rotations[self.structure.registered]
-        steps = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
-        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps.as_rotvec(), axis=0)])
+        steps = rotation_vectors(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
     @property
     def explained(self) -> float:

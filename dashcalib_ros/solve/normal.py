@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Floats32, Ints, Mask
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.rotation import rotation_matrices
 from dashcalib_ros.reconstruct.scene import Scene, Structure, residuals_px
 from dashcalib_ros.solve.quadratic import Quadratic, TurnCost
 
@@ -50,7 +51,7 @@ class Eliminated:
                           self.point_score - self.point_mixed @ both)
         turn, move = np.split(pose.reshape(-1, POSE), 2, axis=1)
         rotations, translations = structure.rotations.copy(), structure.translations.copy()
-        rotations[self.keyframes] = _rotation(turn) @ rotations[self.keyframes]
+        rotations[self.keyframes] = rotation_matrices(turn) @ rotations[self.keyframes]
         translations[self.keyframes] += move
         points = structure.points.copy()
         points[self.tracks] += shift
@@ -309,13 +310,6 @@ def _squares_and_freedom(used: Mask, residual: Floats, weight: Floats, parameter
     # the gauge (position, rotation and scale of the scene) is free: seven
     freedom = max(2 * observations - 3 * points - 6 * poses + 7 - parameters, 1)
     return float(np.sum((residual * weight[:, None])**2) / np.mean(weight**2)), float(freedom)
-
-
-def _rotation(turns: Floats) -> Floats:
-    """Return the (n, 3, 3) rotation matrices of rotation vectors (n, 3), rad (Rodrigues)."""
-    angle = np.maximum(np.linalg.norm(turns, axis=1), 1e-12)[:, None, None]
-    axis = _cross(turns) / angle
-    return np.asarray(np.eye(3) + np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis)
 
 
 def _cross(vectors: Floats) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dashcalib_ros.config import LinesConfig
-from dashcalib_ros.detect import LineCollector, Lines
+from dashcalib_ros.detect import LineCollector, Lines, edges
 from dashcalib_ros.detect.edges import ENDS, KNOTS, upright_edges
 
 CONFIG = LinesConfig()
@@ -67,12 +67,27 @@ def test_lines_on_the_own_car_are_left_out():
     assert len(lines.within(valid)) == 0
 
 
-def collected(count, step_s=0.1, **changes):
-    collector = LineCollector(LinesConfig(**changes))
-    image = picture(lambda y: 150.0 + 0 * y)
+def collected(count, step_s=0.1, beside=False, **changes):
+    collector = LineCollector(LinesConfig(**changes), beside)
     for n in range(count):
+        image = picture(lambda y, x=100.0 + n % 100: x + 0 * y)
         collector.push(image, round(n * step_s * 1e9))
     return collector.lines()
+
+
+@pytest.mark.parametrize('images', [100, 20])
+def test_a_thread_beside_finds_the_same(images):
+    now, beside = (collected(200, beside=each, images=images) for each in (False, True))
+    np.testing.assert_array_equal(beside.stamps_s, now.stamps_s)
+    np.testing.assert_array_equal(beside.points, now.points)
+
+
+def test_what_the_thread_raises_is_not_lost(monkeypatch):
+    def fails(image):
+        raise MemoryError
+    monkeypatch.setattr(edges, 'upright_edges', fails)
+    with pytest.raises(MemoryError):
+        collected(1, beside=True)
 
 
 def test_a_picture_is_searched_now_and_then():

@@ -1,0 +1,17 @@
+"""Rotation vectors and matrices, by OpenCV: SciPy's take 0.2 s to load, in every process."""
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+
+
+def rotation_matrices(vectors: Floats) -> Floats:
+    """Return the (n, 3, 3) matrices of rotation vectors (n, 3), rad."""
+    return np.array([cv2.Rodrigues(vector)[0] for vector in vectors]).reshape(-1, 3, 3)
+
+
+def rotation_vectors(matrices: Floats) -> Floats:
+    """Return the vectors (n, 3), rad, of rotation matrices (n, 3, 3); less than 1e-5 rad is 0."""
+    return np.array([cv2.Rodrigues(matrix)[0][:, 0] for matrix in matrices]).reshape(-1, 3)
