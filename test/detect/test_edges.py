@@ -69,9 +69,9 @@ def test_lines_on_the_own_car_are_left_out():
 
 def collected(count, step_s=0.1, beside=False, **changes):
     collector = LineCollector(LinesConfig(**changes), beside)
+    images = [picture(lambda y, x=x: x + 0 * y) for x in (100.0, 130.0, 160.0)]
     for n in range(count):
-        image = picture(lambda y, x=100.0 + n % 100: x + 0 * y)
-        collector.push(image, round(n * step_s * 1e9))
+        collector.push(images[n % 3], round(n * step_s * 1e9))
     return collector.lines()
 
 
