@@ -62,7 +62,7 @@ class SceneSelection:
         self._loading = False
         if live:
             # nothing else runs during an import: while images come, some would be lost
-            _load_more()
+            _load_judging()
         # the turns whose scenes were written to turns.store
         self._stored_turns: Set[TurnId] = frozenset()
         # the turns whose pictures are in files
@@ -260,9 +260,6 @@ class SceneSelection:
         pool = self._pool
         looking = pool.begin(without_repeated, scenes, self.config.scene.min_images)
         using = pool.begin(use, scenes, self.config, tells=True)
-        if not self._live:
-            # this process has nothing else to do
-            _load_judging()
         kept, repeated = pool.result(looking)
         # of one that is repeated in part, the rest is kept
         if repeated or any(len(one.tracks.frames) < len(other.tracks.frames)
@@ -341,29 +338,23 @@ class SceneSelection:
         self._on_trouble(text)
 
 
-def _load_judging() -> None:
-    """Import what judges a result: it takes 0.2 s."""
-    from scipy import special  # noqa: F401
-
-    import dashcalib_ros.judge.conclude  # noqa: F401
-
-
 def _load_solving() -> None:
-    """Import what a child needs until the solution, COLMAP too; SciPy is for one child only."""
+    """Import what a child needs until the solution, COLMAP too."""
     import dashcalib_ros.reconstruct.build
     import dashcalib_ros.solve.joint  # noqa: F401
 
 
-def _load_more() -> None:
-    """Import what judges a result, and what may be needed for it: it takes half a second."""
-    from scipy import optimize  # noqa: F401
+def _load_judging() -> None:
+    """Import what judges a result, and what that may need: it takes half a second."""
+    from scipy import optimize, special  # noqa: F401
     from scipy.spatial import transform  # noqa: F401
-    _load_judging()
+
+    import dashcalib_ros.judge.conclude  # noqa: F401
 
 
 def _load_all() -> None:
     """Import what a child of a live drive may need until the result."""
-    _load_more()
+    _load_judging()
     _load_solving()
 
 

@@ -38,7 +38,7 @@ from dashcalib_ros import selection
 from dashcalib_ros.ros import images, node, main
 images.DEPTH = 50
 node.PERIOD_S = 0.1
-selection._load_more = lambda: None
+selection._load_judging = lambda: None
 sys.exit(main())
 """]
 

@@ -202,6 +202,33 @@ def test_the_processes_that_reconstruct_turns_load_no_more_than_they_need():
     assert loaded_by('import dashcalib_ros.reconstruct.build', 'scipy', 'rosbags', 'rich') == set()
 
 
+def test_a_result_and_its_report_need_no_scipy():
+    # it takes half a second to load, and 27 MB and more, in each process
+    code = """
+import sys, zlib
+sys.path.insert(0, 'test')
+import numpy as np
+from made_calibration import MOUNT, make_calibration
+from solving import CONFIG, scenes_of
+from synthetic import LENS, SIZE
+from dashcalib_ros.detect.straights import Straights
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge.conclude import Evidence, conclude
+from dashcalib_ros.reconstruct.repeated import without_repeated
+from dashcalib_ros.report import result_json
+from dashcalib_ros.report.page import report_html
+from dashcalib_ros.solve import solve
+scenes, repeated = without_repeated(scenes_of(3), 6)
+points = np.random.default_rng(0).uniform(50, 250, (12, 60, 2)).astype(np.float32)
+found = conclude(solve(scenes, CONFIG), Evidence(
+    SIZE, 300, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {},
+    straights=Straights(points, points + 1, np.arange(12.0), np.full(12, 0.6))), CONFIG)
+assert found.camera is not None and not repeated
+result_json(found), report_html(found), report_html(make_calibration(mount=MOUNT))
+"""
+    assert loaded_by(code, 'scipy', 'jinja2') == {'jinja2'}
+
+
 def test_colmap_is_loaded_where_it_is_used():
     code = 'import dashcalib_ros.reconstruct.adjust'
     assert loaded_by(code, 'pycolmap', 'pyceres') == {'pycolmap', 'pyceres'}

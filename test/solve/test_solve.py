@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import special
 from solving import CONFIG, NOTHING, START, adjusted, scenes_of, solved, z_of
 from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
@@ -35,7 +36,7 @@ from dashcalib_ros.solve import solve as solve_stage
 from dashcalib_ros.solve.fitting import misfits
 from dashcalib_ros.solve.focal import profile_around, summed
 from dashcalib_ros.solve.joint import solve
-from dashcalib_ros.solve.knowledge import Knowledge, scatter_between_turns
+from dashcalib_ros.solve.knowledge import Knowledge, scatter_between_turns, t_over_normal
 from dashcalib_ros.solve.normal import noise_in, turn_cost
 from dashcalib_ros.solve.prior import FOCAL_FLOOR, NOISE_FLOOR, centre_pull
 from dashcalib_ros.solve.quadratic import Quadratic, TurnCost, noise_of
@@ -167,6 +168,12 @@ def test_the_scatter_between_turns_holds_95_percent(shares, effect):
         scatter = scatter_between_turns(turns, inverse, np.linalg.cholesky(inverse))
         held.append(np.abs(estimate) < 2 * np.sqrt(scatter * np.diag(inverse)))
     assert 0.88 <= np.mean(held) <= 0.995
+
+
+@pytest.mark.parametrize('freedom', [1.0, 1.05, 1.5, 2.0, 4.3, 30.0, 1000.0])
+def test_student_s_t_is_that_of_scipy(freedom):
+    expected = special.stdtrit(freedom, 0.975) / special.ndtri(0.975)
+    assert t_over_normal(freedom) == pytest.approx(expected, rel=1e-3 if freedom < 1.5 else 1e-5)
 
 
 def test_the_noise_alone_is_that_of_the_information():
