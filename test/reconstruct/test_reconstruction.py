@@ -502,6 +502,32 @@ def test_registration_finds_the_exact_positions_and_repairs_drift(case):
     assert np.median(np.delete(off, reference, axis=0)) < 0.016
 
 
+@pytest.mark.parametrize('case', ['translation', 'affine'])
+def test_in_the_noise_of_the_night_twice_as_many_patches_are_found(case, monkeypatch):
+    tracks, structure, images = registered_case(*CASES[case])
+    rng = np.random.default_rng(0)
+    dark = [np.rint(60 + 0.06 * (image - 128.0) + rng.normal(0, 4, image.shape)).astype(np.uint8)
+            for image in images]
+
+    def found() -> int:
+        xy = register_tracks(tracks, structure, LENS, dark).xy
+        return int(np.isfinite(xy[:, :, 0]).sum(axis=1).min())
+
+    many = found()
+    monkeypatch.setattr(register, 'NOISY', np.inf)
+    assert many > 36 and found() < 0.6 * many
+
+
+@pytest.mark.parametrize('noise', [0.5, 2.0, 4.0, 8.0])
+@pytest.mark.parametrize('edges', [False, True])
+def test_the_noise_of_a_picture_is_measured(noise, edges):
+    x, y = np.meshgrid(np.arange(320.0), np.arange(240.0))
+    image = 100 + 30 * np.sin(x / 30) * np.sin(y / 25) + 80 * (edges & (x % 40 > 20))
+    image = image + np.random.default_rng(1).normal(0, noise, image.shape)
+    assert register._noise_in([np.rint(image).astype(np.uint8)]) == pytest.approx(
+        np.hypot(noise, 0.29), abs=0.3)
+
+
 def test_registration_drops_what_does_not_look_like_the_reference():
     tracks, structure, images = registered_case(*CASES['translation'])
     xy = tracks.xy.copy()
