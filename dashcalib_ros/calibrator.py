@@ -28,6 +28,9 @@ from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 
+# of a drive; after it a turn is hardly pushed out of its place by three better ones
+LATE = 0.6
+
 
 @dataclass(frozen=True)
 class Status:
@@ -56,8 +59,9 @@ class Calibrator:
     """Learns a camera from the turns of a drive.
 
     push() the frames as they come; calibrate() when enough turns have gathered, or at the end.
-    close() ends the child processes; a Calibrator is also a context manager. questions.py asks
-    its turns about other cameras. All methods are for one thread, but close(), which is for any.
+    expect() so many frames, where that is known. close() ends the child processes; a Calibrator is
+    also a context manager. questions.py asks its turns about other cameras. All methods are for
+    one thread, but close(), which is for any.
 
     detection: what was found in the frames so far: turns, tracked points, the ego vehicle. scenes:
     the turns that were reconstructed; which are used, taken out, stored. solution: what the last
@@ -87,6 +91,7 @@ class Calibrator:
         self.scenes = SceneSelection(config, self.detection, live, verbose, use_stored, warn,
                                      inline, on_trouble, on_wait)
         self._live = live
+        self._expected: int | None = None
         self.solution: Solution | None = None
         self._motion: SensorStream | None = None
         self._detect_s = 0.0
@@ -99,10 +104,18 @@ class Calibrator:
         if self.detection.frames == 1:
             self.scenes.load(frame.frame_id)
         if new:
-            self.scenes.submit(more_to_come=True)
+            late = self._expected is not None and self.detection.frames > LATE * self._expected
+            self.scenes.submit(more_to_come=True, late=late)
         self._detect_s += time.monotonic() - started
         self.scenes.make_room()
         return self.status()
+
+    def expect(self, frames: int | None) -> None:
+        """Tell how many frames the drive has, None where that is not known.
+
+        The result does not depend on it: late in a drive, more of the turns are begun.
+        """
+        self._expected = frames
 
     def sense(self, motion: SensorStream) -> None:
         """Take what the car's sensors say of the drive so far, in the place of what came before.

@@ -135,6 +135,8 @@ def pushed(taker: Taker, source: FrameSource, mask: Mask | None) -> Iterator[int
 
     Raises InputError for a mask of another size.
     """
+    if isinstance(taker, Calibrator):
+        taker.expect(source.count)
     for number, frame in enumerate(_read_ahead(source), 1):
         if number == 1:
             check_mask(mask, frame.size)

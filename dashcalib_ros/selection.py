@@ -102,10 +102,12 @@ class SceneSelection:
             self.config = self.config.replace({'turns.wanted': turns})
             self._places = turns
 
-    def submit(self, more_to_come: bool = False, replace_failed: bool = False) -> None:
+    def submit(self, more_to_come: bool = False, late: bool = False,
+               replace_failed: bool = False) -> None:
         """Have the best turns reconstructed; live: all, as a scene is a fiftieth of its images.
 
-        more_to_come: the least of them wait, for better ones may take their places.
+        more_to_come: the least of them wait, for better ones may take their places; late in the
+        drive it is one less.
         replace_failed: turns that gave no scene are replaced by the next best. Only calibrations
         do that: which turns are reconstructed must not depend on the speed of the workers.
         """
@@ -128,7 +130,7 @@ class SceneSelection:
             self._loading = True
             for _ in range(self.config.threads):
                 self._pool.begin(_load_all if self._live else _load_solving)
-        waiting = 0 if self._live or not more_to_come else WAITING
+        waiting = 0 if self._live or not more_to_come else WAITING - late
         due = ready[:max(len(ready) - waiting, 0)]
         for turn in due:
             self._pool.submit(turn, self._valid[turn.id])

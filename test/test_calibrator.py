@@ -23,7 +23,7 @@ from synthetic import synthetic_turn
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect import TurnId
+from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.input import Frame
@@ -443,6 +443,35 @@ def test_turns_of_this_drive_come_before_more_prominent_ones_of_earlier_drives(o
     chosen = [scene.turn for scene in selection.chosen()]
     assert ''.join('o' if turn.of_this_drive else 's' for turn in chosen) == used
     selection.close()
+
+
+@pytest.mark.parametrize(('more_to_come', 'late', 'begun'), [
+    (True, False, [0]), (True, True, [0, 1]), (False, False, [0, 1, 2, 3])])
+def test_the_least_turns_wait_for_better_ones(frames, more_to_come, late, begun):
+    turns = tuple(Turn(n, n, n, float(n), 0.1 - 0.01 * n, tuple(frames[:2])) for n in range(4))
+    nothing, submitted = types.SimpleNamespace(), []
+    nothing.exchange = nothing.release = nothing.keep_only = nothing.begin = lambda *given: None
+    selection = SceneSelection(QUICK.replace({'turns.wanted': 5}), types.SimpleNamespace(
+        **vars(nothing), turns=lambda: turns, valid=lambda: None))
+    selection.close()
+    selection._pool = types.SimpleNamespace(
+        **vars(nothing), scenes=dict, submit=lambda turn, valid: submitted.append(turn.center))
+    selection.submit(more_to_come, late)
+    assert submitted == begun
+
+
+@pytest.mark.parametrize(('expected', 'late'), [
+    (None, [False] * 10), (10, [False] * 6 + [True] * 4), (5, [False] * 3 + [True] * 7)])
+def test_it_is_late_in_a_drive_of_known_length_only(expected, late, frames, monkeypatch):
+    told = []
+    with Calibrator(QUICK) as calibrator:
+        calibrator.expect(expected)
+        monkeypatch.setattr(calibrator.detection, '_fixed', lambda turns: ['a turn'])
+        monkeypatch.setattr(calibrator.scenes, 'submit',
+                            lambda more_to_come, late: told.append(late))
+        for frame in frames[:10]:
+            calibrator.push(frame)
+    assert told == late
 
 
 def test_turns_that_are_rejected_leave_the_store(tmp_path):
