@@ -28,9 +28,6 @@ from dashcalib_ros.selection import Progress, SceneSelection
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 
-# of a drive; after it a turn is hardly pushed out of its place by three better ones
-LATE = 0.6
-
 
 @dataclass(frozen=True)
 class Status:
@@ -91,7 +88,6 @@ class Calibrator:
         self.scenes = SceneSelection(config, self.detection, live, verbose, use_stored, warn,
                                      inline, on_trouble, on_wait)
         self._live = live
-        self._expected: int | None = None
         self.solution: Solution | None = None
         self._motion: SensorStream | None = None
         self._detect_s = 0.0
@@ -104,8 +100,7 @@ class Calibrator:
         if self.detection.frames == 1:
             self.scenes.load(frame.frame_id)
         if new:
-            late = self._expected is not None and self.detection.frames > LATE * self._expected
-            self.scenes.submit(more_to_come=True, late=late)
+            self.scenes.submit(more_to_come=True)
         self._detect_s += time.monotonic() - started
         self.scenes.make_room()
         return self.status()
@@ -115,7 +110,7 @@ class Calibrator:
 
         The result does not depend on it: late in a drive, more of the turns are begun.
         """
-        self._expected = frames
+        self.scenes.expected = frames
 
     def sense(self, motion: SensorStream) -> None:
         """Take what the car's sensors say of the drive so far, in the place of what came before.

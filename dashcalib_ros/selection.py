@@ -27,15 +27,18 @@ NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow en
             'the car hardly moved')
 ALONE = 'this drive has no turn that could agree with it'
 OTHER_CAMERA = 'the turns of this drive are of another camera'
-# turns that wait in memory for better ones; of KITTI 03 five are reconstructed then, not eight
+# turns that wait for better ones; of KITTI 03 five are reconstructed then, not eight
 WAITING = 3
+# of a drive; after it one less waits: it will hardly be pushed aside
+LATE = 0.6
 
 
 class SceneSelection:
     """Lets the pool reconstruct the best turns; chooses scenes among these and stored turns.
 
-    config: turns.wanted is what want() was told last. warnings: about turns.store, and about turns
-    that ended the workers.
+    config: turns.wanted is what want() was told last. expected: how many frames the drive has,
+    None where that is not known. warnings: about turns.store, and about turns that ended the
+    workers.
 
     All methods are for the Calibrator's thread, but close(), which is for any.
     """
@@ -47,6 +50,7 @@ class SceneSelection:
                  on_wait: Callable[[], bool] | None = None) -> None:
         """live, use_stored, warn, inline, on_trouble, on_wait: as the Calibrator's."""
         self.warnings: list[str] = []
+        self.expected: int | None = None
         # how many turns are used: more than wanted once these have left a result weak
         self._places = config.turns.wanted
         # turns of this drive that are used beyond that
@@ -102,12 +106,10 @@ class SceneSelection:
             self.config = self.config.replace({'turns.wanted': turns})
             self._places = turns
 
-    def submit(self, more_to_come: bool = False, late: bool = False,
-               replace_failed: bool = False) -> None:
+    def submit(self, more_to_come: bool = False, replace_failed: bool = False) -> None:
         """Have the best turns reconstructed; live: all, as a scene is a fiftieth of its images.
 
-        more_to_come: the least of them wait, for better ones may take their places; late in the
-        drive it is one less.
+        more_to_come: the least of them wait, for better ones may take their places.
         replace_failed: turns that gave no scene are replaced by the next best. Only calibrations
         do that: which turns are reconstructed must not depend on the speed of the workers.
         """
@@ -130,6 +132,7 @@ class SceneSelection:
             self._loading = True
             for _ in range(self.config.threads):
                 self._pool.begin(_load_all if self._live else _load_solving)
+        late = self.expected is not None and self._detection.frames > LATE * self.expected
         waiting = 0 if self._live or not more_to_come else WAITING - late
         due = ready[:max(len(ready) - waiting, 0)]
         for turn in due:

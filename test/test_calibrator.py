@@ -445,33 +445,29 @@ def test_turns_of_this_drive_come_before_more_prominent_ones_of_earlier_drives(o
     selection.close()
 
 
-@pytest.mark.parametrize(('more_to_come', 'late', 'begun'), [
-    (True, False, [0]), (True, True, [0, 1]), (False, False, [0, 1, 2, 3])])
-def test_the_least_turns_wait_for_better_ones(frames, more_to_come, late, begun):
+@pytest.mark.parametrize(('more_to_come', 'frames_so_far', 'expected', 'begun'), [
+    (True, 10, None, [0]), (True, 6, 10, [0]), (True, 7, 10, [0, 1]), (True, 3, 5, [0]),
+    (True, 4, 5, [0, 1]), (True, 10, 5, [0, 1]), (False, 1, None, [0, 1, 2, 3])])
+def test_the_least_turns_wait_for_better_ones_late_in_a_drive_of_known_length_fewer(
+        frames, more_to_come, frames_so_far, expected, begun):
     turns = tuple(Turn(n, n, n, float(n), 0.1 - 0.01 * n, tuple(frames[:2])) for n in range(4))
     nothing, submitted = types.SimpleNamespace(), []
     nothing.exchange = nothing.release = nothing.keep_only = nothing.begin = lambda *given: None
     selection = SceneSelection(QUICK.replace({'turns.wanted': 5}), types.SimpleNamespace(
-        **vars(nothing), turns=lambda: turns, valid=lambda: None))
+        **vars(nothing), turns=lambda: turns, valid=lambda: None, frames=frames_so_far))
     selection.close()
     selection._pool = types.SimpleNamespace(
         **vars(nothing), scenes=dict, submit=lambda turn, valid: submitted.append(turn.center))
-    selection.submit(more_to_come, late)
+    selection.expected = expected
+    selection.submit(more_to_come)
     assert submitted == begun
 
 
-@pytest.mark.parametrize(('expected', 'late'), [
-    (None, [False] * 10), (10, [False] * 6 + [True] * 4), (5, [False] * 3 + [True] * 7)])
-def test_it_is_late_in_a_drive_of_known_length_only(expected, late, frames, monkeypatch):
-    told = []
+def test_a_calibrator_tells_its_selection_what_to_expect():
     with Calibrator(QUICK) as calibrator:
-        calibrator.expect(expected)
-        monkeypatch.setattr(calibrator.detection, '_fixed', lambda turns: ['a turn'])
-        monkeypatch.setattr(calibrator.scenes, 'submit',
-                            lambda more_to_come, late: told.append(late))
-        for frame in frames[:10]:
-            calibrator.push(frame)
-    assert told == late
+        assert calibrator.scenes.expected is None
+        calibrator.expect(10)
+        assert calibrator.scenes.expected == 10
 
 
 def test_turns_that_are_rejected_leave_the_store(tmp_path):

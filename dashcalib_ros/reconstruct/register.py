@@ -15,6 +15,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.reconstruct.heading import MAD
 from dashcalib_ros.reconstruct.scene import Structure
 from dashcalib_ros.reconstruct.tracks import Tracks
 
@@ -48,7 +49,8 @@ def register_tracks(tracks: Tracks, structure: Structure, camera: Camera,
     reference = _reference_rows(structure.used, depth)
     step = np.arange(-HALF_WINDOW, HALF_WINDOW + 1, dtype=np.float32)
     grid = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
-    smoothing_px = NOISY_SMOOTHING_PX if _noise_in(images) > NOISY else SMOOTHING_PX
+    noise = _noise_of(images[len(images) // 2])
+    smoothing_px = NOISY_SMOOTHING_PX if noise > NOISY else SMOOTHING_PX
     template, steps = _templates(tracks, reference, images, grid, smoothing_px)
     xy = np.full_like(tracks.xy, np.nan)
     every = np.arange(tracks.xy.shape[1])
@@ -80,11 +82,11 @@ def _reference_rows(used: Mask, depth: Floats) -> Ints:
     return np.asarray(order[middle, np.arange(used.shape[1])], np.int64)
 
 
-def _noise_in(images: Sequence[GreyImage]) -> float:
-    """Return the standard deviation of the noise of the picture in the middle, grey levels."""
-    response = cv2.filter2D(images[len(images) // 2], cv2.CV_16S, NOISE_FILTER)
+def _noise_of(image: GreyImage) -> float:
+    """Return the standard deviation of a picture's noise, grey levels."""
+    response = cv2.filter2D(image, cv2.CV_16S, NOISE_FILTER)
     # edges, which few pixels are on, do not count in a median; of 16 pixels one is enough
-    return 1.4826 * float(np.median(np.abs(response[::4, ::4]))) / 6
+    return MAD * float(np.median(np.abs(response[::4, ::4]))) / 6
 
 
 def _doubled(image: GreyImage, smoothing_px: float) -> Floats32:

@@ -524,7 +524,7 @@ def test_the_noise_of_a_picture_is_measured(noise, edges):
     x, y = np.meshgrid(np.arange(320.0), np.arange(240.0))
     image = 100 + 30 * np.sin(x / 30) * np.sin(y / 25) + 80 * (edges & (x % 40 > 20))
     image = image + np.random.default_rng(1).normal(0, noise, image.shape)
-    assert register._noise_in([np.rint(image).astype(np.uint8)]) == pytest.approx(
+    assert register._noise_of(np.rint(image).astype(np.uint8)) == pytest.approx(
         np.hypot(noise, 0.29), abs=0.3)
 
 
