@@ -205,6 +205,7 @@ class MotionEstimator:
         keep = math.ceil(2 * self.config.spacing_s * self.config.rate / (1 - EARLY)) + 3
         self._seen: deque[_Seen] = deque(maxlen=keep)
         self._pairs: dict[tuple[int, int], Floats | None] = {}
+        self._turning = -math.inf, math.nan
         self._last = None
         self._ids: Ints = np.zeros(0, np.int64)
         self._xy: Floats32 = np.zeros((0, 2), np.float32)
@@ -304,17 +305,24 @@ class MotionEstimator:
         return (first, middle) if first else (None, None)
 
     def _magnitude(self, first: _Seen | None, middle: _Seen | None) -> float:
-        """Return the triplet's turning magnitude; NaN without a triplet, or without epipoles."""
+        """Return the triplet's turning magnitude; NaN without a triplet, or without epipoles.
+
+        Measured once a spacing; between, it is the last one's.
+        """
         if first is None or middle is None:
             return math.nan
         last = self._seen[-1]
+        # triplets that share more than a pair cost three times as much, and tell no more
+        if last.stamp_ns - self._turning[0] < 1e9 * self.config.spacing_s - 0.5 * self._period_ns:
+            return self._turning[1]
         pairs = ((first, middle), (middle, last), (first, last))
         found = {(a.index, b.index): self._epipoles(a, b) for a, b in pairs}
         # the next triplets need only pairs that begin within this one
         self._pairs = {key: value for key, value in {**self._pairs, **found}.items()
                        if key[0] >= first.index}
         values = [turning(epipoles) for epipoles in found.values() if epipoles is not None]
-        return float(np.mean(values)) if values else math.nan
+        self._turning = last.stamp_ns, float(np.mean(values)) if values else math.nan
+        return self._turning[1]
 
     def _earlier(self, seen: _Seen) -> _Seen | None:
         """Return the image that is nearest to one spacing earlier, None if there is none."""

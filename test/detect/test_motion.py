@@ -11,6 +11,7 @@ import pytest
 from dashcalib_ros.config import Config, MaskConfig, MotionConfig
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Stop, Turn
 from dashcalib_ros.detect import MotionEstimator, TurnDetector
+from dashcalib_ros.detect import estimator as estimator_module
 from dashcalib_ros.detect.epipoles import epipoles_of, turning
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
@@ -213,13 +214,29 @@ def test_same_input_same_motion(stopping_frames):
     assert str(first) == str(second)
 
 
-def test_size_of_the_picture_hardly_matters(stopping_frames):
+def test_size_of_the_picture_hardly_matters(stopping, stopping_frames):
     """Magnitudes are relative to the width, whatever is tracked on."""
-    part = stopping_frames[70:110]
+    part = stopping_frames[stopping.turn_centers[0] - 25:][:40]
     whole, _ = detect(part)
     small, _ = detect(part, Config().replace({'motion.width': 240}))
     a, b = (np.array([m.magnitude for m in ms if m.center]) for ms in (whole, small))
     assert np.nanmedian(np.abs(a - b)) < 0.1 * np.nanmax(a)
+
+
+def test_a_triplet_is_measured_once_a_spacing(stopping_frames, monkeypatch):
+    """Triplets at each image cost three times as much; a magnitude holds until the next one."""
+    asked = []
+    monkeypatch.setattr(estimator_module, 'epipoles_of', lambda *arguments: (
+        asked.append(arguments), epipoles_of(*arguments))[1])
+    motions, _ = detect(stopping_frames[:40])
+    of_triplets = [m.magnitude for m in motions if m.center is not None and not m.standing]
+    assert len(asked) <= 2 * len(of_triplets) / 3 + 3
+    for begin in range(0, len(of_triplets) - 2, 3):
+        assert len(set(of_triplets[begin:begin + 3])) == 1
+    # a slow camera has one triplet for each image
+    slow, _ = detect(stopping_frames[:40:4])
+    values = [m.magnitude for m in slow if m.center is not None and not m.standing]
+    assert len(set(values)) == len(values) > 3
 
 
 def test_straight_drive_has_no_turns():
