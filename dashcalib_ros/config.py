@@ -116,7 +116,7 @@ class SceneConfig:
     profile_tracks: int = expert(300, 'longest tracks used for the focal profile', 50, 5000)
     keyframes: int = expert(
         30, 'of a turn at the most; more cost time and change nothing', 5, 1000)
-    profile_keyframes: int = expert(16, 'of a turn at the most, for the focal profile', 5, 1000)
+    profile_keyframes: int = expert(12, 'of a turn at the most, for the focal profile', 5, 1000)
     min_images: int = expert(6, 'a turn with fewer keyframes is not tried', 4, 100)
     error_px: float = expert(2.0, 'px; an observation farther off is not used', 0.2, 20.0)
     chain_error: float = expert(

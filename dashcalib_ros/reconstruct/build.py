@@ -31,14 +31,18 @@ from dashcalib_ros.reconstruct.tracks import Tracks, thinned, track_turn
 
 # focal length / width; a lens that seems longer is no fisheye: 90 degrees across, or less
 WIDE = 0.5
-# how often a chain that does not reach all images is built anew, at the most
+# how often a scene that leaves images or much else unexplained is chained anew, at the most
 COMPLETIONS = 2
 # columns and rows in which tracks are to be seen in each keyframe
 GRID = (6, 3)
 # a turn with fewer tracks is not tried
 MIN_TRACKS = 80
-# px^2 per observation; a turn that costs more is chained with other tracks, too
+# px^2 per observation; what costs more is chained anew, and may be another kind of lens
 GOOD_COST = 1.2
+# the same; a minimum like this may be anywhere, so all focal lengths are completed
+BAD_COST = 1.8
+# of the cost of the chain before; one that costs more is no better
+WORTH = 0.95
 
 
 def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft | None:
@@ -127,13 +131,13 @@ def _trials(tracks: Tracks, turn: Turn, config: Config, model: type[Camera]
             ) -> dict[float, Scene]:
     """Return the best scene for each focal length held fixed; none for one without a scene.
 
-    In most turns the longest tracks chain best. If no focal length explains much with them, tracks
-    spread over all keyframes are tried, too.
+    In most turns the longest tracks chain best. If they leave images out, tracks spread over all
+    keyframes are tried, too.
     """
     settings = config.scene
     few = thinned(tracks, settings.profile_keyframes)
     trials = _profile_trials(_longest(few, settings.profile_tracks), turn, config, model)
-    if not trials or min(map(_cost_of, trials.values())) > GOOD_COST:
+    if not trials or not min(trials.values(), key=_cost_of).structure.registered.all():
         others = _profile_trials(_spread(few, settings.profile_tracks), turn, config, model)
         for ratio, scene in others.items():
             trials[ratio] = min(trials.get(ratio, scene), scene, key=_cost_of)
@@ -148,74 +152,74 @@ def _profile_trials(tracks: Tracks, turn: Turn, config: Config, model: type[Came
                     ) -> dict[float, Scene]:
     """Return the scenes at focal lengths held fixed: every second one, then around the best.
 
-    Each is adjusted once. Only the best and its neighbours are completed where they explain the
-    turn: what is far from the best costs as much time, and changes only how bad it is. So it is
-    not even begun where those on both sides of the best are worse.
+    What is far from the best costs as much time, and changes only how bad it is: it is adjusted
+    once, and not even begun where those on both sides of the best are worse. With a wide lens, a
+    chain without distortion breaks soon, even at the true focal length. So the best is chained
+    anew with the distortion that it has found, and its neighbours begin with that.
     """
-    settings, seed, ratios = config.scene, config.seed, model.focal_ratios
-    observations = int(tracks.seen.sum())
-    begun: dict[int, Scene | None] = {}
-    completed: set[int] = set()
+    settings, ratios = config.scene, model.focal_ratios
+    width, observations = tracks.image_size[0], int(tracks.seen.sum())
+    found: dict[int, Scene] = {}
 
-    def with_cost(n: int, scene: Scene) -> Scene:
+    def adjusted(scene: Scene) -> Scene:
+        scene = _refined(scene, settings, None, 1, ROUGH)
         cost = truncated_cost(scene, scene.camera, settings.error_px)
         return replace(scene, profile=Profile(
-            np.array([ratios[n]]), np.array([cost]), observations))
+            np.array([scene.camera.fx / width]), np.array([cost]), observations))
 
-    def begin(n: int) -> None:
-        camera = model.centred(tracks.image_size, ratios[n] * tracks.image_size[0])
-        scene = chain_scene(tracks, turn.id, camera, _NO_PROFILE, settings, seed)
-        begun[n] = scene and with_cost(n, _refined(scene, settings, None, 1, ROUGH))
+    def chained(camera: Camera) -> Scene | None:
+        scene = chain_scene(tracks, turn.id, camera, _NO_PROFILE, settings, config.seed)
+        return scene and adjusted(scene)
+
+    def begin(n: int, like: Camera) -> None:
+        scene = chained(like.with_focal(ratios[n] * width))
+        if scene is not None:
+            found[n] = min(found.get(n, scene), scene, key=_cost_of)
 
     def complete(n: int) -> None:
-        completed.add(n)
-        if n not in begun:
-            begin(n)
-        if (scene := begun[n]) is not None:
-            scene = _refined(scene, settings, None, 1, ROUGH)
-            begun[n] = with_cost(n, _completed(scene, settings, seed))
+        found[n] = adjusted(found[n])
+        for _ in range(COMPLETIONS):
+            if found[n].structure.registered.all() and _cost_of(found[n]) <= GOOD_COST:
+                break
+            other = chained(found[n].camera)
+            other = other and adjusted(other)
+            if other is None or _cost_of(other) > WORTH * _cost_of(found[n]):
+                break
+            found[n] = other
 
-    def found() -> dict[int, Scene]:
-        return {n: scene for n, scene in begun.items() if scene is not None}
-
-    def promising(step: int, others: Set[int]) -> Set[int]:
-        """Return the best and those a step beside it; others, too, where it is not good."""
-        trials = found()
-        if not trials:
-            return others
-        best = min(trials, key=lambda n: (_cost_of(trials[n]), n))
-        near = {best - step, best, best + step} & set(range(len(ratios)))
-        return near if _cost_of(trials[best]) <= GOOD_COST else near | others
+    def best() -> int:
+        return min(found, key=lambda n: (_cost_of(found[n]), n))
 
     coarse = range(1, len(ratios), 2)
+    begun: set[int] = set()
     wanted: Set[int] = set(coarse[1:-1])
     while wanted:
         for n in sorted(wanted):
-            begin(n)
-        wanted = promising(2, set(coarse)) - begun.keys()
-    while wanted := promising(1, found().keys()) - completed:
-        for n in sorted(wanted):
+            begin(n, model.centred(tracks.image_size, width))
+        begun |= wanted
+        wanted = (set(coarse) & {best() - 2, best() + 2} if found else set(coarse)) - begun
+    completed: set[int] = set()
+    compared: set[int] = set()
+    while found:
+        n = best()
+        near = {n - 1, n + 1} & set(range(len(ratios))) - completed - compared
+        if n not in completed:
             complete(n)
-    return {ratios[n]: scene for n, scene in found().items()}
-
-
-def _completed(scene: Scene, config: SceneConfig, seed: int) -> Scene:
-    """Chain anew where images are missing, now that the distortion is known better.
-
-    With a wide lens, a chain without distortion breaks soon, even at the true focal length.
-    """
-    for _ in range(COMPLETIONS):
-        if scene.structure.registered.all():
+            completed.add(n)
+        elif near:
+            for other in sorted(near):
+                if other not in found or _cost_of(found[other]) > GOOD_COST:
+                    begin(other, found[n].camera)
+                if other in found:
+                    found[other] = adjusted(found[other])
+            compared |= near
+        elif _cost_of(found[n]) > BAD_COST and (rest := found.keys() - completed):
+            for other in sorted(rest):
+                complete(other)
+            completed |= rest
+        else:
             break
-        other = chain_scene(scene.tracks, scene.turn, scene.camera, scene.profile, config, seed)
-        if other is None:
-            break
-        other = _refined(other, config, None, tolerance=ROUGH)
-        if (truncated_cost(other, other.camera, config.error_px)
-                >= truncated_cost(scene, scene.camera, config.error_px)):
-            break
-        scene = other
-    return scene
+    return {ratios[n]: scene for n, scene in found.items()}
 
 
 _NO_PROFILE = Profile(np.zeros(0), np.zeros(0), 0)

@@ -15,6 +15,7 @@ from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
 from dashcalib_ros.reconstruct import adjust, build, register
 from dashcalib_ros.reconstruct.adjust import Solver
+from dashcalib_ros.reconstruct.build import chain_scene
 from dashcalib_ros.reconstruct.chain import absolute_pose, chain, relative_pose
 from dashcalib_ros.reconstruct.register import register_tracks
 from dashcalib_ros.reconstruct.scene import (
@@ -259,6 +260,27 @@ def test_the_profile_finds_a_barrel_lens(turn):
     assert best.structure.registered.all()
     assert best.camera.k1 == pytest.approx(LENS.k1, abs=0.04)
     assert (np.diff(profile.ratios) > 0).all() and len(profile.ratios) >= 4
+
+
+def test_focal_lengths_beside_the_best_begin_with_its_distortion(turn, monkeypatch):
+    begun: list[Radial] = []
+    monkeypatch.setattr(build, 'chain_scene', lambda *arguments: (
+        begun.append(arguments[2]), chain_scene(*arguments))[1])
+    sample = build._spread(thinned(turn.tracks, 12), 200)
+    build._profile_trials(sample, Turn(0, 0, 60, 3.0, 0.05), Config(), Radial)
+    coarse = SIZE[0] * np.array(Radial.focal_ratios[1::2])
+    fine = [camera for camera in begun if np.abs(coarse / camera.fx - 1).min() > 0.05]
+    assert fine and all(camera.k1 < -0.1 for camera in fine)
+    assert any(camera.k1 == 0 for camera in begun)
+
+
+def test_where_no_usual_focal_length_gives_a_scene_the_others_are_tried(turn, monkeypatch):
+    ratios = Radial.focal_ratios
+    monkeypatch.setattr(build, 'chain_scene', lambda *arguments: (
+        None if ratios[2] < arguments[2].fx / SIZE[0] < ratios[8] else chain_scene(*arguments)))
+    sample = build._spread(thinned(turn.tracks, 12), 200)
+    trials = build._profile_trials(sample, Turn(0, 0, 60, 3.0, 0.05), Config(), Radial)
+    assert trials and set(trials) <= {*ratios[:3], *ratios[8:]}
 
 
 # adjust
