@@ -115,19 +115,17 @@ def _alike(scene: Scene, other: Scene, rows: Ints, starts: Ints, times: Floats) 
     rows: the registered keyframes. starts: (n,) with which of them spans begin. times: (k,) when
     the other scene shows the keyframes. 0 where too few tracks are near one.
     """
+    ends = rows[starts[:, None] + (0, SPAN)]
+    owns, theirs = scene.tracks.xy[ends], _places_at(other, times[ends])
     shares = np.zeros(len(starts))
-    for n, start in enumerate(starts):
-        ends = rows[[start, start + SPAN]]
-        own = scene.tracks.xy[ends]
-        there = np.array([_places_at(other, times[row]) for row in ends])
-        own, there = (each[:, np.isfinite(each[:, :, 0].sum(axis=0))] for each in (own, there))
+    for n, (own, there) in enumerate(zip(owns, theirs, strict=True)):
+        own, there = (each[:, np.isfinite(each[:, :, 0]).all(axis=0)] for each in (own, there))
         own = own[:, ::max(1, own.shape[1] // MOST_TRACKS)]
         if not own.shape[1] or not there.shape[1]:
             continue
-        across, down = (own[0][:, None, axis] - there[0][:, axis] for axis in (0, 1))
-        apart = across**2 + down**2
-        nearest = apart.argmin(axis=1)
-        near = apart.min(axis=1) < NEAR_PX**2
+        # half the squared distance, without what is the same for all
+        nearest = (np.sum(there[0]**2, axis=1) / 2 - own[0] @ there[0].T).argmin(axis=1)
+        near = np.linalg.norm(own[0] - there[0][nearest], axis=1) < NEAR_PX
         if near.sum() >= FEWEST_NEAR:
             moved = (own[1] - own[0]) - (there[1] - there[0])[nearest]
             shares[n] = np.mean(np.linalg.norm(moved[near], axis=1) < ALIKE_PX)
@@ -145,17 +143,18 @@ def _yaw_deg(scene: Scene) -> tuple[Floats, Floats]:
     return _seconds(scene)[scene.structure.registered], scene.yaws_deg
 
 
-def _places_at(scene: Scene, time: float) -> Floats:
-    """Return (t, 2) where a scene's tracks are at a time, between two keyframes; NaN unseen."""
-    times = _seconds(scene)
+def _places_at(scene: Scene, at: Floats) -> Floats:
+    """Return (..., t, 2) where a scene's tracks are at times (...) between two keyframes.
+
+    NaN where they are not seen.
+    """
+    times, xy = _seconds(scene), scene.tracks.xy
+    inside = np.clip(at, times[0], times[-1])
+    after = np.maximum(np.searchsorted(times, inside), 1)
+    share = (inside - times[after - 1]) / np.maximum(times[after] - times[after - 1], 1e-9)
     # a keyframe that is as near as that counts as this picture
-    inside = float(np.clip(time, times[0], times[-1]))
-    if abs(time - inside) > OFFSET_S / 2:
-        return np.full((scene.tracks.xy.shape[1], 2), np.nan)
-    after = max(int(np.searchsorted(times, inside)), 1)
-    share = (inside - times[after - 1]) / max(times[after] - times[after - 1], 1e-9)
-    before, later = scene.tracks.xy[after - 1], scene.tracks.xy[after]
-    return np.asarray((1 - share) * before + share * later)
+    share = np.where(np.abs(at - inside) > OFFSET_S / 2, np.nan, share)[..., None, None]
+    return np.asarray((1 - share) * xy[after - 1] + share * xy[after])
 
 
 def _cut(scene: Scene, rows: Mask) -> Scene:
