@@ -39,8 +39,6 @@ GRID = (6, 3)
 MIN_TRACKS = 80
 # px^2 per observation; what costs more is chained anew, and may be another kind of lens
 GOOD_COST = 1.2
-# the same; a minimum like this may be anywhere, so all focal lengths are completed
-BAD_COST = 1.8
 # of the cost of the chain before; one that costs more is no better
 WORTH = 0.95
 
@@ -65,7 +63,8 @@ def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft 
         return None
     if len(found) > 1:
         # at the focal lengths of the grid, the right kind may look worse
-        found = [_refined(scene, settings, _around(scene.camera)) for scene in found]
+        found = [_refined(scene, settings, _around(scene.camera), Solver.tolerance)
+                 for scene in found]
     # min() returns the first one of equals: the simplest
     best = min(found, key=lambda scene: truncated_cost(scene, scene.camera, settings.error_px))
     return Draft(thinned(tracks, settings.keyframes), Start(best.profile, best.camera),
@@ -96,13 +95,13 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
     if scene is None:
         return None
     scene, reach = replace(scene, rivals=draft.rivals), _around(start)
-    scene = _refined(scene, settings, reach, tolerance=ROUGH)
+    scene = _refined(scene, settings, reach)
     by_index = {frame.index: frame.image for frame in turn.frames}
     images = [by_index[int(index)] for index in scene.tracks.frames]
     registered = register_tracks(scene.tracks, scene.structure, scene.camera, images)
     scene = retriangulated(replace(scene, tracks=registered), scene.camera,
                            settings.error_px, settings.min_angle_deg)
-    scene = _refined(scene, settings, reach, rounds=1)
+    scene = _refined(scene, settings, reach, Solver.tolerance)
     return scene if scene.structure.used.any() else None
 
 
@@ -117,14 +116,12 @@ def chain_scene(tracks: Tracks, turn: TurnId, camera: Camera, profile: Profile,
 
 
 def _refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | None,
-             rounds: int = 2, tolerance: float = Solver.tolerance) -> Scene:
-    """Return the scene after rounds of adjustment and triangulation."""
+             tolerance: float = ROUGH) -> Scene:
+    """Return the scene after an adjustment and triangulation."""
     solver = Solver(config.loss_px, config.iterations, tolerance)
     free: Free = 'first distortion' if reach is None else 'one focal length'
-    for _ in range(rounds):
-        [scene], camera = adjust([scene], scene.camera, solver, free, reach)
-        scene = retriangulated(scene, camera, config.error_px, config.min_angle_deg)
-    return scene
+    [scene], camera = adjust([scene], scene.camera, solver, free, reach)
+    return retriangulated(scene, camera, config.error_px, config.min_angle_deg)
 
 
 def _trials(tracks: Tracks, turn: Turn, config: Config, model: type[Camera]
@@ -162,7 +159,7 @@ def _profile_trials(tracks: Tracks, turn: Turn, config: Config, model: type[Came
     found: dict[int, Scene] = {}
 
     def adjusted(scene: Scene) -> Scene:
-        scene = _refined(scene, settings, None, 1, ROUGH)
+        scene = _refined(scene, settings, None)
         cost = truncated_cost(scene, scene.camera, settings.error_px)
         return replace(scene, profile=Profile(
             np.array([scene.camera.fx / width]), np.array([cost]), observations))
@@ -213,7 +210,7 @@ def _profile_trials(tracks: Tracks, turn: Turn, config: Config, model: type[Came
                 if other in found:
                     found[other] = adjusted(found[other])
             compared |= near
-        elif _cost_of(found[n]) > BAD_COST and (rest := found.keys() - completed):
+        elif not found[n].profile.tells and (rest := found.keys() - completed):
             for other in sorted(rest):
                 complete(other)
             completed |= rest

@@ -32,7 +32,7 @@ SCALE = 1000.0
 RELATIVE_TRIALS = (50, 1000)
 ABSOLUTE_TRIALS = (10, 100)
 # steps of a pose's refinement: the adjustments that follow go on from there
-REFINEMENTS = 2
+REFINEMENTS = 5
 Pose = tuple[Floats, Floats]
 
 

@@ -16,6 +16,8 @@ from dashcalib_ros.reconstruct.tracks import Tracks
 
 # cosine (11 degrees); a point farther off its viewing ray is an outlier, wherever it projects
 ALONG = 0.98
+# px^2 per observation; a profile whose minimum is higher may have it anywhere
+BAD_COST = 1.8
 # by which the road may turn a car about any axis
 BUMPS_DEG = 10.0
 # px; wider pictures are made smaller: several of them go into one report
@@ -144,6 +146,11 @@ class Profile:
     def best(self) -> float:
         """Return the ratio with the least cost."""
         return float(self.ratios[np.argmin(self.costs)])
+
+    @property
+    def tells(self) -> bool:
+        """Return whether the turn is explained well enough for its minimum to mean anything."""
+        return bool(self.costs.min() <= BAD_COST)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,11 @@ PROBES = (0.8, 1.0, 1.25)
 
 
 def summed(profiles: Sequence[Profile]) -> Profile:
-    """Return the profiles' sum, in squared error times observations, on a common fine grid."""
+    """Return the profiles' sum, in squared error times observations, on a common fine grid.
+
+    A profile that tells nothing would outvote gentle bends; it counts only where all are like it.
+    """
+    profiles = [profile for profile in profiles if profile.tells] or profiles
     low = max(profile.ratios[0] for profile in profiles)
     high = min(profile.ratios[-1] for profile in profiles)
     if low >= high:

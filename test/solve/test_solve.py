@@ -233,6 +233,14 @@ def test_profiles_add_up_by_their_observations():
     assert summed([single]).best == pytest.approx(0.5)
 
 
+def test_a_turn_that_no_focal_length_explains_does_not_outvote_a_gentle_bend():
+    ratios = np.geomspace(0.3, 1.2, 9)
+    gentle = Profile(ratios, 0.9 + 0.05 * np.log(ratios / 0.6)**2, 500)
+    broken = Profile(ratios, 2.2 + np.log(ratios / 1.1)**2, 500)
+    assert summed([gentle, broken]).best == pytest.approx(0.6, rel=0.1)
+    assert summed([broken]).best == pytest.approx(1.1, rel=0.1)
+
+
 # what a turn knows
 
 def small_scene(noise_px: float = 0.2, **options) -> Scene:
