@@ -15,6 +15,8 @@ from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
 
 # factors of the resulting focal length at which the profile is evaluated
 PROBES = (0.8, 1.0, 1.25)
+# of the result's cost; where another probe has less, so many times the tracks are asked
+CLOSE, MORE = 1.1, 4
 
 
 def summed(profiles: Sequence[Profile]) -> Profile:
@@ -57,29 +59,40 @@ def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
                    config: Config) -> Profile:
     """Return the cost with the focal length fixed at PROBES times the result, all else adjusted.
 
-    Each probe is an adjustment that starts from the result, with a part of the tracks. The least
-    triangulation angle is the same in pixels for all: at a fixed angle a shorter focal length
-    would have more points, and explain more observations only for that. If the coarse profile has
-    its minimum outside the probes, that focal length is probed too, with scenes chained anew: of
-    the two, the one that explains more observations is right.
+    Each probe is an adjustment that starts from the result, with a part of the tracks, and with
+    more of them where it is close: few points hold a turn's poses badly. The least triangulation
+    angle is the same in pixels for all: at a fixed angle a shorter focal length would have more
+    points, and explain more observations only for that. If the coarse profile has its minimum
+    outside the probes, that focal length is probed too, with scenes chained anew: of the two, the
+    one that explains more observations is right.
     """
+    wanted, result = config.intrinsics.profile_tracks, camera.fx / camera.image_size[0]
+    found = _probed([subsample_tracks(scene, wanted) for scene in scenes], camera, coarse, config)
+    others = found.costs[~np.isclose(found.ratios, result)]
+    if others.min() < CLOSE * float(np.interp(result, found.ratios, found.costs)):
+        more = [subsample_tracks(scene, MORE * wanted) for scene in scenes]
+        found = _probed(more, camera, coarse, config)
+    return found
+
+
+def _probed(scenes: Sequence[Scene], camera: Camera, coarse: Profile, config: Config) -> Profile:
+    """Return profile_around() of these tracks."""
     def settings_at(fixed: Camera) -> SceneConfig:
         least = config.scene.min_angle_deg * camera.fx / fixed.fx
         return replace(config.scene, min_angle_deg=least)
 
-    few = [subsample_tracks(scene, config.intrinsics.profile_tracks) for scene in scenes]
     width = camera.image_size[0]
     costs = {}
     for probe in PROBES:
         fixed = camera.with_focal(camera.fx * probe)
-        costs[fixed.fx / width] = _cost_at(few, fixed, settings_at(fixed))
+        costs[fixed.fx / width] = _cost_at(scenes, fixed, settings_at(fixed))
     if not PROBES[0] < coarse.best * width / camera.fx < PROBES[-1]:
         fixed = type(camera).centred(camera.image_size, coarse.best * width)
         settings = settings_at(fixed)
-        anew = [rechain(scene, fixed, settings, config.seed) or scene for scene in few]
+        anew = [rechain(scene, fixed, settings, config.seed) or scene for scene in scenes]
         costs[coarse.best] = _cost_at(anew, fixed, settings)
     ratios = sorted(costs)
-    observations = sum(int(scene.tracks.seen.sum()) for scene in few)
+    observations = sum(int(scene.tracks.seen.sum()) for scene in scenes)
     return Profile(np.array(ratios), np.array([costs[ratio] for ratio in ratios]), observations)
 
 

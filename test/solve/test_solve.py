@@ -31,7 +31,7 @@ from dashcalib_ros.reconstruct.scene import (
     retriangulated,
     truncated_cost,
 )
-from dashcalib_ros.solve import fitting, joint, steps
+from dashcalib_ros.solve import fitting, focal, joint, steps
 from dashcalib_ros.solve import solve as solve_stage
 from dashcalib_ros.solve.fitting import misfits
 from dashcalib_ros.solve.focal import profile_around, summed
@@ -521,6 +521,21 @@ def test_sigma_too_large(good, relative, level):
     wide[0, 0] = (relative * good.camera.fx)**2
     found, reasons = levels(replace(good, covariance=wide))
     assert found == level and ('the focal length is known' in reasons) == (level != 'accepted')
+
+
+@pytest.mark.parametrize(('rise', 'asked'), [(0.5, [20, 20, 20]), (0.02, [20] * 3 + [80] * 3)])
+def test_more_tracks_are_asked_where_another_focal_length_is_close(monkeypatch, rise, asked):
+    [scene] = scenes_of(1, tracks=150)
+    seen: list[int] = []
+
+    def cost_at(scenes, camera, _):
+        seen.append(scenes[0].tracks.xy.shape[1])
+        return 1.0 if camera.fx == LENS.fx else 1.0 + rise
+
+    monkeypatch.setattr(focal, '_cost_at', cost_at)
+    coarse = Profile(np.array([LENS.fx / SIZE[0]]), np.array([1.0]), 1)
+    profile_around([scene], LENS, coarse, CONFIG.replace({'intrinsics.profile_tracks': 20}))
+    assert seen == asked
 
 
 def test_points_at_small_angles_do_not_speak_for_a_shorter_focal_length():
