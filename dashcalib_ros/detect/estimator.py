@@ -307,13 +307,14 @@ class MotionEstimator:
     def _magnitude(self, first: _Seen | None, middle: _Seen | None) -> float:
         """Return the triplet's turning magnitude; NaN without a triplet, or without epipoles.
 
-        A fast camera's is measured once a spacing; between, it is the last one's.
+        With three images a spacing or more, it is measured once a spacing; between, the last one
+        is returned.
         """
         if first is None or middle is None:
             return math.nan
         last = self._seen[-1]
-        # triplets that share more than a pair cost three times as much, and tell no more; a slow
-        # camera has few, and each counts
+        # triplets at each image cost three times as much, and tell no more; a slow camera has few,
+        # and each counts
         spacing_ns = 1e9 * self.config.spacing_s
         fast = last.stamp_ns - self._seen[-2].stamp_ns < 0.4 * spacing_ns
         if fast and last.stamp_ns - self._turning[0] < spacing_ns - 0.5 * self._period_ns:

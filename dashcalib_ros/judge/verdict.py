@@ -140,13 +140,8 @@ def flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
 
 
 def profile_contrast(solution: Solution) -> float:
-    """Return the relative rise of the cost from the result to the lowest of the other probes.
-
-    Negative when another focal length explains the observations better than the result.
-    """
-    costs, ratio = solution.around.costs, solution.camera.fx / solution.camera.image_size[0]
-    at = int(np.argmin(np.abs(solution.around.ratios - ratio)))
-    return float(np.delete(costs, at).min() / costs[at] - 1)
+    """Return the relative rise of the cost from the result to the lowest of the other probes."""
+    return solution.around.contrast(solution.camera.fx / solution.camera.image_size[0])
 
 
 def _far_from_profile(solution: Solution, config: VerdictConfig) -> Finding | None:

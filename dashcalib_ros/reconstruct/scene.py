@@ -152,6 +152,14 @@ class Profile:
         """Return whether the turn is explained well enough for its minimum to mean anything."""
         return bool(self.costs.min() <= BAD_COST)
 
+    def contrast(self, ratio: float) -> float:
+        """Return the relative rise of the cost from the sample at a ratio to the lowest other one.
+
+        Negative when another focal length explains the observations better.
+        """
+        at = int(np.argmin(np.abs(self.ratios - ratio)))
+        return float(np.delete(self.costs, at).min() / self.costs[at] - 1)
+
 
 @dataclass(frozen=True)
 class Start:

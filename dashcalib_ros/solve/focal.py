@@ -15,8 +15,8 @@ from dashcalib_ros.solve.fitting import rechain, retriangulate, subsample_tracks
 
 # factors of the resulting focal length at which the profile is evaluated
 PROBES = (0.8, 1.0, 1.25)
-# of the result's cost; where another probe has less, so many times the tracks are asked
-CLOSE, MORE = 1.1, 4
+# where another probe's cost is higher by less than this share, so many times the tracks are used
+CLOSE, MORE = 0.1, 4
 
 
 def summed(profiles: Sequence[Profile]) -> Profile:
@@ -66,13 +66,14 @@ def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
     outside the probes, that focal length is probed too, with scenes chained anew: of the two, the
     one that explains more observations is right.
     """
-    wanted, result = config.intrinsics.profile_tracks, camera.fx / camera.image_size[0]
-    found = _probed([subsample_tracks(scene, wanted) for scene in scenes], camera, coarse, config)
-    others = found.costs[~np.isclose(found.ratios, result)]
-    if others.min() < CLOSE * float(np.interp(result, found.ratios, found.costs)):
-        more = [subsample_tracks(scene, MORE * wanted) for scene in scenes]
-        found = _probed(more, camera, coarse, config)
-    return found
+    def probed(tracks: int) -> Profile:
+        few = [subsample_tracks(scene, tracks) for scene in scenes]
+        return _probed(few, camera, coarse, config)
+
+    wanted = config.intrinsics.profile_tracks
+    found = probed(wanted)
+    close = found.contrast(camera.fx / camera.image_size[0]) < CLOSE
+    return probed(MORE * wanted) if close else found
 
 
 def _probed(scenes: Sequence[Scene], camera: Camera, coarse: Profile, config: Config) -> Profile:

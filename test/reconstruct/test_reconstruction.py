@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
 from dashcalib_ros.reconstruct import adjust, build, register
 from dashcalib_ros.reconstruct.adjust import Solver
-from dashcalib_ros.reconstruct.build import chain_scene
 from dashcalib_ros.reconstruct.chain import absolute_pose, chain, relative_pose
 from dashcalib_ros.reconstruct.register import register_tracks
 from dashcalib_ros.reconstruct.scene import (
@@ -263,11 +263,11 @@ def test_the_profile_finds_a_barrel_lens(turn):
 
 
 def test_focal_lengths_beside_the_best_begin_with_its_distortion(turn, monkeypatch):
-    begun: list[Radial] = []
-    monkeypatch.setattr(build, 'chain_scene', lambda *arguments: (
-        begun.append(arguments[2]), chain_scene(*arguments))[1])
+    asked = Mock(wraps=build.chain_scene)
+    monkeypatch.setattr(build, 'chain_scene', asked)
     sample = build._spread(thinned(turn.tracks, 12), 200)
     build._profile_trials(sample, Turn(0, 0, 60, 3.0, 0.05), Config(), Radial)
+    begun = [call.args[2] for call in asked.call_args_list]
     coarse = SIZE[0] * np.array(Radial.focal_ratios[1::2])
     fine = [camera for camera in begun if np.abs(coarse / camera.fx - 1).min() > 0.05]
     assert fine and all(camera.k1 < -0.1 for camera in fine)
@@ -275,7 +275,7 @@ def test_focal_lengths_beside_the_best_begin_with_its_distortion(turn, monkeypat
 
 
 def test_where_no_usual_focal_length_gives_a_scene_the_others_are_tried(turn, monkeypatch):
-    ratios = Radial.focal_ratios
+    ratios, chain_scene = Radial.focal_ratios, build.chain_scene
     monkeypatch.setattr(build, 'chain_scene', lambda *arguments: (
         None if ratios[2] < arguments[2].fx / SIZE[0] < ratios[8] else chain_scene(*arguments)))
     sample = build._spread(thinned(turn.tracks, 12), 200)
