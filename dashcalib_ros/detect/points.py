@@ -1,6 +1,7 @@
 """Corner points: found in an image, and tracked from image to image."""
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,8 @@ from dashcalib_ros.arrays import Floats32, GreyImage, Mask
 
 # px; a point that does not track back to within this is dropped
 FORWARD_BACKWARD_PX = 0.5
+# px, height and width; OpenCV's dense flow crashes in pictures that are narrower
+DENSE_FLOW_PX = 32
 
 
 @dataclass(frozen=True)
@@ -18,13 +21,14 @@ class Tracking:
     """Options of the tracking; the defaults are those of a reconstruction.
 
     window: px, (width, height) of the Lucas-Kanade window. OpenCV takes eight columns at once, and
-    what is left one by one. levels: of the pyramid, above the full picture.
+    what is left one by one. levels: of the pyramid, above the full picture; None: no pyramid, the
+    search begins where dense optical flow leads, in two thirds of the time for a thousand points.
     steps, step_px: the iteration ends after this many steps, or with a step this short.
     border: px; points nearer to it are dropped: where the window leaves the picture, they drift.
     """
 
     window: tuple[int, int] = (24, 21)
-    levels: int = 4
+    levels: int | None = None
     steps: int = 10
     step_px: float = 0.03
     border: int = 8
@@ -75,8 +79,10 @@ def follow_points(before: GreyImage, after: GreyImage, points: Floats32, trackin
     # cv2's stubs have wrong types for this function
     flow: Any = cv2.calcOpticalFlowPyrLK
     ends = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, tracking.steps, tracking.step_px
-    settings = {'winSize': tracking.window, 'criteria': ends}
-    moved, ahead, _ = flow(before, after, points, None, maxLevel=tracking.levels, **settings)
+    settings = {'winSize': tracking.window, 'criteria': ends,
+                'flags': cv2.OPTFLOW_USE_INITIAL_FLOW}
+    begun = points.copy() if tracking.levels is not None else _led(before, after, points)
+    moved, ahead, _ = flow(before, after, points, begun, maxLevel=tracking.levels or 0, **settings)
     x, y, border = moved[:, 0], moved[:, 1], tracking.border
     trusted = np.asarray(
         (ahead.ravel() > 0)
@@ -84,9 +90,25 @@ def follow_points(before: GreyImage, after: GreyImage, points: Floats32, trackin
     if trusted.any():
         # the backward search starts from the point itself: a wrong match still ends elsewhere, and
         # it takes a fifth of the time
-        begun = points[trusted]
-        back, behind, _ = flow(after, before, moved[trusted], begun.copy(), maxLevel=0,
-                               flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **settings)
+        start = points[trusted]
+        back, behind, _ = flow(after, before, moved[trusted], start.copy(), maxLevel=0, **settings)
         trusted[trusted] = ((behind.ravel() > 0)
-                            & (np.linalg.norm(back - begun, axis=1) < FORWARD_BACKWARD_PX))
+                            & (np.linalg.norm(back - start, axis=1) < FORWARD_BACKWARD_PX))
     return moved, trusted
+
+
+def _led(before: GreyImage, after: GreyImage, points: Floats32) -> Floats32:
+    """Return (n, 2) where dense optical flow leads the points, right to a few pixels."""
+    height, width = after.shape
+    share = max(0.5, DENSE_FLOW_PX / min(height, width))
+    size = math.ceil(width * share), math.ceil(height * share)
+    halves = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (before, after)]
+    dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    # twice the preset's: at 3 images a second points move far
+    dense.setGradientDescentIterations(25)
+    # cv2's stubs ask for the array that it returns
+    flow = dense.calc(halves[0], halves[1], None)  # type: ignore[call-overload]
+    scale = np.array([width / size[0], height / size[1]], np.float32)
+    x, y = ((points + np.float32(0.5)) / scale - np.float32(0.5)).T
+    step = cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(points + scale * step.reshape(-1, 2), np.float32)

@@ -87,11 +87,15 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
     turn: needs the images of the draft's keyframes only.
     """
     start, settings = draft.start.camera, config.scene
-    # with spread tracks there may be no pair of images that shares enough of them
-    scene = None
+    scene: Scene | None = None
+    # with spread tracks there may be no pair of images that shares enough of them, or images left
     for choose in (_spread, _longest):
-        scene = scene or chain_scene(choose(draft.tracks, settings.tracks), turn.id, start,
-                                     draft.start.profile, settings, config.seed)
+        other = chain_scene(choose(draft.tracks, settings.tracks), turn.id, start,
+                            draft.start.profile, settings, config.seed)
+        if scene is None or other is not None and _images(other) > _images(scene):
+            scene = other
+        if scene is not None and scene.structure.registered.all():
+            break
     if scene is None:
         return None
     scene, reach = replace(scene, rivals=draft.rivals), _around(start)
@@ -103,6 +107,10 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
                            settings.error_px, settings.min_angle_deg)
     scene = _refined(scene, settings, reach, Solver.tolerance)
     return scene if scene.structure.used.any() else None
+
+
+def _images(scene: Scene) -> int:
+    return int(scene.structure.registered.sum())
 
 
 def chain_scene(tracks: Tracks, turn: TurnId, camera: Camera, profile: Profile,
