@@ -92,7 +92,7 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
     for choose in (_spread, _longest):
         other = chain_scene(choose(draft.tracks, settings.tracks), turn.id, start,
                             draft.start.profile, settings, config.seed)
-        if scene is None or other is not None and _images(other) > _images(scene):
+        if scene is None or (other is not None and _images(other) > _images(scene)):
             scene = other
         if scene is not None and scene.structure.registered.all():
             break
