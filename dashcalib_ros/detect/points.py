@@ -104,8 +104,6 @@ def _led(before: GreyImage, after: GreyImage, points: Floats32) -> Floats32:
     size = math.ceil(width * share), math.ceil(height * share)
     halves = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (before, after)]
     dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-    # twice the preset's: at 3 images a second points move far
-    dense.setGradientDescentIterations(25)
     # cv2's stubs ask for the array that it returns
     flow = dense.calc(halves[0], halves[1], None)  # type: ignore[call-overload]
     scale = np.array([width / size[0], height / size[1]], np.float32)

@@ -87,15 +87,7 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
     turn: needs the images of the draft's keyframes only.
     """
     start, settings = draft.start.camera, config.scene
-    scene: Scene | None = None
-    # with spread tracks there may be no pair of images that shares enough of them, or images left
-    for choose in (_spread, _longest):
-        other = chain_scene(choose(draft.tracks, settings.tracks), turn.id, start,
-                            draft.start.profile, settings, config.seed)
-        if scene is None or (other is not None and _images(other) > _images(scene)):
-            scene = other
-        if scene is not None and scene.structure.registered.all():
-            break
+    scene = _begun(draft, turn.id, config)
     if scene is None:
         return None
     scene, reach = replace(scene, rivals=draft.rivals), _around(start)
@@ -109,8 +101,20 @@ def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
     return scene if scene.structure.used.any() else None
 
 
-def _images(scene: Scene) -> int:
-    return int(scene.structure.registered.sum())
+def _begun(draft: Draft, turn: TurnId, config: Config) -> Scene | None:
+    """Return a first scene from spread tracks, or from the longest if images are left out.
+
+    Where tracks are short, no pair of images may share enough spread ones, or the chain breaks.
+    """
+    found = []
+    for choose in (_spread, _longest):
+        scene = chain_scene(choose(draft.tracks, config.scene.tracks), turn, draft.start.camera,
+                            draft.start.profile, config.scene, config.seed)
+        if scene is not None:
+            found.append(scene)
+            if scene.structure.registered.all():
+                break
+    return max(found, key=lambda scene: int(scene.structure.registered.sum()), default=None)
 
 
 def chain_scene(tracks: Tracks, turn: TurnId, camera: Camera, profile: Profile,

@@ -18,6 +18,10 @@ from dashcalib_ros.detect.turn import Turn
 MIN_LENGTH = 3
 # px between two keyframes; a track that moves less stands still in the picture
 STANDING_PX = 0.3
+# s between two images; where more passes, points move farther than dense flow finds them: of steps
+# of 100 px in 640 it loses half of the points that a pyramid of so many levels follows
+DENSE_FLOW_S = 0.15
+LEVELS = 4
 # a keyframe comes at the latest when fewer of the last one's points live
 KEYFRAME_OVERLAP = 0.6
 
@@ -48,7 +52,9 @@ def track_turn(turn: Turn, config: TracksConfig, valid: Mask | None = None) -> T
     valid: (h, w), False where the ego vehicle is; None for everywhere.
     """
     images = [frame.image for frame in turn.frames]
-    ids, frames, xy = _follow(images, config, valid)
+    stamps_ns = np.array([frame.stamp_ns for frame in turn.frames], np.int64)
+    near = len(images) < 2 or np.median(np.diff(stamps_ns)) < DENSE_FLOW_S * 1e9
+    ids, frames, xy = _follow(images, Tracking(levels=None if near else LEVELS), config, valid)
     keyframes = _keyframes(ids, frames, xy, images[0].shape[1], config)
     rows = np.isin(frames, keyframes)
     names, columns = np.unique(ids[rows], return_inverse=True)
@@ -56,8 +62,7 @@ def track_turn(turn: Turn, config: TracksConfig, valid: Mask | None = None) -> T
     table[np.searchsorted(keyframes, frames[rows]), columns] = xy[rows]
     table = table[:, _worth_keeping(table)]
     indices = np.array([turn.frames[k].index for k in keyframes], dtype=np.int64)
-    stamps_ns = np.array([turn.frames[k].stamp_ns for k in keyframes], dtype=np.int64)
-    return Tracks(indices, table, turn.frames[0].size, stamps_ns)
+    return Tracks(indices, table, turn.frames[0].size, stamps_ns[keyframes])
 
 
 def thinned(tracks: Tracks, keyframes: int) -> Tracks:
@@ -71,14 +76,13 @@ def thinned(tracks: Tracks, keyframes: int) -> Tracks:
                   tracks.stamps_ns[kept])
 
 
-def _follow(images: list[GreyImage], config: TracksConfig, valid: Mask | None
-            ) -> tuple[Ints, Ints, Floats]:
+def _follow(images: list[GreyImage], tracking: Tracking, config: TracksConfig,
+            valid: Mask | None) -> tuple[Ints, Ints, Floats]:
     """Return the observations as flat arrays: track (n,), image (n,), xy (n, 2)."""
     ids = np.zeros(0, np.int64)
     points = np.zeros((0, 2), np.float32)
     born = 0
     rows = []
-    tracking = Tracking()
     for k, image in enumerate(images):
         if k:
             points, trusted = follow_points(images[k - 1], image, points, tracking)

@@ -12,9 +12,11 @@ from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.camera.camera import Prior
 from dashcalib_ros.config import Config, SceneConfig, TracksConfig
 from dashcalib_ros.detect import TurnId
+from dashcalib_ros.detect.points import follow_points
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
 from dashcalib_ros.reconstruct import adjust, build, register
+from dashcalib_ros.reconstruct import tracks as track_module
 from dashcalib_ros.reconstruct.adjust import Solver
 from dashcalib_ros.reconstruct.chain import absolute_pose, chain, relative_pose
 from dashcalib_ros.reconstruct.register import register_tracks
@@ -447,6 +449,28 @@ def test_one_focal_length_at_the_truth_stays_there(colmap_scene):
         scene.structure.points, colmap_scene.structure.points, atol=1e-6)
 
 
+@pytest.mark.parametrize(('spread', 'longest', 'taken'), [
+    (20, 20, 'spread'), (4, 20, 'longest'), (9, 4, 'spread'), (None, 4, 'longest'),
+    (None, None, None)])
+def test_a_scene_begins_with_the_tracks_that_leave_fewer_images_out(
+        monkeypatch, spread, longest, taken):
+    images = {'spread': spread, 'longest': longest}
+    monkeypatch.setattr(build, '_spread', lambda tracks, count: 'spread')
+    monkeypatch.setattr(build, '_longest', lambda tracks, count: 'longest')
+    tried = []
+
+    def chain_scene(tracks, *others):
+        tried.append(tracks)
+        count = images[tracks]
+        return count and Mock(of=tracks, structure=Mock(registered=np.arange(20) < count))
+
+    monkeypatch.setattr(build, 'chain_scene', chain_scene)
+    scene = build._begun(Mock(), TurnId(True, 0), Config())
+    assert (scene and scene.of) == taken
+    # nothing is tried where no image is left out
+    assert tried == (['spread'] if spread == 20 else ['spread', 'longest'])
+
+
 # registration of patches
 
 class Texture:
@@ -629,6 +653,22 @@ def test_tracks_follow_the_picture():
     moved = np.diff(tracks.xy, axis=0) - [3 * STEP_PX, 3.0]
     moved = moved[np.isfinite(moved[..., 0])]
     assert np.median(np.abs(moved)) < 0.05 and np.abs(moved).max() < 0.6
+
+
+@pytest.mark.parametrize(('every_ns', 'levels'), [(10**8, None), (10**9 // 3, 4)])
+def test_at_few_images_a_second_a_pyramid_finds_what_moved_far(monkeypatch, every_ns, levels):
+    turn = moving_turn([STEP_PX] * 6)
+    turn = replace(turn, frames=tuple(
+        replace(frame, stamp_ns=n * every_ns) for n, frame in enumerate(turn.frames)))
+    asked = []
+
+    def follow(before, after, points, tracking):
+        asked.append(tracking.levels)
+        return follow_points(before, after, points, tracking)
+
+    monkeypatch.setattr(track_module, 'follow_points', follow)
+    assert track_turn(turn, TracksConfig()).xy.shape[1] > 100
+    assert asked == [levels] * 6
 
 
 def test_tracks_keep_out_of_the_mask():
