@@ -13,8 +13,9 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel, Prior
+from dashcalib_ros.config import SceneConfig
 from dashcalib_ros.reconstruct.colmap import pyceres, pycolmap
-from dashcalib_ros.reconstruct.scene import Scene, projected_px
+from dashcalib_ros.reconstruct.scene import Scene, projected_px, retriangulated
 
 # no lens has a coefficient beyond this: the scene has diverged
 MAX_DISTORTION = 1.0
@@ -83,6 +84,15 @@ def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
     found[first:end] = camera.params[first:end]
     camera = camera.with_params(found)
     return _projected(moved, camera), camera
+
+
+def refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | None,
+             tolerance: float = ROUGH) -> Scene:
+    """Return the scene after an adjustment and triangulation."""
+    solver = Solver(config.loss_px, config.iterations, tolerance)
+    free: Free = 'first distortion' if reach is None else 'one focal length'
+    [scene], camera = adjust([scene], scene.camera, solver, free, reach)
+    return retriangulated(scene, camera, config.error_px, config.min_angle_deg)
 
 
 def _in_front(scenes: Sequence[Scene]) -> list[Scene]:

@@ -16,8 +16,10 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.config import SceneConfig
+from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.colmap import pycolmap
-from dashcalib_ros.reconstruct.scene import Structure, rays_of, triangulate
+from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure, rays_of, triangulate
 from dashcalib_ros.reconstruct.tracks import Tracks
 
 # points that both images of the first pair see, at the least
@@ -81,6 +83,16 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
         registered[nearest] = True
         failed[:] = False
         newest = nearest
+
+
+def chain_scene(tracks: Tracks, turn: TurnId, camera: Camera, profile: Profile,
+                config: SceneConfig, seed: int) -> Scene | None:
+    """Return a first scene with a camera that is known roughly; None if no pair starts a chain."""
+    generous = max(config.error_px, config.chain_error * tracks.image_size[0])
+    structure = chain(tracks, camera, generous, config.min_angle_deg, seed)
+    if structure is None:
+        return None
+    return Scene(turn, tracks, structure, camera, profile)
 
 
 def _initial_pair(rays: Floats, error_rad: float, seed: int

@@ -5,7 +5,7 @@ so that tracking is exact to a part of a pixel, in a tenth of the time.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,8 @@ STANDING_PX = 0.3
 # of 100 px in 640 it loses half of the points that a pyramid of so many levels follows
 DENSE_FLOW_S = 0.15
 LEVELS = 4
+# columns and rows in which tracks are to be seen in each keyframe
+GRID = (6, 3)
 # a keyframe comes at the latest when fewer of the last one's points live
 KEYFRAME_OVERLAP = 0.6
 
@@ -74,6 +76,43 @@ def thinned(tracks: Tracks, keyframes: int) -> Tracks:
     xy = tracks.xy[kept]
     return Tracks(tracks.frames[kept], xy[:, _worth_keeping(xy)], tracks.image_size,
                   tracks.stamps_ns[kept])
+
+
+def longest(tracks: Tracks, wanted: int) -> Tracks:
+    """Return as many tracks as wanted, those that are seen in the most keyframes."""
+    length = tracks.seen.sum(axis=0)
+    chosen = np.sort(np.argsort(-length, kind='stable')[:wanted])
+    return replace(tracks, xy=tracks.xy[:, chosen])
+
+
+def spread(tracks: Tracks, wanted: int) -> Tracks:
+    """Return long tracks that are spread evenly over the keyframes and the picture.
+
+    Keyframes lie closest in the middle of a turn, so the longest tracks do, too: with those alone,
+    the poses at the turn's ends would be determined by few points.
+    """
+    seen = tracks.seen
+    width, height = tracks.image_size
+    columns, rows = GRID
+    keyframe, track = np.nonzero(seen)
+    x, y = tracks.xy[keyframe, track].T
+    cell = (np.clip(x * columns / width, 0, columns - 1).astype(int)
+            + columns * np.clip(y * rows / height, 0, rows - 1).astype(int))
+    cells = keyframe * columns * rows + cell
+    length = seen.sum(axis=0)
+    order = np.argsort(-length, kind='stable')
+    by_track = np.split(cells[np.argsort(track, kind='stable')], np.cumsum(length)[:-1])
+    share = wanted * float(np.mean(length)) / (len(seen) * columns * rows)
+    count = np.zeros(len(seen) * columns * rows)
+    chosen: list[int] = []
+    for n in order:
+        if len(chosen) < wanted and np.mean(count[by_track[n]] < share) >= 0.5:
+            count[by_track[n]] += 1
+            chosen.append(int(n))
+    spare = np.setdiff1d(order, chosen, assume_unique=True)
+    spare = spare[np.argsort(-length[spare], kind='stable')]
+    kept = np.sort([*chosen, *spare[:wanted - len(chosen)]]).astype(int)
+    return replace(tracks, xy=tracks.xy[:, kept])
 
 
 def _follow(images: list[GreyImage], tracking: Tracking, config: TracksConfig,

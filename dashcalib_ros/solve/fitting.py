@@ -11,7 +11,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.adjust import Solver, adjust
-from dashcalib_ros.reconstruct.build import chain_scene
+from dashcalib_ros.reconstruct.chain import chain_scene
 from dashcalib_ros.reconstruct.scene import Scene, errors_px, retriangulated, truncated_cost
 from dashcalib_ros.solve.prior import loss_px_of
 

@@ -32,7 +32,7 @@ from dashcalib_ros.input import Frame
 from dashcalib_ros.judge import Poses, read_poses, trivial_guess
 from dashcalib_ros.judge.odometry import COLOURS, angle_deg, length, odometry, path_files
 from dashcalib_ros.judge.odometry import TurnPath as TruePath
-from dashcalib_ros.reconstruct.build import chain_scene
+from dashcalib_ros.reconstruct.chain import chain_scene
 from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure
 from dashcalib_ros.reconstruct.tracks import Tracks, track_turn
 from dashcalib_ros.report import load_camera

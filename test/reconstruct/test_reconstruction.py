@@ -15,7 +15,7 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.points import follow_points
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
-from dashcalib_ros.reconstruct import adjust, build, register
+from dashcalib_ros.reconstruct import adjust, build, focal_profile, register
 from dashcalib_ros.reconstruct import tracks as track_module
 from dashcalib_ros.reconstruct.adjust import Solver
 from dashcalib_ros.reconstruct.chain import absolute_pose, chain, relative_pose
@@ -31,13 +31,14 @@ from dashcalib_ros.reconstruct.scene import (
     triangulate,
     truncated_cost,
 )
-from dashcalib_ros.reconstruct.tracks import Tracks, thinned, track_turn
+from dashcalib_ros.reconstruct.tracks import Tracks, longest, spread, thinned, track_turn
 
 CONFIG = SceneConfig()
 NO_PROFILE = Profile(np.ones(1), np.ones(1), 1)
 NO_PRIOR = Prior(LENS.params, np.diag([1e8, 1e8, 1e8, 1e8, 1e4, 1e4]))
 FREE = (LENS.params - [200, 200, 100, 100, 1, 1], LENS.params + [200, 200, 100, 100, 1, 1])
 TRUE_YAW = 80.0
+TURN = TurnId(True, 0)
 
 
 @pytest.fixture(scope='module')
@@ -253,9 +254,9 @@ def test_the_profile_finds_a_barrel_lens(turn):
     # a chain that starts without distortion registers 6 of 20 images here, at the true focal
     # length too; the profile's minimum then was at 1.9 times the truth
     config = Config().replace({'scene.profile_tracks': 200})
-    sample = build._spread(thinned(turn.tracks, 16), config.scene.profile_tracks)
-    trials = build._profile_trials(sample, Turn(0, 0, 60, 3.0, 0.05), config, Radial)
-    profile = build._profile_of(trials)
+    sample = spread(thinned(turn.tracks, 16), config.scene.profile_tracks)
+    trials = focal_profile._Trials(sample, TURN, config, Radial).scenes()
+    profile = focal_profile.profile_of(trials)
     truth = LENS.fx / SIZE[0]
     assert truth / 1.25 < profile.best < truth * 1.25
     best = trials[profile.best]
@@ -265,10 +266,10 @@ def test_the_profile_finds_a_barrel_lens(turn):
 
 
 def test_focal_lengths_beside_the_best_begin_with_its_distortion(turn, monkeypatch):
-    asked = Mock(wraps=build.chain_scene)
-    monkeypatch.setattr(build, 'chain_scene', asked)
-    sample = build._spread(thinned(turn.tracks, 12), 200)
-    build._profile_trials(sample, Turn(0, 0, 60, 3.0, 0.05), Config(), Radial)
+    asked = Mock(wraps=focal_profile.chain_scene)
+    monkeypatch.setattr(focal_profile, 'chain_scene', asked)
+    sample = spread(thinned(turn.tracks, 12), 200)
+    focal_profile._Trials(sample, TURN, Config(), Radial).scenes()
     begun = [call.args[2] for call in asked.call_args_list]
     coarse = SIZE[0] * np.array(Radial.focal_ratios[1::2])
     fine = [camera for camera in begun if np.abs(coarse / camera.fx - 1).min() > 0.05]
@@ -277,11 +278,11 @@ def test_focal_lengths_beside_the_best_begin_with_its_distortion(turn, monkeypat
 
 
 def test_where_no_usual_focal_length_gives_a_scene_the_others_are_tried(turn, monkeypatch):
-    ratios, chain_scene = Radial.focal_ratios, build.chain_scene
-    monkeypatch.setattr(build, 'chain_scene', lambda *arguments: (
+    ratios, chain_scene = Radial.focal_ratios, focal_profile.chain_scene
+    monkeypatch.setattr(focal_profile, 'chain_scene', lambda *arguments: (
         None if ratios[2] < arguments[2].fx / SIZE[0] < ratios[8] else chain_scene(*arguments)))
-    sample = build._spread(thinned(turn.tracks, 12), 200)
-    trials = build._profile_trials(sample, Turn(0, 0, 60, 3.0, 0.05), Config(), Radial)
+    sample = spread(thinned(turn.tracks, 12), 200)
+    trials = focal_profile._Trials(sample, TURN, Config(), Radial).scenes()
     assert trials and set(trials) <= {*ratios[:3], *ratios[8:]}
 
 
@@ -455,8 +456,8 @@ def test_one_focal_length_at_the_truth_stays_there(colmap_scene):
 def test_a_scene_begins_with_the_tracks_that_leave_fewer_images_out(
         monkeypatch, spread, longest, taken):
     images = {'spread': spread, 'longest': longest}
-    monkeypatch.setattr(build, '_spread', lambda tracks, count: 'spread')
-    monkeypatch.setattr(build, '_longest', lambda tracks, count: 'longest')
+    monkeypatch.setattr(build, 'spread', lambda tracks, count: 'spread')
+    monkeypatch.setattr(build, 'longest', lambda tracks, count: 'longest')
     tried = []
 
     def chain_scene(tracks, *others):
@@ -465,7 +466,7 @@ def test_a_scene_begins_with_the_tracks_that_leave_fewer_images_out(
         return count and Mock(of=tracks, structure=Mock(registered=np.arange(20) < count))
 
     monkeypatch.setattr(build, 'chain_scene', chain_scene)
-    scene = build._begun(Mock(), TurnId(True, 0), Config())
+    scene = build._begun(Mock(), TURN, Config())
     assert (scene and scene.of) == taken
     # nothing is tried where no image is left out
     assert tried == (['spread'] if spread == 20 else ['spread', 'longest'])
@@ -760,7 +761,7 @@ def test_thinned(turn):
 
 def test_the_longest_tracks_are_kept_in_their_order(turn):
     lengths = turn.tracks.seen.sum(axis=0)
-    few = build._longest(turn.tracks, 50)
+    few = longest(turn.tracks, 50)
     chosen = np.sort(np.argsort(-lengths, kind='stable')[:50])
     np.testing.assert_array_equal(few.xy, turn.tracks.xy[:, chosen])
 
@@ -768,7 +769,7 @@ def test_the_longest_tracks_are_kept_in_their_order(turn):
 def test_tracks_are_chosen_where_others_are_few(turn):
     seen = turn.tracks.seen
     longest = np.sort(np.argsort(-seen.sum(axis=0), kind='stable')[:80])
-    few = build._spread(turn.tracks, 80)
+    few = spread(turn.tracks, 80)
     assert few.xy.shape[1] == 80
     # the image with the fewest tracks has more than the longest tracks alone give it
     assert few.seen.sum(axis=1).min() > seen[:, longest].sum(axis=1).min()
@@ -777,5 +778,5 @@ def test_tracks_are_chosen_where_others_are_few(turn):
                              for each in turn.tracks.xy.transpose(1, 0, 2)])[0]
              for track in few.xy.transpose(1, 0, 2)]
     assert where == sorted(where)
-    every = build._spread(turn.tracks, 10**6)
+    every = spread(turn.tracks, 10**6)
     np.testing.assert_array_equal(every.xy, turn.tracks.xy)
