@@ -22,7 +22,7 @@ class Tracking:
 
     window: px, (width, height) of the Lucas-Kanade window. OpenCV takes eight columns at once, and
     what is left one by one. levels: of the pyramid, above the full picture; None: no pyramid, the
-    search begins where dense optical flow leads, in two thirds of the time for a thousand points.
+    search begins where dense optical flow leads, which takes half to two thirds of the time.
     steps, step_px: the iteration ends after this many steps, or with a step this short.
     border: px; points nearer to it are dropped: where the window leaves the picture, they drift.
     """
@@ -89,7 +89,7 @@ def follow_points(before: GreyImage, after: GreyImage, points: Floats32, trackin
         & (x > border) & (x < width - 1 - border) & (y > border) & (y < height - 1 - border))
     if trusted.any():
         # the backward search starts from the point itself: a wrong match still ends elsewhere, and
-        # it takes a fifth of the time
+        # the full picture is enough
         start = points[trusted]
         back, behind, _ = flow(after, before, moved[trusted], start.copy(), maxLevel=0, **settings)
         trusted[trusted] = ((behind.ravel() > 0)

@@ -87,7 +87,7 @@ def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
 
 
 def refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | None,
-             tolerance: float = ROUGH) -> Scene:
+            tolerance: float = ROUGH) -> Scene:
     """Return the scene after an adjustment and triangulation."""
     solver = Solver(config.loss_px, config.iterations, tolerance)
     free: Free = 'first distortion' if reach is None else 'one focal length'
@@ -175,7 +175,7 @@ def _adjuster(reconstruction: pycolmap.Reconstruction, solver: Solver, refine_fo
     options.ceres.solver_options.max_num_iterations = solver.iterations
     options.ceres.solver_options.function_tolerance = solver.tolerance
     # with bounds, Ceres evaluates every step once more for a line search. Without, a step that
-    # leaves them ends on them, and counts only if the cost falls: the same result in 0.8 the time
+    # leaves them ends on them, and counts only if the cost falls: 0.8 of the time
     options.ceres.solver_options.max_num_line_search_step_size_iterations = 0
     options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
