@@ -28,6 +28,7 @@ from dashcalib_ros.judge.calibration import Verdict, Witnesses
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.solve.fixed_camera import FixedCameraTest, largest_crop
 from dashcalib_ros.solve.knowledge import LEAST_GAIN
+from dashcalib_ros.solve.model_choice import CLEAR_KIND_RATIO
 from dashcalib_ros.solve.solution import Solution
 
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
@@ -45,8 +46,6 @@ MAX_READOUT_MS = 50.0
 MAX_LINE_MOVE = 0.001
 # over the picture; a model asked for, but farther from what turns choose, is weak
 MAX_MODEL_SIGMAS = 2.0
-# of the turns' costs, pinhole to fisheye; true fisheyes have 2.7 and more
-MIN_KIND_RATIO = 1.5
 # over the picture; kinds of lenses that differ by less may be mistaken
 MAX_KIND_SIGMAS = 10.0
 
@@ -336,7 +335,7 @@ def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
             continue
         alike_px = MAX_KIND_SIGMAS * solution.picture.rms
         far = each.apart_px is None or each.apart_px > alike_px
-        if far and each.cost_ratio < MIN_KIND_RATIO:
+        if far and each.cost_ratio < CLEAR_KIND_RATIO:
             return Finding('weak', f'the turns do not tell whether the lens is {camera.model} or '
                                    f'{each.model}, and near the corners these differ',
                            'drive where there is something to see up to the corners')

@@ -17,6 +17,7 @@ from dashcalib_ros.solve.fitting import adapted_to, misfits
 from dashcalib_ros.solve.fixed_camera import FixedCameraTest
 from dashcalib_ros.solve.focal import kinds_of_lenses, nearest_start, profile_around, summed
 from dashcalib_ros.solve.model_choice import (
+    CLEAR_KIND_RATIO,
     chosen_of,
     compared_with_others,
     leaves_more,
@@ -140,7 +141,9 @@ def _best_of(begun: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
     the best one. That one is fitted again, too: it must not win or lose by fewer steps of
     adjustment. Where it then explains a turn no more, there is nothing to compare the others with,
     and it stays. Each kind is tried with all its coefficients, too: a decentred pinhole is no
-    fisheye. Which of its models is used is chosen later.
+    fisheye. Kinds that explain the turns about as well are compared with the fields that they
+    leave: a fisheye's four coefficients take up a part of what a windscreen bends. Which of its
+    models is used is chosen later.
     """
     def chosen(found: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
         fit, tried = chosen_of([each.fit for each in found])
@@ -156,8 +159,12 @@ def _best_of(begun: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
     if not any(type(each.fit.camera) is type(best.fit.camera) for each in again):
         return best, tried
     found, tried = chosen(again)
+    family = found.fit.camera.family
+    if any(each.cost_ratio < CLEAR_KIND_RATIO for each in tried
+           if MODELS[each.model].family != family):
+        found, tried = chosen([replace(each, fit=with_field(each.fit)) for each in again])
     kinds = {type(each.fit.camera) for each in begun}
-    return next(each for each in [found, *again, *begun] if type(each.fit.camera) in kinds
+    return next(each for each in [*again, *begun] if type(each.fit.camera) in kinds
                 and each.profile is found.profile), tried
 
 

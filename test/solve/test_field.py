@@ -11,12 +11,16 @@ from scipy.spatial.transform import Rotation
 from solving import CONFIG, scenes_of, solved, z_of
 from synthetic import LENS, SIZE
 
+from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.camera.field import TERMS, Field
+from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.cli import main
 from dashcalib_ros.judge.agreement import focal_alone
 from dashcalib_ros.judge.calibration import LensField
+from dashcalib_ros.reconstruct.scene import Profile, Start
 from dashcalib_ros.report import load_calibration, result_json
 from dashcalib_ros.solve.field import displacements, field_basis, without_field
+from dashcalib_ros.solve.model_choice import CLEAR_KIND_RATIO
 
 
 def a_field(rms_px: float, seed: int = 3) -> Field:
@@ -107,6 +111,19 @@ def test_strong_and_misleading_fields_are_found(no_profile, rms_px, seed):
                     axis=-1).reshape(-1, 2)
     ours, true = found.field.field.displacement(grid).ravel(), field.displacement(grid).ravel()
     assert ours @ true > 0.8 * np.linalg.norm(ours) * np.linalg.norm(true)
+
+
+def test_a_windscreen_makes_no_fisheye_of_a_pinhole(no_profile):
+    # its four coefficients explain more of such a field than those of a pinhole do
+    unsure = Profile(np.array([0.4, 0.65, 0.9]), np.array([2.0, 1.5, 1.8]), 100)
+    found = solved([dataclasses.replace(scene, rivals=(Start(unsure, as_model(LENS, Fisheye)),))
+                    for scene in behind(a_field(3.5, 2),
+                                        scenes_of(4, tracks=130, noise_px=0.15))])
+    assert type(found.camera) is Radial
+    assert found.field is not None and found.field.used
+    assert abs(z_of(found)[0]) < 2.0
+    assert [each.model for each in found.tried if each.cost_ratio > CLEAR_KIND_RATIO] == [
+        'fisheye']
 
 
 def test_a_slight_field_is_not_used_and_makes_sigma_larger(no_profile):
