@@ -28,8 +28,7 @@ from dashcalib_ros.judge.calibration import Verdict, Witnesses
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.solve.fixed_camera import FixedCameraTest, largest_crop
 from dashcalib_ros.solve.knowledge import LEAST_GAIN
-from dashcalib_ros.solve.model_choice import CLEAR_KIND_RATIO
-from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Solution
 
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
 ON_BOUND = 0.01

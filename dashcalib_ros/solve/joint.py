@@ -17,7 +17,6 @@ from dashcalib_ros.solve.fitting import adapted_to, misfits
 from dashcalib_ros.solve.fixed_camera import FixedCameraTest
 from dashcalib_ros.solve.focal import kinds_of_lenses, nearest_start, profile_around, summed
 from dashcalib_ros.solve.model_choice import (
-    CLEAR_KIND_RATIO,
     chosen_of,
     compared_with_others,
     leaves_more,
@@ -26,7 +25,7 @@ from dashcalib_ros.solve.model_choice import (
     with_model_chosen,
 )
 from dashcalib_ros.solve.prior import bounds_of, centre_pull
-from dashcalib_ros.solve.solution import Candidate, Solution
+from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Candidate, Solution
 from dashcalib_ros.solve.stabiliser import without_crops, without_stabiliser
 from dashcalib_ros.solve.steps import (
     Fit,

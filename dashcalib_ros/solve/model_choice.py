@@ -24,8 +24,6 @@ from dashcalib_ros.solve.steps import Fit, fit_all, is_rolling
 
 # a lens with p1, p2 of 0.003 looks like a shutter of 3 ms
 SHORT_READOUT_S = 0.008
-# of the turns' costs, pinhole to fisheye; true fisheyes have 2.1 and more, true pinholes 0.8 to 1
-CLEAR_KIND_RATIO = 1.5
 # of tracks, at least, where another model is made to map alike
 PLACES = 500
 

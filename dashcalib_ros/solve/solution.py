@@ -18,6 +18,8 @@ from dashcalib_ros.solve.knowledge import Knowledge, PictureSigma, SigmaMap, sig
 
 # fewer turns are not left out: one of two says little of the other
 LEAST_TURNS = 3
+# cost_ratio of the kinds of lenses; behind true fisheyes pinholes have 2.1 and more
+CLEAR_KIND_RATIO = 1.5
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from dashcalib_ros.judge.calibration import LensField
 from dashcalib_ros.reconstruct.scene import Profile, Start
 from dashcalib_ros.report import load_calibration, result_json
 from dashcalib_ros.solve.field import displacements, field_basis, without_field
-from dashcalib_ros.solve.model_choice import CLEAR_KIND_RATIO
+from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO
 
 
 def a_field(rms_px: float, seed: int = 3) -> Field:
