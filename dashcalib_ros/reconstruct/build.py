@@ -9,7 +9,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.reconstruct.adjust import Solver, refined
 from dashcalib_ros.reconstruct.chain import chain_scene
-from dashcalib_ros.reconstruct.focal_profile import GOOD_COST, best_trial
+from dashcalib_ros.reconstruct.focal_profile import best_trial
 from dashcalib_ros.reconstruct.register import register_tracks
 from dashcalib_ros.reconstruct.scene import (
     Draft,
@@ -21,8 +21,9 @@ from dashcalib_ros.reconstruct.scene import (
 )
 from dashcalib_ros.reconstruct.tracks import longest, spread, thinned, track_turn
 
-# focal length / width; a lens that seems longer is no fisheye: 90 degrees across, or less
-WIDE = 0.5
+# focal length / width; a lens that seems longer has 90 degrees across, or less, or it is a fisheye
+# that a pinhole explains badly: those of 130 degrees and more cost 1.7 px^2 per observation
+WIDE, BAD_COST = 0.5, 1.5
 # a turn with fewer tracks is not tried
 MIN_TRACKS = 80
 
@@ -61,7 +62,7 @@ def _around(camera: Camera) -> tuple[float, float]:
 
 def _may_be_another(profile: Profile) -> bool:
     """Return whether a pinhole's profile leaves it open that the lens is a fisheye."""
-    return profile.best < WIDE or float(profile.costs.min()) > GOOD_COST
+    return profile.best < WIDE or float(profile.costs.min()) > BAD_COST
 
 
 def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:
