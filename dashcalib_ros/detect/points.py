@@ -48,8 +48,8 @@ def find_corners(image: GreyImage, present: Floats32, wanted: int,
     free = np.full(image.shape, 255, np.uint8)
     if valid is not None:
         free[~valid] = 0
-    for x, y in present:
-        cv2.circle(free, (int(x), int(y)), spacing, 0, -1)
+    for place in present.astype(int).tolist():
+        cv2.circle(free, place, spacing, 0, -1)
     share = -(-wanted // (columns * rows))
     cell = (np.clip(present[:, 1] * rows / height, 0, rows - 1).astype(int) * columns
             + np.clip(present[:, 0] * columns / width, 0, columns - 1).astype(int))

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from statistics import NormalDist
 
 import numpy as np
@@ -235,7 +235,7 @@ class Knowledge:
         """
         left, block = self.left[self.own], np.ix_(self.own, self.own)
         alike = (len(self.turns) - 1) * self.total.covariance_by_track[block]
-        return np.asarray(np.diag(self.floor**2) + np.outer(left, left) + self._largest_estimate()
+        return np.asarray(np.diag(self.floor**2) + np.outer(left, left) + self._largest_estimate
                           + self.turns_err_alike * alike)
 
     @property
@@ -245,7 +245,7 @@ class Knowledge:
         Of a single turn the other parameters follow fx as the turn lets them make up for it.
         """
         if len(self.turns) > 1:
-            shown = self._largest_estimate()
+            shown = self._largest_estimate
             return np.asarray(max(self._variance_of_fx() / shown[0, 0] - 1, 0.0) * shown)
         own = self.total.covariance[0, self.own]
         along = self.one_turn_sigma * own / own[0]
@@ -255,15 +255,15 @@ class Knowledge:
         """Return the variance of fx if each turn may be off by one_turn_sigma more."""
         alone = [self.of([n]) for n in range(len(self.turns))]
         offsets = np.array([self.offset_of(each)[0] for each in alone])
-        variances = np.array([each._largest_estimate()[0, 0] for each in alone])
+        variances = np.array([each._largest_estimate[0, 0] for each in alone])
         return variance_if_turns_differ(offsets, variances, self.one_turn_sigma**2)
 
+    @cached_property
     def _largest_estimate(self) -> Floats:
         root, count = np.linalg.cholesky(self.total.covariance), len(self.own)
         # a readout or a field, if there is one, moves nothing in the picture of a camera that
-        # stands. QR's triangle has the same directions as the many rows of pixels, and is small
-        triangle = np.linalg.qr(sensitivity(self.camera)[0].reshape(-1, count), mode='r')
-        _, _, modes = np.linalg.svd(triangle @ root[:count])
+        # stands
+        _, _, modes = np.linalg.svd(_triangle_of(self.camera) @ root[:count])
         basis = root @ modes.T
         back = modes @ np.linalg.inv(root)
         by_track = back @ self.total.covariance_by_track @ back.T
@@ -299,6 +299,16 @@ class Knowledge:
         if field is not None:
             sigma = np.hypot(sigma, np.linalg.norm(field.displacement(pixels), axis=-1))
         return SigmaMap(pixels, sigma)
+
+
+@lru_cache(maxsize=4)
+def _triangle_of(camera: Camera) -> Floats:
+    """Return (n, n) QR's triangle of the picture's derivatives by the camera's parameters.
+
+    It has the same directions as the many rows of pixels. Many sets of turns ask for it.
+    """
+    moves, _ = sensitivity(camera)
+    return np.asarray(np.linalg.qr(moves.reshape(-1, moves.shape[2]), mode='r'))
 
 
 def variance_if_turns_differ(offsets: Floats, variances: Floats, more: float,
