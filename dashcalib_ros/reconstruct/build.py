@@ -23,7 +23,7 @@ from dashcalib_ros.reconstruct.tracks import longest, spread, thinned, track_tur
 
 # focal length / width; a lens that seems longer has 90 degrees across, or less, or it is a fisheye
 # that a pinhole explains badly: those of 130 degrees and more cost 1.7 px^2 per observation
-WIDE, BAD_COST = 0.5, 1.5
+WIDE, LEAVES_MUCH = 0.5, 1.5
 # a turn with fewer tracks is not tried
 MIN_TRACKS = 80
 
@@ -62,7 +62,7 @@ def _around(camera: Camera) -> tuple[float, float]:
 
 def _may_be_another(profile: Profile) -> bool:
     """Return whether a pinhole's profile leaves it open that the lens is a fisheye."""
-    return profile.best < WIDE or float(profile.costs.min()) > BAD_COST
+    return profile.best < WIDE or float(profile.costs.min()) > LEAVES_MUCH
 
 
 def finish_scene(turn: Turn, draft: Draft, config: Config) -> Scene | None:

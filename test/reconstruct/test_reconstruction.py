@@ -250,6 +250,13 @@ def test_cost_is_least_at_the_true_focal_length(turn):
     assert costs[1.0] < 0.8 * min(costs[0.75], costs[1.25])
 
 
+@pytest.mark.parametrize(('ratio', 'cost', 'tried'), [
+    (0.45, 0.5, True), (0.6, 1.4, False), (0.6, 1.7, True)])
+def test_a_fisheye_is_tried_for_wide_lenses_and_where_a_pinhole_leaves_much(ratio, cost, tried):
+    profile = Profile(np.array([0.8, 1.0, 1.25]) * ratio, np.array([2.0, cost, 2.0]), 100)
+    assert build._may_be_another(profile) is tried
+
+
 def test_the_profile_finds_a_barrel_lens(turn):
     # a chain that starts without distortion registers 6 of 20 images here, at the true focal
     # length too; the profile's minimum then was at 1.9 times the truth
