@@ -14,11 +14,13 @@ from typing import Any
 from dashcalib_ros.cli.arguments import BAD_INPUT, COMMANDS, INTERRUPTED, PROGRAM, make_parser
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr
+from dashcalib_ros.workers.worker import one_thread_for_numpy
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code; argv: arguments without the program's name."""
     open_closed_streams()
+    one_thread_for_numpy()
     # the handler is set inside try: a signal may also come while it is set or restored
     try:
         parser = make_parser()

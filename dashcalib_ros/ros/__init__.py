@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, write_stdout
+from dashcalib_ros.workers.worker import one_thread_for_numpy
 
 INSTALL = ("calibrator: error: the Python package {name} is missing: source your ROS 2 "
            "installation (. /opt/ros/jazzy/setup.sh), or pip install "
@@ -25,6 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for each in SIGNALS:
         signal.signal(each, lambda number, frame: signals.append(number))
     open_closed_streams()
+    one_thread_for_numpy()
     try:
         from dashcalib_ros.ros.settings import check_files, help_text, parse
         arguments = list(sys.argv[1:] if argv is None else argv)

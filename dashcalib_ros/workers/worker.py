@@ -15,6 +15,15 @@ Progress = Callable[[str, float], None]
 THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 
+def one_thread_for_numpy() -> None:
+    """Ask numpy's libraries for one thread, unless the user asks for more; before numpy is loaded.
+
+    The matrices here are small: a second thread does little but wait, at full speed.
+    """
+    for name in THREAD_VARIABLES:
+        os.environ.setdefault(name, '1')
+
+
 class WorkerDiedError(WorkerError):
     """The worker died before it answered, or is closed."""
 
