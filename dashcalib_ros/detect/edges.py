@@ -97,15 +97,12 @@ class _Traced:
 
 def _traced(peak: Mask, shortest: float) -> _Traced:
     """Return the long edges without branches; peak: (h, w)."""
-    steep = peak.view(np.uint8)
-    _, labels = cv2.connectedComponents(steep, connectivity=8)
-    found = cv2.findNonZero(steep)
-    places = np.zeros((0, 2), np.int32) if found is None else found.reshape(-1, 2)
-    column, row = places.astype(np.int64).T
-    pixels = np.bincount(label := labels[row, column])
+    _, labels = cv2.connectedComponents(peak.view(np.uint8), connectivity=8)
+    places = np.flatnonzero(peak)
+    pixels = np.bincount(label := labels.ravel()[places])
     # most are short: they are dropped first
     on = pixels[label] >= shortest
-    row, column = row[on], column[on]
+    row, column = np.divmod(places[on], peak.shape[1])
     used, edge = np.unique(label[on], return_inverse=True)
     (top, bottom), (left, right) = (_extent(place, edge, len(used)) for place in (row, column))
     height = bottom - top + 1
