@@ -19,6 +19,7 @@ from made_calibration import TRUTH, make_calibration
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.cli import main
 from dashcalib_ros.report import write_results
+from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 HEAVY = ('numpy', 'cv2', 'scipy', 'yaml', 'rich', 'matplotlib', 'pycolmap', 'rosbags', 'rclpy')
 
@@ -78,6 +79,19 @@ def test_help_imports_nothing_heavy():
             f'print(before, [name for name in {HEAVY} if name in sys.modules])')
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     assert done.stdout.splitlines()[-1] == '0 []', done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(('asked', 'threads'), [(None, '1'), ('2', '2')])
+@pytest.mark.parametrize('of', ['cli', 'ros'])
+def test_numpy_gets_one_thread_unless_more_are_asked_for(of, asked, threads):
+    if of == 'ros':
+        pytest.importorskip('rclpy')
+    code = (f'import os, sys; from dashcalib_ros.{of} import main; before = "numpy" in '
+            'sys.modules; main(["--help"]); print(before, os.environ["OPENBLAS_NUM_THREADS"])')
+    env = {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES}
+    env |= {} if asked is None else {'OPENBLAS_NUM_THREADS': asked}
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, env=env)
+    assert done.stdout.splitlines()[-1] == f'False {threads}', done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(('line', 'expected'), [
