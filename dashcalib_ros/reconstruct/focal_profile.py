@@ -22,7 +22,7 @@ from dashcalib_ros.reconstruct.tracks import Tracks, longest, spread, thinned
 
 # how often a scene that leaves images or much else unexplained is chained anew, at the most
 COMPLETIONS = 2
-# px^2 per observation; what costs more is chained anew, and may be another kind of lens
+# px^2 per observation; what costs more is chained anew
 GOOD_COST = 1.2
 # of the cost of the chain before; one that costs more is no better
 WORTH = 0.95
