@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from documents import write_table
 from drives import BY_NAME, drive_of, pictures_of
+from mapping import UNSEEN_PX, projected, rays
 from measure import (
     calibrate,
     commit,
@@ -38,6 +39,8 @@ from measure import (
     table,
 )
 from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 from views import INEXACT, inexact_view
 from wide import WIDE, wide_drive_of
 
@@ -171,7 +174,10 @@ def stepped(scale: float, since: float) -> Callable[[Film, np.random.Generator],
 
 
 def behind_windscreen(most_px: float) -> Callable[[Film, np.random.Generator], Film]:
-    """Bend the picture smoothly and locally: three bumps, a sixth to a third of the width."""
+    """Bend the picture smoothly and locally: three bumps, a sixth to a third of the width.
+
+    The truth becomes the camera that comes closest to lens and windscreen together.
+    """
     def change(film: Film, rng: np.random.Generator) -> Film:
         height, width = film.frames[0].image.shape
         x, y = np.meshgrid(np.arange(width), np.arange(height))
@@ -185,12 +191,33 @@ def behind_windscreen(most_px: float) -> Callable[[Film, np.random.Generator], F
         off -= off.mean(axis=(1, 2), keepdims=True)
         off *= most_px / np.hypot(*off).max()
         columns, rows = (x + off[0]).astype(np.float32), (y + off[1]).astype(np.float32)
+        pixels = np.stack([x, y], axis=-1)[::8, ::8].reshape(-1, 2).astype(float)
+        seen = rays(film.truth, pixels + off[:, ::8, ::8].reshape(2, -1).T)
         return with_pictures(film, (
             np.asarray(cv2.remap(frame.image, columns, rows, cv2.INTER_CUBIC,
                                  borderMode=cv2.BORDER_REPLICATE), np.uint8)
-            for frame in film.frames))
+            for frame in film.frames), **camera_that_sees(seen, pixels, film.truth))
 
     return change
+
+
+def camera_that_sees(seen: Floats, pixels: Floats, near: Mapping[str, Any]) -> dict[str, float]:
+    """Return the camera of near's kind that projects rays (n, 3) closest to pixels (n, 2).
+
+    A windscreen does in part what a lens does: what is seen through both has another fx.
+    """
+    names = ['fx', 'fy', 'cx', 'cy', 'k1', 'k2',
+             *(name for name in ('p1', 'p2', 'k3', 'k4') if near.get(name))]
+    start = np.array([near.get(name, 0.0) for name in names] + [0.0] * 3)
+
+    def residual(guess: Floats) -> Floats:
+        camera = {**near, **dict(zip(names, guess, strict=False))}
+        off = projected(camera, Rotation.from_rotvec(guess[-3:]).apply(seen)) - pixels
+        return np.nan_to_num(off, nan=UNSEEN_PX).ravel()
+
+    scale = np.maximum(np.abs(start), 0.01)
+    return dict(zip(names, map(float, least_squares(residual, start, x_scale=scale).x),
+                    strict=False))
 
 
 def looped(times: int, there_and_back: bool = False, fresh_noise: float = 0.0,
