@@ -287,9 +287,7 @@ class MotionEstimator:
         enough = len(self._ids) >= REPLENISH * self.config.points
         if enough or min(image.shape) < LEAST_SIDE:
             return
-        half = np.asarray(
-            cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
-        valid = None
+        half, valid = shrink_image(image, 2), None
         if self._valid is not None:
             valid = cv2.resize(self._valid.astype(np.uint8), half.shape[::-1],
                                interpolation=cv2.INTER_NEAREST) > 0

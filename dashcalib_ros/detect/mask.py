@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
+from dashcalib_ros.input.scale import shrink_image
 
 # px at the mask's resolution; with less flow the world does not count as moving
 MOVED = 2.5
@@ -69,7 +70,7 @@ class EgoMask:
         counts = moves > MOVED
         if not counts.any():
             return
-        half = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        half = shrink_image(image, 2).astype(np.float32)
         # remove slow changes of brightness: sky and vignetting
         half -= cv2.blur(half, (15, 15))
         x = cv2.Sobel(half, cv2.CV_32F, 1, 0, scale=0.125)

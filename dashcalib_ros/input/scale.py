@@ -101,6 +101,9 @@ def shrink_image(image: GreyImage, factor: int) -> GreyImage:
     if factor == 1:
         return image
     height, width = (max(1, side // factor) for side in image.shape)
-    small = cv2.resize(image[:height * factor, :width * factor], (width, height),
-                       interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8)
+    whole = image[:height * factor, :width * factor]
+    if factor in (3, 5) and min(whole.shape) >= factor:
+        # the same means as INTER_AREA's, in half the time
+        means = cv2.blur(whole, (factor, factor))
+        return np.ascontiguousarray(means[factor // 2::factor, factor // 2::factor])
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -8,7 +8,7 @@ import pytest
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
-from dashcalib_ros.input.scale import Scale
+from dashcalib_ros.input.scale import Scale, shrink_image
 
 SCALES = [Scale(), Scale(shrink=2), Scale(shrink=4), Scale(enlarge=2), Scale(enlarge=3),
           Scale(enlarge=4)]
@@ -57,6 +57,19 @@ def test_a_pixel_is_where_the_scale_says(scale):
     # the steepest slope is 7 grey values per px: half a px more or less would be 3.5; blocks of
     # 4 px are a little flatter than their middles
     assert abs(off).max() < 3 and np.sqrt(np.mean(off ** 2)) < (1.2 if scale.px == 4 else 0.6)
+
+
+@pytest.mark.parametrize('factor', [2, 3, 4, 5, 6])
+def test_shrinking_averages_whole_blocks(factor):
+    image = np.random.default_rng(factor).integers(0, 256, (61, 79), np.uint8)
+    height, width = 61 // factor, 79 // factor
+    blocks = image[:height * factor, :width * factor].reshape(height, factor, width, factor)
+    small = shrink_image(image, factor)
+    assert small.dtype == np.uint8 and small.flags.c_contiguous
+    assert np.abs(small - blocks.mean(axis=(1, 3))).max() <= 0.5
+    # fewer rows or columns than a block has
+    assert shrink_image(image[:1], factor).shape == (1, width)
+    assert shrink_image(image[:, :1], factor).shape == (height, 1)
 
 
 @pytest.mark.parametrize('factor', [2, 3, 4])
