@@ -14,7 +14,7 @@ from dashcalib_ros.config import MaskConfig, MotionConfig
 from dashcalib_ros.detect.continuity import goes_on
 from dashcalib_ros.detect.epipoles import epipoles_of, turning
 from dashcalib_ros.detect.mask import CELL, EgoMask
-from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
+from dashcalib_ros.detect.points import Tracking, find_clear_corners, follow_points
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
 from dashcalib_ros.detect.straights import PAIRS, STRAIGHT, StraightCollector, Straights
 from dashcalib_ros.errors import InputError
@@ -291,7 +291,8 @@ class MotionEstimator:
         if self._valid is not None:
             valid = cv2.resize(self._valid.astype(np.uint8), half.shape[::-1],
                                interpolation=cv2.INTER_NEAREST) > 0
-        corners = find_corners(half, self._xy / np.float32(2), self.config.points, valid) * 2 + 0.5
+        corners = 2 * find_clear_corners(half, self._xy / np.float32(2), self.config.points,
+                                         valid) + 0.5
         self._ids = np.concatenate([self._ids, self._born + np.arange(len(corners))])
         self._xy = np.concatenate([self._xy, corners.astype(np.float32)])
         self._born += len(corners)

@@ -7,11 +7,18 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from dashcalib_ros.arrays import Floats32, GreyImage, Mask
+from dashcalib_ros.arrays import Floats32, GreyImage, Ints, Mask
 
 # px; a point that does not track back to within this is dropped
 FORWARD_BACKWARD_PX = 0.5
+# points of a cell of the grid over which corners are spread
+CELL_POINTS = 25
+# from a new corner to the points that there are, of the mean distance between those wanted
+SPACING = 0.4
+# of the strongest corner in its cell; a weaker one is not used
+QUALITY = 0.02
 # px, height and width; OpenCV's dense flow crashes in pictures that are narrower
 DENSE_FLOW_PX = 32
 
@@ -38,12 +45,47 @@ def find_corners(image: GreyImage, present: Floats32, wanted: int,
                  valid: Mask | None = None) -> Floats32:
     """Return (n, 2) new corners, spread over a grid, so that there are about `wanted` points.
 
-    present: (m, 2) points that are tracked already; no new corner is near them. valid: (height,
-    width), False where no corner may be; None: nowhere.
+    They are right to a pixel, which is enough to follow them. present: (m, 2) points that are
+    tracked already; no new corner is near them. valid: (height, width), False where no corner may
+    be; None: nowhere.
+    """
+    # in pairs of pixels, as all that follows
+    height, width = (side // 2 for side in image.shape)
+    if min(height, width) == 0:
+        return np.zeros((0, 2), np.float32)
+    taken = np.zeros((height, width), np.uint8)
+    there = np.clip(present / 2, 0, (width - 1, height - 1)).astype(int)
+    taken[there[:, 1], there[:, 0]] = 1
+    strength = _corner_strength(image)
+    spacing = max(2, round(SPACING * math.sqrt(height * width / wanted)))
+    corner = (strength > 0) & (strength >= cv2.dilate(strength, _square(spacing // 2)))
+    corner &= cv2.dilate(taken, _square(spacing - 1)) == 0
+    if valid is not None:
+        corner &= valid[1:2 * height:2, 1:2 * width:2]
+
+    y, x = np.nonzero(corner)
+    grid = _grid(width, height, wanted)
+    cell, strong = _cells(np.column_stack([x, y]), (width, height), grid), strength[y, x]
+    lacking = -(-wanted // (grid[0] * grid[1])) - np.bincount(
+        _cells(there, (width, height), grid), minlength=grid[0] * grid[1])
+    # the strongest of each cell first
+    order = np.lexsort((-strong, cell))
+    cell, strong = cell[order], strong[order]
+    first = np.searchsorted(cell, cell)
+    found = order[(np.arange(len(cell)) - first < lacking[cell])
+                  & (strong > QUALITY * strong[first])]
+    return (2 * np.column_stack([x[found], y[found]]) + 0.5).astype(np.float32)
+
+
+def find_clear_corners(image: GreyImage, present: Floats32, wanted: int,
+                       valid: Mask | None = None) -> Floats32:
+    """Return what find_corners() does, for a few points in a small picture.
+
+    OpenCV's choice takes three times as long, but half as many lie on burnt-in text and on the
+    edge of a bonnet, where the world's motion is not seen.
     """
     height, width = image.shape
-    columns = max(2, round(np.sqrt(wanted / 25 * width / height)))
-    rows = max(2, round(np.sqrt(wanted / 25 * height / width)))
+    columns, rows = grid = _grid(width, height, wanted)
     spacing = max(4, width // 100)
     free = np.full(image.shape, 255, np.uint8)
     if valid is not None:
@@ -51,20 +93,51 @@ def find_corners(image: GreyImage, present: Floats32, wanted: int,
     for place in present.astype(int).tolist():
         cv2.circle(free, place, spacing, 0, -1)
     share = -(-wanted // (columns * rows))
-    cell = (np.clip(present[:, 1] * rows / height, 0, rows - 1).astype(int) * columns
-            + np.clip(present[:, 0] * columns / width, 0, columns - 1).astype(int))
-    held = np.bincount(cell, minlength=rows * columns).reshape(rows, columns)
+    held = np.bincount(_cells(present, (width, height), grid),
+                       minlength=rows * columns).reshape(rows, columns)
     found = [np.zeros((0, 2), np.float32)]
     for row, column in np.argwhere(held < share):
         top, bottom = row * height // rows, (row + 1) * height // rows
         left, right = column * width // columns, (column + 1) * width // columns
         window = np.s_[top:bottom, left:right]
         corners = cv2.goodFeaturesToTrack(
-            image[window], int(share - held[row, column]), 0.02, spacing, mask=free[window],
+            image[window], int(share - held[row, column]), QUALITY, spacing, mask=free[window],
             blockSize=5)
         if corners is not None:
             found.append(np.asarray(corners.reshape(-1, 2) + (left, top), np.float32))
     return np.concatenate(found)
+
+
+def _grid(width: int, height: int, wanted: int) -> tuple[int, int]:
+    """Return the columns and rows of the grid over which so many points are spread."""
+    return (max(2, round(math.sqrt(wanted / CELL_POINTS * width / height))),
+            max(2, round(math.sqrt(wanted / CELL_POINTS * height / width))))
+
+
+def _cells(places: npt.NDArray[Any], size: tuple[int, int], grid: tuple[int, int]) -> Ints:
+    """Return (n,) the number of the cell in which each of the places (n, 2) lies, row by row."""
+    column, row = np.clip(places * grid / size, 0, np.subtract(grid, 1)).astype(np.int64).T
+    return np.asarray(row * grid[0] + column)
+
+
+def _corner_strength(image: GreyImage) -> Floats32:
+    """Return (height / 2, width / 2) twice the smaller eigenvalue of the gradients' covariance.
+
+    The gradients are those of the full picture, which keeps its details; their products are
+    summed over 6 x 6 pixels (Shi and Tomasi). OpenCV's own takes four times as long.
+    """
+    height, width = (side // 2 for side in image.shape)
+    x, y = (cv2.Sobel(image[:2 * height, :2 * width], cv2.CV_32F, *order)
+            for order in ((1, 0), (0, 1)))
+    xx, xy, yy = (cv2.blur(cv2.resize(cv2.multiply(a, b), (width, height),
+                                      interpolation=cv2.INTER_AREA), (3, 3))
+                  for a, b in ((x, x), (x, y), (y, y)))
+    return np.asarray(xx + yy - cv2.magnitude(xx - yy, xy + xy), np.float32)
+
+
+def _square(reach: int) -> GreyImage:
+    """Return the neighbourhood of a pixel so far to each side."""
+    return np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
 
 
 def follow_points(before: GreyImage, after: GreyImage, points: Floats32, tracking: Tracking

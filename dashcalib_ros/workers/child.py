@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol, cast
 
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.workers.memory import forget_file_pages, return_free_memory
+from dashcalib_ros.workers.memory import forget_file_pages, return_free_memory, reuse_image_buffers
 from dashcalib_ros.workers.worker import THREAD_VARIABLES, Progress, WorkerDiedError
 
 # not `-m`: it would import from the current folder first, and a random.py may lie there
@@ -290,6 +290,7 @@ def main() -> None:
     # Ctrl-C reaches the whole process group: the parent ends the child if needed
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(niceness)
+    reuse_image_buffers()
     threading.Thread(target=_watch_parent, args=(parent,), daemon=True).start()
     requests = os.fdopen(os.dup(0), 'rb')
     # libraries may print: they get stderr, as the pipe is for answers only

@@ -38,6 +38,44 @@ def shifted(by: float) -> tuple[np.ndarray, np.ndarray]:
     return seen(0, 150), seen(by, 150 - by / 2)
 
 
+def test_corners_are_spread_apart_and_where_they_may_be():
+    picture = street(WIDTH, HEIGHT)
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[250:, :300] = False
+    corners = find_corners(picture, NOTHING, 400, valid)
+    assert 300 < len(corners) <= 450
+    x, y = np.rint(corners).astype(int).T
+    assert valid[y, x].all()
+    counts = np.histogram2d(y, x, bins=(3, 4), range=((0, 250), (300, WIDTH)))[0]
+    assert counts.min() >= 5
+    apart = np.linalg.norm(corners[:, None] - corners, axis=2) + 1e3 * np.eye(len(corners))
+    assert apart.min() >= 4
+
+
+def test_new_corners_are_added_where_points_are_missing():
+    picture = street(WIDTH, HEIGHT)
+    points = find_corners(picture, NOTHING, 400)
+    # right of the middle all are lost, and a few elsewhere
+    kept = points[(points[:, 0] < WIDTH / 2) & (np.arange(len(points)) % 10 > 0)]
+    new = find_corners(picture, kept, 400)
+    assert np.mean(new[:, 0] >= WIDTH / 2) > 0.8
+    assert len(new) > 0.9 * (len(points) - len(kept))
+    assert np.linalg.norm(new[:, None] - kept, axis=2).min() > 4
+
+
+def test_corners_are_where_edges_meet():
+    picture = np.full((90, 160), 60, np.uint8)
+    picture[30:, 50:] = 200
+    [corner] = find_corners(picture, NOTHING, 4)
+    assert np.abs(corner - [49.5, 29.5]).max() <= 2
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (1, 640), (2, 2), (3, 5), (480, 640)])
+def test_pictures_without_corners(shape):
+    present = np.array([[0.4, 0.2]], np.float32)
+    assert find_corners(np.full(shape, 7, np.uint8), present, 300).shape == (0, 2)
+
+
 @pytest.mark.parametrize('tracking', BOTH)
 @pytest.mark.parametrize('by', [0.0, 0.4, 7.0, 40.0])
 def test_points_are_followed_near_and_far(tracking, by):
