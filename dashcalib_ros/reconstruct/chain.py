@@ -9,7 +9,6 @@ camera sees all directions, so every ray can be given to them as a pixel of such
 """
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -17,18 +16,10 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.config import SceneConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.colmap import pycolmap
-from dashcalib_ros.reconstruct.scene import (
-    Profile,
-    Scene,
-    Structure,
-    rays_of,
-    retriangulated,
-    triangulate,
-)
+from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure, rays_of, triangulate
 from dashcalib_ros.reconstruct.tracks import Tracks
 
 # points that both images of the first pair see, at the least
@@ -97,34 +88,11 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
 def chain_scene(tracks: Tracks, turn: TurnId, camera: Camera, profile: Profile,
                 config: SceneConfig, seed: int) -> Scene | None:
     """Return a first scene with a camera that is known roughly; None if no pair starts a chain."""
-    structure = chain(tracks, camera, _generous_px(tracks, config), config.min_angle_deg, seed)
+    generous = max(config.error_px, config.chain_error * tracks.image_size[0])
+    structure = chain(tracks, camera, generous, config.min_angle_deg, seed)
     if structure is None:
         return None
     return Scene(turn, tracks, structure, camera, profile)
-
-
-def with_focal_length_of(camera: Camera, scene: Scene, config: SceneConfig) -> Scene:
-    """Return a first scene with a camera of another focal length, from a scene of all images.
-
-    Seen through a longer lens, the same motion in the picture is a smaller turn, and a smaller
-    step to the side, along the same way ahead. It takes a tenth of a chain's time.
-    """
-    old, by = scene.structure, scene.camera.fx / camera.fx
-    steps = old.rotations[1:] @ old.rotations[:-1].transpose(0, 2, 1)
-    moves = old.translations[1:] - np.einsum('kij,kj->ki', steps, old.translations[:-1])
-    rotations, translations = [np.eye(3)], [np.zeros(3)]
-    for step, move in zip(rotation_matrices(by * rotation_vectors(steps)), moves * (by, by, 1.0),
-                          strict=True):
-        rotations.append(step @ rotations[-1])
-        translations.append(step @ translations[-1] + move)
-    moved = replace(old, rotations=np.array(rotations), translations=np.array(translations))
-    return retriangulated(replace(scene, structure=moved), camera,
-                          _generous_px(scene.tracks, config), config.min_angle_deg)
-
-
-def _generous_px(tracks: Tracks, config: SceneConfig) -> float:
-    """Return the largest reprojection error of a first scene: the camera is only a guess."""
-    return max(config.error_px, config.chain_error * tracks.image_size[0])
 
 
 def _initial_pair(rays: Floats, error_rad: float, seed: int

@@ -2,7 +2,7 @@
 
 Incremental reconstruction with a free focal length often diverges, although it registers every
 image with small residuals (docs/notebook/lessons.md: f = 157 for 1353). With a wrong focal length
-held fixed it cannot diverge; it only explains fewer observations. So the turn is reconstructed at
+held fixed it cannot diverge; it only explains fewer observations. So the turn is chained at
 several fixed focal lengths, and the one with the lowest cost over *all* observations is the start.
 """
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.adjust import refined
-from dashcalib_ros.reconstruct.chain import chain_scene, with_focal_length_of
+from dashcalib_ros.reconstruct.chain import chain_scene
 from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
 from dashcalib_ros.reconstruct.tracks import Tracks, longest, spread, thinned
 
@@ -61,11 +61,10 @@ def _cost_of(scene: Scene) -> float:
 class _Trials:
     """Scenes of the same tracks at the focal lengths of a model's grid, held fixed.
 
-    One is chained; the others go on from the poses of the nearest one that has all images. What is
-    far from the best costs as much time, and changes only how bad it is: it is adjusted once, and
-    not even begun where those on both sides of the best are worse. With a wide lens, a chain
-    without distortion breaks soon, even at the true focal length. So the best is chained anew with
-    the distortion that it has found, and its neighbours begin with that.
+    What is far from the best costs as much time, and changes only how bad it is: it is adjusted
+    once, and not even begun where those on both sides of the best are worse. With a wide lens, a
+    chain without distortion breaks soon, even at the true focal length. So the best is chained
+    anew with the distortion that it has found, and its neighbours begin with that.
     """
 
     def __init__(self, tracks: Tracks, turn: TurnId, config: Config, model: type[Camera]) -> None:
@@ -118,20 +117,10 @@ class _Trials:
         return min(self._found, key=lambda n: (_cost_of(self._found[n]), n))
 
     def _begin(self, places: Iterable[int], like: Camera) -> None:
-        # the middle of the grid first
-        for n in sorted(places, key=lambda n: abs(2 * n + 1 - len(self._ratios))):
-            camera = like.with_focal(self._ratios[n] * self._width)
-            near = self._nearest(n)
-            scene = self._chained(camera) if near is None else self._adjusted(
-                with_focal_length_of(camera, near, self._config.scene))
+        for n in places:
+            scene = self._chained(like.with_focal(self._ratios[n] * self._width))
             if scene is not None:
                 self._found[n] = min(self._found.get(n, scene), scene, key=_cost_of)
-
-    def _nearest(self, n: int) -> Scene | None:
-        """Return the scene of all images with the next focal length; None if there is none."""
-        whole = [other for other, scene in self._found.items()
-                 if scene.structure.registered.all()]
-        return self._found[min(whole, key=lambda m: (abs(m - n), m))] if whole else None
 
     def _complete(self, n: int) -> None:
         scene = self._adjusted(self._found[n])
