@@ -19,7 +19,6 @@ from typing import Any
 
 from dashcalib_ros.errors import DashcalibError, WorkerError, one_line
 from dashcalib_ros.fleet.storage import needs
-from dashcalib_ros.workers.memory import reuse_image_buffers
 from dashcalib_ros.workers.worker import (
     THREAD_VARIABLES,
     InlineWorker,
@@ -244,6 +243,5 @@ def _in_one_thread(function: Callable[..., Any], *arguments: Any) -> tuple[Any, 
     """Measure a task in this process, which must have one thread for numpy; raises WorkerError."""
     import cv2
     cv2.setNumThreads(1)
-    reuse_image_buffers()
     found: tuple[Any, float, float] = InlineWorker().call(measured, function, *arguments)
     return found
