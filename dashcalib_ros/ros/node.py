@@ -111,9 +111,8 @@ class CameraNode(Node, ABC):
         self._load()
         # so many turns are kept: no more can be wanted later
         self._most_turns = max(self._core.turns.capacity, self._core.turns.wanted)
-        self._learner = Learner(self._core, self._own.queue_size,
-                                lambda news: self._later(lambda: self._on_news(news)),
-                                self._preview.take, self._mask)
+        self._learner = Learner(self._core, self._own.queue_size, self._hear, self._preview.take,
+                                self._mask)
         self._sensors = Sensors(self, self._own, self._learner.sensors.add)
         self._set_goal()
         self.create_timer(PERIOD_S, self._on_tick, clock=steady)
@@ -198,11 +197,17 @@ class CameraNode(Node, ABC):
         """Return whether rclpy calls no callback any more, after an exception of its own."""
         return not self._wake.callback_group.can_execute(self._wake)
 
-    def _later(self, action: Callable[[], None]) -> None:
+    def _hear(self, news: News) -> None:
+        """Take news from other threads; a Status, of each image, waits for the next image."""
+        # rclpy needs 0.4 ms to wake up
+        self._later(lambda: self._on_news(news), wake=not isinstance(news, Status))
+
+    def _later(self, action: Callable[[], None], wake: bool = True) -> None:
         """Let the executor's thread run an action, in order; called from other threads."""
         self._actions.put(action)
-        with suppress(RuntimeError):  # rclpy's, when the context is shut down already
-            self._wake.trigger()
+        if wake:
+            with suppress(RuntimeError):  # rclpy's, when the context is shut down already
+                self._wake.trigger()
 
     def _empty(self) -> None:
         with suppress(queue.Empty):
@@ -217,6 +222,7 @@ class CameraNode(Node, ABC):
     # images ----------------------------------------------------------------------------------
 
     def _on_image(self, message: Any) -> None:
+        self._empty()
         taken = self._intake.take(message)
         if taken is None:
             return
@@ -369,6 +375,7 @@ class CameraNode(Node, ABC):
     # diagnostics -----------------------------------------------------------------------------
 
     def _on_tick(self) -> None:
+        self._empty()
         images, intake, learner = self._images, self._intake, self._learner
         intake.complain(learner.inbox.dropped)
         if images.listening:

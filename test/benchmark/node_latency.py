@@ -166,7 +166,7 @@ def report(bench: Listener, sent: int, spent: dict[bool, Any], memory: list[floa
         lines.append(f'| image to camera_info, {name}: median, p99 ({len(ages)} images) | '
                      f'{median:.1f}, {p99:.1f} ms |')
     lines += [f'| CPU of the node\'s process (transport and detection), of one core'
-              f'{", pictures subscribed" if watched else ""} | {100 * cpu / passed:.0f} % |'
+              f'{", pictures subscribed" if watched else ""} | {100 * cpu / passed:.1f} % |'
               for watched, (cpu, passed) in spent.items() if passed]
     lines += [f'| {name}: pictures, kB each | {len(sizes)}, {np.mean(sizes) / 1e3:.0f} |'
               for name, sizes in bench.pictures.items() if sizes]

@@ -1,4 +1,4 @@
-"""Signals that come while rclpy starts, when its own handlers are not all there yet."""
+"""The executor: signals that come while rclpy starts, and what a callback costs."""
 from __future__ import annotations
 
 import gc
@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
 import rclpy
+from rclpy import executors
 
 from dashcalib_ros.ros.program import Executor, spin
 
@@ -35,3 +36,23 @@ def test_an_executor_that_cannot_be_made_leaves_no_traceback(monkeypatch):
         Executor(context=context)
     gc.collect()
     assert told == []
+
+
+def test_a_callback_costs_one_look_at_the_entities(ros_context, monkeypatch):
+    node, called, looks = rclpy.create_node('few', context=ros_context), [], []
+    guard = node.create_guard_condition(lambda: called.append(True))
+    executor = Executor(context=ros_context)
+    executor.add_node(node)
+    executor.spin_once(0.1)
+    wait_set = executors._rclpy.WaitSet
+    monkeypatch.setattr(executors._rclpy, 'WaitSet',
+                        lambda *counts: looks.append(True) or wait_set(*counts))
+    try:
+        for _ in range(3):
+            # while it waits, as images do
+            threading.Timer(0.1, guard.trigger).start()
+            executor.spin_once(5.0)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+    assert len(called) == len(looks) == 3
