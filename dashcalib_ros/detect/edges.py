@@ -101,9 +101,10 @@ def _traced(peak: Mask, shortest: float) -> _Traced:
     places = np.flatnonzero(peak)
     pixels = np.bincount(label := labels.ravel()[places])
     # most are short: they are dropped first
-    on = pixels[label] >= shortest
+    long = pixels >= shortest
+    on, used = long[label], np.flatnonzero(long)
     row, column = np.divmod(places[on], peak.shape[1])
-    used, edge = np.unique(label[on], return_inverse=True)
+    edge = (np.cumsum(long) - 1)[label[on]]
     (top, bottom), (left, right) = (_extent(place, edge, len(used)) for place in (row, column))
     height = bottom - top + 1
     good = ((height >= shortest) & (right - left < height)
