@@ -33,7 +33,7 @@ PIXELS = 0.06
 # grey levels per px; a gradient below this is noise or a flat place
 FLAT = 1.5
 # share of a flat region's outline that must be vehicle, for the region to be vehicle, too
-ENCLOSED = 0.6
+ENCLOSED = 0.4
 # px at the working width; resolution of the mask
 CELL = 16
 # coherence of a cell's gradient: the world's is about 0, the vehicle's 0.7
