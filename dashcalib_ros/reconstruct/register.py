@@ -119,7 +119,7 @@ def _templates(tracks: Tracks, reference: Ints,
     """
     count, pixels = len(reference), len(grid)
     template = np.zeros((count, pixels), np.float32)
-    gradient = np.zeros((count, pixels, 2), np.float32)
+    gradient = np.zeros((count, 2, pixels), np.float32)
     for k in np.unique(reference):
         rows = np.flatnonzero((reference == k) & np.isfinite(tracks.xy[k, :, 0]))
         if len(rows) == 0:
@@ -128,18 +128,19 @@ def _templates(tracks: Tracks, reference: Ints,
         image = _doubled(images[k], smoothing_px)
         template[rows] = _sample(image, centre)
         for axis, ahead in enumerate(np.array([[[0.5], [0]], [[0], [0.5]]], np.float32)):
-            gradient[rows, :, axis] = _sample(image, centre + ahead) - _sample(
-                image, centre - ahead)
-    contrast = np.maximum(template.std(axis=1, keepdims=True), 1e-3)
-    template = (template - template.mean(axis=1, keepdims=True)) / contrast
+            gradient[rows, axis] = _sample(image, centre + ahead) - _sample(image, centre - ahead)
+    template -= template.mean(axis=1, keepdims=True)
+    contrast = np.sqrt(np.einsum('tp,tp->t', template, template) / np.float32(pixels))
+    contrast = np.maximum(contrast, 1e-3)[:, None]
+    template /= contrast
     gradient /= contrast[:, :, None]
     # d/dp of T(W(d; p)) at the identity, p = a11 a12 a21 a22 tx ty
     descent = np.concatenate([
-        gradient[:, :, :1] * grid, gradient[:, :, 1:] * grid, gradient], axis=2)
-    hessian = (descent.transpose(0, 2, 1) @ descent).astype(np.float64)
+        gradient[:, :1] * grid.T, gradient[:, 1:] * grid.T, gradient], axis=1)
+    hessian = (descent @ descent.transpose(0, 2, 1)).astype(np.float64)
     damping = 1e-3 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9
     inverse = np.linalg.inv(hessian + damping * np.eye(6)).astype(np.float32)
-    return template, inverse @ descent.transpose(0, 2, 1)
+    return template, inverse @ descent
 
 
 def _align(image: Floats32, start: Floats, scale: Floats, template: Floats32, steps: Floats32,
@@ -148,14 +149,16 @@ def _align(image: Floats32, start: Floats, scale: Floats, template: Floats32, st
     found, good = start.copy(), np.zeros(len(start), bool)
     # of the patches that still move, in the order of their numbers
     numbers, centre = np.arange(len(start)), start
-    linear = scale[:, None, None] * np.eye(2)
+    linear, pixels = scale[:, None, None] * np.eye(2), np.float32(len(grid))
     for _ in range(ITERATIONS):
         affine = linear.astype(np.float32)
         patch = _sample(image, affine[:, :, :1] * grid[:, 0] + affine[:, :, 1:] * grid[:, 1]
                         + centre[:, :, None].astype(np.float32))
         patch -= patch.mean(axis=1, keepdims=True)
-        patch /= np.maximum(np.sqrt(np.mean(patch * patch, axis=1, keepdims=True)), 1e-3)
-        correlation = np.mean(patch * template, axis=1)
+        # einsum makes no array of the products
+        contrast = np.sqrt(np.einsum('np,np->n', patch, patch) / pixels)
+        patch /= np.maximum(contrast, 1e-3)[:, None]
+        correlation = np.einsum('np,np->n', patch, template) / pixels
         step = (steps @ (patch - template)[:, :, None])[:, :, 0].astype(np.float64)
         # keep single steps small: the patch is only a few pixels wide
         warp = np.eye(2) + np.clip(step[:, :4], -0.2, 0.2).reshape(-1, 2, 2)

@@ -70,19 +70,33 @@ def repeats(scene: Scene, other: Scene) -> Mask:
     if scene.tracks.image_size != other.tracks.image_size:
         return again
     rows = np.flatnonzero(scene.structure.registered)
+    spans = _spans(scene, rows)
     for direction in (1.0, -1.0):
         for offset, turning in _offsets(scene, other, direction):
-            times = direction * _seconds(scene) + offset
+            times = direction * _seconds(scene)[rows] + offset
             probes = turning[np.linspace(0, len(turning) - 1, PROBES).astype(int)]
-            if not (_alike(scene, other, rows, probes, times) > LEAST_ALIKE).any():
+            if not (_alike(spans, other, probes, times) > LEAST_ALIKE).any():
                 continue
-            starts = np.arange(len(rows) - SPAN)
-            share = _alike(scene, other, rows, starts, times)
+            share = _alike(spans, other, np.arange(len(spans)), times)
             # one span may agree by chance, not its neighbours, too
             same = np.flatnonzero(np.convolve(share, np.ones(3) / 3, 'same') > LEAST_ALIKE)
             if len(same) >= LEAST_SPANS:
                 again[rows[np.unique(same[:, None] + np.arange(SPAN + 1))]] = True
     return again
+
+
+def _spans(scene: Scene, rows: Ints) -> list[Floats]:
+    """Return a few tracks (2, t, 2) at both ends of each span of registered keyframes, rows."""
+    spans = []
+    for ends in zip(rows, rows[SPAN:], strict=False):
+        xy = _seen(scene.tracks.xy[list(ends)])
+        spans.append(xy[:, ::max(1, xy.shape[1] // MOST_TRACKS)])
+    return spans
+
+
+def _seen(xy: Floats) -> Floats:
+    """Return the tracks (2, t, 2) that are seen at both ends."""
+    return xy[:, np.isfinite(xy[:, :, 0]).all(axis=0)]
 
 
 def _offsets(scene: Scene, other: Scene, direction: float) -> list[tuple[float, Ints]]:
@@ -109,26 +123,25 @@ def _offsets(scene: Scene, other: Scene, direction: float) -> list[tuple[float, 
             for offset, each in zip(offsets, fits, strict=True) if each.sum() >= LEAST_SPANS]
 
 
-def _alike(scene: Scene, other: Scene, rows: Ints, starts: Ints, times: Floats) -> Floats:
+def _alike(spans: Sequence[Floats], other: Scene, starts: Ints, times: Floats) -> Floats:
     """Return (n,) of the tracks near one of the other scene, the share that moves as that does.
 
-    rows: the registered keyframes. starts: (n,) with which of them spans begin. times: (k,) when
-    the other scene shows the keyframes. 0 where too few tracks are near one.
+    starts: (n,) the spans that are asked. times: (k,) when the other scene shows the registered
+    keyframes. 0 where too few tracks are near one.
     """
-    ends = rows[starts[:, None] + (0, SPAN)]
-    owns, theirs = scene.tracks.xy[ends], _places_at(other, times[ends])
     shares = np.zeros(len(starts))
-    for n, (own, there) in enumerate(zip(owns, theirs, strict=True)):
-        own, there = (each[:, np.isfinite(each[:, :, 0]).all(axis=0)] for each in (own, there))
-        own = own[:, ::max(1, own.shape[1] // MOST_TRACKS)]
+    places = _places_at(other, times[starts[:, None] + (0, SPAN)])
+    for n, (own, there) in enumerate(zip((spans[start] for start in starts), places, strict=True)):
+        there = _seen(there)
         if not own.shape[1] or not there.shape[1]:
             continue
         # half the squared distance, without what is the same for all
-        nearest = (np.sum(there[0]**2, axis=1) / 2 - own[0] @ there[0].T).argmin(axis=1)
-        near = np.linalg.norm(own[0] - there[0][nearest], axis=1) < NEAR_PX
-        if near.sum() >= FEWEST_NEAR:
-            moved = (own[1] - own[0]) - (there[1] - there[0])[nearest]
-            shares[n] = np.mean(np.linalg.norm(moved[near], axis=1) < ALIKE_PX)
+        x, y = there[0].T
+        nearest = ((x * x + y * y) / 2 - own[0] @ there[0].T).argmin(axis=1)
+        before, after = own - there[:, nearest]
+        near = np.hypot(*before.T) < NEAR_PX
+        if np.count_nonzero(near) >= FEWEST_NEAR:
+            shares[n] = np.mean(np.hypot(*(after - before)[near].T) < ALIKE_PX)
     return shares
 
 

@@ -113,10 +113,26 @@ def _linear_points(rays: Floats, rotations: Floats, translations: Floats, seen: 
     squares = (poses.transpose(0, 2, 1) @ poses).reshape(-1, 16)
     normal = (seen.T.astype(np.float64) @ squares).reshape(-1, 4, 4)
     normal -= along.transpose(1, 2, 0) @ along.transpose(1, 0, 2)
-    homogeneous = np.linalg.eigh(normal)[1][:, :, 0]
+    homogeneous = _least_eigenvectors(normal)
     scale = homogeneous[:, 3:]
     scale = np.where(np.abs(scale) < 1e-12, 1e-12, scale)
     return np.asarray(homogeneous[:, :3] / scale)
+
+
+def _least_eigenvectors(matrices: Floats) -> Floats:
+    """Return (t, n) eigenvectors of the least eigenvalues of matrices (t, n, n), none negative.
+
+    By inverse iteration, in half the time that all eigenvectors take.
+    """
+    size = matrices.shape[-1]
+    # which changes no eigenvector; without it, singular ones have no inverse
+    small = 1e-12 * np.trace(matrices, axis1=1, axis2=2) + 1e-30
+    power = np.linalg.inv(matrices + small[:, None, None] * np.eye(size))
+    for _ in range(2):
+        power = power @ power
+        power /= np.max(np.abs(power), axis=(1, 2), keepdims=True)
+    largest = np.argmax(np.einsum('tnn->tn', power), axis=1)
+    return np.asarray(power[np.arange(len(power)), largest])
 
 
 def _widest_angle(rotations: Floats, translations: Floats, points: Floats, seen: Mask) -> Floats:

@@ -169,12 +169,11 @@ def _keyframes(ids: Ints, frames: Ints, xy: Floats, width: int,
 
 def _worth_keeping(table: Floats) -> Mask:
     """Return (t,): True for tracks that are seen in enough keyframes and move in the picture."""
-    seen = np.isfinite(table[:, :, 0])
-    with np.errstate(all='ignore'):
-        low = np.min(np.where(seen[:, :, None], table, np.inf), axis=0)
-        high = np.max(np.where(seen[:, :, None], table, -np.inf), axis=0)
-    extent = np.linalg.norm(high - low, axis=1)
+    worth = np.isfinite(table[:, :, 0]).sum(axis=0) >= MIN_LENGTH
+    xy = table[:, worth]
+    extent = np.fmax.reduce(xy, axis=0) - np.fmin.reduce(xy, axis=0)
     # a track on burnt-in text stands still, and may jump from one letter to the next
-    step = np.linalg.norm(np.diff(table, axis=0), axis=2)
-    standing = (step < STANDING_PX).sum(axis=0) > 0.5 * np.isfinite(step).sum(axis=0)
-    return np.asarray((seen.sum(axis=0) >= MIN_LENGTH) & (extent > 2.0) & ~standing)
+    squares = np.sum(np.diff(xy, axis=0)**2, axis=2)
+    standing = (squares < STANDING_PX**2).sum(axis=0) > 0.5 * np.isfinite(squares).sum(axis=0)
+    worth[worth] = (np.hypot(*extent.T) > 2.0) & ~standing
+    return np.asarray(worth, bool)
