@@ -160,6 +160,22 @@ def test_triangulates_around_one_bad_observation():
     np.testing.assert_allclose(points[long], structure.points[long], rtol=1e-3, atol=1e-3)
 
 
+def test_tracks_that_determine_no_point_do_no_harm_to_the_others():
+    exact = synthetic_turn(noise_px=0.0)
+    structure, rays = exact.structure, LENS.rays(exact.tracks.xy)
+    # never seen, seen once, and seen from one place only
+    rays[:, 0], rays[1:, 1], rays[:, 2] = np.nan, np.nan, np.nan
+    rotations, translations = structure.rotations.copy(), structure.translations.copy()
+    rotations[1], translations[1] = rotations[0], translations[0]
+    rays[:2, 2] = LENS.rays(exact.tracks.xy)[0, exact.tracks.seen[0]][0]
+    rays[1, 3:] = np.nan
+    points, used = triangulate(LENS, rays, rotations, translations, structure.registered, 0.1, 1.0)
+    assert not used[:, :3].any()
+    good = used[:, 3:].any(axis=0)
+    assert good.sum() > 100
+    assert points[3:][good] == pytest.approx(structure.points[3:][good], rel=1e-4, abs=1e-4)
+
+
 def test_triangulates_only_from_registered_images_and_wide_angles():
     exact = synthetic_turn(noise_px=0.0)
     structure = exact.structure
