@@ -129,10 +129,7 @@ def _templates(tracks: Tracks, reference: Ints,
         template[rows] = _sample(image, centre)
         for axis, ahead in enumerate(np.array([[[0.5], [0]], [[0], [0.5]]], np.float32)):
             gradient[rows, axis] = _sample(image, centre + ahead) - _sample(image, centre - ahead)
-    template -= template.mean(axis=1, keepdims=True)
-    contrast = np.sqrt(np.einsum('tp,tp->t', template, template) / np.float32(pixels))
-    contrast = np.maximum(contrast, 1e-3)[:, None]
-    template /= contrast
+    template, contrast = _normalised(template)
     gradient /= contrast[:, :, None]
     # d/dp of T(W(d; p)) at the identity, p = a11 a12 a21 a22 tx ty
     descent = np.concatenate([
@@ -141,6 +138,16 @@ def _templates(tracks: Tracks, reference: Ints,
     damping = 1e-3 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] / 6 + 1e-9
     inverse = np.linalg.inv(hessian + damping * np.eye(6)).astype(np.float32)
     return template, inverse @ descent
+
+
+def _normalised(patches: Floats32) -> tuple[Floats32, Floats32]:
+    """Return patches (n, p) of mean 0 and standard deviation 1, and what that was (n, 1)."""
+    centred = patches - patches.mean(axis=1, keepdims=True)
+    # einsum makes no array of the products
+    variance = np.einsum('np,np->n', centred, centred) / np.float32(patches.shape[1])
+    contrast = np.maximum(np.sqrt(variance), 1e-3)[:, None]
+    centred /= contrast
+    return centred, contrast
 
 
 def _align(image: Floats32, start: Floats, scale: Floats, template: Floats32, steps: Floats32,
@@ -154,10 +161,7 @@ def _align(image: Floats32, start: Floats, scale: Floats, template: Floats32, st
         affine = linear.astype(np.float32)
         patch = _sample(image, affine[:, :, :1] * grid[:, 0] + affine[:, :, 1:] * grid[:, 1]
                         + centre[:, :, None].astype(np.float32))
-        patch -= patch.mean(axis=1, keepdims=True)
-        # einsum makes no array of the products
-        contrast = np.sqrt(np.einsum('np,np->n', patch, patch) / pixels)
-        patch /= np.maximum(contrast, 1e-3)[:, None]
+        patch, _ = _normalised(patch)
         correlation = np.einsum('np,np->n', patch, template) / pixels
         step = (steps @ (patch - template)[:, :, None])[:, :, 0].astype(np.float64)
         # keep single steps small: the patch is only a few pixels wide

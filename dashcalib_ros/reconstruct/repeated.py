@@ -70,10 +70,10 @@ def repeats(scene: Scene, other: Scene) -> Mask:
     if scene.tracks.image_size != other.tracks.image_size:
         return again
     rows = np.flatnonzero(scene.structure.registered)
-    spans = _spans(scene, rows)
+    spans, seconds = _spans(scene, rows), _seconds(scene)[rows]
     for direction in (1.0, -1.0):
         for offset, turning in _offsets(scene, other, direction):
-            times = direction * _seconds(scene)[rows] + offset
+            times = direction * seconds + offset
             probes = turning[np.linspace(0, len(turning) - 1, PROBES).astype(int)]
             if not (_alike(spans, other, probes, times) > LEAST_ALIKE).any():
                 continue

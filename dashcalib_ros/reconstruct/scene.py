@@ -120,12 +120,13 @@ def _linear_points(rays: Floats, rotations: Floats, translations: Floats, seen: 
 
 
 def _least_eigenvectors(matrices: Floats) -> Floats:
-    """Return (t, n) eigenvectors of the least eigenvalues of matrices (t, n, n), none negative.
+    """Return (t, n) the eigenvector of the least eigenvalue of each matrix (t, n, n).
 
-    By inverse iteration, in half the time that all eigenvectors take.
+    The matrices are symmetric and have no negative eigenvalues. Inverse iteration takes half the
+    time of finding all eigenvectors.
     """
     size = matrices.shape[-1]
-    # which changes no eigenvector; without it, singular ones have no inverse
+    # added to the diagonal: the eigenvectors stay, and a singular matrix has an inverse, too
     small = 1e-12 * np.trace(matrices, axis1=1, axis2=2) + 1e-30
     power = np.linalg.inv(matrices + small[:, None, None] * np.eye(size))
     for _ in range(2):

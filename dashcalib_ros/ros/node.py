@@ -198,16 +198,19 @@ class CameraNode(Node, ABC):
         return not self._wake.callback_group.can_execute(self._wake)
 
     def _hear(self, news: News) -> None:
-        """Take news from other threads; a Status, of each image, waits for the next image."""
-        # rclpy needs 0.4 ms to wake up
-        self._later(lambda: self._on_news(news), wake=not isinstance(news, Status))
+        """Take news from other threads."""
+        action = partial(self._on_news, news)
+        if isinstance(news, Status):
+            # one comes with each image: it waits for the next one, as waking up takes time
+            self._actions.put(action)
+        else:
+            self._later(action)
 
-    def _later(self, action: Callable[[], None], wake: bool = True) -> None:
+    def _later(self, action: Callable[[], None]) -> None:
         """Let the executor's thread run an action, in order; called from other threads."""
         self._actions.put(action)
-        if wake:
-            with suppress(RuntimeError):  # rclpy's, when the context is shut down already
-                self._wake.trigger()
+        with suppress(RuntimeError):  # rclpy's, when the context is shut down already
+            self._wake.trigger()
 
     def _empty(self) -> None:
         with suppress(queue.Empty):

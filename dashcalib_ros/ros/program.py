@@ -34,7 +34,7 @@ def run(argv: Sequence[str], lifecycle: bool, stopped: Callable[[], bool]) -> in
     """
     node: CameraNode | None = None
     reuse_image_buffers()
-    # a second thread saves no time at a few ms per image, and costs 1 % of a core
+    # detection takes a few ms per image: a second thread costs more than it saves
     cv2.setNumThreads(1)
     try:
         start_ros(argv)
@@ -124,10 +124,11 @@ def start_ros(argv: Sequence[str]) -> None:
 
 
 class Executor(SingleThreadedExecutor):
-    """rclpy's, without the traceback that it prints where the context is shut down already.
+    """rclpy's, but for two things.
 
-    And without waking itself after each callback, which makes it gather all entities of the node
-    twice: with one thread, nothing waits meanwhile.
+    It prints no traceback where the context is shut down already. It does not wake itself after
+    each callback: that made it gather all entities of the node twice, and in one thread nothing
+    waits meanwhile.
     """
 
     # its __del__ reads this, also where __init__ failed before setting it
