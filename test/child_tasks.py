@@ -27,6 +27,13 @@ def add(a, b):
     return a + b
 
 
+def _tell(path):
+    """Write this process's id; who sees the file may read it."""
+    new = Path(f'{path}.new')
+    new.write_text(str(os.getpid()))
+    new.rename(path)
+
+
 def pid():
     return os.getpid()
 
@@ -42,14 +49,14 @@ def threads():
 
 def sleep(seconds, started=None):
     if started is not None:
-        Path(started).write_text(str(os.getpid()))
+        _tell(started)
     time.sleep(seconds)
     return 'slept'
 
 
 def until(flag, started):
     """Write this process's id, and wait for a file."""
-    Path(started).write_text(str(os.getpid()))
+    _tell(started)
     while not Path(flag).exists():
         time.sleep(0.01)
     return 'seen'
@@ -122,7 +129,7 @@ def build_dies_at_first(turn, config, valid):
 
 
 def build_slowly(turn, config, valid):
-    Path(f'{turn.frames[0]}.{turn.center}').write_text(str(os.getpid()))
+    _tell(f'{turn.frames[0]}.{turn.center}')
     time.sleep(60)
 
 

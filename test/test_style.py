@@ -4,9 +4,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parent.parent
+# each has other types of arrays, and what one takes another may not: newest of Python 3.11, 3.12
+CHECKED_WITH = ('2.4', '2.5')
 
 
 @pytest.mark.parametrize('command', [['ruff', 'check', '.'], ['mypy', 'dashcalib_ros']])
@@ -14,6 +17,9 @@ def test_the_code_is_clean(command):
     if importlib.util.find_spec(command[0]) is None:
         # rosdep has no key for ruff: colcon test does without
         pytest.skip(f'{command[0]} is not installed: pip install the test extra')
+    if command[0] == 'mypy' and not np.__version__.startswith(CHECKED_WITH):
+        pytest.skip(f'types are checked with numpy {" and ".join(CHECKED_WITH)}, '
+                    f'this is {np.__version__}')
     done = subprocess.run([sys.executable, '-m', *command], cwd=ROOT, capture_output=True,
                           text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -137,8 +137,9 @@ class Drive:
             raise IndexError(f'frame {index} of {len(self)}')
         scene, exposure_s = self.scene(index), self.spec.exposure_ms / 1000.0
         instants = [share * exposure_s for share in INSTANTS] if exposure_s > 0.0 else [0.0]
-        image = sum(self.raycaster.render(scene, *self.row_poses(index, later_s))
-                    for later_s in instants) / np.float32(len(instants))
+        light = sum(self.raycaster.render(scene, *self.row_poses(index, later_s))
+                    for later_s in instants)
+        image = np.asarray(light, np.float32) / np.float32(len(instants))
         return Frame(index, self.stamp_ns(index), self._expose(image, index))
 
     def scene(self, index: int) -> Quads:

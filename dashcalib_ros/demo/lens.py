@@ -83,7 +83,7 @@ class Lens:
 
     def distorted_radius(self, radius: float) -> float:
         """Return the distorted of an undistorted normalised radius; p1 and p2 aside."""
-        return radius * float(self._stretch(np.float64(radius * radius)))
+        return radius * float(self._stretch(np.asarray(radius * radius)))
 
     def project(self, points: npt.ArrayLike) -> Floats:
         """Return pixels (n, 2) of points (n, 3) in the camera's frame (z forward, metres).

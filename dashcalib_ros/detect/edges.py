@@ -99,7 +99,7 @@ def _traced(peak: Mask, shortest: float) -> _Traced:
     """Return the long edges without branches; peak: (h, w)."""
     _, labels = cv2.connectedComponents(peak.view(np.uint8), connectivity=8)
     places = np.flatnonzero(peak)
-    pixels = np.bincount(label := labels.ravel()[places])
+    pixels = np.bincount(label := np.asarray(labels, np.int32).ravel()[places])
     # most are short: they are dropped first
     long = pixels >= shortest
     on, used = long[label], np.flatnonzero(long)

@@ -287,7 +287,7 @@ class Monitor:
         share = newer.hessian @ np.linalg.inv(newer.hessian + others.hessian)
         information = basis.T @ (newer.hessian - share @ newer.hessian) @ basis
         pull = basis.T @ (newer.score - share @ (newer.score + others.score))
-        size = np.linalg.lstsq(information, pull, rcond=None)[0]
+        size = np.asarray(np.linalg.lstsq(information, pull, rcond=None)[0], np.float64)
         return size, float(pull @ size)
 
     def _together(self, readings: Sequence[Reading]) -> Quadratic:

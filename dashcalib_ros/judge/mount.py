@@ -183,7 +183,8 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
         weights = seen / (1 + (errors / loss)**2)
         weighted = (weights[..., None] * slopes).transpose(0, 2, 1)
         hessian = weighted @ slopes + np.finfo(float).eps * np.eye(5)
-        change = -np.linalg.solve(hessian, weighted @ errors[..., None])[..., 0]
+        change = np.asarray(
+            -np.linalg.solve(hessian, weighted @ errors[..., None])[..., 0], np.float64)
         length = np.maximum(np.linalg.norm(change, axis=1), np.finfo(float).tiny)
         change *= np.minimum(1.0, LONGEST_STEP / length)[:, None]
         turned = rotation_matrices(change[:, :3]) @ turned

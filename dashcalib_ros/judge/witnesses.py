@@ -405,7 +405,7 @@ def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
     noise = float(residual @ residual) / max(len(residual) - UNKNOWNS, 1)
     hessian = jacobian.T @ jacobian
     hessian[-1, -1] += noise / PACE**2
-    covariance = noise * np.linalg.inv(hessian)
+    covariance = np.asarray(noise * np.linalg.inv(hessian), np.float64)
     # which of the clocks is wrong is not known, nor whether it jumped: an angle may be off by that
     covariance[6, 6] += (gyro.pace * gyro.inverse_scale)**2
     parts, rests = _by_turn(turns, jacobian), _by_turn(turns, residual)

@@ -306,7 +306,8 @@ def _weights(residual: Floats, loss_px: float) -> Floats:
 def _squares_and_freedom(used: Mask, residual: Floats, weight: Floats, parameters: int
                          ) -> tuple[float, float]:
     """Return the sum of the weighted squared residuals, px^2, and their degrees of freedom."""
-    observations, points, poses = used.sum(), used.any(axis=0).sum(), used.any(axis=1).sum()
+    observations, points, poses = (
+        int(each.sum()) for each in (used, used.any(axis=0), used.any(axis=1)))
     # the gauge (position, rotation and scale of the scene) is free: seven
     freedom = max(2 * observations - 3 * points - 6 * poses + 7 - parameters, 1)
     return float(np.sum((residual * weight[:, None])**2) / np.mean(weight**2)), float(freedom)
