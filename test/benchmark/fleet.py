@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """What `dashcalib batch` must show; one command for all of it, or for a part.
 
-    python test/benchmark/fleet.py [lost] [clips] [prior] [speed] [--videos N]
-                                   [--seeds N ...] [--cache DIR] [--out DIR]
+    python test/benchmark/fleet.py [lost] [clips] [prior] [speed] [real] [--videos N]
+                                   [--seeds N ...] [--data DIR] [--cache DIR] [--out DIR]
 
 lost: 200 clips of 20 cameras on two Ray nodes; one node is killed, then the driver; are the tables
 those of one process, byte for byte? clips: five one-turn clips against the drive they were cut
 from. prior: thirty units with one bend each, and three that are zoomed. speed: clips and seconds
-of video per core-second, with 1 and 2 workers. Writes DIR/fleet.json.
+of video per core-second, with 1 and 2 workers. real: the same of the recorded drives in --data,
+with one. Writes DIR/fleet.json.
 """
 from __future__ import annotations
 
@@ -20,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,19 @@ LIMIT_S = 3600.0
 FEWER = ('--set', 'fleet.turns=6')
 # of `prior`; its settings were chosen on 1 to 4 and 11 to 16
 SEEDS = (21, 22, 23, 24, 25, 26, 27, 28)
+# of `real`: folder, pictures, images a second where they do not say
+RECORDED = (('kitti03', 'bag', ''), ('kitti07', 'images', 9.65), ('kitti_raw', 'images', 9.7),
+            ('ntu_campus', 'images', 3), ('carnd', 'drive.mp4', ''))
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the parts are asked: see the options."""
+
+    videos: int
+    seeds: Sequence[int]
+    cache: Path
+    data: Path | None
 
 
 def command(manifest: Path, out: Path, *options: str) -> list[str]:
@@ -62,10 +77,10 @@ def again(manifest: Path, out: Path, *options: str) -> dict[str, Any]:
     return effort
 
 
-def lost(work: Path, cache: Path, videos: int, seeds: Sequence[int]) -> dict[str, Any]:
+def lost(work: Path, asked: Asked) -> dict[str, Any]:
     """Kill a node and the driver; compare the tables with those of one process."""
     from ray.cluster_utils import Cluster
-    manifest = fleet(work / 'fleet', cache, videos)
+    manifest = fleet(work / 'fleet', asked.cache, asked.videos)
     alone, together = work / 'alone', work / 'together'
     reference = run(manifest, alone, '--workers', '1', *FEWER)
     shutil.rmtree(together, ignore_errors=True)
@@ -131,11 +146,11 @@ def _counted(values: Any) -> dict[str, int]:
     return found
 
 
-def clips(work: Path, cache: Path, videos: int, seeds: Sequence[int]) -> list[dict[str, Any]]:
+def clips(work: Path, asked: Asked) -> list[dict[str, Any]]:
     """Compare five one-turn clips with the drive that they were cut from."""
     found = []
     for seed in (1, 2):
-        drive, frames = street(seed, cache)
+        drive, frames = street(seed, asked.cache)
         lens = unit_of(np.random.default_rng(seed))
         folder = work / f'street{seed}'
         shutil.rmtree(folder, ignore_errors=True)
@@ -155,11 +170,11 @@ def clips(work: Path, cache: Path, videos: int, seeds: Sequence[int]) -> list[di
     return found
 
 
-def prior(work: Path, cache: Path, videos: int, seeds: Sequence[int]) -> list[dict[str, Any]]:
+def prior(work: Path, asked: Asked) -> list[dict[str, Any]]:
     """Give thirty units with one bend each the prior of their model, and throw out the zoomed."""
     config = Config().replace({'intrinsics.profile_tracks': 60})
     found = []
-    for seed in seeds:
+    for seed in asked.seeds:
         units = [(lens, zoom, fuse(f'u{n:02}', 'model', {'bend': clip}, config))
                  for n, (lens, zoom, clip) in enumerate(bends(seed))]
         known = [unit for _, _, result in units if (unit := solved.unit_of(result))]
@@ -180,12 +195,12 @@ def prior(work: Path, cache: Path, videos: int, seeds: Sequence[int]) -> list[di
     return found
 
 
-def speed(work: Path, cache: Path, videos: int, seeds: Sequence[int]) -> dict[str, Any]:
+def speed(work: Path, asked: Asked) -> dict[str, Any]:
     """Measure clips and seconds of video per core-second, with one worker and with two."""
     folder = work / 'speed'
     shutil.rmtree(folder, ignore_errors=True)
-    for camera in range(videos):
-        drive, frames = street(1 + camera % 2, cache)
+    for camera in range(asked.videos):
+        drive, frames = street(1 + camera % 2, asked.cache)
         lens = unit_of(np.random.default_rng(camera))
         for n, (begin, end) in enumerate(cuts(drive)):
             write_clip(folder / f'{camera}-{n}.avi', frames[begin:end], lens)
@@ -196,6 +211,19 @@ def speed(work: Path, cache: Path, videos: int, seeds: Sequence[int]) -> dict[st
     size = sum(path.stat().st_size for path in (work / 'speed-1/gathered').rglob('*.npz'))
     found['gathered_bytes_per_minute'] = size / (found['1']['video_s'] / 60)
     found['efficiency'] = found['1']['wall_s'] / (2 * found['2']['wall_s'])
+    return found
+
+
+def real(work: Path, asked: Asked) -> dict[str, Any]:
+    """Measure the recorded drives, each as one clip of a camera, with one worker."""
+    if asked.data is None:
+        return {}
+    work.mkdir(parents=True, exist_ok=True)
+    found = {}
+    for name, pictures, fps in RECORDED:
+        manifest = work / f'{name}.csv'
+        manifest.write_text(f'clip,camera,fps\n{asked.data / name / pictures},{name},{fps}\n')
+        found[name] = run(manifest, work / f'real-{name}', '--workers', '1')
     return found
 
 
@@ -218,9 +246,13 @@ def report(found: Mapping[str, Any]) -> str:
                             'within 2 sigma alone', 'with a prior', 'zoomed, without one'], rows))
         parts.append('all: ' + ', '.join(_prior_row(
             [unit for each in found['prior'] for unit in each['units']])))
+    for name, effort in found.get('real', {}).items():
+        core_s = _core_s(effort)
+        parts.append(f'{name}: {effort["video_s"]:.0f} s of video in {core_s:.1f} core-s: '
+                     f'{effort["video_s"] / core_s:.2f} s of video per core-s')
     if 'speed' in found:
         one = found['speed']['1']
-        core_s = one['gather_cpu_s'] + one['solve_cpu_s']
+        core_s = _core_s(one)
         parts.append(
             f'speed: {one["clips_read"]} clips, {one["video_s"]:.0f} s of video 640x360 in '
             f'{core_s:.0f} core-s ({one["solve_cpu_s"]:.0f} of them solving): '
@@ -230,6 +262,10 @@ def report(found: Mapping[str, Any]) -> str:
             f'MB per worker; {found["speed"]["gathered_bytes_per_minute"] / 1e3:.0f} kB gathered '
             f'per minute of video')
     return '\n\n'.join(parts)
+
+
+def _core_s(effort: Mapping[str, Any]) -> float:
+    return float(effort['gather_cpu_s'] + effort['solve_cpu_s'])
 
 
 def _pair(row: Mapping[str, Any], name: str, factor: float, digits: int) -> tuple[str, str]:
@@ -251,12 +287,12 @@ def _prior_row(units: Sequence[Mapping[str, Any]]) -> list[str]:
             f'{sum(not unit["prior"] for unit in zoomed)} of {len(zoomed)}']
 
 
-PARTS = {'lost': lost, 'clips': clips, 'prior': prior, 'speed': speed}
+PARTS = {'lost': lost, 'clips': clips, 'prior': prior, 'speed': speed, 'real': real}
 
 
 def main() -> None:
     """Measure what is asked for."""
-    parser = parser_with(__doc__, 'cache', 'out')
+    parser = parser_with(__doc__, 'data', 'cache', 'out')
     parser.add_argument('parts', nargs='*', metavar='PART', help=f'of {", ".join(PARTS)}')
     parser.add_argument('--videos', type=int, default=4,
                         help='cameras with videos, in `lost` and `speed`')
@@ -270,11 +306,11 @@ def main() -> None:
     path = arguments.out / 'fleet.json'
     found = load(path)
     with tempfile.TemporaryDirectory() as passing:
-        cache = arguments.cache or Path(passing)
+        asked = Asked(arguments.videos, arguments.seeds, arguments.cache or Path(passing),
+                      arguments.data)
         for part in arguments.parts or PARTS:
-            found |= {part: PARTS[part](arguments.out / 'fleet', cache, arguments.videos,
-                                        arguments.seeds),
-                      'commit': commit(), 'cores': os.cpu_count()}
+            found |= {part: PARTS[part](arguments.out / 'fleet', asked), 'commit': commit(),
+                      'cores': os.cpu_count()}
             save(path, found)
     print(report(found))
 
