@@ -32,7 +32,8 @@ def test_an_executor_that_cannot_be_made_leaves_no_traceback(monkeypatch):
     told = []
     monkeypatch.setattr(sys, 'unraisablehook', told.append)
     context = rclpy.Context()
-    with pytest.raises(Exception, match='context'):
+    # of a context without a handle; which one depends on the Python
+    with pytest.raises((AttributeError, TypeError)):
         Executor(context=context)
     gc.collect()
     assert told == []
