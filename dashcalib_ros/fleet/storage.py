@@ -15,7 +15,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -206,12 +205,17 @@ def _system(url: str) -> tuple[Any, str]:
 
 def needs(library: str, what: str) -> ModuleType:
     """Import a library of the extra; raises ConfigError that says how to install it."""
-    if not has(library):
+    try:
+        return import_module(library)
+    except ImportError as error:
         raise ConfigError(f"{what} need {library}: install it with pip install "
-                          f"'dashcalib_ros[fleet]'")
-    return import_module(library)
+                          f"'dashcalib_ros[fleet]' ({one_line(error)})") from error
 
 
 def has(library: str) -> bool:
-    """Return whether a library of the extra is installed."""
-    return find_spec(library) is not None
+    """Return whether a library of the extra can be used: pyarrow is not with an old NumPy."""
+    try:
+        import_module(library)
+    except ImportError:
+        return False
+    return True

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import pytest
 from made_drives import smooth, write_video
@@ -59,7 +60,8 @@ def test_an_output_that_cannot_be_written(tmp_path, capsys):
 @pytest.mark.parametrize(('options', 'expected'), [
     (('--workers', '2'), 3), ((), 3), (('--address', 'auto'), 2)])
 def test_only_a_cluster_needs_ray(tmp_path, capsys, monkeypatch, options, expected):
-    monkeypatch.setattr('dashcalib_ros.fleet.storage.has', lambda name: None)
+    for name in ('ray', 'pyarrow', 'fsspec'):
+        monkeypatch.setitem(sys.modules, name, None)
     (tmp_path / 'm.csv').write_text('clip\na.avi\n')
     code, _, err = run(capsys, tmp_path / 'm.csv', '--out', tmp_path / 'out', *options)
     assert code == expected

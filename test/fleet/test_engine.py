@@ -86,7 +86,7 @@ def test_ray_that_has_ended_is_one_line(monkeypatch):
 
 
 def test_a_cluster_says_which_extra_it_needs(monkeypatch):
-    monkeypatch.setattr('dashcalib_ros.fleet.storage.has', lambda name: None)
+    monkeypatch.setitem(sys.modules, 'ray', None)
     with pytest.raises(ConfigError, match=r'clusters .* need ray: .*\[fleet\]'):
         RayEngine(3, 100, 'auto')
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 
 import pytest
 
@@ -78,7 +79,7 @@ def test_an_output_that_is_no_folder(tmp_path):
 
 
 def test_addresses_say_which_extra_they_need(monkeypatch):
-    monkeypatch.setattr('dashcalib_ros.fleet.storage.has', lambda name: None)
+    monkeypatch.setitem(sys.modules, 'fsspec', None)
     with pytest.raises(ConfigError, match=r's3:// addresses need fsspec: .*\[fleet\]'):
         storage.stamp('s3://bucket/clip.mp4')
 
