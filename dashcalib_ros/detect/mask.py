@@ -101,7 +101,7 @@ class EgoMask:
         flat = known & (strength < FLAT)
         ego = known & ~flat & (stays > CELL_STAYS) | known & (pixels > PIXELS)
         ego = _without_specks(ego)
-        filled = _closed(ego | self._enclosed(flat & ~ego, ego))
+        filled = _closed(ego | self._flat_parts(flat & ~ego, ego, stays))
         for cells in (filled, ego):
             if cells.mean() <= LARGEST:
                 return cells
@@ -164,8 +164,11 @@ class EgoMask:
         world[places[:, 1].reshape(self.grid) < horizon + self._cell] = rotation
         return np.asarray(world, np.float32)
 
-    def _enclosed(self, flat: Mask, ego: Mask) -> Mask:
-        """Return the flat regions at the picture's border with an outline of vehicle cells."""
+    def _flat_parts(self, flat: Mask, ego: Mask, stays: Floats) -> Mask:
+        """Return the flat regions at the picture's border that are of the vehicle.
+
+        Their outline is, or what gradient they have stays: a bonnet's shading, but no noise.
+        """
         count, labels = cv2.connectedComponents(flat.astype(np.uint8), connectivity=4)
         result = np.zeros_like(flat)
         cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -174,7 +177,8 @@ class EgoMask:
         for label in range(1, count):
             region = labels == label
             outline = (cv2.dilate(region.astype(np.uint8), cross) > 0) & ~region
-            if (region & border).any() and outline.any() and ego[outline].mean() >= ENCLOSED:
+            enclosed = outline.any() and ego[outline].mean() >= ENCLOSED
+            if (region & border).any() and (enclosed or np.median(stays[region]) > CELL_STAYS):
                 result |= region
         return result
 

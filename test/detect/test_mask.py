@@ -115,3 +115,15 @@ def test_static_patch_in_a_moving_world():
 def test_kitti03_shows_no_vehicle():
     valid = observe(frame for frame in open_frames(str(KITTI)) if frame.index < 260)
     assert valid is None or valid.mean() > 0.99
+
+
+def test_a_flat_bonnet_is_known_by_its_shading():
+    mask = EgoMask((480, 270))
+    flat, ego = np.zeros(mask.grid, bool), np.zeros(mask.grid, bool)
+    flat[-1, 6:24] = True
+    ego[-1, :6] = ego[-1, 24:] = True  # of its outline, a tenth
+    for stays, taken in ((0.0, False), (0.9, True)):
+        assert np.array_equal(mask._flat_parts(flat, ego, np.full(mask.grid, stays)),
+                              flat & taken)
+    ego[-2, 6:24] = True
+    assert np.array_equal(mask._flat_parts(flat, ego, np.zeros(mask.grid)), flat)
