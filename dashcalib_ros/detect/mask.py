@@ -167,7 +167,8 @@ class EgoMask:
     def _flat_parts(self, flat: Mask, ego: Mask, stays: Floats) -> Mask:
         """Return the flat regions at the picture's border that are of the vehicle.
 
-        Their outline is, or what gradient they have stays: a bonnet's shading, but no noise.
+        Their outline is, or they are at the bottom and what gradient they have stays: a bonnet's
+        shading does. The sky's does, too, but it is not at the bottom.
         """
         count, labels = cv2.connectedComponents(flat.astype(np.uint8), connectivity=4)
         result = np.zeros_like(flat)
@@ -178,7 +179,8 @@ class EgoMask:
             region = labels == label
             outline = (cv2.dilate(region.astype(np.uint8), cross) > 0) & ~region
             enclosed = outline.any() and ego[outline].mean() >= ENCLOSED
-            if (region & border).any() and (enclosed or np.median(stays[region]) > CELL_STAYS):
+            shaded = region[-1].any() and np.median(stays[region]) > CELL_STAYS
+            if (region & border).any() and (enclosed or shaded):
                 result |= region
         return result
 

@@ -125,5 +125,7 @@ def test_a_flat_bonnet_is_known_by_its_shading():
     for stays, taken in ((0.0, False), (0.9, True)):
         assert np.array_equal(mask._flat_parts(flat, ego, np.full(mask.grid, stays)),
                               flat & taken)
+    sky = np.roll(flat, (1, 6), (0, 1))
+    assert sky[0, -1] and not mask._flat_parts(sky, ego, np.full(mask.grid, 0.9)).any()
     ego[-2, 6:24] = True
     assert np.array_equal(mask._flat_parts(flat, ego, np.zeros(mask.grid)), flat)
