@@ -167,8 +167,8 @@ class EgoMask:
     def _flat_parts(self, flat: Mask, ego: Mask, stays: Floats) -> Mask:
         """Return the flat regions at the picture's border that are of the vehicle.
 
-        Their outline is, or they are at the bottom and what gradient they have stays: a bonnet's
-        shading does. The sky's does, too, but it is not at the bottom.
+        Their outline is vehicle, or they reach the bottom and have a gradient that stays, as a
+        bonnet's shading does. A clear sky's gradient may stay, too, but not at the bottom.
         """
         count, labels = cv2.connectedComponents(flat.astype(np.uint8), connectivity=4)
         result = np.zeros_like(flat)

@@ -213,7 +213,7 @@ def needs(library: str, what: str) -> ModuleType:
 
 
 def has(library: str) -> bool:
-    """Return whether a library of the extra can be used: pyarrow is not with an old NumPy."""
+    """Return whether a library of the extra can be imported; not if NumPy is too old for it."""
     try:
         import_module(library)
     except ImportError:

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from fleet_clips import bends, cuts, fleet, street, unit_of, write_clip
 from measure import commit, load, parser_with, save, table
+from real import DRIVES
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.fleet import lens_prior, solved
@@ -41,8 +42,8 @@ FEWER = ('--set', 'fleet.turns=6')
 # of `prior`; its settings were chosen on 1 to 4 and 11 to 16
 SEEDS = (21, 22, 23, 24, 25, 26, 27, 28)
 # of `real`: folder, pictures, images a second where they do not say
-RECORDED = (('kitti03', 'bag', ''), ('kitti07', 'images', 9.65), ('kitti_raw', 'images', 9.7),
-            ('ntu_campus', 'images', 3), ('carnd', 'drive.mp4', ''))
+RECORDED = (*((drive.name, drive.pictures, drive.fps or '') for drive in DRIVES),
+            ('carnd', 'drive.mp4', ''))
 
 
 @dataclass(frozen=True)
