@@ -66,7 +66,7 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'dashcalib = dashcalib_ros.cli:main',
+            'dashcalib = dashcalib_ros.cli:command',
             'calibrator = dashcalib_ros.ros:main',
         ],
     },

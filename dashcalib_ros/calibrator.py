@@ -200,7 +200,8 @@ class Calibrator:
                       tuple(self.scenes.all_scenes()))
 
     def close(self) -> None:
-        """End the child processes; a calibrate() in another thread raises WorkerError."""
+        """End threads and child processes; a calibrate() elsewhere raises WorkerError."""
+        self.detection.close()
         self.scenes.close()
 
     def __enter__(self) -> Calibrator:

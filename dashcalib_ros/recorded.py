@@ -147,11 +147,15 @@ def pushed(taker: Taker, source: FrameSource, mask: Mask | None) -> Iterator[int
 def _read_ahead(source: FrameSource) -> Iterator[Frame]:
     """Yield every frame of the drive, while a thread decodes the next one."""
     frames = iter(source)
-    with ThreadPoolExecutor(1) as reader:
+    reader = ThreadPoolExecutor(1)
+    try:
         coming = reader.submit(next, frames, None)
         while (frame := coming.result()) is not None:
             coming = reader.submit(next, frames, None)
             yield frame
+    finally:
+        # Ctrl-C in the middle of a lock's own code leaves it locked: the thread is not waited for
+        reader.shutdown(wait=False)
 
 
 def _valid(mask: MaskOrPath) -> Mask | None:

@@ -3,6 +3,6 @@
 
 Only what --help needs is imported here; each command imports its own in its function.
 """
-from dashcalib_ros.cli.program import main
+from dashcalib_ros.cli.program import command, main
 
-__all__ = ['main']
+__all__ = ['command', 'main']

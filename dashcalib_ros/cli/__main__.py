@@ -1,6 +1,4 @@
 """python -m dashcalib_ros.cli: the same as the installed command."""
-import sys
+from dashcalib_ros.cli import command
 
-from dashcalib_ros.cli import main
-
-sys.exit(main())
+command()

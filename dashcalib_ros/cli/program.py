@@ -5,16 +5,26 @@ import argparse
 import errno
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 from dashcalib_ros.cli.arguments import BAD_INPUT, COMMANDS, INTERRUPTED, PROGRAM, make_parser
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr
 from dashcalib_ros.workers.worker import one_thread_for_numpy
+
+
+def command() -> NoReturn:
+    """Run main() as a process of its own, the installed command."""
+    code = main()
+    if code == INTERRUPTED:
+        # Ctrl-C in the middle of a lock's own code leaves it locked: no thread is waited for
+        os._exit(code)
+    sys.exit(code)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,6 +52,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         # `python -m` ends with SIGINT instead of our exit code when an interrupt, caught or not,
         # came out of exec('text'), as dataclasses call it on import; the next exec() resets that
         exec('pass')
+        return _fail('interrupted', INTERRUPTED)
+    except RuntimeError as error:
+        # what Condition.wait() makes of Ctrl-C in the middle of its own code: its lock is free
+        if not isinstance(error.__context__, KeyboardInterrupt):
+            raise
         return _fail('interrupted', INTERRUPTED)
     except ModuleNotFoundError as error:
         if not error.name or error.name.startswith('dashcalib_ros'):

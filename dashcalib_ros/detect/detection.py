@@ -88,6 +88,10 @@ class Detection:
         """End the drive; return the turns that this completes or changes."""
         return self._fixed(self._turns.finish())
 
+    def close(self) -> None:
+        """End the thread that looks for lines; what it found stays."""
+        self._lines.close()
+
     def turns(self) -> tuple[Turn, ...]:
         """Return the turns found so far, the most prominent first."""
         return self._turns.bank.turns()

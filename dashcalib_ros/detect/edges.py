@@ -181,6 +181,11 @@ class LineCollector:
             self._found = self._found[::2]
             self._period_ns *= 2
 
+    def close(self) -> None:
+        """End the thread; an interrupt while it starts would leave one that nothing else ends."""
+        if self._thread is not None:
+            self._thread.shutdown(wait=False)
+
     def lines(self) -> Lines:
         """Return the lines found so far."""
         found = [np.zeros((0, KNOTS, 2), np.float32), *(points() for _, points in self._found)]

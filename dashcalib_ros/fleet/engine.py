@@ -164,7 +164,7 @@ class LocalEngine(Engine):
         """End the workers; calls that run end with an error."""
         for worker in self._workers:
             worker.close()
-        self._threads.shutdown()
+        self._threads.shutdown(wait=False)
 
 
 class RayEngine(Engine):

@@ -279,7 +279,8 @@ class ScenePool:
         with self._changed:
             self._notify()
         for thread in self._threads:
-            thread.join(timeout=5)
+            if thread.is_alive():  # else an interrupt came before it started
+                thread.join(timeout=5)
 
     def _pause(self, seconds: float) -> None:
         end = time.monotonic() + seconds

@@ -346,9 +346,17 @@ def test_a_sixteen_bit_mask_keeps_its_darkest_grey(fake, drive, tmp_path):
     assert fake.made[0].mask.all()
 
 
+def interrupted_while_it_waits():
+    """Return what Condition.wait() raises when Ctrl-C comes before it has its lock again."""
+    error = RuntimeError('release unlocked lock')
+    error.__context__ = KeyboardInterrupt()
+    return error
+
+
 @pytest.mark.parametrize(('failure', 'code', 'complaint'), [
     (WorkerError('the worker was killed; try again'), 2, 'the worker was killed; try again'),
     (KeyboardInterrupt(), 130, 'interrupted'),
+    (interrupted_while_it_waits(), 130, 'interrupted'),
     (MemoryError(), 2, 'out of memory'),
     (OSError(errno.ENOSPC, 'No space left on device', '/tmp/x'), 2, 'free some'),
     (OSError(errno.EIO, 'Input/output error', '/media/x'), 2, '/media/x'),
@@ -364,9 +372,10 @@ def test_known_failures_close_everything_and_leave_nothing(
     assert names(tmp_path / 'work') == []
 
 
-def test_a_bug_is_not_hidden(fake, drive, monkeypatch):
-    monkeypatch.setattr(fake, 'failure', ZeroDivisionError())
-    with pytest.raises(ZeroDivisionError):
+@pytest.mark.parametrize('bug', [ZeroDivisionError(), RuntimeError('release unlocked lock')])
+def test_a_bug_is_not_hidden(fake, drive, monkeypatch, bug):
+    monkeypatch.setattr(fake, 'failure', bug)
+    with pytest.raises(type(bug)):
         main(['run', drive])
     assert fake.made[0].closed
 

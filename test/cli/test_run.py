@@ -171,6 +171,37 @@ def test_a_signal_ends_it_whole(bag, tmp_path, name, children):
             os.killpg(process.pid, signal.SIGKILL)
 
 
+# Ctrl-C in the main thread while it starts its n-th thread, which runs already
+INTERRUPTED_START = """
+import sys, threading
+from dashcalib_ros.cli import command
+
+class Thread(threading.Thread):
+    count = 0
+
+    def start(self):
+        super().start()
+        if threading.current_thread() is threading.main_thread():
+            Thread.count += 1
+            if Thread.count == start:
+                raise KeyboardInterrupt
+
+threading.Thread = Thread
+start = int(sys.argv.pop(1))
+command()
+"""
+
+
+# threads that read ahead, look for lines, and wait for the first and the second child
+@pytest.mark.parametrize('thread', [1, 2, 3, 4])
+def test_a_signal_while_a_thread_starts_ends_it(bag, tmp_path, thread):
+    done = dashcalib(str(thread), 'run', bag, '--out', tmp_path / 'out',
+                     command=(sys.executable, '-c', INTERRUPTED_START))
+    assert done.returncode == 130, done.stderr
+    assert done.stderr.splitlines()[-1] == 'dashcalib: error: interrupted'
+    assert 'Traceback' not in done.stderr
+
+
 def test_demo_prints_estimate_sigma_and_truth(demo):
     done, out = demo
     assert done.returncode == 0, done.stdout + done.stderr
