@@ -2,7 +2,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -32,6 +33,8 @@ from dashcalib_ros.selection import Progress
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
 # what frames are pushed into
 Taker = Calibrator | Detection
+# s between two looks whether an image has been read
+READING_S = 0.01
 
 
 def calibrate(path: Paths, fps: float | None = None,
@@ -146,8 +149,7 @@ def pushed(taker: Taker, source: FrameSource, mask: Mask | None) -> Iterator[int
 
 def _read_ahead(source: FrameSource) -> Iterator[Frame]:
     """Yield every frame of the drive, while a thread decodes the next one."""
-    frames = iter(source)
-    reader = ThreadPoolExecutor(1)
+    frames, reader = iter(source), ThreadPoolExecutor(1)
     try:
         coming = reader.submit(next, frames, None)
         while (frame := coming.result()) is not None:
@@ -156,6 +158,18 @@ def _read_ahead(source: FrameSource) -> Iterator[Frame]:
     finally:
         # Ctrl-C in the middle of a lock's own code leaves it locked: the thread is not waited for
         reader.shutdown(wait=False)
+        _close(frames)
+
+
+def _close(frames: Generator[Frame, None, None]) -> None:
+    """End the reading of a drive, which removes temporary files, after the read under way."""
+    while True:
+        try:
+            frames.close()
+        except ValueError:  # it is running
+            time.sleep(READING_S)
+        else:
+            return
 
 
 def _valid(mask: MaskOrPath) -> Mask | None:

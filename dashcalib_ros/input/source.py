@@ -187,7 +187,7 @@ class FrameSource(ABC):
             part.count = None
         return part
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Generator[Frame, None, None]:
         reading = Reading()
         try:
             yield from self._frames(reading)

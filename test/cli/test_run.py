@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import zstandard
 
 pytest.importorskip('dashcalib_ros.calibrator')
 
@@ -169,6 +170,24 @@ def test_a_signal_ends_it_whole(bag, tmp_path, name, children):
     finally:
         if processes_of(process.pid):
             os.killpg(process.pid, signal.SIGKILL)
+
+
+def test_a_signal_while_a_packed_bag_is_read_leaves_no_copy(bag, tmp_path):
+    scratch, packed = tmp_path / 'scratch', tmp_path / 'bag.mcap.zstd'
+    scratch.mkdir()
+    packed.write_bytes(zstandard.compress((bag / 'bag.mcap').read_bytes()))
+    process = subprocess.Popen([*COMMAND, 'run', packed, '--out', tmp_path / 'out'],
+                               stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+                               env={**os.environ, 'TMPDIR': str(scratch)})
+    try:
+        wait_for(lambda: any(scratch.iterdir()))
+        process.send_signal(signal.SIGTERM)
+        assert process.communicate(timeout=60)[1] == 'dashcalib: error: interrupted\n'
+        assert process.returncode == 130
+        assert list(scratch.iterdir()) == []
+    finally:
+        process.kill()
+        process.wait()
 
 
 # Ctrl-C in the main thread while it starts its n-th thread, which runs already
