@@ -494,13 +494,73 @@ def batch_kills(folder: Path, tries: Sequence[int]) -> Iterator[None]:
         yield
 
 
-def child_kills(folder: Path, tries: Sequence[int]) -> Iterator[None]:
-    """SIGKILL of children that calibrate: the result is the same, and no process is left."""
-    pictures = folder / 'pictures'
+def two_turns(pictures: Path) -> Path:
+    """Write the pictures of a drive that is accepted, and return their folder."""
     pictures.mkdir()
     lens = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
     for frame in Drive(lens, DriveSpec(seed=0, turns=2)).frames(processes=2):
         cv2.imwrite(str(pictures / f'{frame.index:06}.png'), frame.image)
+    return pictures
+
+
+# Ctrl-C in the n-th line of threads, locks and processes at which Python looks for signals: after
+# a call into C, and at the begin of a function. The lines are counted, and told at a normal end
+INTERRUPTED = """
+import atexit, sys
+from dashcalib_ros.cli import command
+
+wanted, lines = int(sys.argv.pop(1)), 0
+files = ('threading.py', 'futures/', 'queue.py', 'subprocess.py', 'contextlib.py', 'workers/',
+         'selection.py', 'recorded.py', 'calibrator.py', 'edges.py', 'cli/drive.py')
+
+def looked(frame, event, _):
+    global lines
+    if event in ('call', 'c_return') and any(
+            each in frame.f_code.co_filename for each in files):
+        lines += 1
+        if lines == wanted:
+            sys.setprofile(None)
+            raise KeyboardInterrupt
+
+atexit.register(lambda: print(lines))
+sys.setprofile(looked)
+command()
+"""
+
+
+def interrupts(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Ctrl-C at any line: the command ends, says so in one line, and leaves nothing."""
+    pictures, out = two_turns(folder / 'pictures'), folder / 'out'
+
+    def run(line: int) -> tuple[int, str, str]:
+        process = subprocess.Popen(
+            [sys.executable, '-c', INTERRUPTED, str(line), 'run', str(pictures), '--fps', '10',
+             '--out', str(out)], start_new_session=True, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True)
+        try:
+            written, said = process.communicate(timeout=60)
+        finally:
+            left = processes_of(process.pid)
+            if left:
+                os.killpg(process.pid, signal.SIGKILL)
+        assert not left, left
+        return process.returncode, written, said
+
+    lines = int(run(0)[1].split()[-1])
+    for n in tries:
+        shutil.rmtree(out, ignore_errors=True)
+        line = int(np.random.default_rng(n).integers(1, lines))
+        code, _, said = run(line)
+        # in the last lines, the work is done
+        done = code == 0 and (out / 'result.json').exists()
+        assert done or (code, said, out.exists()) == (
+            130, 'dashcalib: error: interrupted\n', False), f'line {line}: {code}: {said}'
+        yield
+
+
+def child_kills(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGKILL of children that calibrate: the result is the same, and no process is left."""
+    pictures = two_turns(folder / 'pictures')
 
     def calibrated(moments: Sequence[float]) -> tuple[dict[str, Any], str]:
         out = folder / 'out'
@@ -603,6 +663,7 @@ ATTACKS = [
     Attack('manifests', 40, 5, manifests),
     Attack('SIGKILL of a batch', 10, 1, batch_kills),
     Attack('SIGKILL of children that calibrate', 10, 1, child_kills),
+    Attack('Ctrl-C at any line', 100, 4, interrupts),
     Attack('a FIFO for a file', 11, 11, pipes),
     Attack('clips of scenes', 88, 6, scene_files),
     Attack('soak with lost images', 2, 1, soaks)]
