@@ -5,8 +5,10 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from tempfile import TemporaryDirectory
 
 from rich.text import Text
 
@@ -44,17 +46,15 @@ def batch(args: argparse.Namespace) -> int:
         write_stderr(
             f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(cameras), "camera")}; '
             f'Ctrl-C keeps what is done in {args.out}, and the same command goes on')
-    engine = _engine(args, config)
-    try:
-        with progress.stages:
-            files = calibrate_fleet(cameras, args.out, config, engine, args.shard is None,
-                                    progress.tell)
-    except KeyboardInterrupt:
-        warn([f'{progress.done} of {counted(progress.clips, "clip")} done, and kept in '
-              f'{args.out}: the same command goes on'])
-        raise
-    finally:
-        engine.close()
+    with _engine(args, config) as engine:
+        try:
+            with progress.stages:
+                files = calibrate_fleet(cameras, args.out, config, engine, args.shard is None,
+                                        progress.tell)
+        except KeyboardInterrupt:
+            warn([f'{progress.done} of {counted(progress.clips, "clip")} done, and kept in '
+                  f'{args.out}: the same command goes on'])
+            raise
     name = '' if args.shard is None else f'-{shard[0]}-of-{shard[1]}'
     write(joined(args.out, f'effort{name}.json'), progress.effort_json(engine))
     if files:
@@ -62,15 +62,23 @@ def batch(args: argparse.Namespace) -> int:
     return _summarise(cameras, progress.screen)
 
 
-def _engine(args: argparse.Namespace, config: Config) -> Engine:
+@contextmanager
+def _engine(args: argparse.Namespace, config: Config) -> Iterator[Engine]:
+    """Give the engine, which is closed at the end."""
     settings = config.fleet
     if args.address is not None:
-        return RayEngine(settings.attempts, settings.memory_mb, args.address)
+        with closing(RayEngine(settings.attempts, settings.memory_mb, args.address)) as cluster:
+            yield cluster
+        return
     # one a core, while memory lasts
     memory_mb = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2**20
     most = max(1, min(os.cpu_count() or 1, memory_mb // settings.memory_mb))
     count = 1 if args.shard is not None else args.workers or most
-    return LocalEngine(settings.attempts, [ChildWorker() for _ in range(count)])
+    # a child that is killed leaves its copy of a packed or distant clip
+    with TemporaryDirectory(prefix='dashcalib-', ignore_cleanup_errors=True) as scratch, closing(
+            LocalEngine(settings.attempts,
+                        [ChildWorker(scratch=scratch) for _ in range(count)])) as local:
+        yield local
 
 
 def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
