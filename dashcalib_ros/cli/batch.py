@@ -74,7 +74,7 @@ def _engine(args: argparse.Namespace, config: Config) -> Iterator[Engine]:
     memory_mb = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2**20
     most = max(1, min(os.cpu_count() or 1, memory_mb // settings.memory_mb))
     count = 1 if args.shard is not None else args.workers or most
-    # a child that is killed leaves its copy of a packed or distant clip
+    # a child that is killed leaves its copy of a packed or remote clip
     with TemporaryDirectory(prefix='dashcalib-', ignore_cleanup_errors=True) as scratch, closing(
             LocalEngine(settings.attempts,
                         [ChildWorker(scratch=scratch) for _ in range(count)])) as local:
