@@ -5,8 +5,8 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from tempfile import TemporaryDirectory
 
@@ -46,7 +46,9 @@ def batch(args: argparse.Namespace) -> int:
         write_stderr(
             f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(cameras), "camera")}; '
             f'Ctrl-C keeps what is done in {args.out}, and the same command goes on')
-    with _engine(args, config) as engine:
+    # a child that is killed leaves its copy of a packed or remote clip in the scratch folder
+    with (TemporaryDirectory(prefix='dashcalib-', ignore_cleanup_errors=True) as scratch,
+          closing(_engine(args, config, scratch)) as engine):
         try:
             with progress.stages:
                 files = calibrate_fleet(cameras, args.out, config, engine, args.shard is None,
@@ -62,23 +64,15 @@ def batch(args: argparse.Namespace) -> int:
     return _summarise(cameras, progress.screen)
 
 
-@contextmanager
-def _engine(args: argparse.Namespace, config: Config) -> Iterator[Engine]:
-    """Give the engine, which is closed at the end."""
+def _engine(args: argparse.Namespace, config: Config, scratch: str) -> Engine:
     settings = config.fleet
     if args.address is not None:
-        with closing(RayEngine(settings.attempts, settings.memory_mb, args.address)) as cluster:
-            yield cluster
-        return
+        return RayEngine(settings.attempts, settings.memory_mb, args.address)
     # one a core, while memory lasts
     memory_mb = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2**20
     most = max(1, min(os.cpu_count() or 1, memory_mb // settings.memory_mb))
     count = 1 if args.shard is not None else args.workers or most
-    # a child that is killed leaves its copy of a packed or remote clip
-    with TemporaryDirectory(prefix='dashcalib-', ignore_cleanup_errors=True) as scratch, closing(
-            LocalEngine(settings.attempts,
-                        [ChildWorker(scratch=scratch) for _ in range(count)])) as local:
-        yield local
+    return LocalEngine(settings.attempts, [ChildWorker(scratch=scratch) for _ in range(count)])
 
 
 def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:

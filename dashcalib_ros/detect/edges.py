@@ -182,7 +182,7 @@ class LineCollector:
             self._period_ns *= 2
 
     def close(self) -> None:
-        """End the thread; an interrupt while it starts would leave one that nothing else ends."""
+        """End the thread: if Ctrl-C comes while it starts, nothing else ends it."""
         if self._thread is not None:
             self._thread.shutdown(wait=False)
 

@@ -504,8 +504,9 @@ def two_turns(pictures: Path) -> Path:
     return pictures
 
 
-# Ctrl-C in the n-th line of threads, locks and processes at which Python looks for signals: after
-# a call into C, and at the begin of a function. The lines are counted, and told at a normal end
+# Ctrl-C at the n-th place in the code of threads, locks and processes where Python looks for
+# signals: after a call into C, and where a function begins. A run that is not interrupted prints
+# how many such places there were
 INTERRUPTED = """
 import atexit, sys
 from dashcalib_ros.cli import command
