@@ -125,7 +125,7 @@ class Brown(Radial):
 
     model: ClassVar[str] = 'brown'
     colmap: ClassVar[ColmapModel] = ColmapModel('FULL_OPENCV', 12, (0, 1, 2, 3, 4, 5, 6, 7, 8))
-    spread: ClassVar[tuple[float, ...]] = (1.0, 1.0, 1e-3, 1e-3, 0.1)
+    spread: ClassVar[tuple[float, ...]] = (1.0, 1.0, 1e-3, 1e-3, 0.05)
 
     def widened(self) -> Camera:
         """Return this camera: no model has more."""

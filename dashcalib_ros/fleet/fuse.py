@@ -18,7 +18,7 @@ from dashcalib_ros.errors import counted
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved
 from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.judge.agreement import turns_of_another_camera
+from dashcalib_ros.judge.agreement import focal_of, turns_of_another_camera
 from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import lacks_knowledge_only
 from dashcalib_ros.reconstruct.repeated import without_repeated
@@ -89,7 +89,7 @@ def _estimate(solution: Solution | None, origin: Origin, config: Config) -> Esti
     units = np.outer(solution.camera.units(px), solution.camera.units(px))
     return Estimate(
         solution.camera.resized(px, origin.image_size), solution.covariance * units,
-        (solution.covariance - solution.known.covariance_between_turns) * units,
+        solution.carried(solution.posterior.alike.covariance) * units,
         solution.picture.times(px),
         solution.reprojection_error_px * px, lacks_knowledge_only(solution, config.verdict))
 
@@ -222,15 +222,10 @@ def shares_of(solution: Solution | None, turns: Mapping[TurnId, ClipTurn], px: f
     """Return what each clip gave, and what its turns alone say of fx."""
     if solution is None:
         return {}
-    known, found = solution.known, {}
+    found = {}
     clips = {turns[scene.turn].clip for scene in solution.scenes}
     for clip in sorted(clips):
-        own = known.of(n for n, scene in enumerate(solution.scenes)
-                       if turns[scene.turn].clip == clip)
-        cost = own.with_prior([own.sum(known.own).at_noise(known.noise)])
-        # observations of a track share its errors
-        variance = max(float(cost.covariance[0, 0]), float(cost.covariance_by_track[0, 0]))
-        offset = float((cost.covariance @ cost.score)[0])
-        found[clip] = ClipShare(used=len(own.turns), fx=px * (solution.camera.fx + offset),
-                                fx_sigma=px * float(np.sqrt(variance)))
+        own = [n for n, scene in enumerate(solution.scenes) if turns[scene.turn].clip == clip]
+        focal = focal_of(solution, own)
+        found[clip] = ClipShare(used=len(own), fx=px * focal.fx, fx_sigma=px * focal.sigma)
     return found

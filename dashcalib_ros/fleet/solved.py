@@ -16,7 +16,7 @@ from dashcalib_ros.fleet import lens_prior
 from dashcalib_ros.fleet.lens_prior import LensPrior, OfMake, Unit, conditioned
 from dashcalib_ros.judge import Calibration, Verdict
 from dashcalib_ros.report.result import calibration_of, result_dict
-from dashcalib_ros.solve.knowledge import PictureSigma
+from dashcalib_ros.solve.spread import PictureSigma
 
 # of the JSON text
 FORMAT = 3

@@ -1,7 +1,7 @@
 """Whether the turns agree on one camera, and what each of them, and one more, tells of fx."""
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +10,6 @@ from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.solution import Solution
-
-# least sum of the turns' shares in the information about fx: avoids a division by zero
-LEAST_SHARE = 1e-9
 
 
 def turns_of_another_camera(misfits: Mapping[TurnId, float], config: VerdictConfig) -> set[TurnId]:
@@ -59,29 +56,19 @@ def outdated(turns: Set[TurnId], of_another: Set[TurnId]) -> set[TurnId]:
 
 def focal_disagreement(solution: Solution) -> float:
     """Return the weighted scatter between the turns' own fx, relative to fx."""
-    known = solution.known
-    if len(known.turns) < 2:
+    if len(solution.scenes) < 2:
         return 0.0
-    weights, offsets = [], []
-    for turn, cost in zip(known.turns, known.each(known.own), strict=True):
-        alone = known.with_prior([cost]).covariance
-        offsets.append(float((alone @ turn.score[known.own])[0] / known.noise))
-        weights.append(1 / float(alone[0, 0]))
-    mean = np.average(offsets, weights=weights)
-    scatter = np.average((np.array(offsets) - mean) ** 2, weights=weights)
+    alone = list(focal_alone(solution).values())
+    fx, weights = (np.array(each) for each in zip(
+        *((turn.fx, turn.sigma**-2) for turn in alone), strict=True))
+    scatter = np.average((fx - np.average(fx, weights=weights))**2, weights=weights)
     return float(np.sqrt(scatter) / solution.camera.fx)
 
 
 def leverages(solution: Solution) -> dict[TurnId, float]:
     """Return each turn's share in the information about fx; the shares sum to 1."""
-    known = solution.known
-    turns = known.each(known.own)
-    together = known.with_prior(turns).covariance
-    shares = [float((together @ turn.hessian)[0, 0]) for turn in turns]
-    # they sum to less than 1: the prior has the rest
-    total = max(sum(shares), LEAST_SHARE)
-    return {scene.turn: share / total
-            for scene, share in zip(solution.scenes, shares, strict=True)}
+    known = {turn: found.sigma**-2 for turn, found in focal_alone(solution).items()}
+    return {turn: own / sum(known.values()) for turn, own in known.items()}
 
 
 @dataclass(frozen=True)
@@ -92,31 +79,26 @@ class FocalEstimate:
     sigma: float
 
 
-def focal_alone(solution: Solution, with_field: bool = True) -> dict[TurnId, FocalEstimate]:
+def focal_alone(solution: Solution) -> dict[TurnId, FocalEstimate]:
     """Return what each turn says of fx alone, linearised at the common result.
 
-    A field is fixed, as it is shared; with_field: False leaves it in the tracks. Sigma cannot hold
-    how much turns differ: one turn does not show that.
+    Sigma cannot hold how much turns differ: one turn does not show that.
     """
-    known, found = replace(solution.known, one_turn_sigma=0.0), {}
-    to_no_field = np.zeros(len(known.turns[0].score))
-    if not with_field and solution.field is not None and solution.field.used:
-        directions = solution.field.directions
-        to_no_field[-len(directions):] = -directions
-    for n, scene in enumerate(solution.scenes):
-        alone = known.of([n])
-        own = alone.with_prior(alone.each(known.own)).covariance
-        score = alone.turns[0].moved(to_no_field).score[known.own]
-        offset = float(own[0] @ score / alone.noise)
-        found[scene.turn] = FocalEstimate(solution.camera.fx + offset,
-                                          float(np.sqrt(alone.covariance[0, 0])))
-    return found
+    return {scene.turn: focal_of(solution, [n]) for n, scene in enumerate(solution.scenes)}
+
+
+def focal_of(solution: Solution, places: Iterable[int]) -> FocalEstimate:
+    """Return what some of the turns say of fx, where only their noise makes turns differ."""
+    some = solution.posterior.alike.of(places)
+    return FocalEstimate(solution.camera.fx + float(solution.offset_of(some)[0]),
+                         float(np.sqrt(solution.carried(some.covariance)[0, 0])))
 
 
 def sigma_by_count(solution: Solution) -> list[float]:
     """Return the sigma of fx with the first turn, with the first two, ... and with all, px."""
-    return [float(np.sqrt(solution.known.of(range(count)).covariance[0, 0]))
-            for count in range(1, len(solution.known.turns) + 1)]
+    known = solution.posterior
+    return [float(np.sqrt(solution.carried(known.of(range(count)).covariance)[0, 0]))
+            for count in range(1, len(known.turns) + 1)]
 
 
 # of fx; a larger sigma helps nobody to decide
@@ -126,7 +108,7 @@ TOLD = 0.2
 def next_turn(solution: Solution) -> str:
     """Return what one more turn would bring, in words; '' where nobody can tell."""
     # how much two turns differ is chance; so a single one is told what two more bring
-    more = 1 if len(solution.known.turns) > 1 else 2
+    more = 1 if len(solution.scenes) > 1 else 2
     sigma = with_right_angles(solution, more)
     if not sigma < TOLD:
         return ''
@@ -138,18 +120,12 @@ def next_turn(solution: Solution) -> str:
 def with_right_angles(solution: Solution, more: int) -> float:
     """Return the sigma of fx, of fx, that a calibration with more right angles would state.
 
-    Each is taken to know as much as the turn here that knows most, and turns to differ as they do
-    here. How much a single turn differs is not known: it is taken to be its own sigma.
+    Each is taken to know as much as the turn here that knows most, and to agree with the others.
     """
-    known, shares = solution.known, leverages(solution)
+    known, shares = solution.posterior, leverages(solution)
     best = known.turns[max(range(len(known.turns)),
                            key=lambda n: shares[solution.scenes[n].turn])]
     another = replace(best, score=np.zeros_like(best.score))
-    later = replace(known, turns=(*known.turns, *[another] * more))
-    own = replace(known, floor=np.zeros_like(known.floor),
-                  turns_err_alike=False).own_covariance[0, 0]
-    lasting = known.own_covariance[0, 0] - own
-    # information grows, and all that makes turns differ goes down with it
-    after = own * later.total.covariance[0, 0] / known.total.covariance[0, 0]
-    step = float(later.step_to_wider_model[0])
-    return float(np.sqrt(after + step**2 + lasting) / solution.camera.fx)
+    later = replace(known, turns=(*known.turns, *[another] * more),
+                    earlier=np.append(known.earlier, [False] * more))
+    return float(np.sqrt(solution.carried(later.covariance)[0, 0]) / solution.camera.fx)

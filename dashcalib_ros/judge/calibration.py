@@ -22,8 +22,8 @@ from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
-from dashcalib_ros.solve.knowledge import PictureSigma, sigma_over
 from dashcalib_ros.solve.solution import LeftOut, Solution
+from dashcalib_ros.solve.spread import PictureSigma, sigma_over
 
 UNKNOWN_COVARIANCE = ('this calibration does not know how its parameters are correlated: '
                       'calibrate the drive again')

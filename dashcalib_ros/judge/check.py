@@ -15,8 +15,8 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.calibration import Verdict
 from dashcalib_ros.judge.difference import Difference, difference_of, reasons_of
 from dashcalib_ros.judge.verdict import lines_contradict
-from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.spread import PictureSigma
 
 Answer = Literal['right', 'wrong', 'cannot tell']
 
@@ -97,8 +97,8 @@ def loss_of(given: Camera, solution: Solution, config: Config) -> float:
 
     given: of the solution's pictures. Poses and points are adjusted anew with each camera held.
     """
-    from dashcalib_ros.solve.fitting import costs_with, with_few_tracks
     from dashcalib_ros.solve.prior import loss_px_of
+    from dashcalib_ros.solve.start import costs_with, with_few_tracks
     # a part of the tracks says it, and takes a fifth of the time
     scenes = list(map(with_few_tracks, solution.scenes))
     loss_px = loss_px_of(scenes, solution.camera, config.intrinsics)

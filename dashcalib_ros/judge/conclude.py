@@ -43,7 +43,7 @@ from dashcalib_ros.judge.verdict import (
 from dashcalib_ros.judge.witnesses import Asked
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, picture_of, rms_px
 from dashcalib_ros.reconstruct.scene_file import StoredTurn
-from dashcalib_ros.solve.fixed_camera import largest_crop
+from dashcalib_ros.solve.evidence import largest_crop
 from dashcalib_ros.solve.solution import Solution, cross_validation
 
 # why turns are not used
@@ -54,8 +54,6 @@ STOOD = 'the car stood, its speed says: what turned were others, or the camera a
 # result.json has their versions: a result's last digits depend on them
 PACKAGES = (
     'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap', 'pyceres')
-# of fx or the width; a warning comes if p1, p2 and k3 would change more
-MAX_UNTOLD_MODEL_ERROR = 0.005
 # px RMS; a warning tells of a field that no lens model has, if it is larger
 TOLD_FIELD_PX = 0.5
 
@@ -144,13 +142,13 @@ def _with_numbers(found: Calibration, solution: Solution, lines: Bend | None, ev
         sigma=dict(zip(camera.names(), (solution.sigma * camera.units(px)).tolist(), strict=True)),
         reprojection_error_px=solution.reprojection_error_px * px,
         details=found.details | {'picture_covariance': (
-            solution.wider_covariance * np.outer(units, units)).tolist()},
+            solution.wide_covariance * np.outer(units, units)).tolist()},
         sigma_px=solution.picture.times(px),
         held_out=tuple(each.times(px) for each in cross_validation(solution)),
         straight_lines=lines and lines.resized(px), field=_field(solution, evidence.image_size),
         mount=_mount(solution, evidence, found.verdict.level, found.config),
         rolling_shutter=Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
-        if solution.readout_s else None)
+        if solution.rolling else None)
 
 
 def _warnings(found: Calibration, solution: Solution) -> tuple[str, ...]:
@@ -161,9 +159,7 @@ def _warnings(found: Calibration, solution: Solution) -> tuple[str, ...]:
         warnings.append(
             f'the lens model {asked_for} was asked for and may be why the result is {level}: '
             f'--model {AUTO} takes the one that the turns prove')
-    if found.camera is not None:
-        warnings += _model_error_warnings(solution)
-    if field is not None and field.used and field.rms_px >= TOLD_FIELD_PX:
+    if field is not None and field.rms_px >= max(TOLD_FIELD_PX, field.sigma_px):
         warnings.append(
             f'the picture is bent by {field.rms_px:.1f} px (up to {field.worst_px:.1f} px), as by '
             f'a windscreen or a rectification: camera_info cannot say that, and sigma over the '
@@ -183,7 +179,11 @@ def _straight_lines(solution: Solution | None, evidence: Evidence, config: Confi
     """Return what straight lines say of the solution, in the resized images."""
     if solution is None or evidence.lines is None:
         return None
-    return bend(evidence.lines, solution.camera, config.lines, solution.covariance)
+    lines, field = evidence.lines, solution.field
+    if field is not None:
+        ideal = field.ideal(lines.points.astype(np.float64))
+        lines = replace(lines, points=ideal.astype(np.float32))
+    return bend(lines, solution.camera, config.lines, solution.covariance)
 
 
 def _mount(solution: Solution, evidence: Evidence, level: str, config: Config) -> Mount | None:
@@ -224,25 +224,10 @@ def _field(solution: Solution, image_size: tuple[int, int]) -> LensField | None:
     if solution.field is None:
         return None
     px = solution.px
-    sizes = px * solution.field.field.over(solution.camera)
+    sizes = px * solution.field.over(solution.camera)
     return LensField(
-        solution.field.field.resized(px, image_size), solution.field.used,
+        solution.field.resized(px, image_size), True,
         float(np.sqrt(np.mean(sizes**2))), float(sizes.max()), px * solution.rays_sigma_px)
-
-
-def _model_error_warnings(solution: Solution) -> list[str]:
-    """Return a warning if a wider model would clearly change fx, fy, cx or cy."""
-    count, names = len(solution.known.own), solution.camera.widened().names()
-    step = solution.known.step_to_wider_model
-    shifts, others = step[:4], step[count:]
-    scale = np.repeat([solution.camera.fx, solution.camera.image_size[0]], 2)
-    if not np.max(np.abs(shifts) / scale) > MAX_UNTOLD_MODEL_ERROR:
-        return []
-    changes = ', '.join(f'{name} by {solution.px * shift:+.1f}'
-                        for name, shift in zip(names, shifts, strict=False))
-    found = [f'{name} {value:+.4f}' for name, value in zip(names[count:], others, strict=True)]
-    return [f'the lens seems to have more distortion than the model {solution.camera.model} tells '
-            f'({", ".join(found)}), which would change {changes} px: the sigmas allow for that']
 
 
 def _verdict_without_solution(evidence: Evidence) -> Verdict:
@@ -323,7 +308,7 @@ def _material(scenes: Mapping[TurnId, Scene], solution: Solution | None, evidenc
 
 def _details(solution: Solution) -> dict[str, Any]:
     width = solution.camera.image_size[0]
-    others, alone = len(solution.known.own), solution.alone
+    alone = solution.alone
     details: dict[str, Any] = {
         'step1': {'f_over_width': solution.centred.fx / width,
                   **dict(list(solution.centred.named.items())[4:])},
@@ -331,8 +316,6 @@ def _details(solution: Solution) -> dict[str, Any]:
                           'cost_px2': solution.around.costs.tolist()},
         'profile_contrast': profile_contrast(solution),
         'turns_disagree_fx': focal_disagreement(solution),
-        'left_out': dict(zip(solution.camera.widened().names()[others:],
-                             solution.known.step_to_wider_model[others:].tolist(), strict=True)),
         'fixed_camera': {each.kind: {'strength': each.strength, 'size': each.size}
                          for each in solution.fixed_camera},
         'models': [asdict(candidate) for candidate in solution.tried],

@@ -23,8 +23,8 @@ from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.judge.calibration import Mount
-from dashcalib_ros.solve.knowledge import PictureSigma, SigmaMap, sigma_over
 from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.spread import PictureSigma, SigmaMap, sigma_over
 
 Way = Literal['focal length', 'centre', 'distortion']
 # the first parameters of every camera; all behind them are of the distortion
@@ -207,7 +207,7 @@ def difference_of(given: Camera, solution: Solution, px: float) -> Difference:
     alike = small if isinstance(wide, type(small)) else as_model(small, type(wide))
     padded = type(wide).of(wide.image_size, np.pad(
         alike.params, (0, len(wide.params) - len(alike.params))))
-    offsets = solution.known.seen_by_turns(padded) - found.params
+    offsets = solution.seen_by_turns(padded) - found.params
     units = found.units(px)
     own = found.resized(px, given.image_size)
     return Difference(

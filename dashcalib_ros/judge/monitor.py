@@ -22,7 +22,8 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.difference import CONTRADICTION, LEAST_SIGMA, RELEVANT, Way, limit_of
 from dashcalib_ros.reconstruct.heading import Heading, heading
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.normal import turn_cost
+from dashcalib_ros.solve.imaging import lens_alone
+from dashcalib_ros.solve.linear import noise_of, normal_equations, residuals
 from dashcalib_ros.solve.prior import loss_px_of
 from dashcalib_ros.solve.quadratic import Quadratic
 
@@ -83,7 +84,7 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
 
     scene: as its turn was reconstructed. camera: of the scene's pictures.
     """
-    from dashcalib_ros.solve.fitting import misfits, scene_with
+    from dashcalib_ros.solve.start import misfits, scene_with
     count = len(camera.names())
     found = scene_with(camera, scene, config)
     misfit = np.inf if found is None else misfits(
@@ -91,8 +92,9 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
     if found is None or misfit > config.verdict.max_misfit:
         nothing = Quadratic.prior(np.zeros((count, count)))
         return Reading(scene.turn, nothing, None, False, misfit)
-    turn = turn_cost(found, camera, loss_px_of([found], camera, config.intrinsics))
-    cost = turn.of(np.arange(count)).at_noise(turn.squares / turn.freedom)
+    loss_px, alone = loss_px_of([found], camera, config.intrinsics), lens_alone(camera)
+    cost = normal_equations(found, alone, loss_px).cost.of(np.arange(count)).at_noise(
+        noise_of([found], [residuals(found, alone)], count, loss_px).variance)
     # errors that the observations of a track share make it worth less than their number
     inflation = max(1.0, float(np.trace(np.linalg.pinv(cost.hessian) @ cost.by_track)) / count)
     return Reading(scene.turn, cost.at_noise(inflation), heading(found), misfit=misfit)

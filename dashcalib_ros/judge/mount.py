@@ -156,9 +156,9 @@ def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[str
 
 
 def _without_field(straights: Straights, solution: Solution) -> Straights:
-    if solution.field is None or not solution.field.used:
+    if solution.field is None:
         return straights
-    ideal = solution.field.field.ideal
+    ideal = solution.field.ideal
     return replace(straights,
                    before=np.asarray(ideal(straights.before.astype(np.float64)), np.float32),
                    after=np.asarray(ideal(straights.after.astype(np.float64)), np.float32))

@@ -115,7 +115,7 @@ def odometry(scenes: Sequence[Scene], cameras: Mapping[str, Camera], poses: Pose
 
 def _turn(scene: Scene, cameras: Mapping[str, Camera], poses: Poses, config: Config
           ) -> TurnOdometry | None:
-    from dashcalib_ros.solve.fitting import scene_with
+    from dashcalib_ros.solve.start import scene_with
     tracks = scene.tracks
     rotations, positions, known = poses.at(tracks.frames, tracks.stamps_ns)
     if known.sum() < LEAST_KEYFRAMES:

@@ -26,8 +26,7 @@ from dashcalib_ros.judge.agreement import (
 )
 from dashcalib_ros.judge.calibration import Verdict, Witnesses
 from dashcalib_ros.reconstruct.heading import roll_deg
-from dashcalib_ros.solve.fixed_camera import FixedCameraTest, largest_crop
-from dashcalib_ros.solve.knowledge import LEAST_GAIN
+from dashcalib_ros.solve.evidence import LEAST_GAIN, FixedCameraTest, largest_crop
 from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Solution
 
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
@@ -272,7 +271,7 @@ def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None
 
 def _strange_shutter(solution: Solution, config: VerdictConfig) -> Finding | None:
     readout_ms = 1e3 * abs(solution.readout_s)
-    if readout_ms <= MAX_READOUT_MS:
+    if not solution.rolling or readout_ms <= MAX_READOUT_MS:
         return None
     return Finding('weak', f'the rows of a picture seem to be exposed over {readout_ms:.0f} ms, '
                            f'longer than rolling shutters take',
@@ -301,34 +300,28 @@ def _folds_over(solution: Solution, config: VerdictConfig) -> Finding | None:
 
 
 def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """Compare a model that was asked for with the one that the turns would have chosen.
-
-    Where nothing was seen, as near the corners, only the model says how the lens goes on there:
-    the sigma over the picture knows nothing of that.
-    """
-    own = next((each for each in solution.tried if each.model == solution.camera.model), None)
+    """Compare a model that was asked for with what the turns would have chosen."""
+    asked, px = solution.camera, solution.px
     chosen = next((each for each in solution.tried if each.chosen), None)
-    # a model that has the chosen one in it is as right, and its sigma knows what it asks more
-    if own is None or chosen is None or isinstance(solution.camera, MODELS[chosen.model]):
+    if chosen is not None and MODELS[chosen.model].family != asked.family:
+        far = 'far' if chosen.apart_px is None else f'{px * chosen.apart_px:.1f} px'
+    elif solution.written.apart_px > MAX_MODEL_SIGMAS * solution.rays_sigma_px:
+        chosen, far = None, f'{px * solution.written.apart_px:.1f} px'
+    else:
         return None
-    apart = own.apart_px
-    if apart is not None and apart <= MAX_MODEL_SIGMAS * solution.picture.rms:
-        return None
-    far = f'{solution.px * apart:.1f} px' if apart is not None else 'far'
-    return Finding('weak', f'the turns ask for a lens of the model {chosen.model}, not '
-                           f'{own.model}, and that one is {far} away', 'leave --model away')
+    other = chosen.model if chosen else 'with more coefficients'
+    return Finding('weak', f'the turns ask for a lens of the model {other}, not '
+                           f'{asked.model}, and that one is {far} away', 'leave --model away')
 
 
 def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """Doubt a lens that explains the turns hardly better than a simpler one of the other kind.
+    """Doubt a lens that explains the turns hardly better than one of the other kind.
 
-    A fisheye must explain them far better, as it was tried only where a pinhole left much: a
-    pinhole with all its coefficients clearly better.
+    A fisheye must explain them far better, as a pinhole has the same number of coefficients.
     """
     camera = solution.camera
     for each in solution.tried:
-        model = MODELS[each.model]
-        if model.family == camera.family or len(model.names()) >= len(camera.names()):
+        if MODELS[each.model].family == camera.family:
             continue
         if camera.family == PINHOLE and each.loses_by > LEAST_GAIN:
             continue

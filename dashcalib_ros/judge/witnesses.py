@@ -38,11 +38,10 @@ from dashcalib_ros.judge.gyro_scale import (
     scale_by_gps,
 )
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
-from dashcalib_ros.solve.earlier import with_doubt
-from dashcalib_ros.solve.knowledge import variance_if_turns_differ
-from dashcalib_ros.solve.normal import normal_equations, used_keyframes
+from dashcalib_ros.solve.imaging import lens_alone
+from dashcalib_ros.solve.linear import normal_equations, used_keyframes
 from dashcalib_ros.solve.prior import loss_px_of
-from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.solution import Solution, with_measurement
 
 # s to either side: clocks of sensors in one car are not farther apart
 LARGEST_OFFSET_S = 0.5
@@ -72,6 +71,8 @@ LARGEST_JUMP = 4.5
 RATIOS = np.logspace(-4, 3, 22)
 # parameters of a gyro beside a camera
 UNKNOWNS = 9
+# of likelihoods; beyond it the less likely case counts for nothing
+LARGEST_LOG = 100.0
 # steps of the fit, and those at which the noises are weighed anew
 STEPS, WEIGHED = 8, (1, 4)
 # sigmas; where a witness is farther off, it contradicts
@@ -177,7 +178,7 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
     They are one more measurement of the camera's parameters (a Kalman update); then the turns'
     poses and points are adjusted anew with the camera that it leads to.
     """
-    from dashcalib_ros.solve.fitting import scene_with
+    from dashcalib_ros.solve.start import scene_with
     along = solution.covariance @ fit.by_camera
     own = float(fit.by_camera @ along)
     known = float(fit.covariance[6, 6]) + gyro.sigma**2
@@ -187,15 +188,13 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
     if len(solution.scenes) == 1 and apart > DOUBTED:
         return None, (f'the gyro does not confirm the only turn, it is {apart:.1f} sigma off: '
                       f'check its scale, its clock and that it is of this drive')
-    gain = along / (own + known)
-    camera = solution.camera.with_params(
-        solution.camera.params + gain * (1 - fit.gyro.inverse_scale))
-    scenes = [scene_with(camera, scene, config) for scene in solution.scenes]
+    moved = with_measurement(solution, fit.by_camera @ solution.written.by_solution,
+                             1 - fit.gyro.inverse_scale, known)
+    scenes = [scene_with(moved.camera, scene, config) for scene in solution.scenes]
     if any(scene is None for scene in scenes):
         return None, ''
-    moved = replace(solution, camera=camera, alone=solution,
-                    scenes=tuple(scene for scene in scenes if scene is not None))
-    return with_doubt(moved, -np.outer(gain, along)), ''
+    return replace(moved, alone=solution, scenes=tuple(
+        scene for scene in scenes if scene is not None)), ''
 
 
 def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness | None, str]:
@@ -324,7 +323,7 @@ class Fit:
 def steps_of(scene: Scene, solution: Solution, loss_px: float, start_s: float) -> Steps:
     """Return how a scene's camera turned. start_s: stamp of the drive's first image."""
     structure, camera = scene.structure, solution.camera
-    eliminated = normal_equations(scene, camera, loss_px).eliminated
+    eliminated = normal_equations(scene, lens_alone(camera), loss_px).eliminated
     rows, size = used_keyframes(scene), eliminated.pose_mixed.shape[1]
     follow = []
     for place, sigma in enumerate(np.sqrt(np.diag(solution.covariance))):
@@ -438,8 +437,27 @@ def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:
     more = (TURN_SIGMA * size)**2
     if len(offsets) == 1:
         return more
-    whole = variance_if_turns_differ(offsets, variances, more, still_more=True)
+    whole = variance_if_turns_differ(offsets, variances, more)
     return float(max(whole - 1 / np.sum(1 / variances), 0.0))
+
+
+def variance_if_turns_differ(offsets: Floats, variances: Floats, more: float) -> float:
+    """Return the variance of a common value where each turn may be off by a variance more.
+
+    offsets, variances: (t,) of what each of at least two turns says alone. Either turns differ as
+    their noise says, or by that more: both are as likely before, and are weighed by how well they
+    explain the turns. Where they differ by more than a case says, its variance grows with that.
+    """
+    logs, found = [], []
+    for extra in (0.0, more):
+        weights = 1 / (variances + extra)
+        mean = float(np.average(offsets, weights=weights))
+        squares = weights @ (offsets - mean)**2
+        logs.append(0.5 * float(np.log(weights).sum() - np.log(weights.sum()) - squares))
+        ratio = max(float(squares) / (len(offsets) - 1), 1.0)
+        found.append(ratio / float(weights.sum()) + mean**2)
+    share = 1 / (1 + np.exp(min(logs[0] - logs[1], LARGEST_LOG)))
+    return float((1 - share) * found[0] + share * found[1])
 
 
 def _aligned(turns: Sequence[Steps], angles: Samples, offset: float

@@ -51,7 +51,7 @@ from dashcalib_ros.limits import (
     read_file,
     read_text,
 )
-from dashcalib_ros.solve.knowledge import PictureSigma
+from dashcalib_ros.solve.spread import PictureSigma
 
 Data = Mapping[str, Any]
 # reads one camera of a file; one that says nothing but the camera gives just that

@@ -29,8 +29,8 @@ from dashcalib_ros.report.charts import (
     ticks,
 )
 from dashcalib_ros.report.turns import focal_by_turn
-from dashcalib_ros.solve.knowledge import SigmaMap
 from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.spread import SigmaMap
 
 WIDTH = 440  # px of a plot
 CELLS = 18  # columns of the maps of observations

@@ -39,7 +39,7 @@ from dashcalib_ros.report.wording import (
     parameter_rows,
     run_facts,
 )
-from dashcalib_ros.solve.knowledge import SigmaMap
+from dashcalib_ros.solve.spread import SigmaMap
 
 if TYPE_CHECKING:
     import jinja2

@@ -38,8 +38,8 @@ from dashcalib_ros.judge.calibration import (
 )
 from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, read_text
 from dashcalib_ros.report.camera_file import parse_camera, read_mount
-from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import LeftOut
+from dashcalib_ros.solve.spread import PictureSigma
 
 
 def result_dict(calibration: Calibration) -> dict[str, Any]:

@@ -70,18 +70,17 @@ def turn_sections(c: Calibration, mask_id: str | None) -> list[TurnSection]:
         return []
     alone, solution = _fx_alone(c), c.material.solution
     shares = leverages(solution) if alone and solution is not None else {}
-    bent = _fx_alone(c, with_field=False) if c.field is not None and c.field.used else {}
-    said = {turn: _said(fx, sigma, shares.get(turn, 0.0), bent.get(turn))
+    said = {turn: _said(fx, sigma, shares.get(turn, 0.0))
             for turn, (fx, sigma) in alone.items()}
     found = [_section(turn, c, c.material, said.get(turn.id, ''), mask_id)
              for turn in c.all_turns]
     return [each for each in found if each.picture or each.view]
 
 
-def _fx_alone(c: Calibration, with_field: bool = True) -> dict[TurnId, tuple[float, float]]:
+def _fx_alone(c: Calibration) -> dict[TurnId, tuple[float, float]]:
     """Return what each turn alone says of fx, and its sigma, px of the input.
 
-    Nothing of a refused calibration, which has no numbers. with_field: as for focal_alone().
+    Nothing of a refused calibration, which has no numbers.
     """
     sigma = (c.sigma or {}).get('fx', math.nan)
     if c.camera is None or c.material is None or not 0 < sigma < math.inf:
@@ -90,7 +89,7 @@ def _fx_alone(c: Calibration, with_field: bool = True) -> dict[TurnId, tuple[flo
     if solution is None:
         return {}
     alone = {turn: (found.fx * c.material.px, found.sigma * c.material.px)
-             for turn, found in focal_alone(solution, with_field).items()}
+             for turn, found in focal_alone(solution).items()}
     return alone if np.isfinite(list(alone.values())).all() else {}
 
 
@@ -123,13 +122,10 @@ def _facts(turn: AnySummary, scene: Scene | None, c: Calibration) -> tuple[str, 
     return tuple(facts)
 
 
-def _said(fx: float, sigma: float, share: float, bent: tuple[float, float] | None) -> str:
+def _said(fx: float, sigma: float, share: float) -> str:
     percent = min(max(100 * share, 0.0), 100.0)
-    text = (f'Alone it says fx {with_sigma(fx, sigma)}, and gives '
+    return (f'Alone it says fx {with_sigma(fx, sigma)}, and gives '
             f'{f"{percent:.0f}" if percent >= 1 else "less than 1"} % of what is known of fx.')
-    if bent is not None:
-        text += f' Without the field it would say {with_sigma(*bent)}.'
-    return text
 
 
 def turn_rows(c: Calibration) -> list[dict[str, str]]:

@@ -1,4 +1,8 @@
-"""Scenes -> one shared camera with its covariance (paper, 3.2). COLMAP is loaded when called."""
+"""Scenes -> one shared camera with its covariance (paper, 3.2), as one problem.
+
+The lens, a rolling shutter's readout, a smooth field over the picture, where a stabiliser moves
+the picture its shift in each image, and the structures of all turns are found together.
+"""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -15,5 +19,5 @@ def solve(scenes: Sequence[Scene], config: Config,
     scenes: at least one, each as its turn was reconstructed. Those of earlier drives are not in
     the solution, nor in its misfits, where this drive's turns contradict them.
     """
-    from dashcalib_ros.solve import earlier, joint
-    return earlier.solve_with_earlier(scenes, lambda some: joint.solve(some, config, progress))
+    from dashcalib_ros.solve import joint
+    return joint.solve(scenes, config, progress)

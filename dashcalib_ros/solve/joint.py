@@ -1,222 +1,259 @@
-"""Scenes -> one camera, in the paper's two steps (3.2), and what each turn knows of it."""
+"""Scenes -> one camera: a start for each kind of lens, then one problem of all blocks."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import AUTO, MODELS
-from dashcalib_ros.camera.mapping import sensitivity
+from dashcalib_ros.camera import AUTO, Camera, searched
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.reconstruct.scene import Profile, Scene
-from dashcalib_ros.solve.field import without_field
-from dashcalib_ros.solve.field_rounds import with_field, with_field_of_all_tracks
-from dashcalib_ros.solve.fitting import adapted_to, misfits
-from dashcalib_ros.solve.fixed_camera import FixedCameraTest
-from dashcalib_ros.solve.focal import kinds_of_lenses, nearest_start, profile_around, summed
-from dashcalib_ros.solve.model_choice import (
-    chosen_of,
-    compared_with_others,
-    leaves_more,
-    refitted,
-    refitted_without_shutter,
-    with_model_chosen,
+from dashcalib_ros.solve.evidence import (
+    Candidate,
+    FixedCameraTest,
+    chosen_kind,
+    costs_of,
+    fixed_camera_tests,
 )
-from dashcalib_ros.solve.prior import bounds_of, centre_pull
-from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Candidate, Solution
-from dashcalib_ros.solve.stabiliser import without_crops, without_stabiliser
-from dashcalib_ros.solve.steps import (
-    Fit,
-    Progress,
-    fit_all,
-    fit_one_focal_length,
-    fit_roughly,
-    with_all_tracks,
+from dashcalib_ros.solve.imaging import imaging_with, lens_like
+from dashcalib_ros.solve.linear import IMAGE
+from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate, optimised
+from dashcalib_ros.solve.prior import FOCAL_BOUND, bounds_of
+from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.spread import Posterior
+from dashcalib_ros.solve.start import (
+    adapted_to,
+    explained_by,
+    kinds_of_lenses,
+    misfits,
+    nearest_start,
+    profile_around,
+    summed,
+    with_better_poses,
+    with_poses_of,
 )
+from dashcalib_ros.solve.written import closest, written
 
-# of a stabilised video's crop, with all tracks
-FINAL_ROUNDS = 4
+Progress = Callable[[str, float], None]
+
+# px: least scales of the loss with a part of the tracks, and steps with each. A windscreen's 2 px
+# would be cut off by the usual one, which is the last
+LOSSES = ((2.0, 4), (1.0, 2), (0.5, 2), (0.0, 5))
+# the same with one focal length, a centred lens, its first two coefficients, and a readout
+FIRST_LOSSES = ((2.0, 5), (1.0, 3))
+FIRST_REACH = 0.35
+# gain of a step, in units of the noise, that ends the search with a part of the tracks
+NEAR = 0.5
+# with all tracks: steps after each triangulation
+LAST_STEPS = (3, 3)
+# of the shifts of a stabilised video's pictures
+CROP_STEPS = 20
+# px RMS of 1000 px of width: a field as of a windscreen, or of another kind of lens
+LARGE_FIELD = 1.0
+# nats of evidence that earlier drives had another camera: three standard deviations
+CONTRADICTION = 4.5
+# degrees between the uprights of two sets of turns: pictures are turned by 90 or 180
+OTHER_UPRIGHT_DEG = 45.0
 
 
 @dataclass(frozen=True)
 class _Begun:
-    """A kind of lens after the first fit, and the sum of its turns' focal profiles."""
+    """A kind of lens with a part of the tracks, and the sum of its turns' focal profiles."""
 
-    fit: Fit
+    found: Estimate
     profile: Profile
 
 
-def solve(per_turn: Sequence[Scene], config: Config,
+def solve(scenes: Sequence[Scene], config: Config,
           progress: Progress = lambda stage, done: None) -> Solution | None:
     """Adjust all scenes with one shared camera; None if it explains none, or none determines it.
 
-    per_turn: at least one scene, each as its turn was reconstructed. The minimum of the summed
-    focal profile is the start; a scene with a camera far from it is chained anew, and one that the
-    shared camera does not explain is dropped. Where turns may be of a pinhole or of a fisheye,
-    both are tried with a part of the tracks. Larger lens models are tried where they may explain
-    what is left of the errors.
+    scenes: at least one, each as its turn was reconstructed. Turns of earlier drives that this
+    drive's turns contradict are left out.
     """
     try:
-        return _solved(per_turn, config, progress)
+        found = _solved(scenes, config, progress)
+        if found is not None and _of_another_drive(found):
+            own = [scene for scene in scenes if scene.turn.of_this_drive]
+            found = _solved(own, config, progress)
+        return found
     except np.linalg.LinAlgError:
         # nothing limits a direction of the parameters: pictures that slide past show no depth
         return None
 
 
+def _of_another_drive(found: Solution) -> bool:
+    """Return whether the turns of earlier drives contradict those of this one."""
+    earlier = found.posterior.earlier
+    if earlier.all() or not earlier.any():
+        return False
+    old, new = ([scene for scene in found.scenes if scene.turn.of_this_drive == this]
+                for this in (False, True))
+    apart = abs(roll_deg(old) - roll_deg(new)) % 360
+    return (min(apart, 360 - apart) > OTHER_UPRIGHT_DEG
+            or found.posterior.of_another_drive > CONTRADICTION)
+
+
 def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> Solution | None:
-    begun = [found for kind in kinds_of_lenses(per_turn)
-             if (found := _begun(kind, per_turn, config, progress)) is not None]
+    begun = []
+    for kind in kinds_of_lenses(per_turn):
+        # one kind may be so wrong that nothing determines it
+        with suppress(np.linalg.LinAlgError):
+            found = _begun(kind, per_turn, config, progress)
+            begun += [] if found is None else [found]
     if not begun:
         return None
-    start, tried = _best_of(begun)
-    progress('looking for a field', 0.0)
-    fit = _steadied(_with_field(start.fit))
-    fit = with_all_tracks(replace(fit, measured={
-        scene.turn: _without_distortions(fit, scene) for scene in fit.measured.values()}),
-        per_turn)
-    if not fit.scenes:
+    start, tried = _chosen(begun, config)
+    best = start.found
+    progress('adjusting all parameters', 0.5)
+    measured = {scene.turn: scene for scene in per_turn}
+    best = _with_all_tracks(best, measured, config)
+    if not best.scenes:
         return None
-    fit = fit_all(with_field_of_all_tracks(fit), progress)
-    if fit.crops:
-        # a part of the tracks leaves the crops uncertain
-        fit = without_stabiliser(fit, FINAL_ROUNDS)
-    elif config.model == AUTO and fit.used_field is None:
-        progress('choosing the lens model', 0.0)
-        fit, others = with_model_chosen(fit)
-        tried = _merged(tried, others)
-    elif config.model == AUTO:
-        # models of the same kind were compared with the field in the tracks
-        tried = tuple(each for each in tried if MODELS[each.model].family != fit.camera.family)
-    else:
-        progress('comparing the lens model with others', 0.0)
-        tried = compared_with_others(fit)
-    progress('trying other focal lengths', 0.0)
-    around = profile_around(fit.scenes, fit.camera, start.profile, config)
-    progress('estimating the uncertainty', 0.0)
-    return _solution(fit, per_turn, (start.profile, around), tried)
-
-
-def _with_field(first: Fit) -> Fit:
-    """Return the fit with the field that the turns confirm, and that no wider model explains.
-
-    A decentred lens bends the picture, too, and also where no track goes.
-    """
-    found = with_field(first)
-    if found.used_field is None or first.config.model != AUTO or not leaves_more(first):
-        return found
-    few, wider = first.with_few_tracks(), type(first.camera.widened())
-    plain, decentred = refitted(few, type(first.camera)), refitted_without_shutter(few, wider)
-    if plain is None or decentred is None or chosen_of([plain, decentred])[0] is plain:
-        return found
-    return first if with_field(decentred).used_field is None else found
-
-
-def _without_distortions(fit: Fit, scene: Scene) -> Scene:
-    """Return a turn with all its tracks, the field and the crop that were found taken out."""
-    if fit.used_field is not None:
-        scene = without_field(scene, fit.used_field)
-    return without_crops(scene, fit.crops) if scene.turn in fit.crops else scene
-
-
-def _steadied(first: Fit) -> Fit:
-    """Return the fit with a fixed crop of a stabilised video, if that is what the video shows."""
-    def moves(found: Sequence[FixedCameraTest]) -> bool:
-        return found[0].kind == 'shift' and found[0].clear
-
-    rounds = first.config.intrinsics.crop_rounds
-    # the bend takes longer, and is asked for only where the picture moves
-    if (not rounds or not moves(first.fixed_camera_tests(bent=False))
-            or not moves(first.fixed_camera_tests())):
-        return first
-    return without_stabiliser(first, rounds)
-
-
-def _best_of(begun: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
-    """Return the kind of lens that explains the turns best, and how the kinds compare.
-
-    A kind may lose by the bad poses of one turn only. So all are fitted again from the poses of
-    the best one. That one is fitted again, too: it must not win or lose by fewer steps of
-    adjustment. Where it then explains a turn no more, there is nothing to compare the others with,
-    and it stays. Each kind is tried with all its coefficients, too: a decentred pinhole is no
-    fisheye. Kinds that explain the turns about as well are compared with the fields that they
-    leave: a fisheye's four coefficients take up a part of what a windscreen bends. Which of its
-    models is used is chosen later.
-    """
-    def chosen(found: Sequence[_Begun]) -> tuple[_Begun, tuple[Candidate, ...]]:
-        fit, tried = chosen_of([each.fit for each in found])
-        return next(each for each in found if each.fit is fit), tried
-
-    best, tried = chosen(begun)
-    if len(begun) == 1 or len(best.fit.scenes) < 2:
-        return best, tried
-    few = best.fit.with_few_tracks()
-    again = [replace(each, fit=replace(fit, measured=each.fit.measured)) for each in begun
-             for model in dict.fromkeys([type(each.fit.camera), type(each.fit.camera.widened())])
-             if (fit := refitted(few, model)) is not None]
-    if not any(type(each.fit.camera) is type(best.fit.camera) for each in again):
-        return best, tried
-    found, tried = chosen(again)
-    family = found.fit.camera.family
-    if any(each.cost_ratio < CLEAR_KIND_RATIO for each in tried
-           if MODELS[each.model].family != family):
-        found, tried = chosen([replace(each, fit=with_field(each.fit)) for each in again])
-    kinds = {type(each.fit.camera) for each in begun}
-    return next(each for each in [*again, *begun] if type(each.fit.camera) in kinds
-                and each.profile is found.profile), tried
+    for steps in LAST_STEPS:
+        best = optimised(best.retriangulated(), 0.0, steps)
+    tests = fixed_camera_tests(best)
+    if config.intrinsics.crop_rounds and tests[0].kind == 'shift' and tests[0].clear:
+        progress('looking how the picture moves', 0.0)
+        best = optimised(_moving(best), 0.0, CROP_STEPS)
+        best = optimised(best.retriangulated(), 0.0, CROP_STEPS)
+        tests = fixed_camera_tests(best)
+    return _solution(best, per_turn, start.profile, tried, tests, progress)
 
 
 def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progress
            ) -> _Begun | None:
-    """Return the first fit for one kind of lens, with a part of the tracks.
+    """Return a kind of lens with a part of the tracks; None where it explains no turn.
 
-    None where the shared camera explains none of the scenes.
+    First with one focal length and the centre fixed (paper, 3.2), then with all blocks.
     """
     starts = [scene.starts[kind] for scene in per_turn if kind in scene.starts]
     profile = summed([start.profile for start in starts])
-    start = nearest_start([start.camera for start in starts], profile)
-    measured = {scene.turn: adapted_to(scene, start, config) for scene in per_turn}
-    first = fit_one_focal_length(measured, start, config, progress)
-    if not first.scenes:
+    camera = nearest_start([start.camera for start in starts], profile)
+    progress('adjusting one focal length', 0.0)
+    measured = {scene.turn: adapted_to(scene, camera, config) for scene in per_turn}
+    found = _start(camera, tuple(measured.values()), camera, config, FIRST_REACH)
+    for least_px, steps in FIRST_LOSSES:
+        found = found.with_tracks(FIRST_TRACKS).retriangulated(2 * least_px)
+        if not found.scenes:
+            return None
+        found = optimised(found, least_px, steps,
+                          np.array([0, 1, 4, 5, len(found.camera.params)]), NEAR)
+    kept = explained_by(found.retriangulated().scenes, measured, found.camera, config)
+    if not kept:
         return None
     progress('adjusting all parameters', 0.0)
-    return _Begun(fit_roughly(first), profile)
+    readout_s = found.imaging.readout_s
+    found = _start(found.camera, tuple(kept), found.camera, config)
+    found = replace(found, imaging=replace(found.imaging, readout_s=readout_s))
+    near = _narrowed(found.with_tracks(FIRST_TRACKS))
+    return None if near is None else _Begun(near, profile)
 
 
-def _merged(first: Sequence[Candidate], later: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """Return all candidates, the later figure of those that are in both."""
-    found = {each.model: each for each in (*first, *later)}
-    return tuple(found.values()) if len(found) > 1 else ()
+def _start(camera: Camera, scenes: tuple[Scene, ...], centred: Camera, config: Config,
+           focal_reach: float = FOCAL_BOUND) -> Estimate:
+    """Return the estimate with a lens alone, in the widest model of its kind."""
+    wide = type(camera.widened())
+    centred = wide.centred(camera.image_size, centred.fx, *centred.params[4:6])
+    return Estimate(imaging_with(camera.widened(), scenes), scenes, centred, config, focal_reach)
 
 
-def _shared_with_field(fit: Fit) -> Floats:
-    """Return (n,) how far each parameter would go if it took up a field of this size.
+def _narrowed(found: Estimate) -> Estimate | None:
+    """Return the optimum of all blocks, with a loss that narrows; None where no turn is left."""
+    now = found
+    for least_px, steps in LOSSES:
+        now = now.retriangulated(2 * least_px)
+        if not now.scenes:
+            return None
+        now = optimised(now, least_px, steps, settled=NEAR)
+    return now
 
-    Where the lens ends and the field begins is agreed on, not measured: another calibration may
-    have the same rays and another share of both. Over the picture it makes no difference.
+
+def _chosen(begun: Sequence[_Begun], config: Config
+            ) -> tuple[_Begun, tuple[Candidate, ...]]:
+    """Return the kind of lens that explains the turns best, and how the kinds compare.
+
+    A kind may lose by the bad poses of one turn only. So the others are found again from the poses
+    of the best one; so is one that no turn began with, where the best one leaves much to explain.
+    Where a model was asked for, that one stays.
     """
-    if fit.field is None:
-        return np.zeros(len(fit.camera.names()))
-    moves, _ = sensitivity(fit.camera)
-    by_unit = np.sqrt(np.mean(np.sum(moves**2, axis=1), axis=0))
-    return np.asarray(fit.field.rms_over(fit.camera) / by_unit)
+    best = next(each for each in begun
+                if each.found is chosen_kind([other.found for other in begun])[0])
+    if len(best.found.scenes) < 2:
+        return best, ()
+    rivals = []
+    for model in searched(AUTO):
+        if model.family == best.found.camera.family:
+            continue
+        own = [each for each in begun if each.found.camera.family == model.family]
+        if own or config.model != AUTO or _much_is_left(best.found):
+            rivals += own
+            with suppress(np.linalg.LinAlgError):
+                camera = closest(best.found.imaging, model, best.found.scenes)
+                again = _narrowed(_start(camera, best.found.scenes, camera, config))
+                rivals += [] if again is None else [_Begun(again, best.profile)]
+    found, tried = chosen_kind([best.found, *(each.found for each in rivals)])
+    if config.model != AUTO:
+        return best, tried
+    winner = next(each for each in [best, *rivals] if each.found is found)
+    profile = next((each.profile for each in begun
+                    if each.found.camera.family == found.camera.family), winner.profile)
+    return replace(winner, profile=profile), tried
 
 
-def _solution(fit: Fit, per_turn: Sequence[Scene], profiles: tuple[Profile, Profile],
-              tried: tuple[Candidate, ...]) -> Solution:
-    """Return the solution with its covariance. profiles: the coarse one, and that around it."""
-    tests = fit.fixed_camera_tests()
-    known = replace(fit.known, systematic=max(1.0, *(each.strength for each in tests)))
-    covariance = known.covariance[np.ix_(known.own, known.own)]
-    pull = centre_pull(fit.camera, covariance)
+def _much_is_left(found: Estimate) -> bool:
+    """Return whether the field is so large that another kind of lens may make it needless."""
+    size = np.sqrt(np.mean(found.imaging.field.over(found.camera)**2))
+    return bool(size > LARGE_FIELD * found.camera.image_size[0] / 1000)
+
+
+def _with_all_tracks(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config
+                     ) -> Estimate:
+    """Return the estimate with all tracks, without turns that the camera does not explain."""
+    # a shutter's displacements depend on the points: find these with a generous limit first
+    generous = replace(
+        found, imaging=replace(found.imaging, readout_s=0.0),
+        scenes=tuple(with_poses_of(per_turn[scene.turn], scene) for scene in found.scenes)
+    ).retriangulated(config.scene.chain_error * found.camera.image_size[0])
+    seen = replace(generous, imaging=found.imaging).retriangulated().seen_by_lens
+    kept = explained_by(seen, {scene.turn: scene for scene in seen}, found.camera, config)
+    kept = with_better_poses(kept, list(per_turn.values()), found.camera, config.scene)
+    return replace(found, scenes=tuple(
+        replace(scene, tracks=per_turn[scene.turn].tracks) for scene in kept))
+
+
+def _moving(found: Estimate) -> Estimate:
+    """Return the estimate where each image's picture may be shifted."""
+    still = {scene.turn: np.zeros((len(scene.tracks.frames), IMAGE)) for scene in found.scenes}
+    return replace(found, imaging=replace(found.imaging, images=still))
+
+
+def _solution(found: Estimate, per_turn: Sequence[Scene], coarse: Profile,
+              tried: tuple[Candidate, ...], tests: tuple[FixedCameraTest, ...],
+              progress: Progress) -> Solution:
+    """Return the solution with all that is known of it. coarse: the turns' focal profiles."""
+    progress('estimating the uncertainty', 0.0)
+    config, lens = found.config, found.camera
+    posterior = Posterior(
+        lens, found.field_sigma**2 * lens_like(lens), tuple(costs_of(found, found.loss_px())),
+        np.array([not scene.turn.of_this_drive for scene in found.scenes]), found.prior())
+    result = written(found.imaging, posterior.covariance, found.scenes, config.model)
+    scenes = tuple(result.seen(scene, found.imaging) for scene in found.scenes)
+    progress('trying other focal lengths', 0.0)
+    around = profile_around(scenes, result.camera, coarse, config)
+    count = len(result.camera.params)
+    place = len(lens.params)
     return Solution(
-        camera=fit.camera, centred=fit.centred, scenes=tuple(fit.scenes), known=known,
-        covariance=covariance + np.outer(pull, pull) + np.diag(_shared_with_field(fit)**2),
-        coarse=profiles[0], around=profiles[1],
-        bounds=np.array(bounds_of(fit.centred)), readout_s=fit.readout_s,
-        readout_sigma_s=known.readout_sigma if fit.readout_s else 0.0,
-        misfits=misfits(per_turn, fit.scenes, fit.camera, fit.config.scene.error_px),
-        tried=tried,
-        sigma_map=known.sigma_map(fit.used_field), fixed_camera=tests, crops=fit.crops,
-        field=fit.field)
+        written=result, posterior=posterior, scenes=scenes, coarse=coarse, around=around,
+        centred=type(result.camera).centred(
+            lens.image_size, found.centred.fx, *found.centred.params[4:6]),
+        bounds=np.array(bounds_of(found.centred))[:, :count],
+        readout_s=found.imaging.readout_s,
+        readout_sigma_s=float(np.sqrt(posterior.covariance[place, place])),
+        misfits=misfits(per_turn, scenes, result.camera, config.scene.error_px), tried=tried,
+        fixed_camera=tests, field_sigma=found.field_sigma,
+        crops={turn: images[:, :2] for turn, images in found.imaging.images.items()})

@@ -5,14 +5,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import Prior
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
-from dashcalib_ros.solve.normal import Further
+from dashcalib_ros.solve.imaging import Imaging
+from dashcalib_ros.solve.linear import IMAGE, ImagePrior, used_keyframes
 from dashcalib_ros.solve.quadratic import Quadratic
 
+# s: most dashcams have a rolling shutter, of 10 to 30 ms
+READOUT_SIGMA_S = 0.02
 # rendered images without noise would make the loss cut off everything
 LEAST_LOSS_PX = 0.05
 # of the width: how far lenses sit off the middle of their sensors
@@ -20,11 +23,10 @@ CENTRE_SIGMA = 0.02
 # how far parameters may go from the centred camera: fx and fy of its focal length; the centre of
 # the picture's width and height, as a third may be cut off on one side; no lens has larger k1, k2
 FOCAL_BOUND, CENTRE_BOUND, DISTORTION_BOUND = 0.15, (0.2, 0.3), 1.0
-# systematic errors of the tracking: of fx, for fx and fy; of the width, for cx and cy
-FOCAL_FLOOR, CENTRE_FLOOR = 0.0005, 0.0003
-# of fx for each px^2 of noise: a video with few bits moves its contents with their blocks, in all
-# turns alike. H.264 with 0.03 bits per pixel was up to 1.2 % off, at 0.056 px^2
-NOISE_FLOOR = 0.1
+# prior sigma of a stabiliser's crop, of the width, and how long it holds it, s
+CROP_SIGMA, CROP_TIME_S = 0.03, 1.0
+# prior sigmas of the zoom: of one image, of a stretch, of a turn
+ZOOM_IMAGE, ZOOM_STRETCH, ZOOM_TURN = 0.01, 0.02, 0.03
 
 
 def prior_of(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
@@ -44,13 +46,47 @@ def prior_of(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
     return Prior(_undistorted(camera), spread / noise)
 
 
-def bounds_of(camera: Camera) -> tuple[Floats, Floats]:
+def bounds_of(camera: Camera, focal_reach: float = FOCAL_BOUND) -> tuple[Floats, Floats]:
     """Return the lowest and the highest values (n,) that are allowed, around a centred camera."""
     width, height = camera.image_size
     reach = np.full(len(camera.names()), DISTORTION_BOUND)
-    reach[:4] = (camera.fx * FOCAL_BOUND, camera.fx * FOCAL_BOUND,
+    reach[:4] = (camera.fx * focal_reach, camera.fx * focal_reach,
                  width * CENTRE_BOUND[0], height * CENTRE_BOUND[1])
     return _undistorted(camera) - reach, _undistorted(camera) + reach
+
+
+def crop_prior(scene: Scene, variance: float, images: Floats) -> ImagePrior:
+    """Return the prior of the shifts of a turn's images, as a stabiliser makes them.
+
+    They are smooth in time. variance: of a residual, px^2. images: (k, 3) the present values.
+    """
+    keyframes = used_keyframes(scene)
+    spread = (CROP_SIGMA * scene.tracks.image_size[0])**2 * (
+        np.exp(-_apart(scene)) + 1e-6 * np.eye(len(keyframes)))
+    inner = np.asarray(np.linalg.inv(spread) * variance)
+    return ImagePrior(image_places(keyframes, 0, 1), np.asarray(np.kron(np.eye(2), inner)),
+                      images[keyframes, :2].T.ravel())
+
+
+def zoom_prior(scene: Scene, variance: float) -> ImagePrior:
+    """Return the prior of the zooms of a turn's images, which are 0 now."""
+    keyframes = used_keyframes(scene)
+    spread = (ZOOM_STRETCH**2 * np.exp(-_apart(scene))
+              + ZOOM_IMAGE**2 * np.eye(len(keyframes)) + ZOOM_TURN**2)
+    return ImagePrior(image_places(keyframes, 2), np.asarray(np.linalg.inv(spread) * variance),
+                      np.zeros(len(keyframes)))
+
+
+def _apart(scene: Scene) -> Floats:
+    """Return (k, k) how far the used keyframes are apart, in units of a stabiliser's time."""
+    seconds = scene.tracks.stamps_ns[used_keyframes(scene)] / 1e9
+    return np.asarray(np.abs(seconds[:, None] - seconds) / CROP_TIME_S)
+
+
+def image_places(keyframes: Ints, *components: int) -> Ints:
+    """Return the places of these components among the images' parameters."""
+    return np.concatenate([IMAGE * np.arange(len(keyframes)) + component
+                           for component in components])
 
 
 def _undistorted(camera: Camera) -> Floats:
@@ -73,33 +109,18 @@ def centre_pull(camera: Camera, covariance: Floats) -> Floats:
     return np.asarray(covariance[:, 2:4] @ off / (CENTRE_SIGMA * width)**2)
 
 
-def extra_sigma_of(camera: Camera) -> Floats:
-    """Return the prior sigmas of the coefficients that only the wider model has."""
-    return np.array(camera.widened().spread[len(camera.spread):])
+def prior_of_all(imaging: Imaging, centred: Camera, config: IntrinsicsConfig, field_sigma: float
+                 ) -> Quadratic:
+    """Return the priors of the lens, the readout and the field, from their present values.
 
-
-def wider_prior(camera: Camera, centred: Camera, config: IntrinsicsConfig,
-                further: Sequence[Further] = ()) -> Quadratic:
-    """Return the prior about the wider model's parameters, and further ones, at unit noise.
-
-    centred: the camera that the prior is about; camera: where the prior draws from.
+    centred: the camera that the lens's prior is about. field_sigma: of each of the field's
+    directions, px; inf: it has none.
     """
     information = prior_information(centred, config)
-    sigmas = np.concatenate([extra_sigma_of(camera), *(each.sigmas for each in further)])
-    draws = information @ (prior_of(centred, config, 1.0).mean - camera.params)
-    return Quadratic.prior(information, 1 / np.square(sigmas),
-                           np.r_[draws, np.zeros(len(sigmas))])
-
-
-def floor_of(camera: Camera, noise: float) -> Floats:
-    """Return the sigmas (n,) of systematic errors, which no number of turns averages out.
-
-    noise: variance of a residual, px^2.
-    """
-    floor = np.zeros(len(camera.names()))
-    floor[:2] = np.hypot(FOCAL_FLOOR, NOISE_FLOOR * noise) * camera.fx
-    floor[2:4] = CENTRE_FLOOR * camera.image_size[0]
-    return floor
+    off = imaging.camera.params - prior_of(centred, config, 1.0).mean
+    rest = np.r_[READOUT_SIGMA_S**-2, np.full(len(imaging.directions), field_sigma**-2)]
+    return Quadratic.prior(information, rest, -np.r_[
+        information @ off, rest * np.r_[imaging.readout_s, imaging.directions]])
 
 
 def loss_px_of(scenes: Sequence[Scene], camera: Camera, config: IntrinsicsConfig) -> float:

@@ -64,6 +64,10 @@ class Quadratic:
         return Quadratic(self.hessian / variance, self.score / variance,
                          self.by_track / variance**2)
 
+    def curved(self, factor: float) -> Quadratic:
+        """Return the cost with another curvature and the same gradient."""
+        return Quadratic(factor * self.hessian, self.score, self.by_track)
+
     def of(self, places: Sequence[int] | Ints) -> Quadratic:
         """Return the cost about these parameters; the others are fixed at the solution."""
         places = np.asarray(places)
@@ -115,23 +119,3 @@ class Quadratic:
     def chance(self) -> float:
         """Return by how much noise alone makes the optimum lower, each track one measurement."""
         return float(np.sum(self.covariance * self.by_track))
-
-
-@dataclass(frozen=True)
-class TurnCost(Quadratic):
-    """The cost of one turn, in px^2, its points and poses eliminated, and its noise.
-
-    Its m parameters are what turns share: those of the wider lens model, the camera's own first,
-    then a rolling shutter's readout and a field's directions, where there are such. lens: how many
-    the wider model has. squares: sum of squared residuals, weighted by w^2 over the mean of w^2,
-    px^2. freedom: its degrees of freedom (residuals minus parameters).
-    """
-
-    squares: float
-    freedom: float
-    lens: int
-
-
-def noise_of(turns: Sequence[TurnCost]) -> float:
-    """Return the variance of a residual, px^2, from all turns."""
-    return sum(turn.squares for turn in turns) / sum(turn.freedom for turn in turns)

@@ -1,4 +1,4 @@
-"""What the joint adjustment found, and what each turn says of it without that turn."""
+"""What the optimum says: the camera to write, how far it may be off, and what is named."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -9,76 +9,85 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.mapping import sensitivity
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Profile, Scene, rms_px
-from dashcalib_ros.solve.field import FoundField, displacements
-from dashcalib_ros.solve.fixed_camera import Crops, FixedCameraTest
-from dashcalib_ros.solve.knowledge import Knowledge, PictureSigma, SigmaMap, sigma_over
+from dashcalib_ros.solve.evidence import Candidate, FixedCameraTest
+from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.solve.spread import PictureSigma, Posterior, SigmaMap, sigma_over
+from dashcalib_ros.solve.written import Written
 
 # fewer turns are not left out: one of two says little of the other
 LEAST_TURNS = 3
-# cost_ratio of the kinds of lenses; behind true fisheyes pinholes have 2.1 and more
-CLEAR_KIND_RATIO = 1.5
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A model that was tried.
-
-    loses_by: how much worse than the chosen model it predicts the turns left out: the sum of the
-    robust squared errors, in units of the noise of a track; 0 for the chosen one, negative for one
-    that does better, but not clearly. apart_px: how far its camera is from the chosen one over the
-    picture; None where they cannot be compared. chosen: it is the one that the turns choose.
-    cost_ratio: its cost of the turns left out over that of the chosen one.
-    """
-
-    model: str
-    loses_by: float
-    apart_px: float | None = None
-    chosen: bool = False
-    cost_ratio: float = 1.0
+# cost_ratio of the kinds of lenses: behind true fisheyes pinholes have 1.15 to 2, each with a
+# field of its own; behind windscreens fisheyes have 1.01 to 1.06
+CLEAR_KIND_RATIO = 1.1
 
 
 @dataclass(frozen=True)
 class Solution:
     """All turns adjusted together.
 
-    camera: its n parameters; covariance: (n, n) of them; centred: the camera with one focal length
-    that was found first, about which priors and bounds are. scenes: as adjusted, in the order
-    given; known: what they know, in the same order. coarse: the sum of the turns' focal profiles;
-    around: the profile near the result, of all turns. bounds: (2, n) lowest and highest values
-    that were allowed. readout_s: from the first row to the last of a rolling shutter whose effect
-    was removed from the scenes' tracks; 0 for a global one. readout_sigma_s: its standard
-    deviation. misfits: of every turn that was given: the ratio of its cost with this camera to its
-    cost with its own camera. tried: the models that were compared, the simplest first; empty where
-    the first one left nothing to explain. sigma_map: over the picture. fixed_camera: the tests
-    whether it is one, the strongest first. crops: of a stabilised video, taken out of the tracks.
-    field: what no lens model has; None: nothing speaks for one. doubt: (n, n) the part of
-    covariance that says how little this drive's turns confirm those of earlier drives; None where
-    there are none; less where a gyro knows more. alone: the solution of the pictures alone, where
-    a gyro's angles are in this one. px: of the input's pictures, in one pixel of the scenes.
+    written: the camera that is written, and the field beside it; posterior: what all turns know of
+    the lens, the readout and the field, in the order of scenes. scenes: as adjusted, as the
+    written camera alone would have seen them, in the order given. centred: the camera with one
+    focal length that was found first, about which priors and bounds are; bounds: (2, n) lowest and
+    highest values that were allowed. coarse: the sum of the turns' focal profiles; around: the
+    profile near the result, of all turns. readout_s: from the first row to the last, negative
+    where the last comes first; its standard deviation is readout_sigma_s. misfits: of every turn
+    that was given: the ratio of its cost with this camera to its cost with its own camera. tried:
+    the kinds of lenses that were compared. fixed_camera: the tests whether it is one, the clearest
+    that it is not first. crops: by turn (k, 2) px, how far a stabiliser moved each keyframe's
+    picture; empty for a fixed picture. field_sigma: px, of the prior of the field's directions.
+    alone: the solution of the pictures alone, where a gyro's angles are in this one. px: of the
+    input's pictures, in one pixel of the scenes.
     """
 
-    camera: Camera
-    covariance: Floats
+    written: Written
+    posterior: Posterior
     centred: Camera
     scenes: tuple[Scene, ...]
-    known: Knowledge
     coarse: Profile
     around: Profile
     bounds: Floats
-    sigma_map: SigmaMap
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     misfits: Mapping[TurnId, float] = default(default_factory=dict)
     tried: tuple[Candidate, ...] = ()
     fixed_camera: tuple[FixedCameraTest, ...] = ()
-    crops: Crops = default(default_factory=dict)
-    field: FoundField | None = None
-    doubt: Floats | None = None
+    crops: Mapping[TurnId, Floats] = default(default_factory=dict)
+    field_sigma: float = 0.0
     alone: Solution | None = None
     px: float = 1.0
+
+    @property
+    def camera(self) -> Camera:
+        """Return the written camera, with n parameters."""
+        return self.written.camera
+
+    @property
+    def field(self) -> Field | None:
+        """Return the field beside the camera; None where it is nothing."""
+        return self.written.field
+
+    def carried(self, covariance: Floats) -> Floats:
+        """Return the covariance (n, n) of the camera from one (m, m) of what turns share."""
+        follow = self.written.by_solution
+        return np.asarray(follow @ covariance @ follow.T + self.written.loose)
+
+    @property
+    def covariance(self) -> Floats:
+        """Return the covariance (n, n) of the camera's parameters."""
+        return self.carried(self.posterior.covariance)
+
+    @property
+    def wide_covariance(self) -> Floats:
+        """Return the covariance (w, w) of the parameters of the widest model of this kind.
+
+        The camera's own come first. What the others would be counts as an error.
+        """
+        follow, left = self.written.wide_by_solution, self.written.wide_left
+        return np.asarray(follow @ self.posterior.covariance @ follow.T + np.outer(left, left))
 
     @property
     def sigma(self) -> Floats:
@@ -86,41 +95,51 @@ class Solution:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
-    def wider_covariance(self) -> Floats:
-        """Return the covariance of the wider model's parameters: the camera's own come first.
-
-        Of those that this model has not, the step is all that is known.
-        """
-        covariance = np.array(self.known.covariance)
-        if self.doubt is not None:
-            covariance[:len(self.doubt), :len(self.doubt)] += self.doubt
-        return covariance
+    def sigma_map(self) -> SigmaMap:
+        """Return how far camera_info may be off over the picture, the field that it lacks too."""
+        return self.written.sigma_map(self.posterior.covariance)
 
     @property
     def picture(self) -> PictureSigma:
-        """Return the sigma over the picture."""
+        """Return the sigma of camera_info over the picture."""
         return self.sigma_map.whole
 
     @property
     def rays_sigma_px(self) -> float:
         """Return how far rays with the camera and the field may be off, RMS over the picture."""
-        found, count, together = self.field, len(self.known.own), self.known.total.covariance
-        if found is None:
-            return self.picture.rms
-        moves, pixels = sensitivity(self.camera)
-        bends = displacements(pixels, self.camera.image_size, found.basis)
-        # the readout, if there is one, moves nothing in the picture of a camera that stands
-        still = np.zeros((*bends.shape[:2], len(together) - count - bends.shape[2]))
-        camera_only = sigma_over(moves, together[:count, :count])
-        both = sigma_over(np.concatenate([moves, still, bends], axis=2), together)
-        covariance = self.known.covariance[:count, :count]
-        inflation = np.sum(sigma_over(moves, covariance)**2) / np.sum(camera_only**2)
-        return float(np.sqrt(inflation * np.mean(both**2)))
+        return self.written.sigma_map(self.posterior.covariance, with_field=True).whole.rms
+
+    @property
+    def rolling(self) -> bool:
+        """Return whether there is clear evidence of a rolling shutter, and it matters."""
+        return abs(self.readout_s) >= max(CLEAR_SIGMAS * self.readout_sigma_s, LEAST_READOUT_S)
 
     @property
     def reprojection_error_px(self) -> float:
         """Return the root mean square reprojection error of the used observations, px."""
         return rms_px(self.scenes, self.camera)
+
+    def offset_of(self, some: Posterior) -> Floats:
+        """Return (n,) how far the camera of some of the turns is off that of them all."""
+        return np.asarray(self.written.by_solution @ (some.offset - self.posterior.offset))
+
+    def seen_by_turns(self, given: Camera) -> Floats:
+        """Return (n,) the parameters of this model that turns find where given is true.
+
+        given: of this model, or of its wider one. Where it has coefficients that are 0 here, the
+        turns make up for them with their other parameters.
+        """
+        count, whole = len(self.camera.params), len(given.params)
+        if whole == count:
+            return given.params
+        cost = Quadratic.together(self.posterior.turns).hessian[:whole, :whole]
+        inner = cost[:count, :count] + self.posterior.prior.hessian[:count, :count]
+        return np.asarray(given.params[:count] + np.linalg.solve(
+            inner, cost[:count, count:] @ given.params[count:]))
+
+
+# a shorter readout, in its sigmas and in s, is not named
+CLEAR_SIGMAS, LEAST_READOUT_S = 4.0, 1.0 / 1e3
 
 
 @dataclass(frozen=True)
@@ -151,22 +170,37 @@ class LeftOut:
 def cross_validation(solution: Solution) -> tuple[LeftOut, ...]:
     """Return what each turn says of the calibration without it; () for fewer than three turns.
 
-    Neither camera needs a new adjustment. What one turn cannot show, that others differ from it,
-    is left out of sigma: it is what is asked here.
+    Neither camera needs a new adjustment. That turns may differ is left out of sigma: it is what
+    is asked here.
     """
-    known = replace(solution.known, one_turn_sigma=0.0)
+    known, moves = solution.posterior.alike, solution.written.moves
     if len(known.turns) < LEAST_TURNS:
         return ()
-    moves, _ = sensitivity(known.camera)
-    block = np.ix_(known.own, known.own)
     found = []
     for n, scene in enumerate(solution.scenes):
         alone, others = known.of([n]), known.without(n)
-        apart = moves @ (known.offset_of(alone) - known.offset_of(others))
+        apart = moves @ (alone.offset - others.offset)
         found.append(LeftOut(
             scene.turn, _rms(np.linalg.norm(apart, axis=1)),
-            *(_rms(sigma_over(moves, some.covariance[block])) for some in (alone, others))))
+            *(_rms(sigma_over(moves, some.covariance)) for some in (alone, others))))
     return tuple(found)
+
+
+def with_measurement(solution: Solution, along: Floats, apart: float, variance: float
+                     ) -> Solution:
+    """Return the solution with one more measurement of what turns share, linearised.
+
+    along: (m,) its derivatives; apart: what it says, less what the solution says; variance: its
+    own. Only the camera and what is known of it move: the turns stay as they are.
+    """
+    known = solution.posterior
+    further = Quadratic(np.outer(along, along) / variance, along * apart / variance,
+                        np.zeros((len(along), len(along))))
+    moved = replace(known, further=(*known.further, further))
+    camera = solution.camera.with_params(
+        solution.camera.params + solution.written.by_solution @ (moved.offset - known.offset))
+    return replace(solution, posterior=moved,
+                   written=replace(solution.written, camera=camera))
 
 
 def _rms(values: Floats) -> float:

@@ -1,33 +1,81 @@
-"""Scenes are fitted to a given camera: triangulated or chained anew, given other poses, judged."""
+"""Where the one problem starts: kinds of lenses, focal profiles, turns chained anew.
+
+A turn was reconstructed with a camera of its own. Here it is brought to a common one, and a focal
+length is held to see how the cost rises around the result. Scenes are given as a lens sees them:
+nothing here knows of shutters and fields.
+"""
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.reconstruct.adjust import Solver, adjust
+from dashcalib_ros.reconstruct.adjust import ROUGH, Solver, adjust
 from dashcalib_ros.reconstruct.chain import chain_scene
-from dashcalib_ros.reconstruct.scene import Scene, errors_px, retriangulated, truncated_cost
+from dashcalib_ros.reconstruct.scene import (
+    Profile,
+    Scene,
+    errors_px,
+    retriangulated,
+    truncated_cost,
+)
+from dashcalib_ros.solve.optimise import FIRST_TRACKS, subsample_tracks
 from dashcalib_ros.solve.prior import loss_px_of
 
+# factors of the resulting focal length at which the profile is evaluated
+PROBES = (0.8, 1.0, 1.25)
+# where another probe's cost is higher by less than this share, so many times the tracks are used
+CLOSE, MORE = 0.1, 4
 # px^2; lower costs count as this, so that the ratio of two tiny costs is near 1
 LEAST_COST = 0.01
-# of each turn, where a part of its tracks is enough
-FIRST_TRACKS = 200
 # of an adjustment with a fixed camera; it moves poses and points only, and is cheap
 ITERATIONS = 20
 ROUNDS = 3
-# of points with fixed poses: Gauss-Newton steps, and the damping of their blocks
-POINT_STEPS, POINT_DAMPING = 3, 1e-3
 # of a turn's observations; with fewer it is chained anew with the common camera
 WELL_EXPLAINED = 0.9
 # times a turn's cost with its own camera; above it, its own poses are tried, too
 WELL_FITTING = 1.25
+
+
+def kinds_of_lenses(scenes: Sequence[Scene]) -> list[str]:
+    """Return the families of the cameras that were tried for at least half of the scenes.
+
+    The profiles do not decide between them: with two coefficients of distortion, wide lenses of
+    one kind may look more like the other.
+    """
+    counts = Counter(kind for scene in scenes for kind in scene.starts)
+    return [kind for kind, count in counts.items() if 2 * count >= len(scenes)]
+
+
+def summed(profiles: Sequence[Profile]) -> Profile:
+    """Return the profiles' sum, in squared error times observations, on a common fine grid.
+
+    A profile that tells nothing would outvote gentle bends; it counts only where all are like it.
+    """
+    profiles = [profile for profile in profiles if profile.tells] or profiles
+    low = max(profile.ratios[0] for profile in profiles)
+    high = min(profile.ratios[-1] for profile in profiles)
+    if low >= high:
+        low, high = (min(profile.ratios[0] for profile in profiles),
+                     max(profile.ratios[-1] for profile in profiles))
+    ratios = np.geomspace(low, high, 81)
+    total = np.zeros(len(ratios))
+    for profile in profiles:
+        total += profile.observations * np.interp(
+            np.log(ratios), np.log(profile.ratios), profile.costs)
+    observations = sum(profile.observations for profile in profiles)
+    return Profile(ratios, total / observations, observations)
+
+
+def nearest_start(cameras: Sequence[Camera], profile: Profile) -> Camera:
+    """Return the camera that is nearest to the summed profile's minimum."""
+    wanted = np.log(profile.best * cameras[0].image_size[0])
+    return min(cameras, key=lambda camera: abs(float(np.log(camera.fx)) - wanted))
 
 
 def retriangulate(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
@@ -35,69 +83,9 @@ def retriangulate(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
     return retriangulated(scene, camera, config.error_px, config.min_angle_deg)
 
 
-def retriangulate_all(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> list[Scene]:
-    """Return the scenes with their tracks triangulated anew; scenes without points are dropped."""
-    found = [retriangulate(scene, camera, config) for scene in scenes]
-    return [scene for scene in found if scene.structure.used.any()]
-
-
-def with_points_settled(scene: Scene, camera: Camera, loss_px: float) -> Scene:
-    """Return the scene with each used point where its observations ask for it; poses are fixed.
-
-    Triangulation is linear and knows no loss: joint steps from its points lead astray.
-    """
-    structure, used = scene.structure, scene.structure.used
-    rows, columns = np.nonzero(used)
-    tracks, point = np.unique(columns, return_inverse=True)
-    rotation, observed = structure.rotations[rows], scene.tracks.xy[rows, columns]
-
-    def local(points: Floats) -> Floats:
-        return np.asarray(np.einsum('nij,nj->ni', rotation, points[point])
-                          + structure.translations[rows])
-
-    def squares(points: Floats) -> Floats:
-        off = camera.project(local(points)) - observed
-        return np.asarray(np.sum(off**2, axis=1) / loss_px**2)
-
-    def summed(values: Floats) -> Floats:
-        columns = values.reshape(len(point), -1).T
-        sums = np.stack([np.bincount(point, column) for column in columns], axis=1)
-        return np.asarray(sums.reshape(-1, *values.shape[1:]), np.float64)
-
-    points = structure.points[tracks]
-    off = squares(points)
-    for _ in range(POINT_STEPS):
-        _, by_local, projected = camera.derivatives(local(points))
-        by_point, residual = by_local @ rotation, observed - projected
-        weighted = (by_point / (1 + off)[:, None, None]).transpose(0, 2, 1)
-        blocks = summed(weighted @ by_point)
-        # a badly determined point has a solution, too
-        damping = (POINT_DAMPING * np.einsum('tii->ti', blocks)[:, :, None] + 1e-12) * np.eye(3)
-        step = np.linalg.solve(blocks + damping, summed(weighted @ residual[:, :, None]))
-        moved = points + step[:, :, 0]
-        after = squares(moved)
-        # NaN, of a point that has gone behind a camera, is no gain
-        gains = summed(np.log1p(after)) < summed(np.log1p(off))
-        points = np.where(gains[:, None], moved, points)
-        off = np.where(gains[point], after, off)
-    found = structure.points.copy()
-    found[tracks] = points
-    return replace(scene, structure=replace(structure, points=found))
-
-
 def rechain(scene: Scene, camera: Camera, config: SceneConfig, seed: int) -> Scene | None:
     """Return the scene chained anew from its tracks, None if no pair of images starts a chain."""
     return chain_scene(scene.tracks, scene.turn, camera, scene.profile, config, seed)
-
-
-def subsample_tracks(scene: Scene, wanted: int) -> Scene:
-    """Return the scene with at most this many of its tracks, evenly chosen."""
-    chosen = np.unique(np.linspace(0, scene.tracks.xy.shape[1] - 1, wanted).astype(int))
-    structure = scene.structure
-    return replace(
-        scene, tracks=replace(scene.tracks, xy=scene.tracks.xy[:, chosen]),
-        structure=replace(structure, points=structure.points[chosen],
-                          used=structure.used[:, chosen]))
 
 
 def with_few_tracks(scene: Scene) -> Scene:
@@ -238,3 +226,66 @@ def _with_fixed(camera: Camera, found: Scene, generous: SceneConfig, config: Con
         loss_px = loss_px_of([found], camera, config.intrinsics)
         [found], _ = adjust([found], camera, Solver(loss_px, ITERATIONS), 'nothing')
     return found
+
+
+def profile_around(scenes: Sequence[Scene], camera: Camera, coarse: Profile,
+                   config: Config) -> Profile:
+    """Return the cost with the focal length fixed at PROBES times the result, all else adjusted.
+
+    Each probe is an adjustment that starts from the result, with a part of the tracks, and with
+    more of them where it is close: few points hold a turn's poses badly. The least triangulation
+    angle is the same in pixels for all: at a fixed angle a shorter focal length would have more
+    points, and explain more observations only for that. If the coarse profile has its minimum
+    outside the probes, that focal length is probed too, with scenes chained anew: of the two, the
+    one that explains more observations is right.
+    """
+    def probed(tracks: int) -> Profile:
+        few = [subsample_tracks(scene, tracks) for scene in scenes]
+        return _probed(few, camera, coarse, config)
+
+    wanted = config.intrinsics.profile_tracks
+    found = probed(wanted)
+    close = found.contrast(camera.fx / camera.image_size[0]) < CLOSE
+    return probed(MORE * wanted) if close else found
+
+
+def _probed(scenes: Sequence[Scene], camera: Camera, coarse: Profile, config: Config) -> Profile:
+    """Return profile_around() of these tracks."""
+    def settings_at(fixed: Camera) -> SceneConfig:
+        least = config.scene.min_angle_deg * camera.fx / fixed.fx
+        return replace(config.scene, min_angle_deg=least)
+
+    width = camera.image_size[0]
+    costs = {}
+    for probe in PROBES:
+        fixed = camera.with_focal(camera.fx * probe)
+        costs[fixed.fx / width] = _cost_at(scenes, fixed, settings_at(fixed))
+    if not PROBES[0] < coarse.best * width / camera.fx < PROBES[-1]:
+        fixed = type(camera).centred(camera.image_size, coarse.best * width)
+        settings = settings_at(fixed)
+        anew = [rechain(scene, fixed, settings, config.seed) or scene for scene in scenes]
+        costs[coarse.best] = _cost_at(anew, fixed, settings)
+    ratios = sorted(costs)
+    observations = sum(int(scene.tracks.seen.sum()) for scene in scenes)
+    return Profile(np.array(ratios), np.array([costs[ratio] for ratio in ratios]), observations)
+
+
+def _cost_at(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> float:
+    """Return the truncated cost over all scenes after adjusting all but the focal length, px^2.
+
+    The lowest cost met on the way: the wide loss may lead away from a start that is right.
+    """
+    def cost(moved: Sequence[Scene], camera: Camera) -> float:
+        return float(np.average([truncated_cost(scene, camera, config.error_px)
+                                 for scene in moved],
+                                weights=[int(scene.tracks.seen.sum()) for scene in moved]))
+
+    moved = list(scenes)
+    costs = [cost(moved, camera)]
+    # the first residuals are large: the loss must be as wide, or it ignores them
+    for loss_px in (0.01 * camera.image_size[0], config.loss_px):
+        solver = Solver(loss_px, config.iterations, ROUGH)
+        moved, camera = adjust(moved, camera, solver, 'distortion')
+        moved = [retriangulate(scene, camera, config) for scene in moved]
+        costs.append(cost(moved, camera))
+    return min(costs)

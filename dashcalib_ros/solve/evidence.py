@@ -1,0 +1,270 @@
+"""What is there, decided at the common optimum: the kind of lens, a picture that moves or is bent.
+
+A kind of lens is judged by the turns that did not make it: each is left out in turn. At the
+optimum the cost of every turn is a quadratic function of what turns share, so the solution without
+a turn, and what it costs that turn, need no new adjustment.
+
+A picture that shifts, zooms or is bent locally is judged by a few more parameters: what they gain
+is compared with what chance would gain, each track counted as one measurement. The ratio is about
+1 for a fixed camera. It is named where it is clear, and large enough to matter.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Ints
+from dashcalib_ros.camera import MODELS
+from dashcalib_ros.camera.mapping import mapping_error
+from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.scene import errors_px
+from dashcalib_ros.solve.linear import (
+    IMAGE,
+    LEAST_READOUT_S,
+    ImagePrior,
+    Normal,
+    normal_equations,
+)
+from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate, about_shared
+from dashcalib_ros.solve.prior import crop_prior, zoom_prior
+from dashcalib_ros.solve.quadratic import Quadratic
+
+Kind = Literal['shift', 'zoom', 'bend']
+
+# columns and rows over the picture of places at which a local bend is estimated
+BENDS = (5, 4)
+# prior sigma of the bend at each of them, px
+BEND_PX = 3.0
+# times what chance gains; more is clear
+CLEAR: Mapping[Kind, float] = {'shift': 2.0, 'zoom': 2.0, 'bend': 8.0}
+# of one turn alone, where chance gains up to 2.1
+CLEAR_ZOOM_IN_ONE_TURN = 3.0
+# of the shift behind a rolling shutter, of which bumps leave something over; and where a
+# stabiliser's crop was found: what is left of it
+ROLLING_SHIFT, LEFT_SHIFT = 2.7, 4.0
+# what matters: of the width; of 1; px of 1000 px of width
+MATTERS: Mapping[Kind, float] = {'shift': 0.004, 'zoom': 0.004, 'bend': 0.3}
+# noise variances of a track by which a kind of lens must predict turns better
+LEAST_GAIN = 30.0
+
+
+# the kind of lens
+
+@dataclass(frozen=True)
+class Candidate:
+    """A kind of lens that was tried.
+
+    loses_by: how much worse than the chosen one it predicts the turns left out: the sum of the
+    robust squared errors, in units of the noise of a track; 0 for the chosen one, negative for one
+    that does better, but not clearly. apart_px: how far its camera is from the chosen one over the
+    picture; None where they cannot be compared. chosen: it is the one that the turns choose.
+    cost_ratio: its cost of the turns left out over that of the chosen one.
+    """
+
+    model: str
+    loses_by: float
+    apart_px: float | None = None
+    chosen: bool = False
+    cost_ratio: float = 1.0
+
+
+def costs_of(now: Estimate, loss_px: float) -> list[Quadratic]:
+    """Return each turn's cost about what turns share, at the noise; images' shifts follow."""
+    variance = now.noise(loss_px).variance * now.inflation
+    normals = [normal_equations(scene, now.imaging, loss_px, now.moves, variance=variance)
+               for scene in now.scenes]
+    return [cost.at_noise(variance) for cost in about_shared(now, normals, variance)]
+
+
+def costs_left_out(now: Estimate, loss_px: float) -> dict[TurnId, float]:
+    """Return what each turn costs with all that the other turns find, in units of the noise.
+
+    loss_px: of the Cauchy loss. With one turn only, its cost with its own camera.
+    """
+    unit = now.noise(loss_px).variance * now.inflation
+    turns = costs_of(now, loss_px)
+    total = Quadratic.together([*turns, now.prior()])
+    limit_px, found = now.config.scene.error_px, {}
+    for scene, turn in zip(now.seen_by_lens, turns, strict=True):
+        errors = np.minimum(errors_px(scene, now.camera), limit_px)[scene.tracks.seen]
+        found[scene.turn] = float(loss_px**2 * np.log1p(errors**2 / loss_px**2).sum()) / unit
+        if len(turns) > 1:
+            others = np.linalg.solve(total.hessian - turn.hessian, -turn.score)
+            # near the optimum it cannot cost less without the turn; elsewhere this says nothing
+            found[scene.turn] += max(turn.change(np.asarray(others)), 0.0)
+    return found
+
+
+def chosen_kind(found: Sequence[Estimate]) -> tuple[Estimate, tuple[Candidate, ...]]:
+    """Return the estimate whose kind of lens predicts the turns best, and how others compare.
+
+    A fisheye comes after the pinholes, and must be clearly better: a decentred pinhole is none.
+    """
+    if len(found) == 1:
+        return found[0], ()
+    families = list(dict.fromkeys(model.family for model in MODELS.values()))
+    found = sorted(found, key=lambda each: families.index(each.camera.family))
+    loss_px = min(each.loss_px() for each in found)
+    costs = [costs_left_out(each, loss_px) for each in found]
+    # in the same units; a turn that a camera does not explain at all counts against it
+    unit = [each.noise(loss_px).variance * each.inflation
+            for each in found]
+    least = min(unit)
+    costs = [{turn: cost * own / least for turn, cost in each.items()}
+             for each, own in zip(costs, unit, strict=True)]
+    worst = {turn: max(each.get(turn, 0.0) for each in costs) for each in costs for turn in each}
+    totals = [{turn: each.get(turn, 2 * worst[turn]) for turn in worst} for each in costs]
+    best = 0
+    for n in range(1, len(found)):
+        if is_clear(np.array([totals[best][turn] - totals[n][turn] for turn in worst])):
+            best = n
+    sums = [sum(each.values()) for each in totals]
+    chosen = found[best]
+    return chosen, tuple(Candidate(
+        each.camera.model, sums[n] - sums[best], mapping_error(each.camera, chosen.camera),
+        n == best, sums[n] / sums[best]) for n, each in enumerate(found))
+
+
+def is_clear(gains: Floats, least: float = LEAST_GAIN) -> bool:
+    """Return whether the gains (n,) of turns, in noise variances of a track, are clear evidence.
+
+    They must be larger in sum than least, and not come from one turn.
+    """
+    several = len(gains) < 2 or (np.sum(np.sort(gains)[:-1]) > 0
+                                 and np.sum(gains > 0) > len(gains) / 2)
+    return bool(gains.sum() > least and several)
+
+
+# a fixed picture
+
+@dataclass(frozen=True)
+class FixedCameraTest:
+    """Whether the camera is fixed, or its picture moves in one way.
+
+    strength: what the parameters of this kind gain, over what chance would gain; more than limit
+    is evidence. size: the root mean square of the shift or the bend, px, or of the zoom; least:
+    the smallest that matters. by_turn: the mean zoom of each turn; empty for other kinds.
+    """
+
+    kind: Kind
+    strength: float
+    limit: float
+    size: float
+    least: float
+    by_turn: Mapping[TurnId, float]
+
+    @property
+    def clear(self) -> bool:
+        """Return whether chance does not explain it, and it matters; so for NaN."""
+        return not (self.strength <= self.limit or self.size <= self.least)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A step with more parameters than those of what turns share.
+
+    gain: by how much it lowers the cost, at unit noise; chance: how much noise alone would, each
+    track counted as one measurement. shared: (s,); images: (p,) of each turn's free ones.
+    """
+
+    gain: float
+    chance: float
+    shared: Floats
+    images: tuple[Floats, ...]
+
+    def strength(self, base: _Step) -> float:
+        """Return what this step gains over one without its parameters, over what chance would."""
+        return (self.gain - base.gain) / max(self.chance - base.chance, 1e-9)
+
+
+def fixed_camera_tests(found: Estimate, bent: bool = True) -> tuple[FixedCameraTest, ...]:
+    """Return the tests whether the camera is a fixed one, the clearest that it is not first.
+
+    With a part of the tracks. bent: False leaves out the local bend, which takes longer.
+    """
+    now = found.with_tracks(FIRST_TRACKS)
+    loss_px, width = now.loss_px(), now.camera.image_size[0]
+    variance = now.noise(loss_px).variance
+    further = partial(_bends, image_size=now.camera.image_size) if bent else None
+    normals = [normal_equations(scene, now.imaging, loss_px, True, further,
+                                variance=variance * now.inflation) for scene in now.scenes]
+    prior = now.prior()
+    # what is the present optimum but for a part of the tracks
+    prior = Quadratic.prior(prior.hessian, np.full(
+        len(normals[0].shared.score) - len(prior.score), BEND_PX**-2), np.pad(
+        prior.score, (0, len(normals[0].shared.score) - len(prior.score))))
+    own = np.arange(len(now.prior().score))
+    shifts = [crop_prior(scene, variance, now.imaging.images.get(
+        scene.turn, np.zeros((len(scene.tracks.frames), IMAGE)))) for scene in now.scenes]
+    zooms = [zoom_prior(scene, variance) for scene in now.scenes]
+
+    def solved(images: Sequence[ImagePrior] | None, places: Ints) -> _Step:
+        return _solved(normals, prior, variance, images, places)
+
+    def test(kind: Kind, step: _Step, base: _Step, limit: float, unit: float) -> FixedCameraTest:
+        parts = step.images if kind != 'bend' else (step.shared[len(own):],)
+        turns = {scene.turn: float(part.mean())
+                 for scene, part in zip(now.scenes, parts, strict=False)}
+        return FixedCameraTest(
+            kind, step.strength(base), limit,
+            float(np.sqrt(np.mean(np.square(np.concatenate(parts))))), MATTERS[kind] * unit,
+            turns if kind == 'zoom' else {})
+
+    fixed = solved(None, own)
+    tests = [test('shift', solved(shifts, own), fixed,
+                  LEFT_SHIFT if now.moves else ROLLING_SHIFT
+                  if abs(now.imaging.readout_s) > LEAST_READOUT_S else CLEAR['shift'], width),
+             test('zoom', solved(zooms, own), fixed, CLEAR['zoom'] if len(now.scenes) > 1
+                  else CLEAR_ZOOM_IN_ONE_TURN, 1.0)]
+    if bent:
+        # a stabilised picture goes on moving
+        moving = shifts if now.moves else None
+        tests.append(test('bend', solved(moving, np.arange(len(prior.score))),
+                          solved(moving, own), CLEAR['bend'], width / 1000))
+    return tuple(sorted(tests, key=lambda each: (not each.clear, -each.strength / each.limit)))
+
+
+def _solved(normals: Sequence[Normal], prior: Quadratic, variance: float,
+            images: Sequence[ImagePrior] | None, places: Ints) -> _Step:
+    """Return the step with these parameters free; images: a prior for each turn."""
+    gain = chance = 0.0
+    costs = [prior.of(places)]
+    for n, normal in enumerate(normals):
+        cost = normal.shared if images is None else images[n].eliminated(normal)
+        costs.append(cost.of(places).at_noise(variance))
+        if images is not None:
+            own = images[n].of(normal)
+            gain += float(own.score @ own.covariance @ own.score) / variance
+            chance += own.chance / variance
+    total = Quadratic.together(costs)
+    step = total.optimum
+    of_images = () if images is None else tuple(
+        each.step(normal, np.asarray(places), step)
+        for each, normal in zip(images, normals, strict=True))
+    return _Step(gain + float(total.score @ step), chance + total.chance, step, of_images)
+
+
+def largest_crop(crops: Mapping[TurnId, Floats]) -> float:
+    """Return how far the crop moved at the most, from its middle, px."""
+    paths = np.concatenate(list(crops.values()))
+    return float(np.abs(paths - np.median(paths, axis=0)).max())
+
+
+def _bends(projected: Floats, image_size: tuple[int, int]) -> Floats:
+    """Return (n, 2, 2 f) derivatives of pixels (n, 2) by displacements at f places.
+
+    The weights of the places at a pixel sum to 1.
+    """
+    places = projected / np.array(image_size)
+    columns, rows = ((np.arange(count) + 0.5) / count for count in BENDS)
+    across = np.exp(-0.5 * ((places[..., :1] - columns) * BENDS[0])**2)
+    down = np.exp(-0.5 * ((places[..., 1:] - rows) * BENDS[1])**2)
+    weight = (across[..., :, None] * down[..., None, :]).reshape(len(places), 1, -1)
+    weight /= np.maximum(weight.sum(axis=-1, keepdims=True), 1e-9)
+    zero = np.zeros_like(weight)
+    return np.concatenate([np.concatenate([weight, zero], axis=-1),
+                           np.concatenate([zero, weight], axis=-1)], axis=1)
