@@ -31,7 +31,7 @@ from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Solution
 
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
 ON_BOUND = 0.01
-STEADY = 'switch the stabiliser off'
+STEADY = 'switch the stabiliser off, and fix the zoom'
 # of the sigma of fx by pictures alone; a gyro that knows as much as these leaves 0.71
 CONFIRMED = 0.71
 # relative rise of the error; less is refused
@@ -231,8 +231,9 @@ def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
 def _moving(how: str, px: float, solution: Solution) -> Finding:
     share = 100 * px / solution.camera.image_size[0]
     return Finding('weak', f'the picture moves against the lens by {how} {share:.1f} % of its '
-                           f'width, as that of a stabilised video does: no camera_info holds for '
-                           f'all pictures', STEADY, cause=True)
+                           f'width, as in a stabilised video or while the zoom changes: no '
+                           f'camera_info holds for all pictures', STEADY,
+                   cause=True)
 
 
 def _zoomed(test: FixedCameraTest) -> str:

@@ -50,6 +50,8 @@ ROLLING_SHIFT, LEFT_SHIFT = 2.7, 4.0
 MATTERS: Mapping[Kind, float] = {'shift': 0.004, 'zoom': 0.004, 'bend': 0.3}
 # noise variances of a track by which a kind of lens must predict turns better
 LEAST_GAIN = 30.0
+# the same of another kind, of its cost: fisheyes have 0.13 and more, windscreens up to 0.06
+LEAST_KIND_GAIN = 0.08
 
 
 # the kind of lens
@@ -120,7 +122,9 @@ def chosen_kind(found: Sequence[Estimate]) -> tuple[Estimate, tuple[Candidate, .
     totals = [{turn: each.get(turn, 2 * worst[turn]) for turn in worst} for each in costs]
     best = 0
     for n in range(1, len(found)):
-        if is_clear(np.array([totals[best][turn] - totals[n][turn] for turn in worst])):
+        gains = np.array([totals[best][turn] - totals[n][turn] for turn in worst])
+        if ((is_clear(gains) and found[n].camera.family == found[best].camera.family)
+                or is_clear(gains, LEAST_KIND_GAIN * sum(totals[n].values()))):
             best = n
     sums = [sum(each.values()) for each in totals]
     chosen = found[best]
@@ -246,6 +250,13 @@ def _solved(normals: Sequence[Normal], prior: Quadratic, variance: float,
         each.step(normal, np.asarray(places), step)
         for each, normal in zip(images, normals, strict=True))
     return _Step(gain + float(total.score @ step), chance + total.chance, step, of_images)
+
+
+def moves(tests: Sequence[FixedCameraTest]) -> bool:
+    """Return whether a stabiliser may have shifted the pictures: that looks like a zoom, too."""
+    shift = next(test for test in tests if test.kind == 'shift')
+    return shift.strength > CLEAR['shift'] and any(
+        test.clear for test in tests if test.kind != 'bend')
 
 
 def largest_crop(crops: Mapping[TurnId, Floats]) -> float:

@@ -18,6 +18,7 @@ from dashcalib_ros.solve.evidence import (
     chosen_kind,
     costs_of,
     fixed_camera_tests,
+    moves,
 )
 from dashcalib_ros.solve.imaging import imaging_with, lens_like
 from dashcalib_ros.solve.linear import IMAGE
@@ -50,8 +51,6 @@ FIRST_REACH = 0.35
 NEAR = 0.5
 # with all tracks: steps after each triangulation
 LAST_STEPS = (3, 3)
-# of the shifts of a stabilised video's pictures
-CROP_STEPS = 20
 # px RMS of 1000 px of width: a field as of a windscreen, or of another kind of lens
 LARGE_FIELD = 1.0
 # nats of evidence that earlier drives had another camera: three standard deviations
@@ -117,10 +116,9 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
     for steps in LAST_STEPS:
         best = optimised(best.retriangulated(), 0.0, steps)
     tests = fixed_camera_tests(best)
-    if config.intrinsics.crop_rounds and tests[0].kind == 'shift' and tests[0].clear:
+    if config.intrinsics.crop_rounds and moves(tests):
         progress('looking how the picture moves', 0.0)
-        best = optimised(_moving(best), 0.0, CROP_STEPS)
-        best = optimised(best.retriangulated(), 0.0, CROP_STEPS)
+        best = _steadied(best, measured, config)
         tests = fixed_camera_tests(best)
     return _solution(best, per_turn, start.profile, tried, tests, progress)
 
@@ -159,13 +157,15 @@ def _start(camera: Camera, scenes: tuple[Scene, ...], centred: Camera, config: C
     """Return the estimate with a lens alone, in the widest model of its kind."""
     wide = type(camera.widened())
     centred = wide.centred(camera.image_size, centred.fx, *centred.params[4:6])
-    return Estimate(imaging_with(camera.widened(), scenes), scenes, centred, config, focal_reach)
+    return Estimate(imaging_with(camera.widened(), scenes), scenes, centred, config, focal_reach,
+                    aspect_sigma=config.intrinsics.aspect_sigma)
 
 
-def _narrowed(found: Estimate) -> Estimate | None:
+def _narrowed(found: Estimate, losses: Sequence[tuple[float, int]] = LOSSES
+              ) -> Estimate | None:
     """Return the optimum of all blocks, with a loss that narrows; None where no turn is left."""
     now = found
-    for least_px, steps in LOSSES:
+    for least_px, steps in losses:
         now = now.retriangulated(2 * least_px)
         if not now.scenes:
             return None
@@ -226,10 +226,21 @@ def _with_all_tracks(found: Estimate, per_turn: Mapping[TurnId, Scene], config: 
         replace(scene, tracks=per_turn[scene.turn].tracks) for scene in kept))
 
 
-def _moving(found: Estimate) -> Estimate:
-    """Return the estimate where each image's picture may be shifted."""
+def _steadied(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config) -> Estimate:
+    """Return the optimum where each image's picture may be shifted, as a stabiliser does.
+
+    With a part of the tracks first, and without a readout: it looks alike, and may be far off.
+    """
     still = {scene.turn: np.zeros((len(scene.tracks.frames), IMAGE)) for scene in found.scenes}
-    return replace(found, imaging=replace(found.imaging, images=still))
+    start = replace(found, imaging=replace(
+        found.imaging, readout_s=0.0, images=still, shaking={})).with_tracks(FIRST_TRACKS)
+    near = _narrowed(start, ((LOSSES[0][0], config.intrinsics.crop_rounds), *LOSSES[1:]))
+    if near is None:
+        return found
+    now = _with_all_tracks(near, per_turn, config)
+    for steps in LAST_STEPS if now.scenes else ():
+        now = optimised(now.retriangulated(), 0.0, steps)
+    return now if len(now.scenes) == len(found.scenes) else found
 
 
 def _solution(found: Estimate, per_turn: Sequence[Scene], coarse: Profile,

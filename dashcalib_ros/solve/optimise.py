@@ -26,7 +26,14 @@ from dashcalib_ros.solve.linear import (
     normal_equations,
     residuals,
 )
-from dashcalib_ros.solve.prior import LEAST_LOSS_PX, bounds_of, crop_prior, prior_of_all
+from dashcalib_ros.solve.prior import (
+    LEAST_LOSS_PX,
+    NOT_SQUARE,
+    NOT_SQUARE_NATS,
+    bounds_of,
+    crop_prior,
+    prior_of_all,
+)
 from dashcalib_ros.solve.quadratic import Quadratic
 
 # shares of a step that are tried, the longest first: safe steps are a little short
@@ -50,8 +57,8 @@ class Estimate:
 
     scenes: structures, each with its tracks as measured. centred: the camera that priors and
     bounds are about. focal_reach: ratio by which focal lengths may be off its own. field_sigma: of
-    the prior of the field's directions, px. inflation: of the noise, by errors that the
-    observations of a track share.
+    the prior of the field's directions, px; aspect_sigma: of that of fy / fx. inflation: of the
+    noise, by errors that the observations of a track share.
     """
 
     imaging: Imaging
@@ -60,6 +67,7 @@ class Estimate:
     config: Config
     focal_reach: float
     field_sigma: float = 0.1
+    aspect_sigma: float = 0.0
     inflation: float = 2.0
 
     @property
@@ -111,13 +119,9 @@ class Estimate:
         median = float(np.median(np.linalg.norm(np.concatenate(self.residuals), axis=1)))
         return max(self.config.intrinsics.loss * median, LEAST_LOSS_PX, least_px)
 
-    def prior(self, field: bool = True) -> Quadratic:
-        """Return the priors of the lens, the readout and the field, from the present values.
-
-        field: False leaves the field free.
-        """
-        return prior_of_all(self.imaging, self.centred, self.config.intrinsics,
-                            self.field_sigma if field else np.inf)
+    def prior(self) -> Quadratic:
+        """Return the priors of the lens, the readout and the field, from the present values."""
+        return prior_of_all(self.imaging, self.centred, self.aspect_sigma, self.field_sigma)
 
     def image_priors(self, variance: float) -> list[ImagePrior]:
         """Return for each turn the prior of its images' shifts; empty where none move.
@@ -208,15 +212,39 @@ def about_shared(now: Estimate, normals: Sequence[Normal], variance: float) -> l
 
 
 def _with_sizes_chosen(now: Estimate, costs: Sequence[Quadratic]) -> Estimate:
-    """Return the estimate with the sizes of noise and field that the evidence favours.
+    """Return the estimate with the sizes of noise and priors that the evidence favours.
 
     costs: of each turn, at unit noise.
     """
     total = Quadratic.together(costs)
-    inflation = inflation_of(total, now.prior())
-    both = Quadratic.together([total.at_noise(inflation), now.prior(field=False)])
-    sigma = chosen_field_sigma(both, now.imaging)
-    return replace(now, field_sigma=sigma, inflation=inflation)
+    now = replace(now, inflation=inflation_of(total, now.prior()))
+    total = total.at_noise(now.inflation)
+
+    def with_prior(sizes: Estimate) -> Quadratic:
+        return Quadratic.together([total, sizes.prior()])
+
+    now = replace(now, field_sigma=chosen_field_sigma(
+        with_prior(replace(now, field_sigma=np.inf)), now.imaging))
+    square = now.config.intrinsics.aspect_sigma
+    loose = replace(now, aspect_sigma=NOT_SQUARE)
+    return loose if square < NOT_SQUARE and _not_square(
+        with_prior(loose), now.camera, square) else replace(now, aspect_sigma=square)
+
+
+def _not_square(loose: Quadratic, camera: Camera, square: float) -> bool:
+    """Return whether the turns contradict pixels whose fy / fx is 1 to within a sigma.
+
+    loose: the cost with a prior of NOT_SQUARE for it, at unit noise.
+    """
+    step, along = loose.optimum, np.array([-camera.fy / camera.fx, 1.0]) / camera.fx
+    found = camera.fy / camera.fx - 1 + float(along @ step[:2])
+    variance = float(along @ loose.covariance[:2, :2] @ along)
+    # without that prior
+    weight = max(1 / variance - NOT_SQUARE**-2, 1e-12)
+    found, variance = found / variance / weight, 1 / weight
+    logs = [-0.5 * (np.log(variance + sigma**2) + found**2 / (variance + sigma**2))
+            for sigma in (square, NOT_SQUARE)]
+    return bool(logs[1] - logs[0] > NOT_SQUARE_NATS)
 
 
 def inflation_of(total: Quadratic, prior: Quadratic) -> float:

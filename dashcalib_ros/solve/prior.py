@@ -14,6 +14,8 @@ from dashcalib_ros.solve.imaging import Imaging
 from dashcalib_ros.solve.linear import IMAGE, ImagePrior, used_keyframes
 from dashcalib_ros.solve.quadratic import Quadratic
 
+# of fy / fx, where pixels are not square, and the nats of evidence that this takes
+NOT_SQUARE, NOT_SQUARE_NATS = 0.05, 3.0
 # s: most dashcams have a rolling shutter, of 10 to 30 ms
 READOUT_SIGMA_S = 0.02
 # rendered images without noise would make the loss cut off everything
@@ -29,12 +31,10 @@ CROP_SIGMA, CROP_TIME_S = 0.03, 1.0
 ZOOM_IMAGE, ZOOM_STRETCH, ZOOM_TURN = 0.01, 0.02, 0.03
 
 
-def prior_of(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
+def prior_of(camera: Camera, aspect_sigma: float) -> Prior:
     """Return the prior: square pixels and a centred principal point.
 
-    camera: centred, as found with one focal length. noise: variance of a residual, px^2. The
-    adjustment treats residuals in px as if their sigma were 1, so the prior's covariance is
-    divided by the noise.
+    camera: centred, as found with one focal length. aspect_sigma: of fy / fx.
     """
     width, _ = camera.image_size
     wide = (10 * camera.fx) ** 2
@@ -42,8 +42,8 @@ def prior_of(camera: Camera, config: IntrinsicsConfig, noise: float) -> Prior:
                       (CENTRE_SIGMA * width) ** 2, *np.square(camera.spread)])
     # fx is free; fy equals fx to within the sigma of the aspect ratio
     spread[0, 1] = spread[1, 0] = wide
-    spread[1, 1] += (config.aspect_sigma * camera.fx) ** 2
-    return Prior(_undistorted(camera), spread / noise)
+    spread[1, 1] += (aspect_sigma * camera.fx) ** 2
+    return Prior(_undistorted(camera), spread)
 
 
 def bounds_of(camera: Camera, focal_reach: float = FOCAL_BOUND) -> tuple[Floats, Floats]:
@@ -94,30 +94,16 @@ def _undistorted(camera: Camera) -> Floats:
     return type(camera).centred(camera.image_size, camera.fx).params
 
 
-def prior_information(camera: Camera, config: IntrinsicsConfig) -> Floats:
-    """Return the prior's information (n, n): the inverse of its covariance at unit noise."""
-    return np.asarray(np.linalg.inv(prior_of(camera, config, 1.0).covariance), np.float64)
-
-
-def centre_pull(camera: Camera, covariance: Floats) -> Floats:
-    """Return (n,) how far the prior of the centre has drawn the camera with this covariance.
-
-    The prior is right for lenses; a picture of which a side was cut off has its centre elsewhere.
-    """
-    width, height = camera.image_size
-    off = np.array([(width - 1) / 2, (height - 1) / 2]) - [camera.cx, camera.cy]
-    return np.asarray(covariance[:, 2:4] @ off / (CENTRE_SIGMA * width)**2)
-
-
-def prior_of_all(imaging: Imaging, centred: Camera, config: IntrinsicsConfig, field_sigma: float
+def prior_of_all(imaging: Imaging, centred: Camera, aspect_sigma: float, field_sigma: float
                  ) -> Quadratic:
     """Return the priors of the lens, the readout and the field, from their present values.
 
-    centred: the camera that the lens's prior is about. field_sigma: of each of the field's
-    directions, px; inf: it has none.
+    centred: the camera that the lens's prior is about. aspect_sigma: of fy / fx. field_sigma: of
+    each of the field's directions, px; inf: it has none.
     """
-    information = prior_information(centred, config)
-    off = imaging.camera.params - prior_of(centred, config, 1.0).mean
+    prior = prior_of(centred, aspect_sigma)
+    information = np.asarray(np.linalg.inv(prior.covariance), np.float64)
+    off = imaging.camera.params - prior.mean
     rest = np.r_[READOUT_SIGMA_S**-2, np.full(len(imaging.directions), field_sigma**-2)]
     return Quadratic.prior(information, rest, -np.r_[
         information @ off, rest * np.r_[imaging.readout_s, imaging.directions]])
