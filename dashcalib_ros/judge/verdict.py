@@ -213,7 +213,10 @@ def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
     A stabilised video's movement may have been taken out. The lens is right then, but no
     camera_info holds for pictures that move.
     """
-    clear = [each for each in solution.fixed_camera if each.clear]
+    known = float(solution.sigma[0] / solution.camera.fx)
+    # a zoom that is smaller than what is known of the focal length is none
+    clear = [each for each in solution.fixed_camera
+             if each.clear and not (each.kind == 'zoom' and each.size < known)]
     crop = largest_crop(solution.crops) if solution.crops else 0.0
     if crop > config.max_crop_sigmas * solution.picture.rms:
         return _moving('up to', crop, solution)

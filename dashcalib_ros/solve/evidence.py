@@ -41,11 +41,11 @@ BENDS = (5, 4)
 BEND_PX = 3.0
 # times what chance gains; more is clear
 CLEAR: Mapping[Kind, float] = {'shift': 2.0, 'zoom': 2.0, 'bend': 8.0}
-# of one turn alone, where chance gains up to 2.1
-CLEAR_ZOOM_IN_ONE_TURN = 3.0
-# of the shift behind a rolling shutter, of which bumps leave something over; and where a
-# stabiliser's crop was found: what is left of it
-ROLLING_SHIFT, LEFT_SHIFT = 2.7, 4.0
+# times these behind a rolling shutter, of which bumps leave something over; and in one turn alone.
+# Clips of 10 s of fixed cameras have up to 2.2 in one turn
+ROLLING, ONE_TURN = 1.35, 1.5
+# of the shift, where a stabiliser's crop was found: what is left of it
+LEFT_SHIFT = 4.0
 # what matters: of the width; of 1; px of 1000 px of width
 MATTERS: Mapping[Kind, float] = {'shift': 0.004, 'zoom': 0.004, 'bend': 0.3}
 # noise variances of a track by which a kind of lens must predict turns better
@@ -218,12 +218,12 @@ def fixed_camera_tests(found: Estimate, bent: bool = True) -> tuple[FixedCameraT
             float(np.sqrt(np.mean(np.square(np.concatenate(parts))))), MATTERS[kind] * unit,
             turns if kind == 'zoom' else {})
 
-    fixed = solved(None, own)
+    fixed, more = solved(None, own), ONE_TURN if len(now.scenes) == 1 else 1.0
+    if abs(now.imaging.readout_s) > LEAST_READOUT_S:
+        more *= ROLLING
     tests = [test('shift', solved(shifts, own), fixed,
-                  LEFT_SHIFT if now.moves else ROLLING_SHIFT
-                  if abs(now.imaging.readout_s) > LEAST_READOUT_S else CLEAR['shift'], width),
-             test('zoom', solved(zooms, own), fixed, CLEAR['zoom'] if len(now.scenes) > 1
-                  else CLEAR_ZOOM_IN_ONE_TURN, 1.0)]
+                  LEFT_SHIFT if now.moves else more * CLEAR['shift'], width),
+             test('zoom', solved(zooms, own), fixed, more * CLEAR['zoom'], 1.0)]
     if bent:
         # a stabilised picture goes on moving
         moving = shifts if now.moves else None
