@@ -58,8 +58,8 @@ class OtherCamera:
     what: str
 
     def __str__(self) -> str:
-        return (f'the images are of two cameras: {self.shown} of {self.looks} that lie between '
-                f'those used and were looked at show {self.what}')
+        return (f'the images are of two cameras: between those that are used, {self.shown} of '
+                f'{self.looks} that were looked at show {self.what}')
 
 
 class OneCamera:
