@@ -375,6 +375,8 @@ def test_services_say_why_not(plain):
     ({'rectified': 'whole'}, 'must be one of same, crop, all'),
     ({'reliability': 'perfect'}, 'must be one of'),
     ({'camera_name': 'narrow_stereo'}, 'belongs to image_pipeline'),
+    ({'imu_topic': "'a b'"}, "imu_topic 'a b' is no name of a topic"),
+    ({'fix_topic': '/'}, "fix_topic '/' is no name of a topic"),
     ({'mask_file': 'missing.png'}, 'cannot read the mask'),
     ({'mask_file': '~nobody-of-this-name/mask.png'}, 'cannot read the mask'),
     ({'mask__segmentation': '~nobody-of-this-name/m.onnx'}, 'there is no segmentation model'),
