@@ -55,10 +55,9 @@ setup(
         'completion': ['argcomplete>=3'],
         'segmentation': ['onnxruntime>=1.17'],
         # its wheels end at Python 3.12
-        'motion': ['gpxpy>=1.5', 'telemetry-parser>=0.3; python_version < "3.13"'],
+        'motion': ['telemetry-parser>=0.3; python_version < "3.13"'],
         'fleet': ['ray[client]>=2.40', 'pyarrow>=15', 'fsspec>=2024.2'],
         'test': ['pytest>=8', 'pytest-xdist>=3', 'hypothesis>=6', 'ruff', 'mypy', 'types-PyYAML',
-                 'gpxpy>=1.5',
                  'onnxruntime>=1.17', 'onnx>=1.16', 'argcomplete>=3', 'wheel', 'nbclient>=0.10',
                  'ipykernel>=6', 'matplotlib>=3.8', 'ray>=2.40', 'pyarrow>=15',
                  'fsspec>=2024.2'],
