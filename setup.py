@@ -42,6 +42,7 @@ setup(
         'pycolmap>=4.2',
         'pyceres>=2.6',
         'rosbags>=0.11.9',
+        'apsw',
         'mcap>=1.2',
         'backports.zstd>=1; python_version < "3.14"',
         'lz4>=4',

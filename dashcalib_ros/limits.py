@@ -25,8 +25,12 @@ SIDE = 65_535
 PICTURE_BYTES = MESSAGE_BYTES = 2**28
 # of one unpacked chunk of a bag: recorders end it at about 1 MB, or after one large message
 CHUNK_BYTES = MESSAGE_BYTES + 2**25
-# of the chunks of a bag that overlap in time: all are in memory at once
+# of one record of an MCAP as it is stored: a chunk, or a file that is attached
+RECORD_BYTES = 2**29
+# of the chunks of an MCAP that overlap in time: all are in memory at once
 OVERLAPPING_BYTES = 2**29
+# of the index of a bag, which takes 12 times as much in memory, and topics of a bag
+INDEX_BYTES, TOPICS = 2**26, 10_000
 # steps of SQLite for a byte of a database: reading a whole bag five times takes one
 SQLITE_STEPS = 20
 # of a calibration, a configuration or the metadata.yaml of 3000 files

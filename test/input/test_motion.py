@@ -112,8 +112,8 @@ def test_a_gpx_may_have_any_prefix_fractions_zones_and_damaged_points(tmp_path):
     text = ('<?xml version="1.0" encoding="UTF-8"?><g:gpx xmlns:g="http://example.com/g">'
             '<g:wpt lat="1" lon="1"><g:time>2020-01-01T00:00:00Z</g:time></g:wpt><g:trk>'
             '<g:trkseg><g:trkpt lat="1" lon="1"/>' + ''.join(
-                f'<g:trkpt lat="{lat}" lon="8.{n:03d}"><g:ele>1{n}.5</g:ele><g:extensions><x y="1">7'
-                f'</x></g:extensions><g:time> {time} </g:time></g:trkpt>'
+                f'<g:trkpt lat="{lat}" lon="8.{n:03d}"><g:ele>1{n}.5</g:ele><x><x y="1">7'
+                f'</x></x><g:time> {time} </g:time></g:trkpt>'
                 for n, (lat, time) in enumerate([
                     ('49', '2023-11-14T23:13:20.250+01:00'), ('49.1', '2023-11-14T22:13:21.5Z'),
                     *[('49.1', f'2023-11-14T22:13:{n}') for n in range(22, 32)],
@@ -152,7 +152,8 @@ def test_a_line_without_an_end_comes_in_parts(tmp_path):
 
 
 @pytest.mark.parametrize('text', [
-    '<gpx ' + ' '.join(f'xmlns:n{n}="u{n}"' for n in range(20_000)) + '>', '<n:gpx>', '<a>' * 50_000,
+    '<gpx ' + ' '.join(f'xmlns:n{n}="u{n}"' for n in range(20_000)) + '>',
+    '<n:gpx>', '<a>' * 50_000,
     '<!DOCTYPE gpx><gpx></gpx>', '<gpx>' + '<trkpt/>' * 1000 + '</gpx>', '\0',
     '<gpx>' + ''.join(f'<a{n}/>' for n in range(2000)) + '</gpx>',
     '<gpx ' + ' '.join(f'a{n}=""' for n in range(2000)) + '/>'])
