@@ -27,7 +27,7 @@ from dashcalib_ros.fleet.clips import (
 from dashcalib_ros.fleet.engine import DiedError, Engine, Task
 from dashcalib_ros.fleet.fuse import fuse
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.storage import is_url, joined, read, remove, write
+from dashcalib_ros.fleet.storage import is_url, joined, read, remove, stamp, write
 from dashcalib_ros.judge.conclude import versions
 from dashcalib_ros.report import write_results
 from dashcalib_ros.report.files import ACCEPTED, WEAK
@@ -134,8 +134,9 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
         tell(camera, outcome)
         if len(camera.results) == len(camera.rows):
             camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered, {})
-            if all(result.problem == GONE for _, result in camera.gathered):
-                # it has no files of its own, unless it had some before
+            # where it has files of earlier, they must not stay as they are
+            if (all(result.problem == GONE for _, result in camera.gathered)
+                    and not stamp(joined(out, tables.camera_folder(camera.name)))):
                 _failed(camera, InputError('none of its clips is there; check the paths'))
                 tell(camera, None)
             elif camera.name:
