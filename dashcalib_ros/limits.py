@@ -9,9 +9,10 @@ from __future__ import annotations
 import itertools
 import json
 import stat
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import TextIOWrapper
+from io import SEEK_END, TextIOWrapper
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -57,6 +58,8 @@ OXTS_BYTES, OXTS_FILES = 2**12, 1_000_000
 MANIFEST_BYTES, MANIFEST_ROWS = 2**28, 1_000_000
 # of one array of an .npz that may be part of a calibration, and how many an .npz may have
 ARRAY_BYTES, ARRAYS = 4096, 1000
+# px, or a coefficient, of a camera; a rational model's may be thousands
+LENS_NUMBER = 1e7
 # digits of a number in a text: a float has 17 digits and at most 308 zeros
 DIGITS = 300
 # times the size of a .zstd file, or of a bag whose chunks are packed, once unpacked: raw pictures
@@ -66,6 +69,9 @@ UNPACKED_RATIO = 200
 UNPACKED_LEAST = 2**28
 # bytes that unpacking leaves free on the disk
 FREE_BYTES = 2**30
+
+# bytes in which a zip file's end is, of its end without a comment, and of an entry of its list
+ZIP_TAIL, ZIP_END, ZIP_ENTRY = 2**16 + 22, 22, 200
 
 TOO_LARGE = f'more than {PIXELS // 10**6} million pixels are not taken'
 
@@ -195,6 +201,29 @@ def _nodes(root: Any, level: int = 1) -> Iterator[tuple[Any, int]]:
     if root.id != 'scalar':
         for node in itertools.chain(*root.value) if root.id == 'mapping' else root.value:
             yield from _nodes(node, level + 1)
+
+
+def check_npz(file: BinaryIO, parts: int) -> None:
+    """Raise ValueError for a file of more parts, or packed as numpy packs none.
+
+    zipfile takes memory for each part in its list, and with other kinds any amount to unpack one.
+    """
+    size = file.seek(0, SEEK_END)
+    file.seek(max(0, size - ZIP_TAIL))
+    tail = file.read()
+    end = tail.rfind(b'PK\5\6')
+    if end < 0 or len(tail) - end < ZIP_END or b'PK\6\7' in tail[max(0, end - 20):end]:
+        raise ValueError('it is no .npz, or is cut off')
+    if int.from_bytes(tail[end + 12:end + 16], 'little') > parts * ZIP_ENTRY:
+        raise ValueError('it has too many parts')
+    file.seek(0)
+    with zipfile.ZipFile(file) as packed:
+        if len(packed.infolist()) > parts:
+            raise ValueError('it has too many parts')
+        if any(each.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+               for each in packed.infolist()):
+            raise ValueError('it is compressed in an unknown way')
+    file.seek(0)
 
 
 def parse_json(text: str, what: str) -> Any:
