@@ -31,6 +31,9 @@ LEAST_CLIPS = 3
 # the end of a camera's folder whose name is not the camera's
 HASHED = re.compile(r'-[0-9a-f]{32}$')
 
+# how a text begins that a spreadsheet runs
+FORMULA = ('=', '+', '-', '@', '\t', '\r', '\n')
+
 # each column's type
 CAMERA_COLUMNS = {
     **dict.fromkeys(('camera', 'make', 'verdict', 'verdict_alone', 'model'), 'text'),
@@ -166,7 +169,7 @@ def write_table(out: str, name: str, rows: Sequence[Mapping[str, Any]],
     plain = [{key: _plain(row[key]) for key in columns} for row in rows]
     text = io.StringIO()
     csv.writer(text, lineterminator='\n').writerows([columns, *(
-        ['; '.join(value) if isinstance(value, list) else value for value in row.values()]
+        [_cell('; '.join(value) if isinstance(value, list) else value) for value in row.values()]
         for row in plain)])
     typed = {f'{name}.parquet': _parquet(plain, columns)} if has('pyarrow') else {
         f'{name}.jsonl': ''.join(json.dumps(row, ensure_ascii=False) + '\n' for row in plain
@@ -187,6 +190,11 @@ def _parquet(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> b
     data = io.BytesIO()
     parquet.write_table(table, data, compression='zstd')
     return data.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    """Return a value that a spreadsheet shows: texts that begin so are formulas to it."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
 
 
 def _plain(value: Any) -> Any:
