@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from dashcalib_ros.camera import calibrated_models
+from dashcalib_ros.errors import visible
 from dashcalib_ros.fleet.clips import ClipResult, hash_of
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.solved import ClipShare, Final, Solved
@@ -32,7 +33,7 @@ LEAST_CLIPS = 3
 HASHED = re.compile(r'-[0-9a-f]{32}$')
 
 # how a text begins that a spreadsheet runs
-FORMULA = ('=', '+', '-', '@', '\t', '\r', '\n')
+FORMULA = ('=', '+', '-', '@')
 
 # each column's type
 CAMERA_COLUMNS = {
@@ -193,8 +194,11 @@ def _parquet(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> b
 
 
 def _cell(value: Any) -> Any:
-    """Return a value that a spreadsheet shows: texts that begin so are formulas to it."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
+    """Return a value that is one cell to every program, and text to a spreadsheet."""
+    if not isinstance(value, str):
+        return value
+    text = visible(value)
+    return f"'{text}" if text.startswith(FORMULA) else text
 
 
 def _plain(value: Any) -> Any:

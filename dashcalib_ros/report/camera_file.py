@@ -114,6 +114,10 @@ def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedC
 
 def load_with_faults(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
     """Read a camera as load_camera() does; what stands wrong beside it is in its faults."""
+    return _seeing(_loaded(path, name))
+
+
+def _loaded(path: str | os.PathLike[str], name: str | None) -> NamedCamera:
     text = os.fspath(path)
     before, _, after = text.rpartition(':')
     # lexists() takes any text, also one that is too long for a name
@@ -247,10 +251,15 @@ def _check_lens(camera: Camera, path: str | Path) -> None:
         if abs(value) > LENS_NUMBER:
             raise InputError(f'{path} has {name} = {value:.4g}, which no lens has; give a '
                              f'complete calibration in px')
+
+
+def _seeing(found: NamedCamera) -> NamedCamera:
+    """Return it; raises InputError where no pixel of its picture has a ray."""
     with np.errstate(all='ignore'):
-        if not np.isfinite(camera.rays(grid_of(camera))).all(axis=1).any():
-            raise InputError(f'{path} is of a lens that sees no ray in its picture of '
-                             f'{camera.image_size[0]}x{camera.image_size[1]}; calibrate anew')
+        if not np.isfinite(found.camera.rays(grid_of(found.camera))).all(axis=1).any():
+            raise InputError(f'{found.name} is of a lens that sees no ray in its picture of '
+                             f'{found.image_size[0]}x{found.image_size[1]}; calibrate anew')
+    return found
 
 
 def _view(k: Sequence[float]) -> list[float]:

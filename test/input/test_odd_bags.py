@@ -8,6 +8,7 @@ import sqlite3
 
 import lz4.frame
 import pytest
+import yaml
 import zstandard
 from made_drives import (
     ROS2,
@@ -239,6 +240,32 @@ def test_a_count_that_is_none_is_no_obstacle(tmp_path, count):
     source = open_frames(bag)
     same(list(source), drive(3))
     assert 'no usable metadata.yaml' in source.warnings[0]
+
+
+@pytest.mark.parametrize('names', [
+    ['../../etc/passwd'], ['/etc/passwd', '/dev/zero'], ['..', '.', ''],
+    [f'f{n}.mcap' for n in range(1000)]])
+def test_a_metadata_file_that_names_other_files_is_not_used(tmp_path, names):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)))
+    source = open_frames(listing(bag, names))
+    same(list(source), drive(3))
+    assert 'no usable metadata.yaml' in source.warnings[0]
+
+
+def test_a_file_that_is_listed_a_thousand_times_is_read_once(tmp_path):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)))
+    source = open_frames(listing(bag, 1000 * [storage(bag).name]))
+    same(list(source), drive(3))
+    assert source.warnings == ()
+
+
+def listing(bag, names):
+    """Let a bag's metadata.yaml list these files."""
+    path = bag / 'metadata.yaml'
+    content = yaml.safe_load(path.read_text())
+    content['rosbag2_bagfile_information']['relative_file_paths'] = names
+    path.write_text(yaml.safe_dump(content))
+    return bag
 
 
 def test_a_metadata_file_that_is_a_pipe_is_no_obstacle(tmp_path):
