@@ -697,7 +697,7 @@ def endless_databases() -> list[str]:
 
 
 def packed_bag(path: Path, same_time: bool, indexed: bool) -> None:
-    """Write an MCAP of 100 chunks of 64 MB each, in less than 1 MB."""
+    """Write an MCAP of 200 chunks of 256 MB each, in less than 10 MB."""
     from mcap.writer import CompressionType, IndexType, Writer
     with path.open('wb') as stream:
         writer = Writer(stream, chunk_size=1, compression=CompressionType.ZSTD,
@@ -705,8 +705,8 @@ def packed_bag(path: Path, same_time: bool, indexed: bool) -> None:
         writer.start('ros2', 'hostile')
         schema = writer.register_schema('sensor_msgs/msg/Image', 'ros2msg', b'')
         channel = writer.register_channel('/camera', 'cdr', schema)
-        data = bytes(2**26)
-        for n in range(100):
+        data = bytes(2**28 - 100)
+        for n in range(200):
             stamp_ns = 1 if same_time else n + 1
             writer.add_message(channel, stamp_ns, data, stamp_ns)
         writer.finish()
