@@ -12,7 +12,6 @@ import shutil
 import sqlite3
 import struct
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -44,6 +43,7 @@ from dashcalib_ros.limits import (
     UNPACKED_LEAST,
     UNPACKED_RATIO,
 )
+from dashcalib_ros.whole_files import temporary_folder
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -114,8 +114,8 @@ def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
     if file.suffix.lower() != '.zstd':
         yield file
         return
-    with tempfile.TemporaryDirectory(prefix='dashcalib-') as folder:
-        plain = Path(folder, file.stem)
+    with temporary_folder() as folder:
+        plain = folder / file.stem
         try:
             _unpack_file(file, plain)
         except (zstd.ZstdError, EOFError):
