@@ -13,8 +13,8 @@ import sqlite3
 import struct
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from io import BufferedReader, BytesIO
@@ -36,6 +36,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.input.source import first_of
 from dashcalib_ros.limits import (
     CHUNK_BYTES,
     FREE_BYTES,
@@ -109,36 +110,83 @@ _WITHIN_LIMIT = _WithinLimit()
 def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
     """Give the file; of a .zstd file, a temporary copy of what could be unpacked.
 
-    Raises InputError where that is too much for a recording or for the disk; OSError.
+    Also of an SQLite file whose recorder was killed: its last messages are in a journal beside
+    it. Raises InputError where a copy is too much for a recording or for the disk; OSError.
     """
-    if file.suffix.lower() != '.zstd':
+    packed = file.suffix.lower() == '.zstd'
+    journals = [] if packed else _journals(file)
+    if not packed and not journals:
         yield file
         return
     with temporary_folder() as folder:
-        plain = folder / file.stem
+        plain = folder / (file.stem if packed else file.name)
         try:
-            _unpack_file(file, plain)
+            if packed:
+                _unpack_file(file, plain)
+            else:
+                _complete(file, journals, plain)
+                damage(f'{file.name} was not closed, and its end is taken from '
+                       f'{first_of([each.name for each in journals])}')
         except (zstd.ZstdError, EOFError):
             damage(f'{file.name} is damaged')
+        except sqlite3.DatabaseError as error:
+            damage(f'{file.name} was not closed, and {journals[0].name}, which has its end, '
+                   f'cannot be used ({one_line(error)})')
+            plain = file
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            raise InputError(f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, '
-                             f'or unpack it first (zstd -d)') from error
+            cure = ', or unpack it first (zstd -d)' if packed else ''
+            raise InputError(f'no room to {"unpack" if packed else "copy"} {file} in {folder}: '
+                             f'set TMPDIR to a bigger disk{cure}') from error
         yield plain
 
 
 def _unpack_file(packed: Path, plain: Path) -> None:
     limit = max(UNPACKED_LEAST, UNPACKED_RATIO * packed.stat().st_size)
-    with zstd.open(packed, 'rb') as source, plain.open('wb', PIECE) as output:
-        while piece := source.read1(PIECE):
-            if output.tell() + len(piece) > limit:
+    with zstd.open(packed, 'rb') as source:
+        for size in _copied(source.read1, plain):
+            if size > limit:
                 raise InputError(
                     f'{packed} unpacks to more than {limit / 2**20:.0f} MB, which is no '
                     f'recording; if it is one, unpack it first (zstd -d)')
+
+
+def _copied(read: Callable[[int], bytes], plain: Path) -> Iterator[int]:
+    """Write what is read to a file; yield its size before each piece. Leaves FREE_BYTES free."""
+    with plain.open('wb', PIECE) as output:
+        while piece := read(PIECE):
+            yield output.tell() + len(piece)
             if shutil.disk_usage(plain.parent).free < FREE_BYTES:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             output.write(piece)
+
+
+def _journals(file: Path) -> list[Path]:
+    """Return what SQLite has beside a file that was not closed: messages that are not in it yet.
+
+    A rollback journal is one too: what is half-written in the file is in it as it was before.
+    """
+    beside = (file.with_name(f'{file.name}{end}') for end in ('-wal', '-journal'))
+    return [each for each in beside if each.is_file() and each.stat().st_size]
+
+
+def _complete(file: Path, journals: Sequence[Path], plain: Path) -> None:
+    """Make a copy of a database with what its journals have; raises OSError, sqlite3's errors.
+
+    Opening the file itself would write to it.
+    """
+    for source in (file, *journals):
+        with source.open('rb') as stream:
+            target = plain.with_name(f'{plain.name}{source.name.removeprefix(file.name)}')
+            for _ in _copied(stream.read, target):
+                pass
+    with closing(sqlite3.connect(plain)) as database:
+        database.execute('PRAGMA schema_version').fetchone()  # takes a rollback journal
+        _, frames, _ = database.execute('PRAGMA wal_checkpoint').fetchone()
+        if not frames:
+            raise sqlite3.DatabaseError('nothing in it is whole')
+        database.execute('PRAGMA journal_mode = DELETE')
 
 
 @dataclass(frozen=True)
@@ -188,7 +236,8 @@ def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]]
             with _WITHIN_LIMIT, _reader(path) as reader:
                 for connection in reader.connections:
                     counts[connection.topic, connection.msgtype] += connection.msgcount
-            return counts, True
+            # what a journal has that cannot be used is not counted
+            return counts, path != file or not _journals(file)
         except Exception:  # a damaged file makes rosbags raise nearly anything
             return Counter((record.topic, record.msgtype) for record in scan(path, damage)), False
 

@@ -182,8 +182,12 @@ def _check_limits(path: Path) -> None:
     if path.is_dir():
         parse_yaml(read_text(path / METADATA, YAML_BYTES), str(path / METADATA))
     for file in open_bag(path).files:
-        with unpacked(file, lambda _: None):
+        with unpacked(file, _refuse):
             pass
+
+
+def _refuse(damage: str) -> None:
+    raise InputError(damage)
 
 
 def _camera_info(types: Any, c: RosCamera, header: Any) -> Any:

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -30,6 +31,8 @@ NO_TIMES = 0x80
 THREADS = min(4, os.cpu_count() or 1)
 # pictures at the beginning whose times tell the rate; one of them can be decoded
 LOOKED_AT = 100
+# of an MP4 that are looked at: it has some five, and a fragmented one begins with its index
+BOXES = 1000
 # of the rate that the video says, by which --fps may be off
 ALIKE = 0.02
 # of the pictures that a video promises, by its length and its rate or by their number
@@ -221,8 +224,32 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, av.VideoStream]]:
 
 
 def _unplayable(path: Path) -> InputError:
+    if _lacks_index(path):
+        return InputError(f'{path} was not closed: the camera lost its power, or the copy ended, '
+                          f'before it had its index (moov); copy it again, or make the index '
+                          f'anew from a whole video of the same camera (untrunc WHOLE.mp4 '
+                          f'{path.name})')
     return InputError(f'{path} is no video that can be played, or it is cut off: copy it again, '
                       f'or convert it (ffmpeg -i IN -c:v libx264 OUT.mp4)')
+
+
+def _lacks_index(path: Path) -> bool:
+    """Return whether an MP4 has pictures, but not where they are: that is written at its end."""
+    size, at, pictures = path.stat().st_size, 0, False
+    with path.open('rb') as file:
+        for _ in range(BOXES):
+            if at + 16 > size:
+                break
+            file.seek(at)
+            length, name, long = struct.unpack('>I4sQ', file.read(16))
+            if name == b'moov' or not name.isalnum():
+                return False
+            pictures |= name == b'mdat'
+            length = long if length == 1 else length
+            if length < 8:  # up to the end of the file
+                break
+            at += length
+    return pictures
 
 
 def _undecodable() -> InputError:
