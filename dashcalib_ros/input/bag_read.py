@@ -136,9 +136,11 @@ def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            cure = ', or unpack it first (zstd -d)' if packed else ''
-            raise InputError(f'no room to {"unpack" if packed else "copy"} {file} in {folder}: '
-                             f'set TMPDIR to a bigger disk{cure}') from error
+            raise InputError(
+                f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, or unpack it '
+                f'first (zstd -d)' if packed else
+                f'no room to copy {file}, which was not closed, to {folder}: set TMPDIR to a '
+                f'bigger disk, or close it first (sqlite3 {file.name} .schema)') from error
         yield plain
 
 

@@ -9,9 +9,13 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dashcalib_ros.arrays import GreyImage, Pixels
 from dashcalib_ros.errors import InputError, shortened
+
+if TYPE_CHECKING:
+    from dashcalib_ros.camera import Camera
 
 IMAGE_SUFFIXES = frozenset(
     ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'))
@@ -136,7 +140,8 @@ class FrameSource(ABC):
     name: of the drive, for messages.
     count: how many images to expect (for a progress bar), None if unknown.
     topic: the bag's image topic; None for videos and folders.
-    size: (width, height) where it is known before the first image, else None.
+    size: (width, height) where it is known before the first image, else None. stored_size: that
+    of the pictures as they are stored, where their pixels are not square; else None.
     length_ns: how long the drive is where its stamps are counted from 0, else None.
     recorded: its stamps are times of recording, as a bag has them. begin_ns: when it began, None
     where that is not known.
@@ -149,6 +154,7 @@ class FrameSource(ABC):
     """
 
     size: tuple[int, int] | None = None
+    stored_size: tuple[int, int] | None = None
     length_ns: int | None = None
     recorded = False
     contradictions: tuple[str, ...] = ()
@@ -173,6 +179,24 @@ class FrameSource(ABC):
     def warnings(self) -> tuple[str, ...]:
         """Return what the user should know, one line each; complete after the last frame."""
         return self.contradictions + self._opening_warnings + self._reading_warnings
+
+    def stored(self, camera: Camera) -> Camera | None:
+        """Return a camera of these images for the pictures as they are stored.
+
+        None where that is the same.
+        """
+        return self._stretched(camera, self.size, self.stored_size)
+
+    def shown(self, camera: Camera) -> Camera:
+        """Return the camera of these images, of one for the pictures as they are stored."""
+        return self._stretched(camera, self.stored_size, self.size) or camera
+
+    @staticmethod
+    def _stretched(camera: Camera, before: tuple[int, int] | None, after: tuple[int, int] | None
+                   ) -> Camera | None:
+        if before is None or after is None or camera.image_size != before:
+            return None
+        return camera.resized(after[0] / before[0], after, after[1] / before[1])
 
     def excerpt(self, start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
         """Return the part of the drive from start_s on, duration_s long; None: to its end."""

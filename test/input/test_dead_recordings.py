@@ -62,7 +62,7 @@ def test_messages_that_are_in_the_write_ahead_log_are_read(tmp_path):
         assert f'its end is taken from {file.name}-wal' in source.warnings[-1]
     # nothing is written to a recording
     assert {path.name: path.read_bytes() for path in file.parent.iterdir()} == before
-    with pytest.raises(InputError, match='was not closed.* repair it first'):
+    with pytest.raises(InputError, match=r'was not closed.* repair it first'):
         check_bag(file, '/camera', tmp_path / 'out')
     file.with_name(f'{file.name}-wal').unlink()
     assert len(list(open_frames(file))) == 10
