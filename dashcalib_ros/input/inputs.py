@@ -8,7 +8,7 @@ import glob
 import math
 import os
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -25,6 +25,7 @@ from dashcalib_ros.input.source import (
     Reading,
     by,
     by_name,
+    cameras_named,
     first_of,
     is_bag_file,
     os_error,
@@ -60,14 +61,6 @@ MAKERS = {maker: re.compile(name, re.IGNORECASE) for maker, name in (
     ('BlackVue names', r'(?P<t>\d{8}_\d{6})(?P<n>)_[A-Z](?P<c>[A-Z])[LS]?'),
     ('Insta360 names', r'(?:PRO_)?VID_(?P<t>\d{8}_\d{6})_(?P<c>\d\d)_(?P<n>\d+)(?:_\d+)?'),
     ('Vantrue names', r'(?P<t>\d{8}_\d{6})_(?P<n>\d+)_(?:[A-Z]_)?(?P<c>[ABC])'))}
-# how others name the camera of several that record at a time: 2026-01-31_10-00-00-left_repeater,
-# CH1_20260131, and one letter: NO20260131-100000-000123F, REC_2026_01_31_F, 260131_100000_001_FH
-SIDE_WORD = re.compile(
-    r'(?<![a-z])(?:front|back|rear|left|right|(?:in|out)side|interior|cabin|inner|driver|repeater'
-    r'|pillar'
-    r'|(?:ch|cam|camera|channel)[-_ ]?\d{1,2})(?![a-z0-9])')
-SIDE_LETTER = re.compile(r'(?<=[\d_ -])([a-z])[hls]?$')
-SIDES = frozenset('fbrli')
 # names of files in a message; of more only the first and the last are told
 TOLD = 12
 
@@ -229,23 +222,7 @@ def _numbered(source: FrameSource) -> tuple[str, str, int, str]:
 def _cameras(sources: Sequence[FrameSource]) -> int:
     """Return how many cameras recorded these, as their names tell."""
     by_maker = {camera for *_, camera in map(_numbered, sources)}
-    return max(len(by_maker), _sides(Path(source.name).stem for source in sources))
-
-
-def _sides(stems: Iterable[str]) -> int:
-    """Return of how many cameras these names are: what they differ in names a side of the car."""
-    words: defaultdict[str, set[str]] = defaultdict(set)
-    letters: defaultdict[str, set[str]] = defaultdict(set)
-    lower = {stem.lower() for stem in stems}
-    for stem in lower:
-        if found := SIDE_WORD.findall(stem):
-            words[SIDE_WORD.sub('', stem).strip('-_ ')].add(' '.join(found))
-        elif letter := SIDE_LETTER.search(stem):
-            letters[stem[:letter.start()].strip('-_ ')].add(letter[1])
-    # a to f are parts of one drive
-    groups = words | {rest: each for rest, each in letters.items() if each <= SIDES}
-    # some name only the second camera
-    return max((len(each) + (rest in lower) for rest, each in groups.items()), default=0)
+    return max(len(by_maker), cameras_named([source.name for source in sources]))
 
 
 def _listed(sources: Sequence[FrameSource]) -> str:
@@ -331,7 +308,7 @@ class FolderSource(FrameSource):
         self._names = sorted(filter(_is_image, names), key=by_name)
         if not self._names:
             raise InputError(_no_images(path, names))
-        if (cameras := _sides(Path(name).stem for name in self._names)) > 1:
+        if (cameras := cameras_named(self._names)) > 1:
             raise InputError(f'{path} has pictures of {cameras} cameras '
                              f'({first_of(self._names)}): put those of one into a folder of '
                              f'their own')

@@ -4,6 +4,7 @@ from __future__ import annotations
 import copy
 import re
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
@@ -24,6 +25,14 @@ BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
 METADATA = 'metadata.yaml'
 # ns; what a stamp of 64 bits holds
 LAST_NS = 2**63 - 1
+# how others name the camera of several that record at a time: 2026-01-31_10-00-00-left_repeater,
+# CH1_20260131, and one letter: NO20260131-100000-000123F, REC_2026_01_31_F, 260131_100000_001_FH
+SIDE_WORD = re.compile(
+    r'(?<![a-z])(?:front|back|rear|left|right|(?:in|out)side|interior|cabin|inner|driver|repeater'
+    r'|pillar'
+    r'|(?:ch|cam|camera|channel)[-_ ]?\d{1,2})(?![a-z0-9])')
+SIDE_LETTER = re.compile(r'(?<=[\d_ -])([a-z])[hls]?$')
+SIDES = frozenset('fbrli')
 # images are further apart; stamps are rounded
 CLOSE_NS = 1_000_000
 
@@ -32,6 +41,25 @@ def by_name(name: str) -> tuple[list[tuple[int, str]], str]:
     """Return a sort key for names in which numbers count as numbers: 2.png before 10.png."""
     parts = re.findall(r'[0-9]+|[^0-9]+', name)
     return [(int(part), '') if part[0] in '0123456789' else (-1, part) for part in parts], name
+
+
+def cameras_named(names: Sequence[str]) -> int:
+    """Return of how many cameras these files are: what they differ in names a side of the car."""
+    stems = {str(path.parent / path.stem).lower() for path in map(Path, names)}
+    found = [(SIDE_WORD.sub('', stem), SIDE_WORD.findall(stem)) for stem in stems]
+    letters: defaultdict[str, set[str]] = defaultdict(set)
+    for rest, _ in found:
+        if letter := SIDE_LETTER.search(rest):
+            letters[rest[:letter.start()]].add(letter[1])
+    cameras: defaultdict[str, set[str]] = defaultdict(set)
+    for rest, side in found:
+        letter = SIDE_LETTER.search(rest)
+        others = letters[rest[:letter.start()]] if letter else set()
+        # a to f are parts of one drive; some name the rear camera only
+        if letter and others <= SIDES and (len(others) > 1 or others == {'r'}):
+            rest, side = rest[:letter.start()], [*side, letter[1]]
+        cameras[rest.strip('-_ ')].add(' '.join(side))
+    return max(map(len, cameras.values()), default=0)
 
 
 def by(size: tuple[int, int]) -> str:

@@ -112,6 +112,7 @@ TWO_CAMERAS = {
     'Insta360': ('VID_20260131_100000_00_001', 'VID_20260131_100000_10_001'),
     'words': ('drive-front', 'drive-back'), 'letters': ('drive_f', 'drive_r'),
     'channels': ('20260131_CH1', '20260131_CH2'), 'channels before': ('ch01_31', 'ch02_31'),
+    'folders': ('Front/NO20260131-100000-000123F', 'Back/NO20260131-100000-000123B'),
     'cameras': ('cam0-run', 'cam1-run'), 'only the rear one': ('20260131', '20260131_R'),
     'nuScenes': ('CAM_FRONT_LEFT', 'CAM_FRONT_RIGHT')}
 
@@ -121,6 +122,7 @@ def link_as(names, folder, suffix):
     folder.mkdir()
     video = write_video(folder.parent / f'one{suffix}', smooth())
     for name in names:
+        (folder / name).parent.mkdir(exist_ok=True)
         (folder / f'{name}{suffix}').hardlink_to(video)
     return folder
 
@@ -128,7 +130,8 @@ def link_as(names, folder, suffix):
 @pytest.mark.parametrize('maker', TWO_CAMERAS)
 def test_two_cameras_of_one_car_are_not_one_drive(tmp_path, maker):
     folder = link_as(TWO_CAMERAS[maker], tmp_path / 'clips', '.avi')
-    fails('recordings of 2 cameras .*: give a pattern that names one', folder)
+    fails('recordings of 2 cameras .*: give a pattern that names one',
+          folder / '*/*' if maker == 'folders' else folder)
     first, second = (next(folder.glob(f'{name}.avi')) for name in TWO_CAMERAS[maker][:2])
     assert open_frames(first).count == 12
     # who names them means them
@@ -138,7 +141,8 @@ def test_two_cameras_of_one_car_are_not_one_drive(tmp_path, maker):
 @pytest.mark.parametrize('names', [
     'abcdef', ('drive_a', 'drive_b', 'drive_c', 'drive_f'), ('2026_f', '2027_f'),
     ('front_1', 'front_2'), ('backup', 'frontier'), ('cam1_a', 'cam1_b'),
-    ('one_front', 'two_back'), ('camera 2026', 'camera 2027'), ('leftover', 'rightmost')])
+    ('one_front', 'two_back'),
+    ('drive', 'drive_b'), ('camera 2026', 'camera 2027'), ('leftover', 'rightmost')])
 def test_parts_of_a_drive_are_not_taken_for_cameras(tmp_path, names):
     assert open_frames(link_as(names, tmp_path / 'clips', '.avi')).count == 12 * len(names)
 
@@ -152,6 +156,15 @@ def test_pictures_of_two_cameras_in_one_folder(tmp_path):
         fails('pictures of 2 cameras .*: put those of one into a folder', folder, fps=10)
         (folder / f'{names[1]}.png').unlink()
         assert open_frames(folder, fps=10).count == 1
+
+
+def test_bags_of_two_cameras_in_one_folder(tmp_path):
+    (tmp_path / 'bags').mkdir()
+    for name in ('front_0', 'rear_0'):
+        storage(write_bag(tmp_path / name, images(drive(3)))).rename(
+            tmp_path / f'bags/{name}.mcap')
+    fails('recordings of 2 cameras .*: give the files of one', tmp_path / 'bags')
+    assert open_frames(tmp_path / 'bags/rear_0.mcap').count == 3
 
 
 def test_previews_beside_videos_are_left_alone(tmp_path):
