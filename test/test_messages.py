@@ -35,6 +35,8 @@ PARTS = {
         "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"},
     'input/bag_read.py': {
         '… does not start like a bag', '… has a broken chunk (…)', 'a packed part is cut off',
+        'nothing in it is whole', '… was not closed, and its end is taken from …',
+        '… was not closed, and …, which has its end, cannot be used (…)',
         'a part of the bag unpacks to more than … MB',
         'the index does not lead to all messages'},
     'input/bag_storage.py': {

@@ -159,6 +159,8 @@ JSON: Argument = ('--json', {**FLAG, 'help': 'print JSON'})
 # of the drive, behind INPUT
 DRIVE: tuple[Argument, ...] = (
     ('--topic', {'metavar': 'T', 'help': "the bag's image topic"}),
+    ('--stream', {'metavar': 'N', 'dest': 'topic',
+                  'help': "the video's stream, where it has several: 1, 2 ..."}),
     ('--fps', {'type': POSITIVE, 'metavar': 'F', 'help': 'rate of a video or image folder'}),
     ('--start', {'type': SECONDS, 'default': 0.0, 'metavar': 'S',
                  'help': 'leave out the first S seconds of the drive'}),

@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from tempfile import TemporaryDirectory
 
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH
 from dashcalib_ros.cli.drive import read_config
@@ -45,9 +44,7 @@ def batch(args: argparse.Namespace) -> int:
         write_stderr(
             f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(cameras), "camera")}; '
             f'Ctrl-C keeps what is done in {args.out}, and the same command goes on')
-    # a child that is killed leaves its copy of a packed or remote clip in the scratch folder
-    with (TemporaryDirectory(prefix='dashcalib-', ignore_cleanup_errors=True) as scratch,
-          closing(_engine(args, config, scratch)) as engine):
+    with closing(_engine(args, config)) as engine:
         try:
             with progress.stages:
                 files = calibrate_fleet(cameras, args.out, config, engine, args.shard is None,
@@ -63,7 +60,7 @@ def batch(args: argparse.Namespace) -> int:
     return _summarise(cameras, progress.screen)
 
 
-def _engine(args: argparse.Namespace, config: Config, scratch: str) -> Engine:
+def _engine(args: argparse.Namespace, config: Config) -> Engine:
     settings = config.fleet
     if args.address is not None:
         return RayEngine(settings.attempts, settings.memory_mb, args.address)
@@ -71,7 +68,7 @@ def _engine(args: argparse.Namespace, config: Config, scratch: str) -> Engine:
     memory_mb = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2**20
     most = max(1, min(os.cpu_count() or 1, memory_mb // settings.memory_mb))
     count = 1 if args.shard is not None else args.workers or most
-    return LocalEngine(settings.attempts, [ChildWorker(scratch=scratch) for _ in range(count)])
+    return LocalEngine(settings.attempts, [ChildWorker() for _ in range(count)])
 
 
 def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:

@@ -60,13 +60,13 @@ def check(args: argparse.Namespace) -> int:
     if args.mounting and named.mount is None:
         raise UsageError(f'{named.name} does not say how the camera sits on the car: give a '
                          f'result.json or calibration.yaml that dashcalib run has written')
-    given = named.camera
     poses, track = _poses(args)
     if args.out is not None:
         if args.poses is None:
             raise UsageError('--out is for the paths that --poses compares; add --poses FILE')
         check_writable(args.out)
     source, mask = open_drive(args)
+    given = source.shown(named.camera)
     sensors, motion = read_sensors(args), None
     with open_calibrator(config, mask, args.verbose) as calibrator, Stages(args.quiet) as stages:
         if sensors is not None:

@@ -48,7 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         # SIGTERM unwinds the program as Ctrl-C does, so that everything is closed
         with handling(signal.default_int_handler, signal.SIGTERM):
             # imported only here: --help must not wait for numpy and OpenCV
+            from dashcalib_ros.whole_files import remove_leftovers
             from dashcalib_ros.workers.memory import reuse_image_buffers
+            remove_leftovers()
             reuse_image_buffers()
             command = getattr(import_module(COMMANDS[args.command].module), args.command)
             code: int = command(args)

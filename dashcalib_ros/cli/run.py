@@ -4,7 +4,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -45,6 +44,7 @@ from dashcalib_ros.report.tables import (
     summary,
 )
 from dashcalib_ros.standard_streams import write_stdout
+from dashcalib_ros.whole_files import temporary_folder
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,22 +52,32 @@ def run(args: argparse.Namespace) -> int:
     config = read_config(args)
     source, mask = open_drive(args)
     motion = read_sensors(args)
-    if args.write_bag is not None:
-        _check_bag(args, source)
+    screen = Screen(args.quiet, to_stderr=bool(args.json))
     with output_folder(args.out):
+        if args.write_bag is not None:
+            _check_bag(args, source)
         with Stages(args.quiet) as stages:
             calibration = calibrate(source, config, mask, args.verbose, stages, motion)
-        written = write_results(calibration, args.out, created=now())
-    _warn(calibration, written)
-    if args.json:
-        write_stdout(result_json(calibration).rstrip('\n'))
-    screen = Screen(args.quiet, to_stderr=bool(args.json))
-    screen.show(conclusion(calibration.verdict), summary(calibration),
-                _files(args.out, written.files))
+        try:
+            written = write_results(calibration, args.out, created=now())
+        except OutputError:
+            # a full disk must not hide what an hour of work has found
+            _tell(args, calibration, screen, Written(()))
+            raise
+    _tell(args, calibration, screen, written)
     if args.write_bag is not None:
         _write_bag(args, str(source.topic), calibration, screen)
     screen.show(next_step(calibration.verdict))
     return exit_code(calibration.verdict.level)
+
+
+def _tell(args: argparse.Namespace, calibration: Calibration, screen: Screen, written: Written
+          ) -> None:
+    _warn(calibration, written)
+    if args.json:
+        write_stdout(result_json(calibration).rstrip('\n'))
+    files = [_files(args.out, written.files)] if written.files else []
+    screen.show(conclusion(calibration.verdict), summary(calibration), *files)
 
 
 def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:
@@ -185,5 +195,5 @@ def _bag_path(out: Path, keep: bool) -> Iterator[Path]:
             raise OutputError(f'{out / "bag"} exists; remove it or choose another --out')
         yield out / 'bag'
         return
-    with tempfile.TemporaryDirectory(prefix='dashcalib-demo-') as folder:
-        yield Path(folder) / 'bag'
+    with temporary_folder() as folder:
+        yield folder / 'bag'

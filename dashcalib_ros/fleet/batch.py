@@ -6,7 +6,6 @@ cameras, and each camera published with it. Whatever is done has a file, and is 
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -31,6 +30,7 @@ from dashcalib_ros.fleet.storage import is_url, joined, read, remove, stamp, wri
 from dashcalib_ros.judge.conclude import versions
 from dashcalib_ros.report import write_results
 from dashcalib_ros.report.files import ACCEPTED, WEAK
+from dashcalib_ros.whole_files import temporary_folder
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ def publish_camera(name: str, found: lens_prior.OfMake | None, clips: Sequence[M
     yaml_name = 'camera_narrow_stereo' if yaml_name == 'narrow_stereo' else yaml_name
     place = joined(out, tables.camera_folder(result.camera))
     if is_url(place):
-        with tempfile.TemporaryDirectory(prefix='dashcalib-') as scratch:
+        with temporary_folder() as scratch:
             files = write_results(final.calibration, scratch, yaml_name).files
             for path in files:
                 write(joined(place, path.name), path.read_bytes())

@@ -19,6 +19,7 @@ from typing import Any
 
 from dashcalib_ros.errors import DashcalibError, WorkerError, one_line
 from dashcalib_ros.fleet.storage import needs
+from dashcalib_ros.whole_files import remove_leftovers
 from dashcalib_ros.workers.worker import (
     THREAD_VARIABLES,
     InlineWorker,
@@ -168,6 +169,8 @@ class LocalEngine(Engine):
         for worker in self._workers:
             worker.close()
         self._threads.shutdown(wait=False)
+        # a child that was killed leaves its copy of a packed or remote clip
+        remove_leftovers()
 
 
 class RayEngine(Engine):

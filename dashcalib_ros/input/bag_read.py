@@ -11,10 +11,9 @@ import os
 import shutil
 import struct
 import sys
-import tempfile
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from io import BufferedReader, BytesIO
@@ -39,6 +38,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.input.source import first_of
 from dashcalib_ros.limits import (
     CHUNK_BYTES,
     FREE_BYTES,
@@ -51,6 +51,7 @@ from dashcalib_ros.limits import (
     UNPACKED_LEAST,
     UNPACKED_RATIO,
 )
+from dashcalib_ros.whole_files import temporary_folder
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -292,36 +293,85 @@ class Reader2(rosbag2.Reader):
 def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
     """Give the file; of a .zstd file, a temporary copy of what could be unpacked.
 
-    Raises InputError where that is too much for a recording or for the disk; OSError.
+    Also of an SQLite file whose recorder was killed: its last messages are in a journal beside
+    it. Raises InputError where a copy is too much for a recording or for the disk; OSError.
     """
-    if file.suffix.lower() != '.zstd':
+    packed = file.suffix.lower() == '.zstd'
+    journals = [] if packed else _journals(file)
+    if not packed and not journals:
         yield file
         return
-    with tempfile.TemporaryDirectory(prefix='dashcalib-') as folder:
-        plain = Path(folder, file.stem)
+    with temporary_folder() as folder:
+        plain = folder / (file.stem if packed else file.name)
         try:
-            _unpack_file(file, plain)
+            if packed:
+                _unpack_file(file, plain)
+            else:
+                _complete(file, journals, plain)
+                damage(f'{file.name} was not closed, and its end is taken from '
+                       f'{first_of([each.name for each in journals])}')
         except (zstd.ZstdError, EOFError):
             damage(f'{file.name} is damaged')
+        except apsw.Error as error:
+            damage(f'{file.name} was not closed, and {journals[0].name}, which has its end, '
+                   f'cannot be used ({one_line(error)})')
+            plain = file
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            raise InputError(f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, '
-                             f'or unpack it first (zstd -d)') from error
+            raise InputError(
+                f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, or unpack it '
+                f'first (zstd -d)' if packed else
+                f'no room to copy {file}, which was not closed, to {folder}: set TMPDIR to a '
+                f'bigger disk, or close it first (sqlite3 {file.name} .schema)') from error
         yield plain
 
 
 def _unpack_file(packed: Path, plain: Path) -> None:
     limit = unpacked_limit(packed)
-    with zstd.open(packed, 'rb') as source, plain.open('wb', PIECE) as output:
-        while piece := source.read1(PIECE):
-            if output.tell() + len(piece) > limit:
+    with zstd.open(packed, 'rb') as source:
+        for size in _copied(source.read1, plain):
+            if size > limit:
                 raise InputError(
                     f'{packed} unpacks to more than {limit / 2**20:.0f} MB, which is no '
                     f'recording; if it is one, unpack it first (zstd -d)')
+
+
+def _copied(read: Callable[[int], bytes], plain: Path) -> Iterator[int]:
+    """Write what is read to a file; yield its size before each piece. Leaves FREE_BYTES free."""
+    with plain.open('wb', PIECE) as output:
+        while piece := read(PIECE):
+            yield output.tell() + len(piece)
             if shutil.disk_usage(plain.parent).free < FREE_BYTES:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             output.write(piece)
+
+
+def _journals(file: Path) -> list[Path]:
+    """Return what SQLite has beside a file that was not closed: messages that are not in it yet.
+
+    A rollback journal is one too: what is half-written in the file is in it as it was before.
+    """
+    beside = (file.with_name(f'{file.name}{end}') for end in ('-wal', '-journal'))
+    return [each for each in beside if each.is_file() and each.stat().st_size]
+
+
+def _complete(file: Path, journals: Sequence[Path], plain: Path) -> None:
+    """Make a copy of a database with what its journals have; raises OSError, apsw.Error.
+
+    Opening the file itself would write to it.
+    """
+    for source in (file, *journals):
+        with source.open('rb') as stream:
+            target = plain.with_name(f'{plain.name}{source.name.removeprefix(file.name)}')
+            for _ in _copied(stream.read, target):
+                pass
+    with closing(apsw.Connection(str(plain))) as database:
+        database.execute('PRAGMA schema_version').fetchone()  # takes a rollback journal
+        _, frames, _ = database.execute('PRAGMA wal_checkpoint').fetchone() or (0, 0, 0)
+        if not frames:
+            raise apsw.Error('nothing in it is whole')
+        database.execute('PRAGMA journal_mode = DELETE')
 
 
 @dataclass(frozen=True)
@@ -371,7 +421,8 @@ def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]]
             with WITHIN_LIMIT, _reader(path) as reader:
                 for connection in reader.connections:
                     counts[connection.topic, connection.msgtype] += connection.msgcount
-            return counts, True
+            # what a journal has that cannot be used is not counted
+            return counts, path != file or not _journals(file)
         except Exception:  # a damaged file makes rosbags raise nearly anything
             return Counter((record.topic, record.msgtype) for record in scan(path, damage)), False
 

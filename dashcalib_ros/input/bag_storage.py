@@ -23,6 +23,7 @@ from dashcalib_ros.input.source import (
     Picture,
     Reading,
     by_name,
+    cameras_named,
     first_of,
     is_bag_file,
 )
@@ -91,6 +92,9 @@ def open_bag(path: Path) -> Bag:
                      for file in listed if file not in present and file.name not in skipped]
     elif present:
         files = present
+        if (cameras := cameras_named([file.name for file in files])) > 1:
+            raise InputError(f'{path} has recordings of {cameras} cameras '
+                             f'({first_of([file.name for file in files])}): give the files of one')
         warnings += [f'{path} has no usable metadata.yaml: reading '
                      f'{first_of([file.name for file in files])} in this order']
     if not files:

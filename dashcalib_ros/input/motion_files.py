@@ -15,7 +15,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.errors import InputError, one_line, shortened
-from dashcalib_ros.input.inputs import VIDEO_SUFFIXES
+from dashcalib_ros.input.inputs import is_video
 from dashcalib_ros.input.motion import (
     EPOCH_S,
     SAMPLES,
@@ -64,7 +64,7 @@ def read_motion(path: Path) -> SensorStream:
     """
     if path.is_dir():
         return _oxts(path)
-    if path.suffix.lower() in VIDEO_SUFFIXES:
+    if is_video(path):
         return _inside_video(path)
     what = f'the motion file {path}'
     if path.suffix.lower() == '.gpx':

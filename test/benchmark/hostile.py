@@ -660,6 +660,184 @@ def scene_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
         yield
 
 
+# what is left behind, and ends ----------------------------------------------------------------
+
+# writes half a bag, and then the rest
+WRITER = """
+import sys
+from pathlib import Path
+from dashcalib_ros.camera import Radial
+from dashcalib_ros.input.bag_write import write_bag
+lens = Radial((320, 240), 300.0, 301.0, 161.0, 118.0, -0.1)
+print(write_bag(sys.argv[1], '/camera', lens, sys.argv[2]), flush=True)
+"""
+
+
+def names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def bag_kills(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGKILL of --write-bag at any moment: the next one leaves its own bag alone."""
+    import made_drives
+    bag = made_drives.write_bag(folder / 'drive', made_drives.images(
+        made_drives.drive(400, 320, 240)))
+
+    def start(out: Path) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, '-c', WRITER, str(bag), str(out)],
+                                stdout=subprocess.DEVNULL)
+
+    for n in tries:
+        place, rng = folder / str(n), np.random.default_rng(n)
+        process = start(place / 'first')
+        while process.poll() is None and not (place.exists() and names_in(place)):
+            time.sleep(0.001)
+        time.sleep(rng.uniform(0, 0.2))
+        process.kill()
+        process.wait()
+        whole = names_in(place) & {'first'}
+        assert start(place / 'second').wait() == 0
+        assert names_in(place) == {*whole, 'second'}, names_in(place)
+        shutil.rmtree(place)
+        yield
+
+
+def scratch(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Commands leave nothing in TMPDIR, nor where they run, be they right or wrong."""
+    pictures, home, tmp = two_turns(folder / 'pictures'), folder / 'home', folder / 'tmp'
+    home.mkdir()
+    tmp.mkdir()
+    given = folder / 'given.json'
+    for n in tries:
+        # one that a check finds wrong makes Ceres warn
+        f = 417.0 * (1.0, 0.9, 1.2, 0.5, 2.0)[n % 5]
+        given.write_text(json.dumps({'fx': f, 'fy': f, 'cx': 320.0, 'cy': 180.0, 'k1': -0.3,
+                                     'k2': 0.1, 'width': 640, 'height': 360}))
+        command = (('check', given, pictures), ('run', pictures, '--out', folder / 'out'))[n // 5]
+        done = subprocess.run(dashcalib(*command, '--fps', 10), cwd=home, capture_output=True,
+                              env={**os.environ, 'TMPDIR': str(tmp)}, timeout=300, check=False)
+        assert done.returncode in (0, 1, 3), done.stderr
+        left = names_in(tmp) | names_in(home)
+        for each in (*tmp.iterdir(), *home.iterdir()):
+            each.unlink()
+        assert not left, left
+        yield
+
+
+def batch_leftovers(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGKILL of a batch and its children while packed clips are read: the next one tidies."""
+    import made_drives
+    import zstandard
+    bag = made_drives.write_bag(folder / 'drive', made_drives.images(
+        made_drives.drive(300, 320, 240)))
+    packed = folder / 'bag.mcap.zstd'
+    packed.write_bytes(zstandard.compress(made_drives.storage(bag).read_bytes()))
+    (folder / 'm.csv').write_text('clip\n' + f'{packed}\n')
+    for n in tries:
+        tmp, out = folder / f'tmp{n}', folder / f'out{n}'
+        tmp.mkdir()
+        environment = {**os.environ, 'TMPDIR': str(tmp)}
+        command = dashcalib('batch', folder / 'm.csv', '--out', out, '--workers', 2)
+        process = subprocess.Popen(command, env=environment, start_new_session=True,
+                                   stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while process.poll() is None and not names_in(tmp):
+            time.sleep(0.001)
+        time.sleep(np.random.default_rng(n).uniform(0, 0.3))
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        # of another program, and of a process that lives
+        (tmp / 'dashcalib-other').mkdir()
+        subprocess.run(command, env=environment, capture_output=True, timeout=300, check=False)
+        assert names_in(tmp) == {'dashcalib-other'}, names_in(tmp)
+        yield
+
+
+def full_disks(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """The results do not fit: the calibration is told all the same, and one line says why."""
+    pictures = two_turns(folder / 'pictures')
+    for n in tries:
+        json_too = ('--json', '-') if n % 2 else ()
+        # no file may be larger than this, as on a disk that is nearly full
+        limit = int(np.random.default_rng(n).uniform(10, 50_000))
+        done = subprocess.run(
+            ['prlimit', f'--fsize={limit}', *dashcalib(
+                'run', pictures, '--fps', 10, '--out', folder / 'out', *json_too)],
+            capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 2 and 'cannot write to' in done.stderr, done.stderr
+        assert 'Traceback' not in done.stderr and 'fx' in done.stdout, done.stdout
+        assert not json_too or json.loads(done.stdout)['intrinsics']['fx'] > 0
+        assert not (folder / 'out').exists()
+        yield
+
+
+def bags_into_nowhere(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """--write-bag to where nothing can be: said before anything is calibrated."""
+    import made_drives
+    bag = made_drives.write_bag(folder / 'drive', made_drives.images(
+        made_drives.drive(400, 320, 240)))
+    (folder / 'file').touch()
+    (folder / 'link').symlink_to(folder / 'nowhere')
+    places = ('file/bag', 'link', '/proc/bag', 'drive', 'out', 'x' * 300, '/dev/null/bag', '')
+    for n in tries:
+        before = names_in(folder)
+        done = subprocess.run(
+            dashcalib('run', bag, '--out', folder / 'out', '--write-bag',
+                      folder / places[n % len(places)]),
+            capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+        assert 'choose another place' in done.stderr or 'check the path' in done.stderr
+        assert names_in(folder) == before
+        yield
+
+
+def old_stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """A store of another camera of the same size moves no calibration farther than its sigma."""
+    from dataclasses import replace
+
+    from fleet_made import YAWS, clip_of
+
+    from dashcalib_ros.reconstruct.scene_file import SceneFile, encoded
+    pictures = two_turns(folder / 'pictures')
+    true = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
+    lens = Radial((640, 360), *(getattr(true, name) for name in (
+        'fx', 'fy', 'cx', 'cy', 'k1', 'k2')))
+    others = [replace(lens, fx=lens.fx * by, fy=lens.fy * by)
+              for by in (0.8, 0.9, 0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05, 1.1, 1.25)]
+    others += [replace(lens, cx=lens.cx + 15), replace(lens, cy=lens.cy - 15),
+               replace(lens, k1=0.0, k2=0.0), replace(lens, fy=lens.fy * 1.02)]
+    for n in tries:
+        store = folder / f'store{n}'
+        store.mkdir()
+        # five turns, sharper than those of the drive
+        made = clip_of(others[n % len(others)], YAWS[:5], world=n, tracks=150, keyframes=12)
+        for m, turn in enumerate(made.turns):
+            (store / f'turn-{m:016x}.npz').write_bytes(encoded(SceneFile(
+                made.origin, (replace(turn, prominence=0.5),), 1)))
+        # of its own, two turns or one
+        part = () if n < len(others) else ('--duration', 14)
+        out = folder / f'out{n}'
+        done = subprocess.run(
+            dashcalib('run', pictures, '--fps', 10, '--out', out, '--set',
+                      f'turns.store={store}', *part),
+            capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode in (0, 3) and 'Traceback' not in done.stderr, done.stderr
+        found = json.loads((out / 'result.json').read_text())
+        print(n, found['verdict'], found['intrinsics'] and found['intrinsics']['fx'] / lens.fx)
+        if found['verdict'] == 'accepted':
+            for name, sigma in found['sigma'].items():
+                off = found['intrinsics'][name] - getattr(lens, name, 0.0)
+                assert abs(off) < 4 * sigma, f'{name} is {off:.4f} off, sigma {sigma:.4f}'
+        yield
+
+
+LEFT = [
+    Attack('SIGKILL while a bag is written', 40, 3, bag_kills),
+    Attack('what is left in TMPDIR', 6, 2, scratch),
+    Attack('SIGKILL of a batch of packed clips', 20, 2, batch_leftovers),
+    Attack('no room for the results', 6, 2, full_disks),
+    Attack('a bag into nowhere', 8, 8, bags_into_nowhere),
+    Attack('an old turn store of another camera', 32, 2, old_stores)]
 # two cameras, and pictures that take long ------------------------------------------------------
 
 def other_view(n: int) -> Callable[[Any], Any]:
@@ -938,6 +1116,7 @@ def write_mcap_of(path: Path, topic: str) -> None:
 
 
 ATTACKS = [
+    *LEFT,
     Attack('SIGKILL while it saves', 20, 1, kills_while_saving),
     Attack('service calls', 500, 25, service_calls),
     Attack('types of parameters', 512, 16, parameter_types),
