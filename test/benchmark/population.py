@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -137,10 +136,12 @@ GROUPS: dict[str, Callable[[Row], bool]] = {
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Return the tables: verdicts and rays, error over sigma, shutters, names, and each camera."""
+    """Return the tables: bars, verdicts, error over sigma, shutters, names, and each camera."""
+    failed = [row for row in rows if row['verdict'] == 'failed']
     rows = [row for row in rows if row['verdict'] != 'failed']
-    return '\n\n'.join([_groups(rows), _sigmas(rows), _shutters(rows), _names(rows),
-                        _wrong(rows), _cameras(rows)])
+    return '\n\n'.join([
+        *(f'Failed: seed {row["seed"]}: {row["reasons"][0]}' for row in failed),
+        _bars(rows), _groups(rows), _sigmas(rows), _shutters(rows), _names(rows), _cameras(rows)])
 
 
 def _groups(rows: Sequence[Row]) -> str:
@@ -221,12 +222,46 @@ def _told(size: float, limit: float) -> bool | None:
     return False if size == 0.0 else True if size >= limit else None
 
 
-def _wrong(rows: Sequence[Row]) -> str:
-    accepted = [row for row in rows if row['verdict'] == 'accepted' and 'z' in row]
-    return '\n'.join(f'Accepted, and fx more than {what} off: {len(them)}: '
-                     f'{", ".join(str(row["seed"]) for row in them)}' for what, them in (
-        (f'{FX_SIGMAS:g} sigma', [row for row in accepted if abs(row['z']['fx']) > FX_SIGMAS]),
-        (f'{FX_PERCENT:g} %', [row for row in accepted if row['percent']['fx'] > FX_PERCENT])))
+def _bars(rows: Sequence[Row]) -> str:
+    """Return what the population must show, and what it shows."""
+    accepted = [row for row in rows if row['verdict'] == 'accepted']
+    z = [abs(value) for row in accepted for value in row.get('z', {}).values()]
+    rays = [row['rays_px'] for row in accepted]
+    told = [row for row in rows if row['readout_ms'] >= TOLD_READOUT_MS and 'shutter_ms' in row]
+    short = [abs(row['shutter_ms'] / row['readout_ms'] - 1) for row in told]
+    within = [abs(row['shutter_ms'] - row['readout_ms']) <= 2 * row['shutter_sigma_ms']
+              if row['shutter_sigma_ms'] else False for row in told]
+    false = [row for row in accepted if 'z' in row and (
+        abs(row['z']['fx']) > FX_SIGMAS or row['percent']['fx'] > FX_PERCENT)]
+    lines: list[tuple[str, float, str, float, float]] = [
+        ('sound lenses accepted', _share(rows, lambda row: not row['glass_px']), '.0%', 0.97, 1),
+        ('behind glass accepted', _share(rows, lambda row: row['glass_px'] > 0), '.0%', 0.9, 1),
+        ('rays off, px: median', _quantile(rays, 0.5), '.2f', 0, 0.25),
+        ('rays off, px: 95 %', _quantile(rays, 0.95), '.2f', 0, 0.8),
+        *((f'parameters within {limit} sigma', _mean([value <= limit for value in z]), '.1%',
+           *bars) for limit, bars in ((1, (0.6, 0.8)), (2, (0.93, 0.99)), (3, (0.99, 1)))),
+        ('camera off over sigma_px: median', _quantile(
+            [row['camera_px'] / row['sigma_px'] for row in accepted], 0.5), '.2f', 0.7, 1.2),
+        (f'fx more than {FX_SIGMAS:g} sigma, or {FX_PERCENT:g} %, off', len(false), 'd', 0, 0),
+        ('readout off: median', _quantile(short, 0.5), '.1%', 0, 0.015),
+        ('readout within 2 sigma', _mean(within), '.0%', 0.93, 1)]
+    return 'Of those accepted; readouts of all that have a camera.\n\n' + table(
+        ['', 'measured', 'at least', 'at most', ''],
+        [[name, format(value, form), format(least, form), format(most, form),
+          'met' if least <= value <= most else 'missed']
+         for name, value, form, least, most in lines if not math.isnan(value)])
+
+
+def _share(rows: Sequence[Row], belongs: Callable[[Row], bool]) -> float:
+    return _mean([row['verdict'] == 'accepted' for row in rows if belongs(row)])
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else math.nan
+
+
+def _quantile(values: Sequence[float], share: float) -> float:
+    return float(np.quantile(values, share)) if values else math.nan
 
 
 def _cameras(rows: Iterable[Row]) -> str:
@@ -251,13 +286,11 @@ def _cameras(rows: Iterable[Row]) -> str:
 
 
 def _spread(values: Sequence[float]) -> list[str]:
-    if not values:
-        return ['', '']
-    return [f'{statistics.median(values):.2f}', f'{np.quantile(values, 0.95):.2f}']
+    return [f'{_quantile(values, share):.2f}' if values else '' for share in (0.5, 0.95)]
 
 
 def _median(values: Sequence[float], form: str = '.2f') -> str:
-    return format(statistics.median(values), form) if values else ''
+    return format(_quantile(values, 0.5), form) if values else ''
 
 
 def run(seed: int, out: Path, stage: str, again: bool) -> None:
@@ -265,7 +298,8 @@ def run(seed: int, out: Path, stage: str, again: bool) -> None:
     scenes, result = out / f'{seed}.scenes.pkl', out / f'{seed}.json'
     if not scenes.exists():
         outcome = isolated(_write_case, seed, scenes)
-        complain(f'{seed}: {outcome.failure or outcome.value}, {outcome.seconds:.0f} s')
+        complain(f'{seed}: {outcome.failure or outcome.value}, {outcome.seconds:.0f} s, '
+                 f'{outcome.peak_mb:.0f} MB')
         if outcome.failure:
             save(result, {'seed': seed, 'verdict': 'failed', 'reasons': [outcome.failure]})
             return
