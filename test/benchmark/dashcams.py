@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from wide import FisheyeLens, WideDrive
 from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.demo import Drive, DriveSpec, Glass, Lens, Turn
 from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.stamps import least_step_ns
 from dashcalib_ros.judge.conclude import Evidence, evidence_of_detection
 from dashcalib_ros.reconstruct.scene import Scene
 
@@ -31,10 +33,8 @@ AnyLens = Lens | FisheyeLens
 # (width, height) and how often
 SIZES = {(640, 360): 3, (640, 480): 3, (800, 450): 2, (848, 480): 3, (960, 540): 4,
          (1024, 576): 2, (1242, 375): 1, (1280, 720): 4, (1392, 512): 1, (1920, 1080): 1}
-# Hz and how often; faster cameras cost more to render, and are thinned
+# Hz and how often
 RATES = {10.0: 5, 12.5: 3, 15.0: 4, 20.0: 2, 25.0: 1, 30.0: 2}
-# Hz; a drive of a faster camera has three turns
-FAST = 15.0
 # shares of the cameras
 FISHEYES, GLASSES, SHUTTERS, DECENTRED, NEAR_FOLDS = 0.25, 0.35, 0.6, 0.5, 0.25
 # k1 of the strongest barrel
@@ -90,7 +90,7 @@ def drive_of(seed: int) -> Drive:
     rng = np.random.default_rng([seed, 47])
     size = _one_of(SIZES, rng)
     rate = _one_of(RATES, rng)
-    count = 3 if rate > FAST else int(rng.integers(3, 7))
+    count = int(rng.integers(3, 7))
     side = rng.choice([-1.0, 1.0])
     spec = DriveSpec(
         seed=seed, rate=rate,
@@ -231,7 +231,7 @@ def reconstructed(seed: int) -> Case:
     lens: AnyLens = drive.wide_lens if isinstance(drive, WideDrive) else drive.lens
     with Calibrator(Config(), inline=True) as calibrator:
         calibrator.expect(len(drive))
-        for frame in drive.frames():
+        for frame in _looked_at(drive, Config().motion.rate):
             calibrator.push(frame)
         calibrator.detection.finish()
         chosen = calibrator.scenes
@@ -253,6 +253,18 @@ def reconstructed(seed: int) -> Case:
                 (lens.width, lens.height), parameters_of(lens), pixels, rays,
                 closest_cameras(lens, rays, pixels), drive.spec.rolling_shutter_ms, lens.glass,
                 drive.spec, processor_s())
+
+
+def _looked_at(drive: Drive, rate: float) -> Iterator[Frame]:
+    """Yield all frames of a drive; those that the detector skips, by their stamps, are black."""
+    before, black = None, np.zeros((drive.lens.height, drive.lens.width), np.uint8)
+    for index in range(len(drive)):
+        stamp_ns = drive.stamp_ns(index)
+        if before is not None and stamp_ns - before < least_step_ns(rate):
+            yield Frame(index, stamp_ns, black)
+        else:
+            before = stamp_ns
+            yield drive.frame(index)
 
 
 def _silent(stage: str, share: float) -> None:
