@@ -323,8 +323,9 @@ def _seeds(text: str) -> range:
 
 def main() -> None:
     """Measure."""
-    # an inline calibrator needs it, and processes that start from here inherit it
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, '1'))
+    # processes that start from here inherit it: an inline calibrator needs one thread, and what
+    # COLMAP and Ceres warn of is not shown by a calibrator's children either
+    os.environ.update({**dict.fromkeys(THREAD_VARIABLES, '1'), 'GLOG_minloglevel': '2'})
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n')[0])
     parser.add_argument('--seeds', type=_seeds, required=True, help='a seed, or the first-last')
     parser.add_argument('--out', type=Path, required=True)
