@@ -47,6 +47,7 @@ from dashcalib_ros.limits import (
     ARRAYS,
     JSON_BYTES,
     LENS_NUMBER,
+    SIDE,
     check_file,
     check_npz,
     check_pixels,
@@ -531,6 +532,8 @@ def read_size(width: Any, height: Any, *, path: str | Path) -> tuple[int, int]:
         if type(value) is not int or value <= 0:
             raise InputError(f'{path}: the image {key} must be a positive integer, not '
                              f'{shortened(repr(value))}')
+        if value > SIDE:
+            raise InputError(f'{path}: the image {key} must be {SIDE} at the most; is it in px?')
     check_pixels(int(width), int(height), f'{path}: the image')
     return int(width), int(height)
 
