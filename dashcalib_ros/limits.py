@@ -2,7 +2,8 @@
 
 All code that reads such input checks it here first. Input beyond a limit raises InputError before
 memory or time is spent on it. What comes from outside takes 1 GB of memory at the most beside the
-pictures that are worked on, and time that grows with its size and no faster.
+pictures that are worked on, but for a fleet's manifest (10 kB for each camera), and time that
+grows with its size and no faster.
 """
 from __future__ import annotations
 
