@@ -195,8 +195,7 @@ class Calibrator:
         Those of a drive of two cameras are not.
         """
         found = self.detection
-        if found.other_camera is None:
-            self.scenes.store_new()
+        self.scenes.store_new()
         chosen, stored = self.scenes.chosen(), len(self.scenes.stored())
         return Status(found.frames, len(found.turns()) + stored, len(chosen),
                       sum(scene.yaw_deg for scene in chosen), found.magnitude,

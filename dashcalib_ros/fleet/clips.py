@@ -12,6 +12,7 @@ from pathlib import Path
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import detect
+from dashcalib_ros.detect.one_camera import APART
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.storage import (
@@ -216,10 +217,13 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
            ) -> SceneFile:
     """Return a clip's turns and their scenes.
 
-    content: the clip's content_hash(). Raises InputError for what cannot be read.
+    content: the clip's content_hash(). Raises InputError for what cannot be read, and for the
+    images of two cameras.
     """
     source = open_frames(path, topic, fps)
     detection = detect(source, config)
+    if detection.other_camera is not None:
+        raise InputError(f'{detection.other_camera}: {APART}')
     best = detection.turns()[:max(config.turns.wanted, config.turns.at_most)]
     valid = detection.valid()
     turns = []
