@@ -25,6 +25,7 @@ from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.input.inputs import Paths, fits_bag, open_frames
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
+from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Check
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import Calibration
@@ -93,7 +94,7 @@ def check(given: Camera, path: Paths, fps: float | None = None,
     """
     source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
     with _fed(source, config, mask, tell) as calibrator:
-        return Questions(calibrator).check(given, calibrator.calibrate(tell), tell)
+        return Questions(calibrator).check(source.shown(given), calibrator.calibrate(tell), tell)
 
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
@@ -203,6 +204,12 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
         material = replace(material, pictures={
             turn: each.coloured(images[each.frame]) if each.frame in images else each
             for turn, each in shown.items()})
+    stored = calibration.camera and source.stored(calibration.camera)
+    if stored:
+        values = ', '.join(f'{name} {value:.2f}' for name, value in zip(
+            ('fx', 'fy', 'cx', 'cy'), stored.params, strict=False))
+        new += (f'for the pictures as they are stored ({by(stored.image_size)}): {values}, and '
+                f'the same distortion',)
     return replace(calibration, verdict=verdict, material=material,
                    input_name=calibration.input_name or source.name,
                    warnings=(*new, *calibration.warnings))

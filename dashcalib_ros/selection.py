@@ -312,9 +312,9 @@ class SceneSelection:
             self._store()
 
     def _store(self) -> None:
-        """Write the present scenes to turns.store."""
-        built = self._pool.scenes()
-        self._stored_turns = built.keys()
+        """Write the present scenes to turns.store; of two cameras in a stream there are none."""
+        built = self._pool.scenes() if self._detection.other_camera is None else {}
+        self._stored_turns = self._pool.scenes().keys()
         own = {turn.id: StoredTurn(scene, turn.stamp_s, turn.prominence)
                for turn in self._detection.turns() if (scene := built.get(turn.id)) is not None}
         self._kept.mirror({**self._kept.turns, **own})

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
-import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,10 +27,10 @@ from dashcalib_ros.reconstruct.scene_file import (
     decoded,
     encoded,
 )
-from dashcalib_ros.whole_files import write_whole
+from dashcalib_ros.whole_files import remove_leftovers, write_whole
 
-# s; temporary files older than this are left over from a killed process
-ABANDONED_S = 3600.0
+# names of turns' files
+NAMES = re.compile(rf'turn-[0-9a-f]{{16}}{re.escape(SUFFIX)}')
 
 
 class TurnStore:
@@ -155,12 +155,7 @@ class TurnStore:
 
     def _listed(self) -> list[str]:
         """Return the names of all files that may be turns."""
-        try:
-            for leftover in self._folder.glob('.turn-*.tmp'):
-                if time.time() - leftover.stat().st_mtime > ABANDONED_S:
-                    leftover.unlink()
-        except OSError:
-            pass  # of another process, or without the permission to remove it
+        remove_leftovers(self._folder, NAMES)
         try:
             return sorted(path.name for path in self._folder.iterdir() if path.suffix == SUFFIX)
         except FileNotFoundError:

@@ -159,8 +159,12 @@ def number(image):
                if image[20:44, 11 + 18 * bit:19 + 18 * bit].mean() > 120)
 
 
-def write_timed(path, times=TIMES, start=0.0, between=3, turn=0, created=None, **options):
-    """Write a video of numbered pictures at these times. between: B-frames; turn: degrees."""
+def write_timed(path, times=TIMES, start=0.0, between=3, turn=0, created=None, aspect=None,
+                **options):
+    """Write a video of numbered pictures at these times.
+
+    between: B-frames; turn: degrees; aspect: of a pixel.
+    """
     tick = Fraction(1, 90000)
     with av.open(str(path), 'w', options=options) as container:
         if created:
@@ -169,6 +173,8 @@ def write_timed(path, times=TIMES, start=0.0, between=3, turn=0, created=None, *
         stream.width, stream.height, stream.pix_fmt = 160, 64, 'yuv420p'
         stream.time_base = stream.codec_context.time_base = tick
         stream.codec_context.gop_size, stream.codec_context.max_b_frames = 30, between
+        if aspect:
+            stream.codec_context.sample_aspect_ratio = Fraction(*aspect)
         if turn:
             stream.set_display_rotation(turn)
         for index, time in enumerate(times):

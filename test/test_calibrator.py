@@ -25,6 +25,7 @@ from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import Samples, SensorStream
@@ -343,6 +344,13 @@ def test_two_short_drives_add_up(drive, frames, tmp_path):
     again = calibrated(half, config)
     assert same(second, again) and again.stored_turns == second.stored_turns
     assert len(list(folder.iterdir())) == 2
+
+
+def test_turns_of_two_cameras_are_not_stored(frames, tmp_path, monkeypatch):
+    monkeypatch.setattr(Detection, 'other_camera', OtherCamera(10, 20, 'another view'))
+    found = calibrated(frames[:ONE_TURN], QUICK.replace({'turns.store': str(tmp_path)}))
+    assert found.verdict.level == 'refused' and found.turns[0].used
+    assert 'two cameras' in found.verdict.reasons[0] and not list(tmp_path.iterdir())
 
 
 def test_a_turn_that_is_played_in_a_loop_counts_once(drive, frames):

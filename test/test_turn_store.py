@@ -1,6 +1,7 @@
 """Turns on disk: what is written comes back, what is not ours is left alone, nothing raises."""
 from __future__ import annotations
 
+import fcntl
 import io
 import json
 import os
@@ -394,12 +395,13 @@ def test_a_full_disk_leaves_nothing_half_written(make, monkeypatch):
 def test_what_a_dead_process_left_half_written_is_removed(make, tmp_path):
     folder = tmp_path / 'turns'
     folder.mkdir()
-    old, new = folder / '.turn-1.npz.tmp', folder / '.turn-2.npz.tmp'
-    for path in (old, new):
+    dead, living = (folder / f'.turn-{n:016x}.npz.0123abcd.tmp' for n in range(2))
+    for path in (dead, living):
         path.write_bytes(b'half')
-    os.utime(old, (0, 0))
-    assert make().turns == {} and make().said == []
-    assert not old.exists() and new.exists()
+    with living.open('r+b') as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        assert make().turns == {} and make().said == []
+    assert not dead.exists() and living.exists()
 
 
 def test_clearing_ends_it(make):

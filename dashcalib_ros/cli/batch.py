@@ -8,9 +8,6 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from tempfile import TemporaryDirectory
-
-from rich.text import Text
 
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH
 from dashcalib_ros.cli.drive import read_config
@@ -23,6 +20,7 @@ from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.engine import Engine, LocalEngine, RayEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
 from dashcalib_ros.fleet.storage import joined, remove, write
+from dashcalib_ros.report.tables import line
 from dashcalib_ros.standard_streams import write_stderr
 from dashcalib_ros.workers.child import ChildWorker
 
@@ -46,9 +44,7 @@ def batch(args: argparse.Namespace) -> int:
         write_stderr(
             f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(cameras), "camera")}; '
             f'Ctrl-C keeps what is done in {args.out}, and the same command goes on')
-    # a child that is killed leaves its copy of a packed or remote clip in the scratch folder
-    with (TemporaryDirectory(prefix='dashcalib-', ignore_cleanup_errors=True) as scratch,
-          closing(_engine(args, config, scratch)) as engine):
+    with closing(_engine(args, config)) as engine:
         try:
             with progress.stages:
                 files = calibrate_fleet(cameras, args.out, config, engine, args.shard is None,
@@ -60,11 +56,11 @@ def batch(args: argparse.Namespace) -> int:
     name = '' if args.shard is None else f'-{shard[0]}-of-{shard[1]}'
     write(joined(args.out, f'effort{name}.json'), progress.effort_json(engine))
     if files:
-        progress.screen.show(Text(f'written to {args.out}: ' + ', '.join(files)))
+        progress.screen.show(line(f'written to {args.out}: ' + ', '.join(files)))
     return _summarise(cameras, progress.screen)
 
 
-def _engine(args: argparse.Namespace, config: Config, scratch: str) -> Engine:
+def _engine(args: argparse.Namespace, config: Config) -> Engine:
     settings = config.fleet
     if args.address is not None:
         return RayEngine(settings.attempts, settings.memory_mb, args.address)
@@ -72,7 +68,7 @@ def _engine(args: argparse.Namespace, config: Config, scratch: str) -> Engine:
     memory_mb = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2**20
     most = max(1, min(os.cpu_count() or 1, memory_mb // settings.memory_mb))
     count = 1 if args.shard is not None else args.workers or most
-    return LocalEngine(settings.attempts, [ChildWorker(scratch=scratch) for _ in range(count)])
+    return LocalEngine(settings.attempts, [ChildWorker() for _ in range(count)])
 
 
 def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
@@ -84,7 +80,7 @@ def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
     warn(lines)
     verdicts = [camera.verdict for camera in cameras if camera.name]
     counts = ', '.join(f'{verdicts.count(level)} {level}' for level in LEVELS)
-    screen.show(Text(f'{counted(len(verdicts), "camera")}: {counts}; '
+    screen.show(line(f'{counted(len(verdicts), "camera")}: {counts}; '
                      f'{counted(len(found), "clip")} could not be read'))
     return NOT_ENOUGH if found or 'refused' in verdicts else ACCEPTED
 
@@ -110,7 +106,7 @@ class _Progress:
         """Take the news of a clip, or of a camera that is solved."""
         if clip is None:
             if camera.own is None or not camera.own.again:
-                self.screen.show(Text(f'{camera.name}: {camera.verdict}'))
+                self.screen.show(line(f'{camera.name}: {camera.verdict}'))
             return
         self.done += 1
         if not clip.again:

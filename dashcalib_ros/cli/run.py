@@ -4,14 +4,13 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 from time import perf_counter
 
-from rich.console import RenderableType
+from rich.console import Group, RenderableType
 from rich.text import Text
 
 from dashcalib_ros.camera import Radial, camera_of
@@ -36,8 +35,16 @@ from dashcalib_ros.report import (
 from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE
 from dashcalib_ros.report.files import TRUTH
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.report.tables import TextTable, against_truth, conclusion, next_step, summary
+from dashcalib_ros.report.tables import (
+    TextTable,
+    against_truth,
+    conclusion,
+    line,
+    next_step,
+    summary,
+)
 from dashcalib_ros.standard_streams import write_stdout
+from dashcalib_ros.whole_files import temporary_folder
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,22 +52,32 @@ def run(args: argparse.Namespace) -> int:
     config = read_config(args)
     source, mask = open_drive(args)
     motion = read_sensors(args)
-    if args.write_bag is not None:
-        _check_bag(args, source)
+    screen = Screen(args.quiet, to_stderr=bool(args.json))
     with output_folder(args.out):
+        if args.write_bag is not None:
+            _check_bag(args, source)
         with Stages(args.quiet) as stages:
             calibration = calibrate(source, config, mask, args.verbose, stages, motion)
-        written = write_results(calibration, args.out, created=now())
-    _warn(calibration, written)
-    if args.json:
-        write_stdout(result_json(calibration).rstrip('\n'))
-    screen = Screen(args.quiet, to_stderr=bool(args.json))
-    screen.show(conclusion(calibration.verdict), summary(calibration),
-                _files(args.out, written.files))
+        try:
+            written = write_results(calibration, args.out, created=now())
+        except OutputError:
+            # a full disk must not hide what an hour of work has found
+            _tell(args, calibration, screen, Written(()))
+            raise
+    _tell(args, calibration, screen, written)
     if args.write_bag is not None:
         _write_bag(args, str(source.topic), calibration, screen)
     screen.show(next_step(calibration.verdict))
     return exit_code(calibration.verdict.level)
+
+
+def _tell(args: argparse.Namespace, calibration: Calibration, screen: Screen, written: Written
+          ) -> None:
+    _warn(calibration, written)
+    if args.json:
+        write_stdout(result_json(calibration).rstrip('\n'))
+    files = [_files(args.out, written.files)] if written.files else []
+    screen.show(conclusion(calibration.verdict), summary(calibration), *files)
 
 
 def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:
@@ -80,13 +97,13 @@ def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration, s
     assert calibration.camera is not None
     count = write_bag(args.input[0], topic, calibration.camera, args.write_bag,
                       calibration.config.rectified)
-    screen.show(Text(f'written: {args.write_bag} with {count} messages on '
+    screen.show(line(f'written: {args.write_bag} with {count} messages on '
                      f'{camera_info_topic(topic)}'))
 
 
 def _files(folder: Path, files: Sequence[Path]) -> Text:
     """Return a line that tells which files are in the output folder now."""
-    return Text(f'written to {folder}: {", ".join(file.name for file in files)}')
+    return line(f'written to {folder}: {", ".join(file.name for file in files)}')
 
 
 def _warn(calibration: Calibration, written: Written) -> None:
@@ -129,16 +146,16 @@ def turns(args: argparse.Namespace) -> int:
         show(TextTable(COLUMNS, [
             (f'{turn.stamp_s - detection.start_s:.1f}', str(turn.center), str(turn.first),
              str(turn.last), str(turn.images), f'{turn.prominence:.4f}') for turn in found]))
-        show(Text(PROMINENCE))
-    show(Text(_conclusion(len(found), config.turns.wanted, frames)))
+        show(line(PROMINENCE))
+    show(Group(*map(line, _conclusion(len(found), config.turns.wanted, frames))))
     return ACCEPTED
 
 
-def _conclusion(found: int, wanted: int, frames: int) -> str:
-    text = f'{found} of {counted(wanted, "turn")} wanted, in {counted(frames, "frame")}'
-    if found:
-        return f'{text}\nnext: dashcalib run, with the same INPUT'
-    return f'{text}\nnext: record a drive with turns at crossings, in daylight'
+def _conclusion(found: int, wanted: int, frames: int) -> tuple[str, str]:
+    """Return what there is, and what to do next."""
+    return (f'{found} of {counted(wanted, "turn")} wanted, in {counted(frames, "frame")}',
+            'next: dashcalib run, with the same INPUT' if found else
+            'next: record a drive with turns at crossings, in daylight')
 
 
 def demo(args: argparse.Namespace) -> int:
@@ -159,14 +176,14 @@ def demo(args: argparse.Namespace) -> int:
         values = {**drive.truth, 'width': size[0], 'height': size[1]}
         write_text(out / TRUTH, json.dumps(values, allow_nan=False) + '\n')
     _warn(calibration, written)
-    compared: list[RenderableType] = [Text('no estimate to compare with the truth')]
+    compared: list[RenderableType] = [line('no estimate to compare with the truth')]
     if calibration.camera is not None:
-        compared = [Text('\nagainst the truth'),
+        compared = [line(''), line('against the truth'),
                     against_truth(compare(calibrated_camera(calibration), truth))]
     files = [*written.files, out / TRUTH, *([out / 'bag'] if args.keep_bag else [])]
     Screen(args.quiet).show(
         conclusion(calibration.verdict), summary(calibration), *compared, _files(out, files),
-        Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'),
+        line(f'rendered and calibrated in {perf_counter() - started:.0f} s'),
         next_step(calibration.verdict))
     return exit_code(calibration.verdict.level)
 
@@ -178,5 +195,5 @@ def _bag_path(out: Path, keep: bool) -> Iterator[Path]:
             raise OutputError(f'{out / "bag"} exists; remove it or choose another --out')
         yield out / 'bag'
         return
-    with tempfile.TemporaryDirectory(prefix='dashcalib-demo-') as folder:
-        yield Path(folder) / 'bag'
+    with temporary_folder() as folder:
+        yield folder / 'bag'

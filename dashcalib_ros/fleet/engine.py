@@ -19,6 +19,7 @@ from typing import Any
 
 from dashcalib_ros.errors import DashcalibError, WorkerError, one_line
 from dashcalib_ros.fleet.storage import needs
+from dashcalib_ros.whole_files import remove_leftovers
 from dashcalib_ros.workers.worker import (
     THREAD_VARIABLES,
     InlineWorker,
@@ -55,7 +56,10 @@ class Engine(ABC):
     """Runs tasks; outcomes come in any order.
 
     cpu_s: of the tasks so far, by their function. peak_mb: of memory, of one worker at the most.
+    here: the workers see this machine's files.
     """
+
+    here = True
 
     def __init__(self, attempts: int) -> None:
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
@@ -165,6 +169,8 @@ class LocalEngine(Engine):
         for worker in self._workers:
             worker.close()
         self._threads.shutdown(wait=False)
+        # a child that was killed leaves its copy of a packed or remote clip
+        remove_leftovers()
 
 
 class RayEngine(Engine):
@@ -172,6 +178,8 @@ class RayEngine(Engine):
 
     A task whose node was lost is tried again without being counted: that is no fault of its own.
     """
+
+    here = False
 
     def __init__(self, attempts: int, memory_mb: int, address: str) -> None:
         """Raise ConfigError without Ray, WorkerError where the cluster cannot be reached."""

@@ -9,9 +9,7 @@ import hashlib
 import os
 import posixpath
 import re
-import shutil
 import stat as stat_module
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -22,7 +20,7 @@ from typing import Any
 from dashcalib_ros.errors import ConfigError, InputError, OutputError, one_line
 from dashcalib_ros.input.inputs import named_like
 from dashcalib_ros.limits import CLIP_BYTES, CLIP_FILES, check_file, read_file
-from dashcalib_ros.whole_files import write_whole
+from dashcalib_ros.whole_files import temporary_folder, write_whole
 
 URL = re.compile(r'[a-z][a-z0-9+.-]+://')
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -130,14 +128,11 @@ def local_copy(place: str) -> Iterator[Path]:
         yield Path(place)
         return
     system, path = _system(place)
-    scratch = Path(tempfile.mkdtemp(prefix='dashcalib-'))
-    try:
+    with temporary_folder() as scratch:
         copy = scratch / posixpath.basename(path.rstrip('/'))
         with _store_errors(f'copy {place}'):
             system.get(path, str(copy), recursive=system.isdir(path))
         yield copy
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def read(place: str, limit: int = LARGEST) -> bytes | None:

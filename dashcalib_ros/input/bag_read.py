@@ -9,41 +9,49 @@ import bz2
 import errno
 import os
 import shutil
-import sqlite3
 import struct
 import sys
-import tempfile
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from io import BufferedReader, BytesIO
-from itertools import chain
+from itertools import accumulate, chain, islice
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
 
+import apsw
 import lz4.frame
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from rosbags import rosbag2
+from rosbags.interfaces import Connection
 from rosbags.rosbag1 import reader as rosbag1
-from rosbags.rosbag2 import storage_mcap
+from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.input.source import first_of
 from dashcalib_ros.limits import (
     CHUNK_BYTES,
     FREE_BYTES,
+    INDEX_BYTES,
     MESSAGE_BYTES,
+    OVERLAPPING_BYTES,
+    RECORD_BYTES,
+    SQLITE_STEPS,
+    TOPICS,
     UNPACKED_LEAST,
     UNPACKED_RATIO,
 )
+from dashcalib_ros.whole_files import temporary_folder
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -53,6 +61,8 @@ else:
 Damage = Callable[[str], None]
 # bytes of a file that are unpacked at once
 PIECE = 2**20
+# of the head of a record of a ROS 1 bag's index
+INDEX_HEAD = 55
 UNPACKERS: dict[str, Callable[[], Any]] = {
     'zstd': zstd.ZstdDecompressor, 'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor}
@@ -65,23 +75,50 @@ def unpack(kind: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
     kind: as bags name it; '' or none: it is not packed. Raises InputError beyond the limit; for
     damage what the libraries raise, and EOFError where it is cut off.
     """
-    if kind in ('', 'none'):
-        return data
     limit = min(limit, CHUNK_BYTES)
-    unpacker = UNPACKERS[kind]()
-    plain: bytes = unpacker.decompress(data, limit + 1)
+    unpacker = UNPACKERS[kind]() if kind not in ('', 'none') else None
+    plain: bytes = data if unpacker is None else unpacker.decompress(data, limit + 1)
     if len(plain) > limit:
         raise InputError(f'a part of the bag unpacks to more than {limit / 2**20:.0f} MB')
-    if not unpacker.eof:
+    if unpacker is not None and not unpacker.eof:
         raise EOFError('a packed part is cut off')
     return plain
 
 
-class _WithinLimit:
-    """Lets rosbags unpack within our limit, which it has not, while a reader of ours is open.
+class _Unpacking:
+    """Lets the chunks of a file unpack to no more, together, than a recording has."""
 
-    It finds its unpackers in two tables. What else uses rosbags in this process keeps its own
-    as soon as the last reader is closed, in whatever order they are.
+    def __init__(self, path: Path) -> None:
+        self._limit = self._left = unpacked_limit(path)
+
+    def check(self, size: int) -> None:
+        """Raise InputError where so many bytes are too many."""
+        if size > self._left:
+            raise InputError(f'its chunks unpack to more than {self._limit / 2**20:.0f} MB, which '
+                             f'is no recording')
+
+    def through(self, unpacker: Callable[[bytes, int], bytes], data: bytes) -> bytes:
+        """Return unpacked data, as unpack() does; raises InputError beyond the limit."""
+        try:
+            plain = unpacker(data, self._left)
+        except InputError:
+            self._left -= min(self._left, CHUNK_BYTES)
+            raise
+        self._left -= len(plain)
+        return plain
+
+
+def unpacked_limit(path: Path) -> int:
+    """Return the bytes to which a file may be unpacked; raises OSError."""
+    return max(UNPACKED_LEAST, UNPACKED_RATIO * path.stat().st_size)
+
+
+class _WithinLimit:
+    """Lets rosbags read within our limits, which it has not, while a reader of ours is open.
+
+    It finds its unpackers in two tables, and SQLite its limits in a list of hooks. What else uses
+    them in this process keeps its own as soon as the last reader is closed, in whatever order
+    they are.
     """
 
     def __init__(self) -> None:
@@ -92,53 +129,249 @@ class _WithinLimit:
 
     def __enter__(self) -> None:
         self._readers += 1
+        apsw.connection_hooks.append(_whole)
         for table, own in self._tables:
-            table.update({kind: partial(unpack, kind) for kind in own if kind in UNPACKERS})
+            table.update({kind: partial(unpack, kind) for kind in own})
 
     def __exit__(self, *error: object) -> None:
         self._readers -= 1
+        apsw.connection_hooks.remove(_whole)
         if not self._readers:
             for table, own in self._tables:
                 table.update(own)
 
 
-_WITHIN_LIMIT = _WithinLimit()
+WITHIN_LIMIT = _WithinLimit()
+
+
+# views, virtual tables, generated columns and long defaults make contents that a file has not
+_MADE = '''
+    SELECT 1 FROM pragma_table_list AS t, pragma_table_xinfo(t.name) AS c WHERE t.schema = 'main'
+    AND (t.type != 'table' OR c.hidden > 1 OR length(c.dflt_value) > 100) LIMIT 1'''
+# several rows of a damaged file may have the same bytes
+_SIZES = '''
+    SELECT total(octet_length(data)), (SELECT count(*) FROM topics), (SELECT
+    total(octet_length(name) + octet_length(type)) FROM topics) FROM messages'''
+
+
+def _limited(database: apsw.Connection) -> None:
+    """Let a database give what is stored in its tables, and its queries end.
+
+    Raises apsw.Error where there is more, here and in its queries.
+    """
+    left = SQLITE_STEPS * max(Path(database.filename).stat().st_size, PIECE) // PIECE
+
+    def endless() -> bool:
+        nonlocal left
+        left -= 1
+        return left < 0
+    database.limit(apsw.SQLITE_LIMIT_LENGTH, MESSAGE_BYTES)
+    database.set_progress_handler(endless, PIECE)
+    if list(database.execute(_MADE)):
+        raise apsw.SQLError('it has more than tables')
+
+
+def _whole(database: apsw.Connection) -> None:
+    """Limit a database that is to be read by its index; raises apsw.Error also for damage."""
+    _limited(database)
+    size = Path(database.filename).stat().st_size
+    [(contents, topics, names)] = database.execute(_SIZES)
+    if max(contents, names) > size or topics > TOPICS:
+        raise apsw.SQLError('its rows have more than the file')
+
+
+class _McapReader(storage_mcap.McapReader):
+    """rosbags' reader of an MCAP file that has an index of its chunks, within limits."""
+
+    def read_index(self) -> None:
+        """Read the index, and check it before anything is unpacked; raises InputError."""
+        if Path(str(self.path)).stat().st_size - self.data_end > INDEX_BYTES:
+            raise InputError('the index is too large')
+        super().read_index()
+        sizes = [chunk.uncompressed_size for chunk in self.chunks]
+        _Unpacking(Path(str(self.path))).check(sum(sizes))
+        # the reader has all chunks of one time in memory
+        ends = sorted((time, size) for chunk in self.chunks for time, size in (
+            (chunk.message_start_time, chunk.uncompressed_size),
+            (chunk.message_end_time + 1, -chunk.uncompressed_size)))
+        if max(accumulate(size for _, size in ends), default=0) > max(
+                OVERLAPPING_BYTES, max(sizes, default=0)):
+            raise InputError('too many chunks overlap')
+
+    def messages_scan(self, *which: Any) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """Read a file without an index of its chunks, once it is known what they unpack to."""
+        _Unpacking(Path(str(self.path))).check(sum(self._chunk_sizes()))
+        yield from super().messages_scan(*which)
+
+    def _chunk_sizes(self) -> Iterator[int]:
+        assert self.bio is not None
+        place = self.data_start
+        while place < self.data_end:
+            self.bio.seek(place)
+            head = self.bio.read(33)
+            size = int.from_bytes(head[1:9], 'little')
+            if size > RECORD_BYTES and head[0] in (Opcode.CHUNK, Opcode.MESSAGE):
+                raise InputError('a record is too large')
+            if head[0] == Opcode.CHUNK:
+                # behind the times of its first and last message
+                yield int.from_bytes(head[25:33], 'little')
+            place += 9 + size
+
+    def meta_scan(self) -> None:
+        """Leave a file without an index to scan_mcap()."""
+        raise InputError('there is no index')
+
+
+class _Ros1Reader(rosbag1.Reader):
+    """rosbags' reader of a ROS 1 bag whose index names each part of the file once.
+
+    _end: of the chunk before, with its index; _index_end: of what the counts of the head are of.
+    """
+
+    _end = _entries = _index_end = 0
+
+    def read_connection(self) -> Connection:
+        """Read a topic; raises InputError beyond limits."""
+        assert self.bio is not None
+        if Path(str(self.path)).stat().st_size - self.bio.tell() > INDEX_BYTES:
+            raise InputError('the index is too large')
+        return super().read_connection()
+
+    def read_chunk_info(self) -> rosbag1.ChunkInfo:
+        """Read where a chunk is."""
+        info = super().read_chunk_info()
+        assert self.bio is not None
+        self._index_end = self.bio.tell()
+        return info
+
+    def read_chunk(self) -> rosbag1.Chunk:
+        """Read a chunk's head; raises InputError where it is a part of the one before."""
+        assert self.bio is not None
+        if self.bio.tell() < self._end:
+            raise InputError('chunks overlap')
+        return super().read_chunk()
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[rosbag1.IndexData]]) -> None:
+        """Read where a topic's messages are in a chunk; raises InputError beyond limits."""
+        assert self.bio is not None
+        head = self.bio.read(INDEX_HEAD)
+        self._entries += int.from_bytes(head[-4:], 'little')
+        if self._entries > INDEX_BYTES:
+            raise InputError('the index is too large')
+        self.bio.seek(-len(head), os.SEEK_CUR)
+        super().read_index_data(pos, indexes)
+        self._end = self.bio.tell()
+
+    def open(self) -> None:
+        """Open the file; its chunks are unpacked within limits."""
+        super().open()
+        if self._index_end != Path(str(self.path)).stat().st_size:
+            self.close()
+            raise InputError('there is more than the head says')
+        unpacking = _Unpacking(Path(str(self.path)))
+        for pos, chunk in self.chunks.items():
+            # the one of the table, which takes a limit
+            own: Any = chunk.decompressor
+            self.chunks[pos] = chunk._replace(decompressor=partial(unpacking.through, own))
+
+
+class _FolderReader(rosbag2.reader.DirectoryReader):
+    """rosbags' reader of a folder with metadata.yaml, within limits."""
+
+    STORAGE_PLUGINS: Mapping[str, Any] = {'mcap': _McapReader,
+                                          'sqlite3': storage_sqlite3.Sqlite3Reader}
+
+
+class Reader2(rosbag2.Reader):
+    """rosbags' reader of a ROS 2 bag; within limits while WITHIN_LIMIT is entered."""
+
+    STORAGE_PLUGINS: Mapping[str, Any] = {'dir': _FolderReader, '.mcap': _McapReader,
+                                          '.db3': storage_sqlite3.Sqlite3Reader}
 
 
 @contextmanager
 def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
     """Give the file; of a .zstd file, a temporary copy of what could be unpacked.
 
-    Raises InputError where that is too much for a recording or for the disk; OSError.
+    Also of an SQLite file whose recorder was killed: its last messages are in a journal beside
+    it. Raises InputError where a copy is too much for a recording or for the disk; OSError.
     """
-    if file.suffix.lower() != '.zstd':
+    packed = file.suffix.lower() == '.zstd'
+    journals = [] if packed else _journals(file)
+    if not packed and not journals:
         yield file
         return
-    with tempfile.TemporaryDirectory(prefix='dashcalib-') as folder:
-        plain = Path(folder, file.stem)
+    with temporary_folder() as folder:
+        plain = folder / (file.stem if packed else file.name)
         try:
-            _unpack_file(file, plain)
+            if packed:
+                _unpack_file(file, plain)
+            else:
+                _complete(file, journals, plain)
+                damage(f'{file.name} was not closed, and its end is taken from '
+                       f'{first_of([each.name for each in journals])}')
         except (zstd.ZstdError, EOFError):
             damage(f'{file.name} is damaged')
+        except apsw.Error as error:
+            damage(f'{file.name} was not closed, and {journals[0].name}, which has its end, '
+                   f'cannot be used ({one_line(error)})')
+            plain = file
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            raise InputError(f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, '
-                             f'or unpack it first (zstd -d)') from error
+            raise InputError(
+                f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, or unpack it '
+                f'first (zstd -d)' if packed else
+                f'no room to copy {file}, which was not closed, to {folder}: set TMPDIR to a '
+                f'bigger disk, or close it first (sqlite3 {file.name} .schema)') from error
         yield plain
 
 
 def _unpack_file(packed: Path, plain: Path) -> None:
-    limit = max(UNPACKED_LEAST, UNPACKED_RATIO * packed.stat().st_size)
-    with zstd.open(packed, 'rb') as source, plain.open('wb', PIECE) as output:
-        while piece := source.read1(PIECE):
-            if output.tell() + len(piece) > limit:
+    limit = unpacked_limit(packed)
+    with zstd.open(packed, 'rb') as source:
+        for size in _copied(source.read1, plain):
+            if size > limit:
                 raise InputError(
                     f'{packed} unpacks to more than {limit / 2**20:.0f} MB, which is no '
                     f'recording; if it is one, unpack it first (zstd -d)')
+
+
+def _copied(read: Callable[[int], bytes], plain: Path) -> Iterator[int]:
+    """Write what is read to a file; yield its size before each piece. Leaves FREE_BYTES free."""
+    with plain.open('wb', PIECE) as output:
+        while piece := read(PIECE):
+            yield output.tell() + len(piece)
             if shutil.disk_usage(plain.parent).free < FREE_BYTES:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             output.write(piece)
+
+
+def _journals(file: Path) -> list[Path]:
+    """Return what SQLite has beside a file that was not closed: messages that are not in it yet.
+
+    A rollback journal is one too: what is half-written in the file is in it as it was before.
+    """
+    beside = (file.with_name(f'{file.name}{end}') for end in ('-wal', '-journal'))
+    return [each for each in beside if each.is_file() and each.stat().st_size]
+
+
+def _complete(file: Path, journals: Sequence[Path], plain: Path) -> None:
+    """Make a copy of a database with what its journals have; raises OSError, apsw.Error.
+
+    Opening the file itself would write to it.
+    """
+    for source in (file, *journals):
+        with source.open('rb') as stream:
+            target = plain.with_name(f'{plain.name}{source.name.removeprefix(file.name)}')
+            for _ in _copied(stream.read, target):
+                pass
+    with closing(apsw.Connection(str(plain))) as database:
+        database.execute('PRAGMA schema_version').fetchone()  # takes a rollback journal
+        _, frames, _ = database.execute('PRAGMA wal_checkpoint').fetchone() or (0, 0, 0)
+        if not frames:
+            raise apsw.Error('nothing in it is whole')
+        database.execute('PRAGMA journal_mode = DELETE')
 
 
 @dataclass(frozen=True)
@@ -185,10 +418,11 @@ def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]]
     counts = Counter[tuple[str, str]]()
     with unpacked(file, damage) as path:
         try:
-            with _WITHIN_LIMIT, _reader(path) as reader:
+            with WITHIN_LIMIT, _reader(path) as reader:
                 for connection in reader.connections:
                     counts[connection.topic, connection.msgtype] += connection.msgcount
-            return counts, True
+            # what a journal has that cannot be used is not counted
+            return counts, path != file or not _journals(file)
         except Exception:  # a damaged file makes rosbags raise nearly anything
             return Counter((record.topic, record.msgtype) for record in scan(path, damage)), False
 
@@ -213,7 +447,7 @@ def records(file: Path, topics: Collection[str], damage: Damage) -> Iterator[Rec
 
 
 def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
-    with _WITHIN_LIMIT, _reader(path) as reader:
+    with WITHIN_LIMIT, _reader(path) as reader:
         wanted = [each for each in reader.connections if each.topic in topics]
         missing = sum(connection.msgcount for connection in wanted)
         if not wanted:
@@ -228,7 +462,7 @@ def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
 
 def _reader(path: Path) -> rosbag1.Reader | rosbag2.Reader:
     with path.open('rb') as file:
-        return rosbag1.Reader(path) if file.read(7) == b'#ROSBAG' else rosbag2.Reader(path)
+        return _Ros1Reader(path) if file.read(7) == b'#ROSBAG' else Reader2(path)
 
 
 def scan(path: Path, damage: Damage) -> Iterator[Record]:
@@ -250,10 +484,10 @@ def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
     schemas: dict[int, str] = {}
     channels: dict[int, Channel] = {}
     with path.open('rb') as file:
-        limit = path.stat().st_size
+        limit = min(path.stat().st_size, RECORD_BYTES)
         repeated = _repeated(file, limit)
         reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
-        for record in chain(repeated, _mcap_records(reader, path.name, damage)):
+        for record in chain(repeated, _mcap_records(reader, _Unpacking(path), path.name, damage)):
             if isinstance(record, Schema):
                 schemas[record.id] = normalize_msgtype(record.name)
             elif isinstance(record, Channel):
@@ -272,6 +506,8 @@ def _repeated(file: BinaryIO, limit: int) -> list[McapRecord]:
     try:
         file.seek(-FOOTER_SIZE - MAGIC_SIZE, os.SEEK_END)
         footer: Any = next(StreamReader(file, skip_magic=True, record_size_limit=limit).records)
+        if file.seek(0, os.SEEK_END) - footer.summary_start > INDEX_BYTES:
+            return []
         file.seek(footer.summary_start)
         reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=limit)
         return [record for record in reader.records if isinstance(record, (Schema, Channel))]
@@ -281,7 +517,8 @@ def _repeated(file: BinaryIO, limit: int) -> list[McapRecord]:
         file.seek(0)
 
 
-def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[McapRecord]:
+def _mcap_records(reader: StreamReader, unpacking: _Unpacking, name: str, damage: Damage
+                  ) -> Iterator[McapRecord]:
     records = reader.records
     while True:
         # damaged lengths and texts come out as any of these: the library does not wrap them
@@ -296,7 +533,7 @@ def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[M
             yield record
             continue
         try:
-            plain = unpack(record.compression, record.data)
+            plain = unpacking.through(partial(unpack, record.compression), record.data)
             inner = breakup_chunk(replace(record, compression='', data=plain), validate_crc=True)
         except Exception as error:  # also the unpackers' own errors
             damage(f'{name} has a broken chunk ({one_line(error)})')
@@ -306,22 +543,27 @@ def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[M
 
 _ROWS = '''
     SELECT topic_id, timestamp, data FROM messages
-    WHERE typeof(timestamp) = 'integer' AND typeof(data) = 'blob' ORDER BY id'''
+    WHERE typeof(timestamp) = 'integer' AND typeof(data) = 'blob' AND octet_length(data) <= ?'''
 
 
 def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
     """Yield the messages of an SQLite bag, by row."""
     uri = f'file:{quote(str(path.absolute()))}?mode=ro&immutable=1'
-    database = sqlite3.connect(uri, uri=True)
+    database = apsw.Connection(uri, apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI)
+    left = path.stat().st_size
     try:
         # else SQLite refuses a file that is shorter than its header says
         database.execute('PRAGMA writable_schema = ON')
+        _limited(database)
         topics = {key: (name, kind) for key, name, kind in
-                  database.execute('SELECT id, name, type FROM topics')}
-        for topic, receive_ns, data in database.execute(_ROWS):
+                  islice(database.execute('SELECT id, name, type FROM topics'), TOPICS)}
+        for topic, receive_ns, data in database.execute(_ROWS, (left,)):
+            left -= len(data)
+            if left < 0:
+                raise apsw.SQLError('its rows have more than the file')
             if topic in topics:
                 yield Record(*topics[topic], receive_ns, data)
-    except sqlite3.DatabaseError as error:
+    except apsw.Error as error:
         damage(f'{path.name}: {one_line(error)}')
     finally:
         database.close()
@@ -332,13 +574,13 @@ def scan_bag(path: Path, damage: Damage) -> Iterator[Record]:
     with path.open('rb') as file:
         file.readline()
         try:
-            yield from _bag_messages(file, {})
+            yield from _bag_messages(file, {}, _Unpacking(path))
         except Exception as error:  # rosbags' errors, and those of what unpacks
             damage(f'{path.name} is cut off ({one_line(error)})')
 
 
-def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]]
-                  ) -> Iterator[Record]:
+def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]],
+                  unpacking: _Unpacking, inside: bool = False) -> Iterator[Record]:
     while file.peek(1):
         head = rosbag1.Header.read(file)
         kind = head.get_uint8('op')
@@ -349,10 +591,10 @@ def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]]
             continue
         size = rosbag1.read_uint32(file)
         data = file.read(size)
-        if kind == rosbag1.RecordType.CHUNK:
+        if kind == rosbag1.RecordType.CHUNK and not inside:
             # a chunk that is cut off may have complete messages at its start
-            plain = BytesIO(unpack(head.get_string('compression'), data))
-            yield from _bag_messages(BufferedReader(plain), connections)
+            plain = unpacking.through(partial(unpack, head.get_string('compression')), data)
+            yield from _bag_messages(BufferedReader(BytesIO(plain)), connections, unpacking, True)
         if len(data) < size:
             raise EOFError(f'{size - len(data)} bytes are missing')
         if kind == rosbag1.RecordType.MSGDATA:

@@ -23,6 +23,7 @@ from dashcalib_ros.input.source import (
     Picture,
     Reading,
     by_name,
+    cameras_named,
     first_of,
     is_bag_file,
 )
@@ -91,6 +92,9 @@ def open_bag(path: Path) -> Bag:
                      for file in listed if file not in present and file.name not in skipped]
     elif present:
         files = present
+        if (cameras := cameras_named([file.name for file in files])) > 1:
+            raise InputError(f'{path} has recordings of {cameras} cameras '
+                             f'({first_of([file.name for file in files])}): give the files of one')
         warnings += [f'{path} has no usable metadata.yaml: reading '
                      f'{first_of([file.name for file in files])} in this order']
     if not files:
@@ -108,8 +112,10 @@ def _metadata(path: Path) -> tuple[tuple[Path, ...], tuple[Topic, ...]]:
     try:
         text = read_text(path, YAML_BYTES)
         content = parse_yaml(text, str(path))['rosbag2_bagfile_information']
-        # older versions wrote the folder's name too, which may have changed since
-        files = tuple(path.parent / PurePath(name).name for name in content['relative_file_paths'])
+        # older versions wrote the folder's name too, which may have changed since; a file counts
+        # once
+        files = tuple(dict.fromkeys(
+            path.parent / PurePath(name).name for name in content['relative_file_paths']))
         counts = Counter[tuple[str, str]]()
         for item in content['topics_with_message_count']:
             about = item['topic_metadata']

@@ -2,24 +2,24 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.camera_info import SAME, RosCamera
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.input.bag_read import unpacked
+from dashcalib_ros.input.bag_read import WITHIN_LIMIT, Reader2, unpacked
 from dashcalib_ros.input.bag_storage import open_bag
 from dashcalib_ros.input.source import METADATA
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
+from dashcalib_ros.whole_files import temporary_folder
 
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 REPAIR = "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
@@ -62,10 +62,15 @@ def check_bag(source: str | os.PathLike[str], image_topic: str | None,
 
     image_topic: None when the source is no bag. Raises InputError or OutputError.
     """
-    if Path(out).exists():
-        raise OutputError(f'{out} exists: choose another place for the bag or remove it')
+    path = Path(out).absolute()
+    _check_free(path)
     with _opened(source, image_topic):
         pass
+    try:
+        with temporary_folder(path.parent) as draft:
+            (draft / f'{path.name}.mcap').touch()  # so is the file in it called
+    except OSError as error:
+        raise _unwritable(path, error) from error
 
 
 def write_bag(source: str | os.PathLike[str], image_topic: str, camera: Camera,
@@ -101,23 +106,29 @@ def new_bag(path: Path) -> Iterator[Writer]:
     Raises OutputError when it exists or cannot be written.
     """
     path = path.absolute()
-    if path.exists():
-        raise OutputError(f'{path} exists: choose another place for the bag or remove it')
+    _check_free(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix='.writing-', dir=path.parent,
-                                         ignore_cleanup_errors=True) as draft:
+        with temporary_folder(path.parent) as draft:
             # rosbags names the file inside after the folder: it has its last name already
-            with Writer(Path(draft, path.name), version=9,
+            with Writer(draft / path.name, version=9,
                         storage_plugin=StoragePlugin.MCAP) as writer:
                 yield writer
-            Path(draft, path.name).rename(path)
+            (draft / path.name).rename(path)
     except (OSError, WriterError) as error:
-        raise OutputError(f'{path} cannot be written ({error}): check the permissions and the '
-                          f'room on that disk') from error
+        raise _unwritable(path, error) from error
 
 
-def _messages(reader: Reader, connections: list[Connection], source: str | os.PathLike[str]
+def _check_free(path: Path) -> None:
+    if os.path.lexists(path):
+        raise OutputError(f'{path} exists: choose another place for the bag or remove it')
+
+
+def _unwritable(path: Path, error: Exception) -> OutputError:
+    return OutputError(f'{path} cannot be written ({error}): check the path, its permissions and '
+                       f'the room on that disk')
+
+
+def _messages(reader: Reader2, connections: list[Connection], source: str | os.PathLike[str]
               ) -> Iterator[tuple[Connection, int, bytes]]:
     try:
         yield from reader.messages(connections)
@@ -143,20 +154,20 @@ def _declared(writer: Writer, connection: Connection) -> Connection:
 
 
 @contextmanager
-def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator[Reader]:
+def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator[Reader2]:
     if image_topic is None:
         raise InputError(f'{source} is no bag: only of a bag a bag can be made')
     path = Path(source)
     if path.suffix == '.bag' or (path.is_dir() and not any(path.glob('*.yaml'))
                                  and any(path.glob('*.bag'))):
         raise InputError(f'{source} is a ROS 1 bag: convert it first (rosbags-convert)')
-    try:
-        _check_limits(path)
-        reader = Reader(path)
-        reader.open()
-    except Exception as error:  # a damaged file makes rosbags raise nearly anything
-        raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
-    with closing(reader):
+    with ExitStack() as opened:
+        try:
+            _check_limits(path)
+            opened.enter_context(WITHIN_LIMIT)
+            reader = opened.enter_context(Reader2(path))
+        except Exception as error:  # a damaged file makes rosbags raise nearly anything
+            raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
         topic = camera_info_topic(image_topic)
         wrong = [each.msgtype for each in reader.connections
                  if each.topic == topic and each.msgtype != CAMERA_INFO]
@@ -171,8 +182,12 @@ def _check_limits(path: Path) -> None:
     if path.is_dir():
         parse_yaml(read_text(path / METADATA, YAML_BYTES), str(path / METADATA))
     for file in open_bag(path).files:
-        with unpacked(file, lambda _: None):
+        with unpacked(file, _refuse):
             pass
+
+
+def _refuse(damage: str) -> None:
+    raise InputError(damage)
 
 
 def _camera_info(types: Any, c: RosCamera, header: Any) -> Any:

@@ -10,7 +10,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,16 +25,31 @@ from dashcalib_ros.input.source import (
     Reading,
     by,
     by_name,
+    cameras_named,
     first_of,
     is_bag_file,
     os_error,
 )
 from dashcalib_ros.limits import PICTURE_BYTES, check_file, read_file
 
-# not whatever FFmpeg takes: it would play a text file
+# what is known by its name, where its content does not tell; not whatever FFmpeg takes: it would
+# play a text file
 VIDEO_SUFFIXES = frozenset(
     ('.mp4', '.m4v', '.mov', '.avi', '.mkv', '.webm', '.ts', '.mts', '.m2ts', '.mpg', '.mpeg',
-     '.wmv', '.flv', '.3gp', '.ogv', '.mjpg', '.mjpeg', '.h264', '.264', '.h265', '.265', '.hevc'))
+     '.wmv', '.flv', '.3gp', '.ogv', '.mjpg', '.mjpeg', '.h264', '.264', '.h265', '.265', '.hevc',
+     '.insv', '.360', '.asf', '.m2t', '.mod', '.vob'))
+# how files begin that are bags, and videos
+BAG_MARKS = re.compile(rb'\x89MCAP0\r\n|SQLite format 3\0|#ROSBAG V2')
+VIDEO_MARKS = re.compile(
+    # MP4 and QuickTime, but for pictures and sound
+    rb'....(?:ftyp(?!heic|heix|mif1|avif|crx |M4A |M4B )|moov|mdat|wide)'
+    rb'|RIFF....AVI |\x1aE\xdf\xa3|OggS|FLV\x01|\0\0\x01\xba'
+    rb'|0&\xb2u\x8ef\xcf\x11'  # Windows Media
+    rb'|(?:....)?(?:G.{187}){2}G|....(?:G.{191}){2}G',  # transport streams
+    re.DOTALL)
+MARK_BYTES = 400
+# small copies that cameras leave beside their videos
+PREVIEWS = re.compile(r'LRV_.*|.*\.(?:LRV|LRF)', re.IGNORECASE)
 
 # how makers name what one camera records, without the ending: t is the time or the number of a
 # recording, n of its part, c which camera of several it is; GX010001, GX020001, GX010002
@@ -44,7 +59,8 @@ MAKERS = {maker: re.compile(name, re.IGNORECASE) for maker, name in (
     ('Garmin names', r'GRMN(?P<t>)(?P<n>\d+)(?P<c>)'),
     ('Viofo names', r'(?P<t>\d{4}_?\d{4}_?\d{6})_(?P<n>\d{3,6})P?(?P<c>[A-Z]?)'),
     ('BlackVue names', r'(?P<t>\d{8}_\d{6})(?P<n>)_[A-Z](?P<c>[A-Z])[LS]?'),
-    ('Insta360 names', r'(?:PRO_)?VID_(?P<t>\d{8}_\d{6})_(?P<c>\d\d)_(?P<n>\d+)(?:_\d+)?'))}
+    ('Insta360 names', r'(?:PRO_)?VID_(?P<t>\d{8}_\d{6})_(?P<c>\d\d)_(?P<n>\d+)(?:_\d+)?'),
+    ('Vantrue names', r'(?P<t>\d{8}_\d{6})_(?P<n>\d+)_(?:[A-Z]_)?(?P<c>[ABC])'))}
 # names of files in a message; of more only the first and the last are told
 TOLD = 12
 
@@ -62,7 +78,8 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     (drives/*.mp4): in the order that the camera's maker gives their names, else of the times at
     which they were recorded, else of their names; a warning says which. No turn spans two of them
     unless they go on; one that cannot be read is left out, with a warning.
-    topic: the image topic of a bag; needed only when it has several.
+    topic: the image topic of a bag; needed only when it has several. Of a video with several
+    streams, the number of one: '2'.
     fps: images per second of a folder (default 10), or instead of what a video says (Hz).
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
 
@@ -110,11 +127,15 @@ def _expanded(text: str) -> _Group:
     if path.exists() or not glob.has_magic(text):
         return _Group(text, [path])
     found = sorted(named_like(text), key=lambda each: by_name(str(each)))
-    known = [each for each in found if _opener_of(each) is not None]
+    known = _without_previews([each for each in found if _opener_of(each) is not None])
     if not known:
         raise InputError(_unknown(found[0]) if found else
                          f'no file is named like {text}: check the pattern')
     return _Group(text, known, len(found) - len(known))
+
+
+def _without_previews(paths: list[Path]) -> list[Path]:
+    return [each for each in paths if not PREVIEWS.fullmatch(each.name)] or paths
 
 
 def named_like(pattern: str) -> Iterator[Path]:
@@ -137,9 +158,10 @@ def _in_folder(folder: Path) -> _Group:
     if fits_bag(folder):
         return _Group(str(folder), [folder])
     entries = sorted(folder.iterdir(), key=lambda each: by_name(each.name))
-    found = [each for each in entries if not each.name.startswith('.')
-             and (_is_video(each) or (each.is_dir() and fits_bag(each)))]
-    images = sum(each.suffix.lower() in IMAGE_SUFFIXES for each in entries)
+    images = sum(map(_has_image_name, entries))
+    found = _without_previews([
+        each for each in entries if not (each.name.startswith('.') or _has_image_name(each))
+        and (is_video(each) or (each.is_dir() and fits_bag(each)))])
     # cameras leave thumbnails beside their videos
     if not found or images > len(found):
         return _Group(str(folder), [folder])
@@ -161,8 +183,8 @@ def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> F
                 failures.append(str(error))
         if len(opened) > 1:
             opened, by = _ordered(opened)
-            if len(cameras := {camera for *_, camera in map(_numbered, opened)}) > 1:
-                raise InputError(f'{group.where} has recordings of {len(cameras)} cameras '
+            if (cameras := _cameras(opened)) > 1:
+                raise InputError(f'{group.where} has recordings of {cameras} cameras '
                                  f'({_listed(opened)}): give a pattern that names one')
             warnings.append(f'{group.where}: {len(opened)} files by {by}: {_listed(opened)}')
         parts += opened
@@ -197,6 +219,12 @@ def _numbered(source: FrameSource) -> tuple[str, str, int, str]:
     return '', '', 0, ''
 
 
+def _cameras(sources: Sequence[FrameSource]) -> int:
+    """Return how many cameras recorded these, as their names tell."""
+    by_maker = {camera for *_, camera in map(_numbered, sources)}
+    return max(len(by_maker), cameras_named([source.name for source in sources]))
+
+
 def _listed(sources: Sequence[FrameSource]) -> str:
     names = [Path(source.name).name for source in sources]
     return ', '.join(names if len(names) <= TOLD else [*names[:TOLD - 2], '...', names[-1]])
@@ -227,23 +255,42 @@ def _opener_of(path: Path) -> Callable[[Path, str | None, float | None], FrameSo
     if fits_bag(path):
         from dashcalib_ros.input.bag_storage import BagSource
         return BagSource
-    if _is_video(path):
+    if is_video(path):
         from dashcalib_ros.input.video import VideoSource
         return VideoSource
     return FolderSource if path.is_dir() else None
 
 
 def fits_bag(path: Path) -> bool:
-    """Return whether a path is a bag, by its name or by what is in the folder."""
+    """Return whether a path is a bag: by what is in the folder or the file, else by its name."""
     if path.is_dir():
         return any(entry.name == METADATA
                    or (is_bag_file(entry.name) and entry.is_file())
                    for entry in path.iterdir())
-    return is_bag_file(path.name)
+    head = _head(path)
+    return bool(BAG_MARKS.match(head)) or (is_bag_file(path.name) and not VIDEO_MARKS.match(head))
 
 
-def _is_video(path: Path) -> bool:
-    return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
+def is_video(path: Path) -> bool:
+    """Return whether a path is a video: by what is in the file, else by its name."""
+    if path.is_dir():
+        return False
+    head = _head(path)
+    return bool(VIDEO_MARKS.match(head)) or (
+        path.suffix.lower() in VIDEO_SUFFIXES and not BAG_MARKS.match(head))
+
+
+def _head(path: Path) -> bytes:
+    """Return how a file begins; nothing of what is no file or cannot be read."""
+    with suppress(OSError, ValueError):
+        if path.is_file():
+            with path.open('rb') as file:
+                return file.read(MARK_BYTES)
+    return b''
+
+
+def _has_image_name(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 DEFAULT_FPS = 10.0  # Hz; the rate the paper works at
@@ -261,6 +308,10 @@ class FolderSource(FrameSource):
         self._names = sorted(filter(_is_image, names), key=by_name)
         if not self._names:
             raise InputError(_no_images(path, names))
+        if (cameras := cameras_named(self._names)) > 1:
+            raise InputError(f'{path} has pictures of {cameras} cameras '
+                             f'({first_of(self._names)}): put those of one into a folder of '
+                             f'their own')
         self._fps = fps or DEFAULT_FPS
         warnings = []
         if fps is None:
@@ -311,7 +362,7 @@ def _check_recorded(text: str) -> None:
 
 
 def _unknown(path: Path) -> str:
-    if path.suffix.lower() in IMAGE_SUFFIXES:
+    if _has_image_name(path):
         return f'{path} is a single image: give the folder of all images of the drive'
     return (f'{path} is no kind of drive known here: give a bag (.mcap, .db3, .bag), '
             f'a video (.mp4, .avi, .mkv ...) or a folder of images')
@@ -343,6 +394,8 @@ class JoinedSource(FrameSource):
                 raise InputError(
                     f'{name} is {by(size)} and {sized[0][0]} is {by(sized[0][1])}: a calibration '
                     f'holds for one size; calibrate each size on its own')
+        if sized and len(stored := {part.stored_size for part in self._parts}) == 1:
+            self.size, [self.stored_size] = sized[0][1], stored
         counts = [part.count for part in self._parts]
         lengths = [part.length_ns for part in self._parts]
         super().__init__(

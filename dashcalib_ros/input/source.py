@@ -4,14 +4,19 @@ from __future__ import annotations
 import copy
 import re
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dashcalib_ros.arrays import GreyImage, Pixels
 from dashcalib_ros.errors import InputError, shortened
+
+if TYPE_CHECKING:
+    from dashcalib_ros.camera import Camera
 
 IMAGE_SUFFIXES = frozenset(
     ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'))
@@ -20,6 +25,14 @@ BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
 METADATA = 'metadata.yaml'
 # ns; what a stamp of 64 bits holds
 LAST_NS = 2**63 - 1
+# how others name the camera of several that record at a time: 2026-01-31_10-00-00-left_repeater,
+# CH1_20260131, and one letter: NO20260131-100000-000123F, REC_2026_01_31_F, 260131_100000_001_FH
+SIDE_WORD = re.compile(
+    r'(?<![a-z])(?:front|back|rear|left|right|(?:in|out)side|interior|cabin|inner|driver|repeater'
+    r'|pillar'
+    r'|(?:ch|cam|camera|channel)[-_ ]?\d{1,2})(?![a-z0-9])')
+SIDE_LETTER = re.compile(r'(?<=[\d_ -])([a-z])[hls]?$')
+SIDES = frozenset('fbrli')
 # images are further apart; stamps are rounded
 CLOSE_NS = 1_000_000
 
@@ -28,6 +41,25 @@ def by_name(name: str) -> tuple[list[tuple[int, str]], str]:
     """Return a sort key for names in which numbers count as numbers: 2.png before 10.png."""
     parts = re.findall(r'[0-9]+|[^0-9]+', name)
     return [(int(part), '') if part[0] in '0123456789' else (-1, part) for part in parts], name
+
+
+def cameras_named(names: Sequence[str]) -> int:
+    """Return of how many cameras these files are: what they differ in names a side of the car."""
+    stems = {str(path.parent / path.stem).lower() for path in map(Path, names)}
+    found = [(SIDE_WORD.sub('', stem), SIDE_WORD.findall(stem)) for stem in stems]
+    letters: defaultdict[str, set[str]] = defaultdict(set)
+    for rest, _ in found:
+        if letter := SIDE_LETTER.search(rest):
+            letters[rest[:letter.start()]].add(letter[1])
+    cameras: defaultdict[str, set[str]] = defaultdict(set)
+    for rest, side in found:
+        letter = SIDE_LETTER.search(rest)
+        others = letters[rest[:letter.start()]] if letter else set()
+        # a to f are parts of one drive; some name the rear camera only
+        if letter and others <= SIDES and (len(others) > 1 or others == {'r'}):
+            rest, side = rest[:letter.start()], [*side, letter[1]]
+        cameras[rest.strip('-_ ')].add(' '.join(side))
+    return max(map(len, cameras.values()), default=0)
 
 
 def by(size: tuple[int, int]) -> str:
@@ -136,7 +168,8 @@ class FrameSource(ABC):
     name: of the drive, for messages.
     count: how many images to expect (for a progress bar), None if unknown.
     topic: the bag's image topic; None for videos and folders.
-    size: (width, height) where it is known before the first image, else None.
+    size: (width, height) where it is known before the first image, else None. stored_size: that
+    of the pictures as they are stored, where their pixels are not square; else None.
     length_ns: how long the drive is where its stamps are counted from 0, else None.
     recorded: its stamps are times of recording, as a bag has them. begin_ns: when it began, None
     where that is not known.
@@ -149,6 +182,7 @@ class FrameSource(ABC):
     """
 
     size: tuple[int, int] | None = None
+    stored_size: tuple[int, int] | None = None
     length_ns: int | None = None
     recorded = False
     contradictions: tuple[str, ...] = ()
@@ -173,6 +207,24 @@ class FrameSource(ABC):
     def warnings(self) -> tuple[str, ...]:
         """Return what the user should know, one line each; complete after the last frame."""
         return self.contradictions + self._opening_warnings + self._reading_warnings
+
+    def stored(self, camera: Camera) -> Camera | None:
+        """Return a camera of these images for the pictures as they are stored.
+
+        None where that is the same.
+        """
+        return self._stretched(camera, self.size, self.stored_size)
+
+    def shown(self, camera: Camera) -> Camera:
+        """Return the camera of these images, of one for the pictures as they are stored."""
+        return self._stretched(camera, self.stored_size, self.size) or camera
+
+    @staticmethod
+    def _stretched(camera: Camera, before: tuple[int, int] | None, after: tuple[int, int] | None
+                   ) -> Camera | None:
+        if before is None or after is None or camera.image_size != before:
+            return None
+        return camera.resized(after[0] / before[0], after, after[1] / before[1])
 
     def excerpt(self, start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
         """Return the part of the drive from start_s on, duration_s long; None: to its end."""

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -14,11 +15,12 @@ import av
 import cv2
 import numpy as np
 from av.container import InputContainer
+from av.stream import Disposition
 from av.video.reformatter import ColorRange, VideoReformatter
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.source import FrameSource, Picture, Reading
+from dashcalib_ros.errors import InputError, shortened
+from dashcalib_ros.input.source import FrameSource, Picture, Reading, by
 from dashcalib_ros.input.stamps import SECOND_NS, StampGate
 from dashcalib_ros.limits import check_pixels
 
@@ -30,26 +32,37 @@ NO_TIMES = 0x80
 THREADS = min(4, os.cpu_count() or 1)
 # pictures at the beginning whose times tell the rate; one of them can be decoded
 LOOKED_AT = 100
+# of an MP4 that are looked at: it has some five, and a fragmented one begins with its index
+BOXES = 1000
 # of the rate that the video says, by which --fps may be off
 ALIKE = 0.02
 # of the pictures that a video promises, by its length and its rate or by their number
 COMPLETE = 0.9, 0.99
+
+# of the two sides of a pixel; DVRs leave out every second row or column
+MOST_STRETCH = 4.0
+# what the shape of a picture leaves of square pixels, as sizes are whole numbers
+ALMOST_SQUARE = 0.02
+SQUARE = (1.0, 1.0)
+# FFmpeg's flags of a stream of pictures that are no video
+THUMBNAILS = int(Disposition.attached_pic | Disposition.timed_thumbnails)
 
 # luma of television's range, 16 to 235 -> 0 to 255
 FULL = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
 
 
 class VideoSource(FrameSource):
-    """The pictures of a video file, as a player shows them: turned as its metadata says.
+    """The pictures of a video file, as a player shows them: turned and stretched as it says.
 
-    Stamps are the pictures' own times, counted from the first one; with fps they are index / fps.
+    topic: the number of the stream, where it has several; None: the one that players take. Stamps
+    are the pictures' own times, counted from the first one; with fps they are index / fps.
     Raises InputError for a file that is no video, and without fps for one that knows no times.
     """
 
     def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:
         self._path, self._fps = path, fps
-        warnings = [f'{path} is a video: topic {topic} is ignored'] if topic is not None else []
-        with _opened(path) as (container, stream):
+        self._stream, warnings = _chosen(path, topic)
+        with _opened(path, self._stream) as (container, stream):
             timed = not container.format.flags & NO_TIMES
             if not (fps or timed):
                 raise InputError(f'{path} does not say when its pictures were taken: give their '
@@ -61,14 +74,19 @@ class VideoSource(FrameSource):
             if first is None:
                 raise _unplayable(path)
             turn = -first.rotation % 360
-            self.size = ((first.height, first.width) if turn % 180 else
-                         (first.width, first.height))
+            self._stretch = _stretch(stream, path, warnings)
+            self.size, stored = (each[::-1] if turn % 180 else each for each in (
+                _stretched(first, self._stretch), (first.width, first.height)))
             self._first_ns = _time_ns(first) or 0
             rate = _rate([time for time in times if time is not None]) if timed else 0.0
             length_s = _length_s(container, stream) if timed else 0.0
             count = stream.frames or round(length_s * rate) or None
             self._complete = COMPLETE[bool(stream.frames)]
             self._created = container.metadata.get('creation_time', '')
+        if self.size != stored:
+            self.stored_size = stored
+            warnings.append(f'{path} says that its pixels are not square: its {by(stored)} '
+                            f'pictures are taken as {by(self.size)}, as players show them')
         if turn:
             warnings.append(f'{path} says to turn its pictures by {turn} degrees: '
                             f'the calibration is for the turned pictures')
@@ -90,10 +108,10 @@ class VideoSource(FrameSource):
         return None if created.year <= 2000 else round(created.timestamp()) * SECOND_NS
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
-        gate, picture = StampGate(), _Picture()
+        gate, picture = StampGate(), _Picture(self._stretch)
         read, index = self._before(start_ns) if start_ns else (0, 0)
         reading.images = index
-        with _opened(self._path) as (container, stream):
+        with _opened(self._path, self._stream) as (container, stream):
             for packet in islice(_packets(container, stream), read, None):
                 read += packet.size > 0  # the last one has nothing in it
                 for frame in _decoded(packet):
@@ -125,7 +143,7 @@ class VideoSource(FrameSource):
         """
         skipped = index = shown = 0
         key_ns = 0
-        with _opened(self._path) as (container, stream):
+        with _opened(self._path, self._stream) as (container, stream):
             for place, packet in enumerate(_packets(container, stream)):
                 time_ns = _time_ns(packet)
                 if time_ns is None or packet.is_discard:
@@ -143,11 +161,12 @@ class VideoSource(FrameSource):
 class _Picture:
     """Frame -> picture, as a player shows it; BGR where colour is asked for. Raises InputError."""
 
-    def __init__(self) -> None:
+    def __init__(self, stretch: tuple[float, float]) -> None:
         self._reformatter = VideoReformatter()
+        self._stretch = stretch
 
     def __call__(self, frame: av.VideoFrame, colour: bool = False) -> Pixels:
-        check_pixels(frame.width, frame.height)
+        check_pixels(*_stretched(frame, self._stretch))
         kind = frame.format
         image: Pixels
         try:
@@ -165,7 +184,31 @@ class _Picture:
                 image = self._reformatter.reformat(frame, format='gray', threads=1).to_ndarray()
         except (av.FFmpegError, ValueError) as error:
             raise _undecodable() from error
+        if self._stretch != SQUARE:
+            # Lanczos moves edges between the pixels least
+            image = cv2.resize(image, _stretched(frame, self._stretch),
+                               interpolation=cv2.INTER_LANCZOS4)
         return np.ascontiguousarray(np.rot90(image, frame.rotation // 90), np.uint8)
+
+
+def _stretch(stream: av.VideoStream, path: Path, warnings: list[str]) -> tuple[float, float]:
+    """Return by how much columns and rows are stretched, so that pixels are square.
+
+    The longer side of a pixel is kept: nothing is lost.
+    """
+    aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
+    ratio = float(aspect) if aspect else 1.0
+    if aspect and not 1 / MOST_STRETCH <= ratio <= MOST_STRETCH:
+        warnings.append(f'{path} says that its pixels are {aspect.numerator}:{aspect.denominator}'
+                        f', which no camera has: they are taken as square')
+        return SQUARE
+    if abs(ratio - 1) <= ALMOST_SQUARE:
+        return SQUARE
+    return max(ratio, 1.0), max(1 / ratio, 1.0)
+
+
+def _stretched(frame: av.VideoFrame, stretch: tuple[float, float]) -> tuple[int, int]:
+    return round(frame.width * stretch[0]), round(frame.height * stretch[1])
 
 
 def _packets(container: InputContainer, stream: av.VideoStream
@@ -202,8 +245,37 @@ def _length_s(container: InputContainer, stream: av.VideoStream) -> float:
     return max(0, (container.duration or 0) - max(0, container.start_time or 0)) / av.time_base
 
 
+def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[str]]:
+    """Return the number of the stream that is wanted, and what is to be said of the choice.
+
+    Raises InputError where there is no such stream.
+    """
+    with _opened(path) as (container, best):
+        streams = _streams(container)
+        there = ', '.join(f'{n} has {by((each.width, each.height))}'
+                          for n, each in enumerate(streams, 1))
+        if topic is None:
+            taken = next((n for n, each in enumerate(streams, 1) if each.index == best.index), 1)
+            several = [f'{path} has {len(streams)} video streams ({there}): {taken} is taken; '
+                       f'choose with --stream'] if len(streams) > 1 else []
+            return None, several
+        if topic.isdecimal() and 1 <= int(topic[:9]) <= len(streams):
+            return int(topic), []
+        if len(streams) > 1 or topic.isdecimal():
+            raise InputError(f'{path} has no video stream {shortened(topic)!r} ({there}): choose '
+                             f'one with --stream')
+    return None, [f'{path} is a video: topic {topic} is ignored']
+
+
+def _streams(container: InputContainer) -> list[av.VideoStream]:
+    """Return the streams of a video that are no thumbnails."""
+    return [each for each in container.streams.video if not each.disposition & THUMBNAILS]
+
+
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[InputContainer, av.VideoStream]]:
+def _opened(path: Path, number: int | None = None
+            ) -> Iterator[tuple[InputContainer, av.VideoStream]]:
+    """Open a video and its stream of this number, counted from 1; None: the best one."""
     try:
         container = av.open(f'file:{path}', options={'format_whitelist': FORMATS})
     except (av.FFmpegError, ValueError) as error:
@@ -211,7 +283,8 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, av.VideoStream]]:
             raise
         raise _unplayable(path) from error
     with container:
-        stream = container.streams.best('video')
+        stream = (container.streams.best('video') if number is None else
+                  _streams(container)[number - 1])
         if not isinstance(stream, av.VideoStream):
             raise _unplayable(path)
         stream.codec_context.thread_type = 'AUTO'
@@ -221,8 +294,32 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, av.VideoStream]]:
 
 
 def _unplayable(path: Path) -> InputError:
+    if _lacks_index(path):
+        return InputError(f'{path} was not closed: the camera lost its power, or the copy ended, '
+                          f'before it had its index (moov); copy it again, or make the index '
+                          f'anew from a whole video of the same camera (untrunc WHOLE.mp4 '
+                          f'{path.name})')
     return InputError(f'{path} is no video that can be played, or it is cut off: copy it again, '
                       f'or convert it (ffmpeg -i IN -c:v libx264 OUT.mp4)')
+
+
+def _lacks_index(path: Path) -> bool:
+    """Return whether an MP4 has pictures, but not where they are: that is written at its end."""
+    size, at, pictures = path.stat().st_size, 0, False
+    with path.open('rb') as file:
+        for _ in range(BOXES):
+            if at + 16 > size:
+                break
+            file.seek(at)
+            length, name, long = struct.unpack('>I4sQ', file.read(16))
+            if name == b'moov' or not name.isalnum():
+                return False
+            pictures |= name == b'mdat'
+            length = long if length == 1 else length
+            if length < 8:  # up to the end of the file
+                break
+            at += length
+    return pictures
 
 
 def _undecodable() -> InputError:

@@ -10,4 +10,8 @@ import zlib  # noqa: F401
 import pyceres  # its import makes the adjuster's problem a pyceres.Problem
 import pycolmap
 
+# what they log goes to stderr anyway; without this, each also leaves files of it in TMPDIR
+for library in (pycolmap, pyceres):
+    library.logging.logtostderr = True
+
 __all__ = ['pyceres', 'pycolmap']

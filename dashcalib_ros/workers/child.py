@@ -50,18 +50,15 @@ class ChildWorker:
     """
 
     def __init__(self, low_priority: bool = False, verbose: bool = False, threads: int = 1,
-                 on_trouble: Callable[[str], None] = lambda text: None,
-                 scratch: str | None = None) -> None:
+                 on_trouble: Callable[[str], None] = lambda text: None) -> None:
         """threads: of OpenCV, whose results do not depend on it.
 
-        on_trouble: gets one line, in the thread that called. scratch: the child's TMPDIR, for the
-        caller to remove what a killed child leaves there; None: this process's.
+        on_trouble: gets one line, in the thread that called.
         """
         self._low_priority = low_priority
         self._threads = threads
         self._verbose = verbose
         self._on_trouble = on_trouble
-        self._scratch = scratch
         self._process: subprocess.Popen[bytes] | None = None
         # of two threads, call()'s and close()'s, each writes its own before it reads the other's:
         # no process that close() does not see goes on, and no pipe that is in use is closed
@@ -142,8 +139,6 @@ class ChildWorker:
 
     def _start(self) -> subprocess.Popen[bytes]:
         environment = dict(os.environ)
-        if self._scratch is not None:
-            environment['TMPDIR'] = self._scratch
         environment['PYTHONPATH'] = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
         environment.update({name: '1' for name in THREAD_VARIABLES})
         command = [sys.executable, '-c', START, str(LOW_PRIORITY if self._low_priority else 0),

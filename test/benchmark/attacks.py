@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from documents import write_table
 from drives import BY_NAME, drive_of, pictures_of
-from mapping import UNSEEN_PX, projected, rays
+from mapping import camera_that_sees, rays
 from measure import (
     calibrate,
     commit,
@@ -39,8 +39,6 @@ from measure import (
     table,
 )
 from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 from views import INEXACT, inexact_view
 from wide import WIDE, wide_drive_of
 
@@ -199,25 +197,6 @@ def behind_windscreen(most_px: float) -> Callable[[Film, np.random.Generator], F
             for frame in film.frames), **camera_that_sees(seen, pixels, film.truth))
 
     return change
-
-
-def camera_that_sees(seen: Floats, pixels: Floats, near: Mapping[str, Any]) -> dict[str, float]:
-    """Return the camera of near's kind that projects rays (n, 3) closest to pixels (n, 2).
-
-    A windscreen does in part what a lens does: what is seen through both has another fx.
-    """
-    names = ['fx', 'fy', 'cx', 'cy', 'k1', 'k2',
-             *(name for name in ('p1', 'p2', 'k3', 'k4') if near.get(name))]
-    start = np.array([near.get(name, 0.0) for name in names] + [0.0] * 3)
-
-    def residual(guess: Floats) -> Floats:
-        camera = {**near, **dict(zip(names, guess, strict=False))}
-        off = projected(camera, Rotation.from_rotvec(guess[-3:]).apply(seen)) - pixels
-        return np.nan_to_num(off, nan=UNSEEN_PX).ravel()
-
-    scale = np.maximum(np.abs(start), 0.01)
-    return dict(zip(names, map(float, least_squares(residual, start, x_scale=scale).x),
-                    strict=False))
 
 
 def looped(times: int, there_and_back: bool = False, fresh_noise: float = 0.0,

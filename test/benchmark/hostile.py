@@ -13,11 +13,15 @@ import contextlib
 import json
 import os
 import re
+import resource
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
+import unicodedata
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,23 +62,29 @@ from ros_bench import (
     noise,
     ros_environment,
 )
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
 
+from dashcalib_ros import Calibrator
 from dashcalib_ros.camera import Radial, ros_camera
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.motion_files import read_motion
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.calibrator_node import camera_info
 from dashcalib_ros.ros.images import LASTING
+from dashcalib_ros.ros.settings import specs
 from dashcalib_ros.ros.store import Store, Whose
 
 KEPT = CAMERA_FILE.format(width=320) + OURS
 FX = 200.0
 # s of the soak; quick
 SOAK_S, SHORT_SOAK_S = 900.0, 60.0
+# s; what takes longer waited for a picture: machines are slow
+SLOW_S = 15.0
 # the memory of a soak's end, of that after its first quarter
 FLAT = 1.1
 
@@ -650,7 +660,463 @@ def scene_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
         yield
 
 
+# what is left behind, and ends ----------------------------------------------------------------
+
+# writes half a bag, and then the rest
+WRITER = """
+import sys
+from pathlib import Path
+from dashcalib_ros.camera import Radial
+from dashcalib_ros.input.bag_write import write_bag
+lens = Radial((320, 240), 300.0, 301.0, 161.0, 118.0, -0.1)
+print(write_bag(sys.argv[1], '/camera', lens, sys.argv[2]), flush=True)
+"""
+
+
+def names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def bag_kills(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGKILL of --write-bag at any moment: the next one leaves its own bag alone."""
+    import made_drives
+    bag = made_drives.write_bag(folder / 'drive', made_drives.images(
+        made_drives.drive(400, 320, 240)))
+
+    def start(out: Path) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, '-c', WRITER, str(bag), str(out)],
+                                stdout=subprocess.DEVNULL)
+
+    for n in tries:
+        place, rng = folder / str(n), np.random.default_rng(n)
+        process = start(place / 'first')
+        while process.poll() is None and not (place.exists() and names_in(place)):
+            time.sleep(0.001)
+        time.sleep(rng.uniform(0, 0.2))
+        process.kill()
+        process.wait()
+        whole = names_in(place) & {'first'}
+        assert start(place / 'second').wait() == 0
+        assert names_in(place) == {*whole, 'second'}, names_in(place)
+        shutil.rmtree(place)
+        yield
+
+
+def scratch(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Commands leave nothing in TMPDIR, nor where they run, be they right or wrong."""
+    pictures, home, tmp = two_turns(folder / 'pictures'), folder / 'home', folder / 'tmp'
+    home.mkdir()
+    tmp.mkdir()
+    given = folder / 'given.json'
+    for n in tries:
+        # one that a check finds wrong makes Ceres warn
+        f = 417.0 * (1.0, 0.9, 1.2, 0.5, 2.0)[n % 5]
+        given.write_text(json.dumps({'fx': f, 'fy': f, 'cx': 320.0, 'cy': 180.0, 'k1': -0.3,
+                                     'k2': 0.1, 'width': 640, 'height': 360}))
+        command = (('check', given, pictures), ('run', pictures, '--out', folder / 'out'))[n // 5]
+        done = subprocess.run(dashcalib(*command, '--fps', 10), cwd=home, capture_output=True,
+                              env={**os.environ, 'TMPDIR': str(tmp)}, timeout=300, check=False)
+        assert done.returncode in (0, 1, 3), done.stderr
+        left = names_in(tmp) | names_in(home)
+        for each in (*tmp.iterdir(), *home.iterdir()):
+            each.unlink()
+        assert not left, left
+        yield
+
+
+def batch_leftovers(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGKILL of a batch and its children while packed clips are read: the next one tidies."""
+    import made_drives
+    import zstandard
+    bag = made_drives.write_bag(folder / 'drive', made_drives.images(
+        made_drives.drive(300, 320, 240)))
+    packed = folder / 'bag.mcap.zstd'
+    packed.write_bytes(zstandard.compress(made_drives.storage(bag).read_bytes()))
+    (folder / 'm.csv').write_text('clip\n' + f'{packed}\n')
+    for n in tries:
+        tmp, out = folder / f'tmp{n}', folder / f'out{n}'
+        tmp.mkdir()
+        environment = {**os.environ, 'TMPDIR': str(tmp)}
+        command = dashcalib('batch', folder / 'm.csv', '--out', out, '--workers', 2)
+        process = subprocess.Popen(command, env=environment, start_new_session=True,
+                                   stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while process.poll() is None and not names_in(tmp):
+            time.sleep(0.001)
+        time.sleep(np.random.default_rng(n).uniform(0, 0.3))
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        # of another program, and of a process that lives
+        (tmp / 'dashcalib-other').mkdir()
+        subprocess.run(command, env=environment, capture_output=True, timeout=300, check=False)
+        assert names_in(tmp) == {'dashcalib-other'}, names_in(tmp)
+        yield
+
+
+def full_disks(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """The results do not fit: the calibration is told all the same, and one line says why."""
+    pictures = two_turns(folder / 'pictures')
+    for n in tries:
+        json_too = ('--json', '-') if n % 2 else ()
+        # no file may be larger than this, as on a disk that is nearly full
+        limit = int(np.random.default_rng(n).uniform(10, 50_000))
+        done = subprocess.run(
+            ['prlimit', f'--fsize={limit}', *dashcalib(
+                'run', pictures, '--fps', 10, '--out', folder / 'out', *json_too)],
+            capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 2 and 'cannot write to' in done.stderr, done.stderr
+        assert 'Traceback' not in done.stderr and 'fx' in done.stdout, done.stdout
+        assert not json_too or json.loads(done.stdout)['intrinsics']['fx'] > 0
+        assert not (folder / 'out').exists()
+        yield
+
+
+def bags_into_nowhere(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """--write-bag to where nothing can be: said before anything is calibrated."""
+    import made_drives
+    bag = made_drives.write_bag(folder / 'drive', made_drives.images(
+        made_drives.drive(400, 320, 240)))
+    (folder / 'file').touch()
+    (folder / 'link').symlink_to(folder / 'nowhere')
+    places = ('file/bag', 'link', '/proc/bag', 'drive', 'out', 'x' * 300, '/dev/null/bag', '')
+    for n in tries:
+        before = names_in(folder)
+        done = subprocess.run(
+            dashcalib('run', bag, '--out', folder / 'out', '--write-bag',
+                      folder / places[n % len(places)]),
+            capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+        assert 'choose another place' in done.stderr or 'check the path' in done.stderr
+        assert names_in(folder) == before
+        yield
+
+
+def old_stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """A store of another camera of the same size moves no calibration farther than its sigma."""
+    from dataclasses import replace
+
+    from fleet_made import YAWS, clip_of
+
+    from dashcalib_ros.reconstruct.scene_file import SceneFile, encoded
+    pictures = two_turns(folder / 'pictures')
+    true = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
+    lens = Radial((640, 360), *(getattr(true, name) for name in (
+        'fx', 'fy', 'cx', 'cy', 'k1', 'k2')))
+    others = [replace(lens, fx=lens.fx * by, fy=lens.fy * by)
+              for by in (0.8, 0.9, 0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05, 1.1, 1.25)]
+    others += [replace(lens, cx=lens.cx + 15), replace(lens, cy=lens.cy - 15),
+               replace(lens, k1=0.0, k2=0.0), replace(lens, fy=lens.fy * 1.02)]
+    for n in tries:
+        store = folder / f'store{n}'
+        store.mkdir()
+        # five turns, sharper than those of the drive
+        made = clip_of(others[n % len(others)], YAWS[:5], world=n, tracks=150, keyframes=12)
+        for m, turn in enumerate(made.turns):
+            (store / f'turn-{m:016x}.npz').write_bytes(encoded(SceneFile(
+                made.origin, (replace(turn, prominence=0.5),), 1)))
+        # of its own, two turns or one
+        part = () if n < len(others) else ('--duration', 14)
+        out = folder / f'out{n}'
+        done = subprocess.run(
+            dashcalib('run', pictures, '--fps', 10, '--out', out, '--set',
+                      f'turns.store={store}', *part),
+            capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode in (0, 3) and 'Traceback' not in done.stderr, done.stderr
+        found = json.loads((out / 'result.json').read_text())
+        print(n, found['verdict'], found['intrinsics'] and found['intrinsics']['fx'] / lens.fx)
+        if found['verdict'] == 'accepted':
+            for name, sigma in found['sigma'].items():
+                off = found['intrinsics'][name] - getattr(lens, name, 0.0)
+                assert abs(off) < 4 * sigma, f'{name} is {off:.4f} off, sigma {sigma:.4f}'
+        yield
+
+
+LEFT = [
+    Attack('SIGKILL while a bag is written', 40, 3, bag_kills),
+    Attack('what is left in TMPDIR', 6, 2, scratch),
+    Attack('SIGKILL of a batch of packed clips', 20, 2, batch_leftovers),
+    Attack('no room for the results', 6, 2, full_disks),
+    Attack('a bag into nowhere', 8, 8, bags_into_nowhere),
+    Attack('an old turn store of another camera', 32, 2, old_stores)]
+# two cameras, and pictures that take long ------------------------------------------------------
+
+def other_view(n: int) -> Callable[[Any], Any]:
+    """Return what another camera shows: longer lenses, mirrored, another mounting."""
+    size, middle = (640, 360), np.array([319.5, 179.5])
+    if n % 6 == 5:
+        return lambda image: np.ascontiguousarray(image[:, ::-1])
+    zoom, roll = ((1.1, 0.0), (1.03, 0.0), (0.95, 0.0), (1.0, 4.0), (1.05, 2.0))[n % 6]
+    matrix = cv2.getRotationMatrix2D(tuple(middle), roll, zoom)
+    return lambda image: cv2.warpAffine(image, matrix, size, borderMode=cv2.BORDER_REFLECT)
+
+
+def two_cameras(_: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Images of another camera where thinning leaves images out: refused; without them not."""
+    lens = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
+    films = {rate: [frame.image for frame in Drive(lens, DriveSpec(
+        seed=0, turns=2, rate=rate, rolling_shutter_ms=20.0)).frames()] for rate in (20.0, 30.0)}
+    sound = len(films)
+    for n in tries:
+        rate = (20.0, 30.0)[n % 2]
+        pattern = ('AB', 'ABA', 'AB', 'AAB')[n % 4]
+        other = other_view(n // 2)
+        with Calibrator() as calibrator:
+            for number, image in enumerate(films[rate]):
+                is_other = n >= sound and pattern[number % len(pattern)] == 'B'
+                calibrator.push(Frame(number, round(number * 1e9 / rate),
+                                      other(image) if is_other else image))
+            found = calibrator.calibrate()
+        told = any('two cameras' in reason for reason in found.verdict.reasons)
+        assert (found.verdict.level, told) == (
+            ('accepted', False) if n < sound else ('refused', True)), found.verdict
+        yield
+
+
+def two_publishers(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """A second publisher comes and goes: no camera_info meanwhile, and no save; then all again."""
+    with running(folder) as (node, camera):
+        still_calibrated(node, camera, 0)
+        for n in tries:
+            second = Bench(camera.node.context, listen=False, name='rear')
+            camera.until(lambda: '/rear' in camera.values.get('publishers', ''), node=node)
+            camera.infos.clear()
+            for number in range(5):
+                for each in (camera, second):
+                    each.publish(image_message(noise(number), START + (100 * n + number) * SECOND))
+            answer = call(node, camera, Trigger, 'save')
+            assert not answer.success and '/rear' in answer.message and not camera.infos
+            second.close()
+            camera.until(lambda: '/rear' not in camera.values['publishers'], node=node)
+            still_calibrated(node, camera, n + 1)
+            yield
+
+
+def slow_pictures(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Small pictures that take a second to a minute to decode: all else goes on meanwhile."""
+    from hostile_pictures import SLOW
+    pictures = [make() for make in SLOW.values()]
+    with running(folder, CompressedImage) as (node, camera):
+        still_calibrated(node, camera, 0)
+        for n in tries:
+            message = compressed_odd(0)
+            message.format, message.data = 'jpeg', []
+            message.data.frombytes(pictures[n % len(pictures)])
+            for _ in range(LASTING):
+                camera.publish(message)
+            begun = time.monotonic()
+            assert call(node, camera, Trigger, 'save').success
+            still_calibrated(node, camera, n + 1)
+            assert time.monotonic() - begun < SLOW_S, 'the node waited for a picture'
+            yield
+
+
+def hangups(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGHUP at any moment of the first seconds: the node ends cleanly, its children too."""
+    for n in tries:
+        node = NodeProcess(folder, command=COMMAND)
+        try:
+            node.wait_for('learning the camera')
+            time.sleep(np.random.default_rng(n).uniform(0.0, 1.0))
+            assert node.stop(signal.SIGHUP) == 0, node.text
+            assert not processes_of(node.process.pid) and 'Traceback' not in node.text
+        finally:
+            node.kill()
+        yield
+
+
+def jumping_clock(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """With use_sim_time, a clock that stands, leaps and goes back: each image is answered."""
+    with running(folder, use_sim_time=True) as (node, camera):
+        clock = camera.node.create_publisher(Clock, '/clock', 10)
+        for n in tries:
+            rng = np.random.default_rng(n)
+            now = int(rng.choice([0, 1, START // SECOND, 2**31 - 1, START // SECOND - 10**6]))
+            for _ in range(int(rng.integers(1, 5))):
+                message = Clock()
+                message.clock.sec = now
+                clock.publish(message)
+            camera.status = None
+            still_calibrated(node, camera, n)
+            camera.until(lambda: camera.status, what='/diagnostics', node=node)
+            yield
+
+
+def odd_parameters(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Any parameter with any value at the start: the node runs, or ends with one line."""
+    names = sorted(specs())
+    odd = ['-1', '0', '1e308', '.nan', '.inf', '99999999999999999999', "''", "'/'", "'a b'", '[]',
+           "['a', 'b']", 'true', "'~nobody/x'", "'../../x'", "'é\\n'", '[1.5, 2.5]']
+    for n in tries:
+        name, value = names[37 * n % len(names)], odd[n % len(odd)]
+        node = NodeProcess(folder, '-p', f'{name}:={value}', command=COMMAND)
+        try:
+            end = time.monotonic() + 30
+            while node.process.poll() is None and 'learning the camera' not in node.text:
+                assert time.monotonic() < end, node.text
+                time.sleep(0.05)
+            if node.process.poll() is None:
+                assert node.stop(signal.SIGTERM) == 0
+            else:
+                assert node.process.returncode == 2, f'{name}:={value}: {node.text}'
+                lines = node.text.splitlines()
+                assert lines[-1].startswith('calibrator: error: '), f'{name}:={value}: {node.text}'
+            assert 'Traceback' not in node.text, f'{name}:={value}: {node.text}'
+        finally:
+            node.kill()
+        yield
+
+
+# small files that become large, and texts that act ------------------------------------------
+
+# bytes of memory and s that the smallest command may take with any small file
+MOST_BYTES, MOST_S = 4 * 2**30, 60
+FORGED = 'a\x1b[2J\x9b1m\u202eb\nverdict: accepted'
+
+
+def limited(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command within memory and time; it ends with one line, without a traceback."""
+    done = subprocess.run(
+        dashcalib(*arguments), capture_output=True, text=True, timeout=MOST_S, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES)))
+    assert 'Traceback' not in done.stderr and 'out of memory' not in done.stderr, done.stderr
+    acting = [sign for sign in done.stdout + done.stderr
+              if sign != '\n' and unicodedata.category(sign) in ('Cc', 'Cf')]
+    assert not acting, acting
+    return done
+
+
+def endless_databases() -> list[str]:
+    """Return SQL that makes bags of more than they store."""
+    topics = ("CREATE TABLE topics(id, name, type, serialization_format, offered_qos_profiles); "
+              "INSERT INTO topics VALUES(1, '/camera', 'sensor_msgs/msg/Image', 'cdr', '');")
+    count = 'WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c{}) '
+    blob = 10**6 * '00'
+    return [
+        f'{topics} CREATE VIEW messages AS {count.format("")} SELECT n id, 1 topic_id, n '
+        f'timestamp, zeroblob(1000) data FROM c',
+        f'{topics} CREATE VIEW messages AS SELECT 1 id, 1 topic_id, 1 timestamp, '
+        f'randomblob(900000000) data',
+        f'{topics} CREATE TABLE messages(id, topic_id, timestamp, data AS '
+        f'(zeroblob(900000000))); INSERT INTO messages {count.format(" LIMIT 10000")} '
+        f'SELECT n, 1, n FROM c',
+        f"{topics} CREATE TABLE messages(id, topic_id, timestamp, data DEFAULT x'{blob}'); INSERT "
+        f"INTO messages(id, topic_id, timestamp) {count.format(' LIMIT 10000')} SELECT n, 1, n "
+        f"FROM c",
+        f"{topics} INSERT INTO topics {count.format(' LIMIT 9000')} SELECT 1, n, '', '', '' FROM "
+        f"c; CREATE TABLE messages(id, topic_id, timestamp, data); INSERT INTO messages "
+        f"{count.format(' LIMIT 100000')} SELECT n, 1, n, x'00' FROM c"]
+
+
+def packed_bag(path: Path, same_time: bool, indexed: bool) -> None:
+    """Write an MCAP of 200 chunks of 256 MB each, in less than 10 MB."""
+    from mcap.writer import CompressionType, IndexType, Writer
+    with path.open('wb') as stream:
+        writer = Writer(stream, chunk_size=1, compression=CompressionType.ZSTD,
+                        index_types=IndexType.ALL if indexed else IndexType.NONE)
+        writer.start('ros2', 'hostile')
+        schema = writer.register_schema('sensor_msgs/msg/Image', 'ros2msg', b'')
+        channel = writer.register_channel('/camera', 'cdr', schema)
+        data = bytes(2**28 - 100)
+        for n in range(200):
+            stamp_ns = 1 if same_time else n + 1
+            writer.add_message(channel, stamp_ns, data, stamp_ns)
+        writer.finish()
+
+
+def bombs(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Small files of each kind that become large, or take for ever; the bound is the command's."""
+    csv, gpx, npz = folder / 'm.csv', folder / 'm.gpx', folder / 'm.npz'
+    for n in tries:
+        path = folder / f'{n}'
+        match n:
+            case 0 | 1 | 2 | 3 | 4:
+                path = path.with_suffix('.db3')
+                with sqlite3.connect(path) as database:
+                    database.executescript(endless_databases()[n] + ';')
+                assert limited('turns', path).returncode == 2
+            case 5 | 6 | 7:
+                path = path.with_suffix('.mcap')
+                packed_bag(path, n == 6, n != 7)
+                assert path.stat().st_size < 10**7
+                assert limited('turns', path).returncode == 2
+            case 8:
+                names = ','.join(['stamp_s', 'speed', *(f'a{k}' for k in range(20_000))])
+                csv.write_text('\n'.join([names, *20_000 * ['1']]))
+                assert read_motion(csv).empty
+            case 9 | 10 | 11 | 12:
+                gpx.write_text('<gpx ' + [
+                    ' '.join(f'xmlns:n{k}="u{k}"' for k in range(100_000)) + '/>',
+                    '>' + 10**6 * '<a>', '>' + ''.join(f'<a{k}/>' for k in range(10**6)),
+                    'a="' + 10**8 * 'x' + '"/>'][n - 9])
+                try:
+                    read_motion(gpx)
+                except DashcalibError:
+                    pass
+                else:
+                    raise AssertionError('it is taken')
+            case 13:
+                csv.write_text('clip,camera\n' + ''.join(f'{k}.mp4,{k}\n' for k in range(10**5)))
+                done = limited('batch', csv, '--out', folder / 'out', '--workers', 1, '--quiet')
+                assert done.returncode == 3, done.stderr
+            case 14:
+                np.savez(npz, allow_pickle=True, K=np.array([Path]), fx=np.array(1.0))
+                assert limited('export', npz, '--to', 'ros').returncode == 2
+            case _:
+                with zipfile.ZipFile(npz, 'w', zipfile.ZIP_BZIP2) as packed:
+                    packed.writestr('K.npy', bytes(2**30))
+                assert limited('export', npz, '--to', 'ros').returncode == 2
+        yield
+
+
+def numbers(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Numbers that a file may say and no lens has, in compare and export."""
+    right, wrong = folder / 'right.yaml', folder / 'wrong.yaml'
+    right.write_text(KEPT)
+    places = ('200.0, 0.0, 160.0', '0.0, 201.0, 120.0', '-0.1, 0.01')
+    for n in tries:
+        value = ('1e300', '-1e300', '1e-300', '1e12', '.inf', '.nan')[n // 3 % 6]
+        wrong.write_text(KEPT.replace(places[n % 3], ', '.join(
+            [value, *places[n % 3].split(', ')[1:]])))
+        for arguments in (('compare', right, wrong), ('compare', wrong, right), (
+                'export', wrong, '--to', 'rays', '--out', folder / 'rays.npz')):
+            assert limited(*arguments).returncode in (0, 2)
+        assert limited('export', right, '--to', 'ros', '--size', '0x0').returncode == 2
+        yield
+
+
+def forged_texts(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Names that clear a screen, forge a line or are formulas: they are shown, and do nothing."""
+    kept, bag = folder / FORGED, folder / 'bag.mcap'
+    kept.write_text(KEPT)
+    write_mcap_of(bag, FORGED)
+    csv = folder / 'm.csv'
+    csv.write_text(f'clip,camera,make\ngone.mp4,"{FORGED}","=cmd|\'/c calc\'!A1"\n')
+    given = [('compare', kept, kept), ('compare', folder / f'{FORGED}.gone', kept),
+             ('export', kept, '--to', 'ros'), ('turns', kept), ('turns', bag),
+             ('turns', bag, '--topic', FORGED), ('check', kept, bag),
+             ('batch', csv, '--out', folder / 'out', '--workers', 1)]
+    for n in tries:
+        done = limited(*given[n])
+        assert '\nverdict: accepted' not in done.stdout + done.stderr
+        if given[n][0] == 'batch':
+            assert ',"\'=cmd' in (table := (folder / 'out' / 'cameras.csv').read_text()) or (
+                ",'=cmd" in table)
+        yield
+
+
+def write_mcap_of(path: Path, topic: str) -> None:
+    """Write a bag with a message on a topic of any name."""
+    from mcap.writer import Writer
+    with path.open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2', 'hostile')
+        schema = writer.register_schema(f'std_msgs/msg/{FORGED}', 'ros2msg', b'')
+        writer.add_message(writer.register_channel(topic, 'cdr', schema), 1, b'', 1)
+        writer.finish()
+
+
 ATTACKS = [
+    *LEFT,
     Attack('SIGKILL while it saves', 20, 1, kills_while_saving),
     Attack('service calls', 500, 25, service_calls),
     Attack('types of parameters', 512, 16, parameter_types),
@@ -668,6 +1134,15 @@ ATTACKS = [
     Attack('Ctrl-C at any line', 100, 4, interrupts),
     Attack('a FIFO for a file', 11, 11, pipes),
     Attack('clips of scenes', 88, 6, scene_files),
+    Attack('two cameras on one stream', 26, 4, two_cameras),
+    Attack('two publishers', 20, 3, two_publishers),
+    Attack('pictures that take long', 20, 5, slow_pictures),
+    Attack('SIGHUP', 20, 2, hangups),
+    Attack('a clock that jumps', 40, 5, jumping_clock),
+    Attack('odd parameters at the start', 120, 8, odd_parameters),
+    Attack('small files that become large', 16, 16, bombs),
+    Attack('numbers that no lens has', 18, 3, numbers),
+    Attack('names that act', 8, 8, forged_texts),
     Attack('soak with lost images', 2, 1, soaks)]
 
 

@@ -60,6 +60,25 @@ def mapping_error(estimate: Mapping[str, Any], truth: Mapping[str, Any],
     return float(np.sqrt(np.mean(np.sum(rest * rest, axis=1))))
 
 
+def camera_that_sees(seen: Floats, pixels: Floats, near: Mapping[str, Any]) -> dict[str, float]:
+    """Return the camera of near's kind that projects rays (n, 3) closest to pixels (n, 2).
+
+    A windscreen does in part what a lens does: what is seen through both has another fx.
+    """
+    names = ['fx', 'fy', 'cx', 'cy', 'k1', 'k2',
+             *(name for name in ('p1', 'p2', 'k3', 'k4') if near.get(name))]
+    start = np.array([near.get(name, 0.0) for name in names] + [0.0] * 3)
+
+    def residual(guess: Floats) -> Floats:
+        camera = {**near, **dict(zip(names, guess, strict=False))}
+        off = projected(camera, Rotation.from_rotvec(guess[-3:]).apply(seen)) - pixels
+        return np.nan_to_num(off, nan=UNSEEN_PX).ravel()
+
+    scale = np.maximum(np.abs(start), 0.01)
+    return dict(zip(names, map(float, least_squares(residual, start, x_scale=scale).x),
+                    strict=False))
+
+
 def projected(camera: Mapping[str, Any], points: Floats) -> Floats:
     """Return pixels (n, 2) of points (n, 3); NaN behind a camera that is no fisheye."""
     x, y, z = points.T

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from drives import STREET
 
-from dashcalib_ros.demo import Drive, DriveSpec, Lens
+from dashcalib_ros.demo import Drive, DriveSpec, Glass, Lens
 from dashcalib_ros.demo.atlas import Atlas
 from dashcalib_ros.demo.parallel import render_parallel
 from dashcalib_ros.demo.quads import Quads
@@ -44,7 +44,8 @@ SIDE_DEG = 45.0
 class FisheyeLens:
     """Sizes, fx, fy, cx and cy in pixels; the first pixel's centre is at (0, 0).
 
-    Raises ConfigError if a corner lies beyond the angle at which the distortion folds over.
+    glass: moves what the lens sees over the picture; None: nothing. Raises ConfigError if a corner
+    lies beyond the angle at which the distortion folds over.
     """
 
     width: int
@@ -57,6 +58,7 @@ class FisheyeLens:
     k2: float = 0.0
     k3: float = 0.0
     k4: float = 0.0
+    glass: Glass | None = None
 
     def __post_init__(self) -> None:
         if not self._corner_radius() < 0.98 * self._bent_angles[-1]:
@@ -92,10 +94,14 @@ class FisheyeLens:
         angle = np.arctan2(across, points[:, 2])
         angle = np.where(angle < ANGLES[len(self._bent_angles) - 1], angle, np.nan)
         scale = bent(angle, self.k) / np.maximum(across, 1e-12)
-        return scale[:, None] * points[:, :2] * (self.fx, self.fy) + (self.cx, self.cy)
+        pixels = scale[:, None] * points[:, :2] * (self.fx, self.fy) + (self.cx, self.cy)
+        return pixels if self.glass is None else self.glass.behind(
+            pixels, (self.width, self.height))
 
     def rays(self, pixels: Floats) -> Floats:
         """Return unit rays (n, 3) of pixels (n, 2)."""
+        if self.glass is not None:
+            pixels = self.glass.before(pixels, (self.width, self.height))
         xy = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         radius = np.hypot(xy[:, 0], xy[:, 1])
         angle = self._angle(radius)
@@ -173,7 +179,7 @@ class Half(Raycaster):
         self.along = (square * pixel).astype(np.float32)
 
     def render(self, quads: Quads, rotation: Floats, position: Floats) -> Singles:
-        """Return the columns' picture; rotation: world from the fisheye camera, (1, 3, 3)."""
+        """Return the columns' picture; rotation: world from the fisheye camera, (n, 3, 3)."""
         return super().render(quads, rotation @ self.turned, position)
 
     def _rays(self, offset: tuple[float, float]) -> tuple[Singles, Singles]:
@@ -206,11 +212,9 @@ class WholeRaycaster:
 
 
 class WideDrive(Drive):
-    """A drive seen through a fisheye lens. No rolling shutter."""
+    """A drive seen through a fisheye lens."""
 
     def __init__(self, lens: FisheyeLens, spec: DriveSpec) -> None:
-        if spec.rolling_shutter_ms:
-            raise ConfigError('a wide drive has no rolling shutter')
         self.wide_lens = lens
         # what a drive asks of its lens, this one has, too
         super().__init__(cast(Lens, lens), spec)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from fakes import stands_in_for
 from made_calibration import MOUNT, TRUTH, make_calibration
-from made_drives import START, drive, images, info_of, write_bag
+from made_drives import START, TIMES, drive, images, info_of, write_bag, write_timed
 
 from dashcalib_ros.calibrator import Calibrator
+from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import main
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
@@ -106,6 +107,19 @@ def test_a_bag_s_own_calibration_is_checked(files, tmp_path, capfd):
     write_bag(tmp_path / 'without', images(drive(3)))
     assert main(['check', 'without']) == 2
     assert 'there is none' in capfd.readouterr().err
+
+
+def test_a_calibration_of_the_stored_pictures_is_checked_as_it_is_shown(files, tmp_path, capfd):
+    """The drive's pixels are twice as wide as high."""
+    write_timed(tmp_path / 'wide.mp4', TIMES[:5], aspect=(2, 1))
+    shown = Radial((320, 64), 240.0, 241.0, 158.0, 30.0)
+    stored = shown.resized(0.5, (160, 64), 1.0)
+    for given in (shown, stored):
+        (tmp_path / 'given.json').write_text(json.dumps(
+            given.named | {'width': given.image_size[0], 'height': 64}))
+        assert main(['check', 'given.json', 'wide.mp4']) == 0
+        assert FakeQuestions.asked == shown
+    assert 'not square' in capfd.readouterr().err
 
 
 def _shown(capfd):

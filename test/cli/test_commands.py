@@ -31,7 +31,8 @@ from dashcalib_ros.demo import demo_drive, render_to_bag
 from dashcalib_ros.demo.drive import Drive
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.turn import Turn
-from dashcalib_ros.errors import ConfigError, WorkerError
+from dashcalib_ros.errors import ConfigError, OutputError, WorkerError
+from dashcalib_ros.report import write_results
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
 
@@ -370,6 +371,33 @@ def test_known_failures_close_everything_and_leave_nothing(
     assert error.startswith('dashcalib: error: ') and error.count('\n') == 1
     assert complaint in error
     assert names(tmp_path / 'work') == []
+
+
+@pytest.mark.parametrize('options', [(), ('--json', '-')])
+def test_a_disk_that_fills_up_meanwhile_does_not_hide_the_result(
+        fake, drive, tmp_path, monkeypatch, capsys, options):
+    def full(*_, **__):
+        raise OutputError('cannot write to calibration: No space left on device; free some')
+    monkeypatch.setattr('dashcalib_ros.cli.run.write_results', create_autospec(
+        write_results, side_effect=full))
+    assert main(['run', drive, '--fps', '10', *options]) == 2
+    shown = capsys.readouterr()
+    assert 'fx' in shown.out and 'accepted' in shown.out
+    if options:
+        assert json.loads(shown.out)['intrinsics']['fx'] == TRUTH.fx
+    assert shown.err.splitlines()[-1].startswith('dashcalib: error: cannot write to calibration')
+    assert 'written to' not in shown.out + shown.err
+    assert names(tmp_path / 'work') == []
+
+
+def test_a_bag_at_the_place_of_the_results_is_told_before_the_calibration(
+        fake, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made_drives.write_bag(tmp_path / 'drive', made_drives.images(made_drives.drive(3)))
+    for bag in ('calibration', 'calibration/..'):
+        assert main(['run', 'drive', '--write-bag', bag]) == 2
+        assert 'exists: choose another place' in capsys.readouterr().err
+    assert fake.made == [] and names(tmp_path) == ['drive']
 
 
 @pytest.mark.parametrize('bug', [ZeroDivisionError(), RuntimeError('release unlocked lock')])

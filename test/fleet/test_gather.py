@@ -12,6 +12,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.fleet import clips
 from dashcalib_ros.fleet.clips import content_hash, gather, gather_clip, settings_hash
 from dashcalib_ros.fleet.manifest import Row
+from dashcalib_ros.input import Frame
 from dashcalib_ros.reconstruct.scene_file import decoded, encoded
 
 
@@ -44,8 +45,18 @@ def test_a_clip_without_turns_is_a_result_too(tmp_path):
     assert encoded(decoded(encoded(found))) == encoded(found)
 
 
-def gathered(place, out):
-    return gather_clip(Row(1, place.name, str(place), 'cam'), str(out), CONFIG)
+def gathered(place, out, fps=None):
+    return gather_clip(Row(1, place.name, str(place), 'cam', fps=fps), str(out), CONFIG)
+
+
+def test_a_clip_of_two_cameras_is_not_used(shared_drive, tmp_path):
+    """Its turns may be of either."""
+    images = [frame.image for frame in shared_drive.frames()]
+    both = [Frame(n, 0, image[:, ::-1] if n % 2 else image)
+            for n, image in enumerate([*images, *images[::-1]])]
+    result = gathered(write_folder(tmp_path / 'images', both), tmp_path / 'out', 20.0)
+    assert result.problem.startswith('the images are of two cameras: ') and not result.file
+    assert not list((tmp_path / 'out').rglob('*.npz'))
 
 
 @pytest.mark.parametrize('how', ['in place', 'another in its place'])

@@ -131,6 +131,26 @@ def test_what_cannot_be_done_is_said_before_the_calibration(bag, tmp_path):
         check_bag('drive.bag', '/image', tmp_path / 'out')
     with pytest.raises(OutputError, match='exists'):
         check_bag(bag, '/cam/image_raw', bag)
+    check_bag(bag, '/cam/image_raw', tmp_path / 'a' / 'b' / 'out')
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['drive']
+
+
+@pytest.mark.parametrize('place', ['file/bag', 'link', "x" * 252, '/proc/bag'])
+def test_a_bag_that_has_no_place_is_told_before_the_calibration(bag, tmp_path, place):
+    (tmp_path / 'file').touch()
+    (tmp_path / 'link').symlink_to(tmp_path / 'nowhere')
+    before = {path.name for path in tmp_path.iterdir()}
+    with pytest.raises(OutputError, match=r'cannot be written|exists'):
+        check_bag(bag, '/cam/image_raw', tmp_path / place)
+    assert {path.name for path in tmp_path.iterdir()} == before
+
+
+def test_a_bag_that_a_killed_process_left_half_written_is_removed(bag, tmp_path):
+    half = tmp_path / 'out' / '.dashcalib.0123abcd.tmp'
+    (half / 'bag').mkdir(parents=True)
+    (half / 'bag' / 'bag_0.mcap').write_bytes(bytes(100))
+    write_bag(bag, '/cam/image_raw', CAMERA, tmp_path / 'out' / 'other')
+    assert [path.name for path in (tmp_path / 'out').iterdir()] == ['other']
 
 
 def test_the_command_says_why_there_is_no_bag(bag, tmp_path):

@@ -100,6 +100,84 @@ def test_front_and_rear_are_not_one_camera(tmp_path):
     assert len(open_frames(str(tmp_path / 'clips/*F.avi')).warnings) == 1
 
 
+TWO_CAMERAS = {
+    'Tesla': ('2026-01-31_10-00-00-front', '2026-01-31_10-00-00-left_repeater',
+              '2026-01-31_10-01-00-front', '2026-01-31_10-01-00-left_repeater'),
+    '70mai': ('NO20260131-100000-000123F', 'NO20260131-100000-000123B'),
+    'Thinkware': ('REC_2026_01_31_10_00_00_F', 'REC_2026_01_31_10_00_00_R'),
+    'Nextbase': ('260131_100000_001_FH', '260131_100000_001_RH'),
+    'Vantrue': ('20260131_100000_0001_N_A', '20260131_100000_0002_N_B'),
+    'BlackVue': ('20260131_100000_NF', '20260131_100000_NR'),
+    'Viofo': ('2026_0131_100000_000001F', '2026_0131_100000_000002R'),
+    'Insta360': ('VID_20260131_100000_00_001', 'VID_20260131_100000_10_001'),
+    'words': ('drive-front', 'drive-back'), 'letters': ('drive_f', 'drive_r'),
+    'channels': ('20260131_CH1', '20260131_CH2'), 'channels before': ('ch01_31', 'ch02_31'),
+    'folders': ('Front/NO20260131-100000-000123F', 'Back/NO20260131-100000-000123B'),
+    'cameras': ('cam0-run', 'cam1-run'), 'only the rear one': ('20260131', '20260131_R'),
+    'nuScenes': ('CAM_FRONT_LEFT', 'CAM_FRONT_RIGHT')}
+
+
+def link_as(names, folder, suffix):
+    """Give one video many names."""
+    folder.mkdir()
+    video = write_video(folder.parent / f'one{suffix}', smooth())
+    for name in names:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / f'{name}{suffix}').hardlink_to(video)
+    return folder
+
+
+@pytest.mark.parametrize('maker', TWO_CAMERAS)
+def test_two_cameras_of_one_car_are_not_one_drive(tmp_path, maker):
+    folder = link_as(TWO_CAMERAS[maker], tmp_path / 'clips', '.avi')
+    fails('recordings of 2 cameras .*: give a pattern that names one',
+          folder / '*/*' if maker == 'folders' else folder)
+    first, second = (next(folder.glob(f'{name}.avi')) for name in TWO_CAMERAS[maker][:2])
+    assert open_frames(first).count == 12
+    # who names them means them
+    assert open_frames([first, second]).count == 24
+
+
+@pytest.mark.parametrize('names', [
+    'abcdef', ('drive_a', 'drive_b', 'drive_c', 'drive_f'), ('2026_f', '2027_f'),
+    ('front_1', 'front_2'), ('backup', 'frontier'), ('cam1_a', 'cam1_b'),
+    ('one_front', 'two_back'),
+    ('drive', 'drive_b'), ('camera 2026', 'camera 2027'), ('leftover', 'rightmost')])
+def test_parts_of_a_drive_are_not_taken_for_cameras(tmp_path, names):
+    assert open_frames(link_as(names, tmp_path / 'clips', '.avi')).count == 12 * len(names)
+
+
+def test_pictures_of_two_cameras_in_one_folder(tmp_path):
+    for names in (('front_0001', 'back_0001'), ('0001_L', '0001_R'), ('1-cam0', '1-cam1')):
+        folder = tmp_path / names[0]
+        folder.mkdir()
+        for name in names:
+            cv2.imwrite(str(folder / f'{name}.png'), np.zeros((48, 64), np.uint8))
+        fails('pictures of 2 cameras .*: put those of one into a folder', folder, fps=10)
+        (folder / f'{names[1]}.png').unlink()
+        assert open_frames(folder, fps=10).count == 1
+
+
+def test_bags_of_two_cameras_in_one_folder(tmp_path):
+    (tmp_path / 'bags').mkdir()
+    for name in ('front_0', 'rear_0'):
+        storage(write_bag(tmp_path / name, images(drive(3)))).rename(
+            tmp_path / f'bags/{name}.mcap')
+    fails('recordings of 2 cameras .*: give the files of one', tmp_path / 'bags')
+    assert open_frames(tmp_path / 'bags/rear_0.mcap').count == 3
+
+
+def test_previews_beside_videos_are_left_alone(tmp_path):
+    small = write_video(tmp_path / 'small.mp4', smooth(width=32, height=24), 'mp4v')
+    (tmp_path / 'clips').mkdir()
+    for name in ('GX010001', 'GX020001'):
+        write_video(tmp_path / f'clips/{name}.MP4', smooth(), 'mp4v')
+        (tmp_path / f'clips/GL{name[2:]}.LRV').hardlink_to(small)
+    for where in (tmp_path / 'clips', str(tmp_path / 'clips/*')):
+        assert open_frames(where).count == 24
+    assert open_frames(str(tmp_path / 'clips/*.LRV')).count == 24
+
+
 def test_the_order_of_the_command_line_counts(tmp_path):
     paths = videos(tmp_path / 'clips', 2)
     assert np.allclose(brightness(open_frames(paths[::-1]))[:12],

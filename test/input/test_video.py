@@ -2,15 +2,21 @@
 from __future__ import annotations
 
 import os
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
+from av.stream import Disposition
+from made_calibration import make_calibration
 from made_drives import TIMES, fails, number, numbered, write_timed
 
+from dashcalib_ros.camera import Radial
 from dashcalib_ros.input.inputs import open_frames
-from dashcalib_ros.recorded import calibrate
+from dashcalib_ros.recorded import calibrate, with_source
 
 
 def cut_at(path, target, start_s):
@@ -157,3 +163,98 @@ def test_every_kind_of_pixels_has_the_full_range(tmp_path, kind):
         container.mux(stream.encode(None))
     found = next(iter(open_frames(path))).image
     assert np.abs(found.astype(int) - image).mean() < 4
+
+
+@pytest.mark.parametrize(('aspect', 'turn', 'size'), [
+    ((4, 3), 0, (213, 64)), ((1, 2), 0, (160, 128)), ((4, 3), 90, (64, 213)),
+    ((2, 1), 180, (320, 64))])
+def test_pixels_that_are_not_square(tmp_path, aspect, turn, size):
+    plain = list(open_frames(write_timed(tmp_path / 'plain.mp4', TIMES[:5], turn=turn)))
+    source = open_frames(write_timed(tmp_path / 'drive.mp4', TIMES[:5], turn=turn, aspect=aspect))
+    assert source.size == size and source.stored_size == plain[0].size
+    for frame, before in zip(source, plain, strict=True):
+        assert frame.size == size
+        there = cv2.resize(frame.image, before.size, interpolation=cv2.INTER_AREA)
+        assert np.abs(there.astype(float) - before.image).mean() < 4
+    stored = f'{plain[0].size[0]}x{plain[0].size[1]}'
+    assert (f'pixels are not square: its {stored} pictures are taken as {size[0]}x{size[1]}'
+            in source.warnings[0])
+    assert source.in_colour({2: source.length_ns // 2})[2].shape[:2] == size[::-1]
+    assert [frame.size for frame in open_frames([tmp_path / 'drive.mp4'] * 2)] == [size] * 10
+
+
+@pytest.mark.parametrize(('aspect', 'said'), [(None, ()), ((1, 1), ()), ((404, 405), ()),
+                                              ((5, 1), ('5:1, which no camera has',))])
+def test_pixels_that_are_taken_as_square(tmp_path, aspect, said):
+    source = open_frames(write_timed(tmp_path / 'drive.mp4', TIMES[:5], aspect=aspect))
+    assert source.size == (160, 64) and source.stored_size is None
+    assert len(source.warnings) == len(said) and all(
+        each in line for each, line in zip(said, source.warnings, strict=True))
+    camera = Radial((160, 64), 120.0, 120.0, 79.5, 31.5)
+    assert source.shown(camera) is camera and source.stored(camera) is None
+
+
+def test_a_camera_of_stretched_pictures_is_told_for_the_stored_ones(tmp_path):
+    """A point of the world is in both at the same place of the picture."""
+    path = write_timed(tmp_path / 'drive.mp4', TIMES[:5], aspect=(2, 1))
+    for source in (open_frames(path), open_frames([path] * 2), open_frames(path, duration_s=0.1)):
+        shown = Radial((320, 64), 240.0, 241.0, 158.0, 30.0, -0.2, 0.03)
+        stored = source.stored(shown)
+        point = np.array([[0.3, 0.1, 1.0]])
+        there, here = shown.project(point)[0], stored.project(point)[0]
+        np.testing.assert_allclose((there + 0.5) / (320, 64), (here + 0.5) / (160, 64))
+        assert stored.fx == 120.0 and stored.fy == 241.0
+        np.testing.assert_allclose(source.shown(stored).params, shown.params)
+    calibration = replace(make_calibration(), camera=shown, image_size=(320, 64))
+    assert with_source(calibration, open_frames(path)).warnings[-1] == (
+        'for the pictures as they are stored (160x64): fx 120.00, fy 241.00, cx 78.75, cy 30.00, '
+        'and the same distortion')
+
+
+def write_streams(path, shades, thumbnail=False):
+    """Write a video with a stream of 10 plain pictures of each shade, and perhaps a thumbnail."""
+    with av.open(str(path), 'w') as container:
+        streams = []
+        for n, _ in enumerate(shades):
+            stream = container.add_stream('libx264', rate=10)
+            stream.width, stream.height, stream.pix_fmt = 64 + 32 * n, 48, 'yuv420p'
+            streams.append(stream)
+        if thumbnail:
+            cover = container.add_stream('mjpeg', rate=10)
+            cover.width, cover.height, cover.pix_fmt = 640, 480, 'yuvj420p'
+            cover.disposition = Disposition.attached_pic
+            container.mux(cover.encode(av.VideoFrame(640, 480, 'yuvj420p')))
+        for _ in range(10):
+            for stream, shade in zip(streams, shades, strict=True):
+                image = np.full((stream.height, stream.width), shade, np.uint8)
+                frame = av.VideoFrame.from_ndarray(image, format='gray8')
+                container.mux(stream.encode(frame.reformat(format='yuv420p')))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    return path
+
+
+def test_a_video_of_two_cameras(tmp_path):
+    path = write_streams(tmp_path / 'drive.mp4', (40, 200))
+    source = open_frames(path)
+    [said] = source.warnings
+    assert 'has 2 video streams (1 has 64x48, 2 has 96x48): ' in said and '--stream' in said
+    taken = int(re.search(r'(.) is taken', said)[1])
+    assert next(iter(source)).size == (32 + 32 * taken, 48)
+    for chosen, shade in (('1', 40), ('2', 200)):
+        source = open_frames(path, topic=chosen)
+        found = list(source)
+        assert len(found) == 10 and source.warnings == ()
+        assert all(abs(frame.image.mean() - shade) < 3 for frame in found)
+        assert len(list(open_frames(path, topic=chosen, start_s=0.45))) == 5
+    for other in ('0', '3', '/camera', '9' * 5000, '-1'):
+        assert '1 has 64x48' in fails('choose one with --stream', path, topic=other)
+
+
+def test_a_thumbnail_is_no_camera(tmp_path):
+    path = write_streams(tmp_path / 'drive.mp4', (40,), thumbnail=True)
+    source = open_frames(path)
+    assert source.warnings == () and len(list(source)) == 10
+    assert open_frames(path, topic='1').warnings == ()
+    fails('no video stream', path, topic='2')
+    assert 'topic /camera is ignored' in open_frames(path, topic='/camera').warnings[0]
