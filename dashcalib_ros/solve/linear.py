@@ -156,8 +156,8 @@ def residuals(scene: Scene, imaging: Imaging) -> Floats:
 
 
 def normal_equations(scene: Scene, imaging: Imaging, loss_px: float, by_image: bool = False,
-                     further: Columns | None = None, safe: bool = False, variance: float = 1.0
-                     ) -> Normal:
+                     further: Columns | None = None, safe: bool = False, variance: float = 1.0,
+                     clusters: bool = True) -> Normal:
     """Return the normal equations of a turn.
 
     loss_px: scale of the Cauchy loss, whose weights w = 1 / (1 + e^2 / loss^2) apply: its gradient
@@ -165,7 +165,7 @@ def normal_equations(scene: Scene, imaging: Imaging, loss_px: float, by_image: b
     each image. further: more columns of what turns share, behind those of imaging. safe: the
     curvature is w, that of a parabola which lies above the loss: a step to the optimum is shorter,
     and lowers the cost. variance: of a residual, px^2, against which priors of how the camera
-    shakes count.
+    shakes count. clusters: by_track has what observations of one image share, too.
     """
     used = scene.structure.used
     linear = _linearised(scene, imaging, loss_px, by_image, further, safe)
@@ -202,7 +202,7 @@ def normal_equations(scene: Scene, imaging: Imaging, loss_px: float, by_image: b
     track_score = points.pull - (at_optimum[:, None] @ points.mixed)[:, 0]
     scores = track_score[:, poses:] - track_score[:, :poses] @ response
     spread = scores.T @ scores
-    if not safe and not by_image:
+    if clusters and not by_image:
         each = _scores(linear, points, response, follow, image, point)
         spread = spread + _shared_by_images(each, image)
     return Normal(

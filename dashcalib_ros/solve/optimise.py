@@ -155,21 +155,23 @@ def optimised(start: Estimate, least_px: float, steps: int, free: Ints | None = 
     field that are not held; None: all. settled: a smaller gain ends it.
     """
     now, loss_px = start, start.loss_px(least_px)
-    for _ in range(steps):
-        now, gain = _step(now, loss_px, free)
+    for n in range(steps):
+        # sizes hardly change from step to step
+        now, gain = _step(now, loss_px, free, free is None and n % 2 == 0)
         if gain < settled:
             break
     return now
 
 
-def _step(now: Estimate, loss_px: float, free: Ints | None) -> tuple[Estimate, float]:
+def _step(now: Estimate, loss_px: float, free: Ints | None, choose: bool
+          ) -> tuple[Estimate, float]:
     """Return the estimate after one step, and what its part of what turns share should gain.
 
-    0 where no step lowers the cost.
+    0 where no step lowers the cost. choose: the sizes of the priors, too.
     """
     noise = now.noise(loss_px)
-    normals = _normals(now, loss_px, noise.variance * now.inflation)
-    if free is None:
+    normals = _normals(now, loss_px, noise.variance * now.inflation, choose)
+    if choose:
         now = _with_sizes_chosen(now, [
             cost.at_noise(noise.variance).curved(noise.curvature)
             for cost in about_shared(now, normals, noise.variance * now.inflation)])
@@ -191,9 +193,10 @@ def _step(now: Estimate, loss_px: float, free: Ints | None) -> tuple[Estimate, f
     return now, 0.0
 
 
-def _normals(now: Estimate, loss_px: float, variance: float) -> list[Normal]:
-    return [normal_equations(scene, now.imaging, loss_px, now.moves, safe=True, variance=variance)
-            for scene in now.scenes]
+def _normals(now: Estimate, loss_px: float, variance: float, clusters: bool = False
+             ) -> list[Normal]:
+    return [normal_equations(scene, now.imaging, loss_px, now.moves, safe=True, variance=variance,
+                             clusters=clusters) for scene in now.scenes]
 
 
 def _settled(now: Estimate, loss_px: float, variance: float) -> Estimate:
