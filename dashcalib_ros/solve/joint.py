@@ -170,6 +170,8 @@ def _narrowed(found: Estimate, losses: Sequence[tuple[float, int]] = LOSSES
         if not now.scenes:
             return None
         now = optimised(now, least_px, steps, settled=NEAR)
+        # what was found first may be farther off than the bounds about it allow
+        now = replace(now, centred=now.centred.with_focal(now.camera.fx))
     return now
 
 
