@@ -165,7 +165,8 @@ def normal_equations(scene: Scene, imaging: Imaging, loss_px: float, by_image: b
     each image. further: more columns of what turns share, behind those of imaging. safe: the
     curvature is w, that of a parabola which lies above the loss: a step to the optimum is shorter,
     and lowers the cost. variance: of a residual, px^2, against which priors of how the camera
-    shakes count. clusters: by_track has what observations of one image share, too.
+    shakes count. clusters: by_track has what observations of one image share, too; at the optimum
+    only: elsewhere all of them ask for the same change.
     """
     used = scene.structure.used
     linear = _linearised(scene, imaging, loss_px, by_image, further, safe)
