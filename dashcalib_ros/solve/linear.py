@@ -374,7 +374,7 @@ def _eliminate_points(linear: _Linear, where: npt.NDArray[np.intp], point: npt.N
     # tracks that begin together are seen by some of the images only
     for some in np.array_split(np.argsort(mixed[:, 0].argmax(axis=1), kind='stable'), CHUNKS):
         filled = np.flatnonzero(scaled[some].any(axis=(0, 1)))
-        flat = scaled[some][:, :, filled].reshape(-1, len(filled))
+        flat = scaled[some][:, :, filled].reshape(3 * len(some), len(filled))
         normal[np.ix_(filled, filled)] -= flat.T @ flat
     return normal, _Points(inverse, blocks[:, :3, 3], mixed[:, :3],
                                                mixed[:, 3])
