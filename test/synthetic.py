@@ -104,27 +104,28 @@ class Path:
         return (local[:, 1:] - local[:, :1]).transpose(0, 2, 1), local[:, 0]
 
 
-def path_of(yaw_deg: float, count: int, seed: int, shaking_deg_s: float = 0.0) -> Path:
+def path_of(yaw_deg: float, seconds: np.ndarray, seed: int, shaking_deg_s: float = 0.0) -> Path:
     """Return a turn's path, with random bumps; shaking_deg_s: of pitch and roll."""
-    rng = np.random.default_rng([seed, 1])
+    rng, count = np.random.default_rng([seed, 1]), len(seconds)
     bumps = rng.standard_normal((count, 3)) * (*np.radians([0.7, 0.7]), 0.03)
     shaking = np.radians(shaking_deg_s) * rng.standard_normal((count, 3)) * (1, 0, 1)
-    return Path(np.radians(yaw_deg), KEYFRAME_S * np.arange(count), bumps, shaking)
+    return Path(np.radians(yaw_deg), seconds, bumps, shaking)
 
 
 def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int = 20,
                    tracks: int = 350, noise_px: float = 0.2, outliers: float = 0.0, seed: int = 0,
                    world: int = 0, extra: tuple[float, float, float] = (0.0, 0.0, 0.0),
-                   readout_s: float = 0.0, shaking_deg_s: float = 0.0) -> SyntheticTurn:
+                   readout_s: float = 0.0, shaking_deg_s: float = 0.0,
+                   keyframe_s: float = KEYFRAME_S) -> SyntheticTurn:
     """Return a turn through random points.
 
     seed: of the noise; world: of the path and the points. outliers: share of the observations that
     are 5 to 40 px off. extra: p1, p2, k3 of the lens that took the pictures.
-    readout_s: of a rolling shutter; keyframes are KEYFRAME_S apart. shaking_deg_s: how fast bumps
-    pitch and roll the camera in each keyframe, which no path through the keyframes shows.
+    readout_s: of a rolling shutter. shaking_deg_s: how fast bumps pitch and roll the camera in each
+    keyframe, which no path through the keyframes shows. keyframe_s: between two keyframes.
     """
     rng = np.random.default_rng([world, 2])
-    path = path_of(yaw_deg, keyframes, world, shaking_deg_s)
+    path = path_of(yaw_deg, keyframe_s * np.arange(keyframes), world, shaking_deg_s)
     rotations, translations = path.poses()
     centres = -np.einsum('kji,kj->ki', rotations, translations)
     many = 40 * tracks
@@ -162,7 +163,7 @@ def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int 
                         * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     measured[~visible[:, chosen]] = np.nan
     everything = Tracks(np.arange(keyframes) * 3, measured, camera.image_size,
-                        np.arange(keyframes) * round(KEYFRAME_S * 1e9))
+                        np.arange(keyframes) * round(keyframe_s * 1e9))
     structure = Structure(rotations, translations, points[chosen], np.ones(keyframes, bool),
                           visible[:, chosen])
     return SyntheticTurn(everything, structure)
