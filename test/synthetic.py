@@ -121,8 +121,8 @@ def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int 
 
     seed: of the noise; world: of the path and the points. outliers: share of the observations that
     are 5 to 40 px off. extra: p1, p2, k3 of the lens that took the pictures.
-    readout_s: of a rolling shutter. shaking_deg_s: how fast bumps pitch and roll the camera in each
-    keyframe, which no path through the keyframes shows. keyframe_s: between two keyframes.
+    readout_s: of a rolling shutter. shaking_deg_s: how fast bumps pitch and roll the camera in
+    each keyframe, which no path through the keyframes shows. keyframe_s: between two keyframes.
     """
     rng = np.random.default_rng([world, 2])
     path = path_of(yaw_deg, keyframe_s * np.arange(keyframes), world, shaking_deg_s)
