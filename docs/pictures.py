@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import matplotlib
 import numpy as np
+from dashcalib_ros.solve.focal import summed
 
 from dashcalib_ros import Config, stages
 from dashcalib_ros.arrays import Floats, GreyImage
@@ -27,7 +28,6 @@ from dashcalib_ros.detect.epipoles import epipoles_of
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.conclude import evidence_of_detection
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.focal import summed
 from dashcalib_ros.solve.solution import Solution
 
 matplotlib.use('agg')

@@ -33,7 +33,9 @@ def solved(scenes: Sequence[Scene], config: Config = CONFIG) -> Solution:
 
 
 def z_of(solution: Solution, truth: Camera = LENS) -> np.ndarray:
-    return (solution.camera.params - truth.params) / solution.sigma
+    """Return how many sigmas each parameter is off; those that truth's model lacks are 0."""
+    more = len(solution.camera.params) - len(truth.params)
+    return (solution.camera.params - np.pad(truth.params, (0, more))) / solution.sigma
 
 
 

@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from dashcalib_ros.solve.steps import Fit, fit_all
 from measure import complain, parser_with, table
 from solutions import RECORDED, Solved
 
@@ -23,7 +24,6 @@ from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.reconstruct.adjust import Solver
 from dashcalib_ros.solve.prior import loss_px_of
 from dashcalib_ros.solve.solution import Solution, cross_validation
-from dashcalib_ros.solve.steps import Fit, fit_all
 
 
 def solved_drives(cache: Path) -> list[Solved]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from dashcalib_ros.solve.field import without_field
 from documents import write_table
 from measure import (
     commit,
@@ -41,7 +42,6 @@ from dashcalib_ros.judge.odometry import Odometry, angle_deg, odometry
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.solve import solve
-from dashcalib_ros.solve.field import without_field
 from dashcalib_ros.solve.solution import Solution
 
 # degrees between a turn's first and last keyframe
