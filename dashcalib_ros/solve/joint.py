@@ -111,15 +111,16 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
         return None
     for steps in LAST_STEPS:
         best = optimised(best.retriangulated(), 0.0, steps)
-    # before shifts of pictures may make up for another lens
+    # now, as shifts of pictures may make up for another lens
     if _of_another_drive(best):
         return _solved([scene for scene in per_turn if scene.turn.of_this_drive], config, progress)
+    unlike = misfits(per_turn, best.seen_by_lens, best.camera, config.scene.error_px)
     tests = fixed_camera_tests(best)
     if config.intrinsics.crop_rounds and moves(tests):
         progress('looking how the picture moves', 0.0)
         best = _steadied(best, measured, config)
         tests = fixed_camera_tests(best)
-    return _solution(best, per_turn, start.profile, tried, tests, progress)
+    return _solution(best, unlike, start.profile, tried, tests, progress)
 
 
 def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progress
@@ -250,10 +251,13 @@ def _posterior(found: Estimate) -> Posterior:
         np.array([not scene.turn.of_this_drive for scene in found.scenes]), found.prior())
 
 
-def _solution(found: Estimate, per_turn: Sequence[Scene], coarse: Profile,
+def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
               tried: tuple[Candidate, ...], tests: tuple[FixedCameraTest, ...],
               progress: Progress) -> Solution:
-    """Return the solution with all that is known of it. coarse: the turns' focal profiles."""
+    """Return the solution with all that is known of it.
+
+    unlike: each turn's misfit. coarse: the turns' focal profiles.
+    """
     progress('estimating the uncertainty', 0.0)
     config, lens, posterior = found.config, found.camera, _posterior(found)
     result = written(found.imaging, posterior.covariance, found.scenes, config.model)
@@ -269,6 +273,6 @@ def _solution(found: Estimate, per_turn: Sequence[Scene], coarse: Profile,
         bounds=np.array(bounds_of(found.centred))[:, :count],
         readout_s=found.imaging.readout_s,
         readout_sigma_s=float(np.sqrt(posterior.covariance[place, place])),
-        misfits=misfits(per_turn, scenes, result.camera, config.scene.error_px), tried=tried,
+        misfits=unlike, tried=tried,
         fixed_camera=tests, field_sigma=found.field_sigma,
         crops={turn: images[:, :2] for turn, images in found.imaging.images.items()})
