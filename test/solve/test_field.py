@@ -91,8 +91,6 @@ def test_a_windscreen_is_found_and_the_lens_behind_it(rms_px, seed):
 
     assert off_px(found.field.ideal(seen)) < 2 * found.rays_sigma_px
     assert off_px(found.field.ideal(seen)) < 0.8 * off_px(seen)
-    ours, true = (each.displacement(found.written.pixels).ravel() for each in (found.field, field))
-    assert ours @ true > 0.8 * np.linalg.norm(ours) * np.linalg.norm(true)
     # what camera_info cannot say is in the sigma over the picture, and not in that of the rays
     assert found.picture.rms > 0.8 * rms_px
     assert found.rays_sigma_px < found.picture.rms
