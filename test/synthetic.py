@@ -4,7 +4,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from dashcalib_ros.camera import Camera, Fisheye, Radial
 from dashcalib_ros.detect import TurnId
@@ -87,7 +86,7 @@ class Path:
         at = length * seconds / self.seconds[-1]
         x, z = (np.interp(at, fine, np.cumsum(along(heading)) * step)
                 for along in (np.sin, np.cos))
-        pitch, roll, height = np.moveaxis(CubicSpline(self.seconds, self.bumps)(seconds), -1, 0)
+        pitch, roll, height = np.moveaxis(self._bumps(seconds), -1, 0)
         local = points - np.stack([x, height, z], axis=-1)
         for axis, angle in ((1, self.heading(at)), (0, pitch), (2, roll)):
             i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -96,6 +95,13 @@ class Path:
                 np.cos(angle) * first + np.sin(angle) * second,
                 np.cos(angle) * second - np.sin(angle) * first)
         return local + np.cross(self.shaking[:, None] * late_s[..., None], local)
+
+    def _bumps(self, seconds: np.ndarray) -> np.ndarray:
+        if np.array_equal(seconds, np.broadcast_to(self.seconds[:, None], seconds.shape)):
+            return np.broadcast_to(self.bumps[:, None], (*seconds.shape, 3))
+        # it takes half a second to load, and test_rooms.py says where it is not needed
+        from scipy.interpolate import CubicSpline
+        return CubicSpline(self.seconds, self.bumps)(seconds)
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Return world-to-camera rotations (k, 3, 3) and translations (k, 3): x right, y down."""
