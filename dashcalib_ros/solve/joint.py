@@ -269,7 +269,7 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
     return Solution(
         written=result, posterior=posterior, scenes=scenes, coarse=coarse, around=around,
         centred=type(result.camera).centred(
-            lens.image_size, found.centred.fx, *found.centred.params[4:6]),
+            lens.image_size, found.centred.fx, *found.centred.params[4:min(count, 6)]),
         bounds=np.array(bounds_of(found.centred))[:, :count],
         readout_s=found.imaging.readout_s,
         readout_sigma_s=float(np.sqrt(posterior.covariance[place, place])),
