@@ -17,7 +17,6 @@ from pathlib import Path
 import cv2
 import matplotlib
 import numpy as np
-from dashcalib_ros.solve.focal import summed
 
 from dashcalib_ros import Config, stages
 from dashcalib_ros.arrays import Floats, GreyImage
@@ -29,6 +28,7 @@ from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.conclude import evidence_of_detection
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.start import summed
 
 matplotlib.use('agg')
 # the same data gives the same files
