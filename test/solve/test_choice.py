@@ -20,10 +20,10 @@ WIDE = Fisheye(SIZE, 300.0, 300.6, 404.0, 221.0, 0.02, -0.008, 0.003, -0.0005)
 DECENTRED = Brown(SIZE, *LENS.params, 0.003, -0.003, 0.0)
 
 
-def wide_scenes(count: int, tracks: int = 220) -> list[Scene]:
+def wide_scenes(count: int, tracks: int = 150) -> list[Scene]:
     start = Fisheye.centred(SIZE, 1.02 * WIDE.fx, 0.0)
     return [synthetic_turn(WIDE, yaw, world=world, tracks=tracks, keyframes=16).scene(start, world)
-            for world, yaw in enumerate((80.0, -70.0, 85.0, -90.0)[:count])]
+            for world, yaw in enumerate((80.0, -70.0, 85.0)[:count])]
 
 
 # the model that is written
@@ -99,7 +99,7 @@ def test_a_model_with_fewer_coefficients_is_weak_where_the_picture_needs_them(br
 
 
 def test_a_fisheye_is_recovered_beyond_90_degrees():
-    scenes = wide_scenes(4)
+    scenes = wide_scenes(3)
     assert np.arccos(np.nanmin(WIDE.rays(scenes[0].tracks.xy)[..., 2])) > np.radians(80)
     found = solved(scenes)
     assert type(found.camera) is Fisheye
@@ -111,12 +111,12 @@ def test_a_fisheye_is_recovered_beyond_90_degrees():
 
 
 def test_turns_that_may_be_of_two_kinds_are_tried_with_both():
-    scenes = wide_scenes(3)
+    scenes = wide_scenes(2)
     narrow = as_model(WIDE, Radial)
     unsure = Profile(np.array([0.2, 0.3, 0.4]), np.array([2.0, 1.5, 1.8]), 100)
     scenes = [replace(scene, rivals=(Start(unsure, narrow),)) for scene in scenes]
     # one turn was taken for that of a pinhole
-    first = synthetic_turn(WIDE, 80.0, world=0, tracks=220, keyframes=16).scene(narrow, 0)
+    first = synthetic_turn(WIDE, 80.0, world=0, tracks=150, keyframes=16).scene(narrow, 0)
     scenes[0] = replace(first, rivals=(Start(scenes[0].profile, scenes[0].camera),))
     found = solved(scenes)
     assert type(found.camera) is Fisheye
@@ -127,7 +127,7 @@ def test_turns_that_may_be_of_two_kinds_are_tried_with_both():
 def test_a_pinhole_that_all_turns_were_taken_for_a_fisheye_is_one():
     taken = as_model(LENS, Fisheye)
     sure = Profile(np.array([0.5, 0.65, 0.8]), np.array([1.2, 1.0, 1.3]), 100)
-    scenes = [replace(synthetic_turn(LENS, yaw, world=world, tracks=200).scene(taken, world),
+    scenes = [replace(synthetic_turn(LENS, yaw, world=world, tracks=120, keyframes=14).scene(taken, world),
                       rivals=(Start(sure, LENS),)) for world, yaw in enumerate((80, -70, 85))]
     found = solved(scenes)
     assert found.camera.family == 'pinhole' and mapping_error(found.camera, LENS) < 1.0

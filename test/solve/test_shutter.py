@@ -18,11 +18,11 @@ from dashcalib_ros.solve.imaging import imaging_with, motion_of, row_shift
 pytestmark = pytest.mark.usefixtures('no_profile')
 
 # keyframes that show how a car turns between them
-DENSE = {'keyframes': 28, 'keyframe_s': 0.15, 'noise_px': 0.1}
+DENSE = {'keyframes': 24, 'keyframe_s': 0.15, 'noise_px': 0.1, 'tracks': 120}
 
 
 @pytest.mark.parametrize(('readout_s', 'shaking_deg_s'), [
-    (0.03, 0.0), (-0.02, 0.0), (0.02, 3.0), (0.01, 1.0)])
+    (0.03, 0.0), (-0.02, 0.0), (0.02, 3.0)])
 def test_a_rolling_shutter_is_measured(readout_s, shaking_deg_s):
     found = solved(scenes_of(3, readout_s=readout_s, shaking_deg_s=shaking_deg_s, **DENSE))
     assert found.rolling
