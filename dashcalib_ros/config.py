@@ -136,28 +136,14 @@ class SceneConfig:
 class IntrinsicsConfig:
     """Scenes -> the parameters of the lens."""
 
-    rounds: int = expert(
-        2, 'adjustments of a step at the most, with new triangulation between', 1, 10)
-    settled: float = expert(
-        0.002, 'of the observations; where new triangulation changes fewer, no round follows',
-        0.0, 1.0)
     loss: float = expert(
         1.0, 'times the median reprojection error; scale of the Cauchy loss', 0.1, 100.0)
     profile_tracks: int = expert(
         120, 'of each turn, for the focal profile around the result', 20, 5000)
     aspect_sigma: float = expert(
         0.003, 'fy / fx is 1 to within this: planar turns know fx but hardly fy', 1e-5, 1.0)
-    shutter_rounds: int = expert(
-        5, 'corrections of a rolling shutter at the most; with 0 every shutter counts as global',
-        0, 20)
     crop_rounds: int = expert(
         10, 'corrections of a stabilised picture at the most; with 0 none is taken out', 0, 100)
-    one_turn_sigma: float = expert(
-        0.012, 'of fx, added where one turn is all: those of real drives differ by 0.6 to 2 %',
-        0.0, 0.1)
-    least_field_nats: float = expert(
-        10.0, 'of evidence for a field that no lens model has: sound lenses 0, KITTI 60 to 400',
-        0.0, 1e6)
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from dashcalib_ros.detect.epipoles import epipoles_of
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.conclude import evidence_of_detection
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.focal import summed
 from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.start import summed
 
 matplotlib.use('agg')
 # the same data gives the same files

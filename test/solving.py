@@ -2,27 +2,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Camera, Radial
-from dashcalib_ros.camera.camera import Prior
 from dashcalib_ros.config import Config
-from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.joint import solve
-from dashcalib_ros.solve.prior import extra_sigma_of
+from dashcalib_ros.solve import solve
+from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.solve.solution import Solution
 
 CONFIG = Config().replace({'intrinsics.profile_tracks': 60})
 START = Radial.centred(SIZE, 1.03 * LENS.fx, -0.25)
 YAWS = (80.0, -70.0, 85.0, -90.0, 65.0, -78.0)
-NO_PRIOR = Prior(LENS.params, np.diag([1e9, 1e9, 1e9, 1e9, 1e6, 1e6]))
-FREE = (LENS.params - [200, 200, 100, 100, 1, 1], LENS.params + [200, 200, 100, 100, 1, 1])
-NOTHING = np.zeros((6, 6))
-# what p1, p2 and k3 of real lenses are like
-EXTRA = extra_sigma_of(LENS)
 
 
 def scenes_of(count: int, camera: Camera = LENS, seed: int = 0, start: Camera = START,
@@ -39,12 +33,29 @@ def solved(scenes: Sequence[Scene], config: Config = CONFIG) -> Solution:
 
 
 def z_of(solution: Solution, truth: Camera = LENS) -> np.ndarray:
-    return (solution.camera.params - truth.params) / solution.sigma
+    """Return how many sigmas each parameter is off; those that truth's model lacks are 0."""
+    more = len(solution.camera.params) - len(truth.params)
+    return (solution.camera.params - np.pad(truth.params, (0, more))) / solution.sigma
 
 
-def adjusted(scenes: list[Scene], loss_px: float, rounds: int = 1) -> tuple[list[Scene], Camera]:
-    camera = LENS
-    for _ in range(rounds):
-        scenes, camera = adjust(scenes, camera, Solver(loss_px, 200, 1e-14), 'everything',
-                                prior=NO_PRIOR, bounds=FREE)
-    return scenes, camera
+
+def with_camera(solution: Solution, camera: Camera) -> Solution:
+    """Return the solution as if this camera were the written one."""
+    return replace(solution, written=replace(solution.written, camera=camera))
+
+
+def with_covariance(solution: Solution, covariance: np.ndarray) -> Solution:
+    """Return the solution as if this were the covariance (n, n) of its camera."""
+    loose = solution.written.loose + covariance - solution.covariance
+    return replace(solution, written=replace(solution.written, loose=loose))
+
+
+def with_turns(solution: Solution, turns: Sequence[Quadratic]) -> Solution:
+    """Return the solution as if its turns knew this."""
+    return replace(solution, posterior=replace(solution.posterior, turns=tuple(turns)))
+
+
+def only(solution: Solution, places: Sequence[int]) -> Solution:
+    """Return the solution as if only these turns had been there."""
+    return replace(solution, scenes=tuple(solution.scenes[n] for n in places),
+                   posterior=solution.posterior.of(places))

@@ -15,6 +15,8 @@ LENS = Radial(SIZE, 520.0, 521.0, 407.0, 219.0, -0.28, 0.09)
 # between two keyframes
 KEYFRAME_S = 0.3
 NEAR_M, FAR_M = 2.0, 45.0
+# before and after a turn; on which the wheel is turned
+STRAIGHT_M, EASED_M = 6.0, 4.0
 # rad (100 degrees) off the axis, to which tests of a fisheye look
 WIDEST = 1.75
 
@@ -45,39 +47,92 @@ def rotation(axis: int, angle: float) -> np.ndarray:
     return matrix
 
 
-def poses_of_turn(yaw_deg: float, count: int, seed: int, radius_m: float = 10.0,
-                  tilt_deg: float = 0.7) -> tuple[np.ndarray, np.ndarray]:
-    """Return world-to-camera rotations (k, 3, 3) and translations (k, 3): x right, y down."""
-    rng = np.random.default_rng([seed, 1])
-    arc = abs(np.radians(yaw_deg)) * radius_m
-    length = arc + 12.0
-    at = np.linspace(0, length, count)
-    heading = np.sign(yaw_deg) * np.clip(at - 6.0, 0, arc) / radius_m
-    fine = np.linspace(0, length, 2000)
-    fine_heading = np.sign(yaw_deg) * np.clip(fine - 6.0, 0, arc) / radius_m
-    step = fine[1]
-    x = np.interp(at, fine, np.cumsum(np.sin(fine_heading)) * step)
-    z = np.interp(at, fine, np.cumsum(np.cos(fine_heading)) * step)
-    centres = np.stack([x, 0.03 * rng.standard_normal(count), z], axis=1)
-    tilt = np.radians(tilt_deg) * rng.standard_normal((count, 2))
-    rotations = np.array([
-        (rotation(1, heading[k]) @ rotation(0, tilt[k, 0]) @ rotation(2, tilt[k, 1])).T
-        for k in range(count)])
-    return rotations, -np.einsum('kij,kj->ki', rotations, centres)
+@dataclass(frozen=True)
+class Path:
+    """How the camera of a turn moves, at any time; as smoothly as cars do.
+
+    yaw: rad, of the whole turn. seconds: (k,) of the keyframes. bumps: (k, 3) pitch and roll, rad,
+    and height, m, at the keyframes. shaking: (k, 3) rad/s, by how much faster each keyframe's
+    camera turns than this path.
+    """
+
+    yaw: float
+    seconds: np.ndarray
+    bumps: np.ndarray
+    shaking: np.ndarray
+    radius_m: float = 10.0
+
+    @property
+    def arc_m(self) -> float:
+        return abs(self.yaw) * self.radius_m
+
+    def heading(self, at_m: np.ndarray) -> np.ndarray:
+        """Return the heading, rad: of a circle into which the wheel turns within EASED_M."""
+        def summed(x: np.ndarray) -> np.ndarray:
+            inside = np.clip(x, 0, self.arc_m)
+            return inside**2 / 2 + self.arc_m * np.maximum(x - self.arc_m, 0)
+
+        x = at_m - STRAIGHT_M
+        return np.sign(self.yaw) / self.radius_m / EASED_M * (
+            summed(x + EASED_M / 2) - summed(x - EASED_M / 2))
+
+    def local(self, points: np.ndarray, late_s: np.ndarray) -> np.ndarray:
+        """Return (k, t, 3) points (t, 3) in the camera's axes so long after each keyframe (k, t).
+        """
+        length = self.arc_m + 2 * STRAIGHT_M
+        fine = np.linspace(-2 * STRAIGHT_M, length + 2 * STRAIGHT_M, 4000)
+        heading, step = self.heading(fine), fine[1] - fine[0]
+        seconds = self.seconds[:, None] + late_s
+        at = length * seconds / self.seconds[-1]
+        x, z = (np.interp(at, fine, np.cumsum(along(heading)) * step)
+                for along in (np.sin, np.cos))
+        pitch, roll, height = np.moveaxis(self._bumps(seconds), -1, 0)
+        local = points - np.stack([x, height, z], axis=-1)
+        for axis, angle in ((1, self.heading(at)), (0, pitch), (2, roll)):
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            first, second = local[..., i], local[..., j]
+            local[..., i], local[..., j] = (
+                np.cos(angle) * first + np.sin(angle) * second,
+                np.cos(angle) * second - np.sin(angle) * first)
+        return local + np.cross(self.shaking[:, None] * late_s[..., None], local)
+
+    def _bumps(self, seconds: np.ndarray) -> np.ndarray:
+        if np.array_equal(seconds, np.broadcast_to(self.seconds[:, None], seconds.shape)):
+            return np.broadcast_to(self.bumps[:, None], (*seconds.shape, 3))
+        # it takes half a second to load, and test_rooms.py says where it is not needed
+        from scipy.interpolate import CubicSpline
+        return CubicSpline(self.seconds, self.bumps)(seconds)
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return world-to-camera rotations (k, 3, 3) and translations (k, 3): x right, y down."""
+        axes = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+        local = self.local(axes, np.zeros((len(self.seconds), 4)))
+        return (local[:, 1:] - local[:, :1]).transpose(0, 2, 1), local[:, 0]
+
+
+def path_of(yaw_deg: float, seconds: np.ndarray, seed: int, shaking_deg_s: float = 0.0) -> Path:
+    """Return a turn's path, with random bumps; shaking_deg_s: of pitch and roll."""
+    rng, count = np.random.default_rng([seed, 1]), len(seconds)
+    bumps = rng.standard_normal((count, 3)) * (*np.radians([0.7, 0.7]), 0.03)
+    shaking = np.radians(shaking_deg_s) * rng.standard_normal((count, 3)) * (1, 0, 1)
+    return Path(np.radians(yaw_deg), seconds, bumps, shaking)
 
 
 def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int = 20,
                    tracks: int = 350, noise_px: float = 0.2, outliers: float = 0.0, seed: int = 0,
                    world: int = 0, extra: tuple[float, float, float] = (0.0, 0.0, 0.0),
-                   readout_s: float = 0.0) -> SyntheticTurn:
+                   readout_s: float = 0.0, shaking_deg_s: float = 0.0,
+                   keyframe_s: float = KEYFRAME_S) -> SyntheticTurn:
     """Return a turn through random points.
 
     seed: of the noise; world: of the path and the points. outliers: share of the observations that
     are 5 to 40 px off. extra: p1, p2, k3 of the lens that took the pictures.
-    readout_s: of a rolling shutter; keyframes are KEYFRAME_S apart.
+    readout_s: of a rolling shutter. shaking_deg_s: how fast bumps pitch and roll the camera in
+    each keyframe, which no path through the keyframes shows. keyframe_s: between two keyframes.
     """
     rng = np.random.default_rng([world, 2])
-    rotations, translations = poses_of_turn(yaw_deg, keyframes, world)
+    path = path_of(yaw_deg, keyframe_s * np.arange(keyframes), world, shaking_deg_s)
+    rotations, translations = path.poses()
     centres = -np.einsum('kji,kj->ki', rotations, translations)
     many = 40 * tracks
     # in front of some image, between the kerb and the roofs
@@ -90,12 +145,11 @@ def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int 
     wide = isinstance(camera, Fisheye)
     distance = np.linalg.norm(seen_from, axis=2) if wide else seen_from[:, :, 2]
     behind = distance < NEAR_M
-    global_shutter = seen_from.copy()
     seen_from[behind] = [0, 0, 1]
     xy = project(seen_from, camera, extra)
     for _ in range(4 if readout_s else 0):
-        late = ((xy[:, :, 1] + 0.5) / height - 0.5) * readout_s / KEYFRAME_S
-        seen_from = between(global_shutter, np.clip(late, -1.0, 1.0))
+        late = np.clip((xy[:, :, 1] + 0.5) / height - 0.5, -1.0, 1.0)
+        seen_from = path.local(points, readout_s * late)
         seen_from[behind] = [0, 0, 1]
         xy = project(seen_from, camera, extra)
     off_axis = np.linalg.norm(seen_from[:, :, :2], axis=2)
@@ -115,17 +169,10 @@ def synthetic_turn(camera: Camera = LENS, yaw_deg: float = 80.0, keyframes: int 
                         * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     measured[~visible[:, chosen]] = np.nan
     everything = Tracks(np.arange(keyframes) * 3, measured, camera.image_size,
-                        np.arange(keyframes) * round(KEYFRAME_S * 1e9))
+                        np.arange(keyframes) * round(keyframe_s * 1e9))
     structure = Structure(rotations, translations, points[chosen], np.ones(keyframes, bool),
                           visible[:, chosen])
     return SyntheticTurn(everything, structure)
-
-
-def between(local: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return (k, t, 3) points a share (k, t) of the way to the next keyframe, or the last."""
-    step = np.diff(local, axis=0)
-    ahead, back = np.concatenate([step, step[-1:]]), np.concatenate([step[:1], step])
-    return local + share[:, :, None] * np.where(share[:, :, None] > 0, ahead, back)
 
 
 def project(points: np.ndarray, camera: Camera, extra: tuple[float, float, float]) -> np.ndarray:

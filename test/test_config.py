@@ -46,7 +46,7 @@ def test_about_twenty_settings_are_for_users_and_come_first():
     users = {name for name in SPECS if not SPECS[name].metadata['expert']}
     assert 10 <= len(users) <= 16
     assert {'turns.wanted', 'turns.store', 'threads', 'motion.rate'} <= users
-    assert not {'scene.loss_px', 'intrinsics.rounds', 'verdict.max_leverage'} & users
+    assert not {'scene.loss_px', 'intrinsics.loss', 'verdict.max_leverage'} & users
 
 
 def test_what_was_measured_is_told_of_settings_that_exist_with_their_defaults():

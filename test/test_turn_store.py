@@ -22,7 +22,7 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.reconstruct import scene_file
 from dashcalib_ros.reconstruct.scene import Scene, Start
 from dashcalib_ros.reconstruct.scene_file import Origin, StoredTurn
-from dashcalib_ros.solve.focal import kinds_of_lenses
+from dashcalib_ros.solve.start import kinds_of_lenses
 from dashcalib_ros.turn_store import TurnStore
 
 HALF_WIDTH_S = 3.0

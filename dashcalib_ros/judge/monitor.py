@@ -93,7 +93,8 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
         nothing = Quadratic.prior(np.zeros((count, count)))
         return Reading(scene.turn, nothing, None, False, misfit)
     loss_px, alone = loss_px_of([found], camera, config.intrinsics), lens_alone(camera)
-    cost = normal_equations(found, alone, loss_px).cost.of(np.arange(count)).at_noise(
+    normal = normal_equations(found, alone, loss_px, clusters=False)
+    cost = normal.cost.of(np.arange(count)).at_noise(
         noise_of([found], [residuals(found, alone)], count, loss_px).variance)
     # errors that the observations of a track share make it worth less than their number
     inflation = max(1.0, float(np.trace(np.linalg.pinv(cost.hessian) @ cost.by_track)) / count)

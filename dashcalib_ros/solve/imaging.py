@@ -192,13 +192,16 @@ class Motion:
 class LocalPoints:
     """Points of the n used observations in the camera's axes.
 
-    rotated: (n, 3) the world's points, rotated. local: (n, 3) at the time of their rows.
-    by_readout: (n, 3) how far they move for a second of readout. late: (n,) when their rows are
-    exposed, in readouts after the middle one. motion: of the camera.
+    rotated: (n, 3) the world's points, rotated. still: (n, 3) at the time of the middle row;
+    local: (n, 3) at the time of their rows. turning: (n, 3) rad/s of the camera. by_readout:
+    (n, 3) how far they move for a second of readout. late: (n,) when their rows are exposed, in
+    readouts after the middle one. motion: of the camera.
     """
 
     rotated: Floats
+    still: Floats
     local: Floats
+    turning: Floats
     by_readout: Floats
     late: Floats
     motion: Motion
@@ -209,12 +212,13 @@ def local_points(scene: Scene, imaging: Imaging) -> LocalPoints:
     structure = scene.structure
     rows, columns = np.nonzero(structure.used)
     rotated = np.einsum('nij,nj->ni', structure.rotations[rows], structure.points[columns])
-    local = rotated + structure.translations[rows]
+    still = rotated + structure.translations[rows]
     motion = motion_of(structure, scene.tracks.stamps_ns)
     late = (scene.tracks.xy[rows, columns, 1] + 0.5) / imaging.camera.image_size[1] - 0.5
-    turning = motion.turning + imaging.shaking.get(scene.turn, 0.0)
-    by_readout = late[:, None] * (np.cross(turning[rows], local) + motion.moving[rows])
-    return LocalPoints(rotated, local + imaging.readout_s * by_readout, by_readout, late, motion)
+    turning = (motion.turning + imaging.shaking.get(scene.turn, 0.0))[rows]
+    by_readout = late[:, None] * (np.cross(turning, still) + motion.moving[rows])
+    return LocalPoints(rotated, still, still + imaging.readout_s * by_readout, turning, by_readout,
+                       late, motion)
 
 
 def row_shift(scene: Scene, imaging: Imaging) -> Floats:
@@ -226,8 +230,7 @@ def row_shift(scene: Scene, imaging: Imaging) -> Floats:
     seen = scene.tracks.seen & structure.registered[:, None] & structure.used.any(axis=0)
     found = local_points(replace(scene, structure=replace(structure, used=seen)), imaging)
     shift = np.zeros(scene.tracks.xy.shape)
-    still = found.local - imaging.readout_s * found.by_readout
-    shift[seen] = np.nan_to_num(camera.project(found.local) - camera.project(still))
+    shift[seen] = np.nan_to_num(camera.project(found.local) - camera.project(found.still))
     return shift
 
 

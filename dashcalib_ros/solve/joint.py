@@ -75,26 +75,22 @@ def solve(scenes: Sequence[Scene], config: Config,
     drive's turns contradict are left out.
     """
     try:
-        found = _solved(scenes, config, progress)
-        if found is not None and _of_another_drive(found):
-            own = [scene for scene in scenes if scene.turn.of_this_drive]
-            found = _solved(own, config, progress)
-        return found
+        return _solved(scenes, config, progress)
     except np.linalg.LinAlgError:
         # nothing limits a direction of the parameters: pictures that slide past show no depth
         return None
 
 
-def _of_another_drive(found: Solution) -> bool:
+def _of_another_drive(found: Estimate) -> bool:
     """Return whether the turns of earlier drives contradict those of this one."""
-    earlier = found.posterior.earlier
-    if earlier.all() or not earlier.any():
+    own = [scene.turn.of_this_drive for scene in found.scenes]
+    if all(own) or not any(own):
         return False
     old, new = ([scene for scene in found.scenes if scene.turn.of_this_drive == this]
                 for this in (False, True))
     apart = abs(roll_deg(old) - roll_deg(new)) % 360
     return (min(apart, 360 - apart) > OTHER_UPRIGHT_DEG
-            or found.posterior.of_another_drive > CONTRADICTION)
+            or _posterior(found).of_another_drive > CONTRADICTION)
 
 
 def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> Solution | None:
@@ -115,12 +111,16 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
         return None
     for steps in LAST_STEPS:
         best = optimised(best.retriangulated(), 0.0, steps)
+    # now, as shifts of pictures may make up for another lens
+    if _of_another_drive(best):
+        return _solved([scene for scene in per_turn if scene.turn.of_this_drive], config, progress)
+    unlike = misfits(per_turn, best.seen_by_lens, best.camera, config.scene.error_px)
     tests = fixed_camera_tests(best)
     if config.intrinsics.crop_rounds and moves(tests):
         progress('looking how the picture moves', 0.0)
         best = _steadied(best, measured, config)
         tests = fixed_camera_tests(best)
-    return _solution(best, per_turn, start.profile, tried, tests, progress)
+    return _solution(best, unlike, start.profile, tried, tests, progress)
 
 
 def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progress
@@ -245,15 +245,23 @@ def _steadied(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config)
     return now if len(now.scenes) == len(found.scenes) else found
 
 
-def _solution(found: Estimate, per_turn: Sequence[Scene], coarse: Profile,
-              tried: tuple[Candidate, ...], tests: tuple[FixedCameraTest, ...],
-              progress: Progress) -> Solution:
-    """Return the solution with all that is known of it. coarse: the turns' focal profiles."""
-    progress('estimating the uncertainty', 0.0)
-    config, lens = found.config, found.camera
-    posterior = Posterior(
+def _posterior(found: Estimate) -> Posterior:
+    """Return what the turns know at their optimum."""
+    lens = found.camera
+    return Posterior(
         lens, found.field_sigma**2 * lens_like(lens), tuple(costs_of(found, found.loss_px())),
         np.array([not scene.turn.of_this_drive for scene in found.scenes]), found.prior())
+
+
+def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
+              tried: tuple[Candidate, ...], tests: tuple[FixedCameraTest, ...],
+              progress: Progress) -> Solution:
+    """Return the solution with all that is known of it.
+
+    unlike: each turn's misfit. coarse: the turns' focal profiles.
+    """
+    progress('estimating the uncertainty', 0.0)
+    config, lens, posterior = found.config, found.camera, _posterior(found)
     result = written(found.imaging, posterior.covariance, found.scenes, config.model)
     scenes = tuple(result.seen(scene, found.imaging) for scene in found.scenes)
     progress('trying other focal lengths', 0.0)
@@ -263,10 +271,10 @@ def _solution(found: Estimate, per_turn: Sequence[Scene], coarse: Profile,
     return Solution(
         written=result, posterior=posterior, scenes=scenes, coarse=coarse, around=around,
         centred=type(result.camera).centred(
-            lens.image_size, found.centred.fx, *found.centred.params[4:6]),
+            lens.image_size, found.centred.fx, *found.centred.params[4:min(count, 6)]),
         bounds=np.array(bounds_of(found.centred))[:, :count],
         readout_s=found.imaging.readout_s,
         readout_sigma_s=float(np.sqrt(posterior.covariance[place, place])),
-        misfits=misfits(per_turn, scenes, result.camera, config.scene.error_px), tried=tried,
+        misfits=unlike, tried=tried,
         fixed_camera=tests, field_sigma=found.field_sigma,
         crops={turn: images[:, :2] for turn, images in found.imaging.images.items()})

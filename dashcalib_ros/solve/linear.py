@@ -165,7 +165,8 @@ def normal_equations(scene: Scene, imaging: Imaging, loss_px: float, by_image: b
     each image. further: more columns of what turns share, behind those of imaging. safe: the
     curvature is w, that of a parabola which lies above the loss: a step to the optimum is shorter,
     and lowers the cost. variance: of a residual, px^2, against which priors of how the camera
-    shakes count. clusters: by_track has what observations of one image share, too.
+    shakes count. clusters: by_track has what observations of one image share, too; at the optimum
+    only: elsewhere all of them ask for the same change.
     """
     used = scene.structure.used
     linear = _linearised(scene, imaging, loss_px, by_image, further, safe)
@@ -281,12 +282,14 @@ def _linearised(scene: Scene, imaging: Imaging, loss_px: float, by_image: bool,
         residual = imaging.ideal_of(scene, structure.used) - projected
         weight = weights(residual, loss_px)
     # a small rotation w of the camera moves the local point by w x (R X)
-    parts, follow = [by_local @ -cross(found.rotated), by_local], None
+    by_still, by_motion, follow = by_local, [], None
     if abs(imaging.readout_s) > LEAST_READOUT_S:
         # a point X moves by turning x X + moving, and both follow the poses
         late = by_local * (imaging.readout_s * found.late)[:, None, None]
-        parts += [late @ -cross(found.local), late]
+        by_still, by_motion = by_local + late @ cross(found.turning), [
+            late @ -cross(found.still), late]
         follow = found.motion.follow(structure)
+    parts = [by_still @ -cross(found.rotated), by_still, *by_motion]
     if by_image:
         middle = (np.array(camera.image_size) - 1) / 2
         shift = np.broadcast_to(np.eye(2), (len(rows), 2, 2))
@@ -297,7 +300,7 @@ def _linearised(scene: Scene, imaging: Imaging, loss_px: float, by_image: bool,
         parts.append(further(projected))
     scale = np.sqrt(weight) if safe else weight
     wide = np.concatenate(parts, axis=2) * scale[:, None, None]
-    by_point = by_local @ structure.rotations[rows] * scale[:, None, None]
+    by_point = by_still @ structure.rotations[rows] * scale[:, None, None]
     # what the lens does not see counts nothing
     blind = ~np.isfinite(wide).all(axis=(1, 2)) | ~np.isfinite(residual).all(axis=1)
     if blind.any():

@@ -13,9 +13,10 @@ from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Profile, Scene, rms_px
 from dashcalib_ros.solve.evidence import Candidate, FixedCameraTest
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.solve.imaging import lens_alone
+from dashcalib_ros.solve.quadratic import NONE, Quadratic
 from dashcalib_ros.solve.spread import PictureSigma, Posterior, SigmaMap, sigma_over
-from dashcalib_ros.solve.written import Written
+from dashcalib_ros.solve.written import Written, written
 
 # fewer turns are not left out: one of two says little of the other
 LEAST_TURNS = 3
@@ -126,16 +127,11 @@ class Solution:
     def seen_by_turns(self, given: Camera) -> Floats:
         """Return (n,) the parameters of this model that turns find where given is true.
 
-        given: of this model, or of its wider one. Where it has coefficients that are 0 here, the
-        turns make up for them with their other parameters.
+        given: of this model, or of its wider one: then it is the one that would be written of it.
         """
-        count, whole = len(self.camera.params), len(given.params)
-        if whole == count:
+        if len(given.params) == len(self.camera.params):
             return given.params
-        cost = Quadratic.together(self.posterior.turns).hessian[:whole, :whole]
-        inner = cost[:count, :count] + self.posterior.prior.hessian[:count, :count]
-        return np.asarray(given.params[:count] + np.linalg.solve(
-            inner, cost[:count, count:] @ given.params[count:]))
+        return written(lens_alone(given), NONE, self.scenes, self.camera.model).camera.params
 
 
 # a shorter readout, in its sigmas and in s, is not named

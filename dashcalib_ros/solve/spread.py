@@ -21,7 +21,7 @@ from dashcalib_ros.solve.quadratic import Quadratic
 
 # of fx: by how much turns may differ. Real ones do by 0.2 to 1 %, rendered ones by nothing
 TURNS_DIFFER = (0.0, 0.0015, 0.003, 0.006, 0.012)
-# of fx, and as much over the picture in every other parameter: two units of one make
+# of fx, alone or with as much over the picture in every other parameter: two units of one make
 DRIVES_DIFFER = 0.02
 # of likelihoods; beyond it the less likely case counts for nothing
 LARGEST_LOG = 100.0
@@ -136,27 +136,27 @@ class Posterior:
         if self.earlier.all() or not self.earlier.any():
             return 0.0
         logs = np.array([[self._case(turns, drives)[0] for turns in self.differ]
-                         for drives in (0.0, DRIVES_DIFFER)])
-        same, other = np.logaddexp.reduce(logs, axis=1)
-        return float(other - same)
+                         for drives in self._drives])
+        same, *others = np.logaddexp.reduce(logs, axis=1)
+        return float(np.logaddexp.reduce(others) - np.log(len(others)) - same)
 
     @cached_property
     def _cases(self) -> tuple[Floats, Floats, Floats]:
         """Return the weights (c,), means (c, m) and covariances (c, m, m) of all cases."""
         several = self.earlier.any() and not self.earlier.all()
         found = [self._case(turns, drives) for turns in self.differ
-                 for drives in ((0.0, DRIVES_DIFFER) if several else (0.0,))]
+                 for drives in (self._drives if several else self._drives[:1])]
         logs = np.array([log for log, _, _ in found])
         weights = np.exp(np.maximum(logs - logs.max(), -LARGEST_LOG))
         return (weights / weights.sum(), np.array([mean for _, mean, _ in found]),
                 np.array([covariance for _, _, covariance in found]))
 
-    def _case(self, turns: float, drives: float) -> tuple[float, Floats, Floats]:
+    def _case(self, turns: float, drives: Floats) -> tuple[float, Floats, Floats]:
         """Return the evidence, in nats, the mean and the covariance of one case.
 
-        turns, drives: by how much they differ, of fx.
+        turns: by how much they differ, of fx. drives: (m, d) columns by which they differ.
         """
-        along = (self._along_fx * turns * self.lens.fx)[:, None]
+        along = turns * self._along_fx
         log, groups = 0.0, []
         for earlier in (False, True):
             own = []
@@ -166,8 +166,8 @@ class Posterior:
                 log += gain
             if own:
                 group = Quadratic.together(own)
-                if earlier and drives:
-                    gain, group = softened(group, drives * self._other_cameras)
+                if earlier and drives.size:
+                    gain, group = softened(group, drives)
                     log += gain
                 groups.append(group)
         total = Quadratic.together([*groups, self.prior, *self.further])
@@ -181,17 +181,18 @@ class Posterior:
 
     @cached_property
     def _along_fx(self) -> Floats:
-        """Return (m,) how all follow where fx is 1 px longer, as the turns let them."""
-        column = self.total.covariance[:, 0]
-        return np.asarray(column / column[0])
+        """Return (m, 1) how all follow where fx is 100 % longer, as the turns let them."""
+        column = self.total.covariance[:, :1]
+        return np.asarray(self.lens.fx * column / column[0])
 
     @cached_property
-    def _other_cameras(self) -> Floats:
-        """Return (m, n) columns, by which cameras of one make differ, of fx."""
+    def _drives(self) -> tuple[Floats, ...]:
+        """Return the cases of (m, d) columns by which drives differ: not at all, in fx, in all."""
         moves, _ = sensitivity(self.lens)
         by_unit = np.sqrt(np.mean(np.sum(moves**2, axis=1), axis=0))
-        return np.asarray(np.eye(len(self.prior.score))[:, self.own]
-                          * self.lens.fx * by_unit[0] / by_unit)
+        places = np.eye(len(self.prior.score))[:, self.own]
+        return (places[:, :0], DRIVES_DIFFER * self._along_fx,
+                DRIVES_DIFFER * self.lens.fx * places * (by_unit[0] / by_unit))
 
 
 def softened(cost: Quadratic, columns: Floats) -> tuple[float, Quadratic]:

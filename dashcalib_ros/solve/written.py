@@ -116,6 +116,7 @@ def written(imaging: Imaging, covariance: Floats, scenes: Sequence[Scene], model
         np.full(len(tracks), (1 - GRID_WEIGHT) / len(tracks)),
         np.full(len(grid), GRID_WEIGHT / len(grid))]))
     of_kind = [each for each in calibrated_models() if each.family == imaging.camera.family]
+    of_kind.sort(key=lambda each: len(each.names()))
     fits = [_fit(imaging, places, each) for each in of_kind]
     apart = [_rms(each.off - fits[-1].off, places.weights) for each in fits]
     chosen = next(n for n, each in enumerate(fits)

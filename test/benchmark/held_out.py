@@ -20,10 +20,8 @@ from solutions import RECORDED, Solved
 from dashcalib_ros import Config
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import mapping_error
-from dashcalib_ros.reconstruct.adjust import Solver
-from dashcalib_ros.solve.prior import loss_px_of
+from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution, cross_validation
-from dashcalib_ros.solve.steps import Fit, fit_all
 
 
 def solved_drives(cache: Path) -> list[Solved]:
@@ -34,20 +32,15 @@ def solved_drives(cache: Path) -> list[Solved]:
 
 def without(solution: Solution, number: int) -> Camera:
     """Return the camera without a turn, by one linear step."""
-    known, other = solution.known, solution.known.without(number)
-    cost = known.with_prior([other.sum(known.own).at_noise(known.noise)])
-    step = np.linalg.solve(cost.hessian, known.turns[number].score[known.own] / known.noise)
-    return solution.camera.with_params(solution.camera.params - step)
+    others = solution.posterior.without(number)
+    return solution.camera.with_params(solution.camera.params + solution.offset_of(others))
 
 
 def refitted(solution: Solution, number: int, config: Config) -> Camera:
-    """Return the camera without a turn, adjusted from the solution."""
-    scenes = [scene for n, scene in enumerate(solution.scenes) if n != number]
-    loss_px = loss_px_of(scenes, solution.camera, config.intrinsics)
-    fit = Fit(scenes, solution.camera, solution.centred,
-              Solver(loss_px, config.scene.iterations), {scene.turn: scene for scene in scenes},
-              config)
-    return fit_all(fit).camera
+    """Return the camera without a turn, of the tracks as the solution has them."""
+    found = solve([scene for n, scene in enumerate(solution.scenes) if n != number], config)
+    assert found is not None
+    return found.camera
 
 
 def drives_table(drives: Iterable[Solved]) -> str:

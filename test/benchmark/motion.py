@@ -34,8 +34,8 @@ from dashcalib_ros.input.motion import Samples, SensorStream, local_metres
 from dashcalib_ros.judge.gyro_scale import scale_by_gps
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.judge.witnesses import Asked, ask_sensors
-from dashcalib_ros.solve.fitting import scene_with
 from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.solve.start import scene_with
 
 DENSITY_DEG, BIAS_DEG, LATE_S, RATE_HZ = 0.1, 0.2, 0.04, 100.0
 LENS = Lens.of(960, 540, 75.0, -0.30, 0.10, (14.0, -9.0), 1.003)

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'judge'))
 
 import numpy as np
-from solving import LENS, scenes_of, solved
+from solving import LENS, scenes_of, solved, with_camera
 from test_mount import SPACING_S, SPEED, mounted, pairs_of
 
 from dashcalib_ros.arrays import Floats
@@ -71,7 +71,7 @@ def main() -> None:
     parser.add_argument('--degrees', type=float, default=1.0)
     parser.add_argument('--metres', type=float, default=200.0)
     arguments = parser.parse_args()
-    known = replace(solved(scenes_of(3)), camera=LENS, scenes=())
+    known = replace(with_camera(solved(scenes_of(3)), LENS), scenes=())
     told, place, nothing, live, idle = 0, [], 0, 0, 0
     for seed in range(arguments.drives):
         rng = np.random.default_rng(seed)

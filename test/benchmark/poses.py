@@ -36,7 +36,7 @@ from dashcalib_ros.reconstruct.chain import chain_scene
 from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure
 from dashcalib_ros.reconstruct.tracks import Tracks, track_turn
 from dashcalib_ros.report import load_camera
-from dashcalib_ros.solve.fitting import scene_with
+from dashcalib_ros.solve.start import scene_with
 
 # frames of a window, from one to the next, and between two keyframes
 WINDOW, STEP, STRIDE = 43, 30, 3

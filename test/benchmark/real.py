@@ -34,6 +34,7 @@ from measure import (
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.camera import Camera
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect.detection import detect
 from dashcalib_ros.judge import Poses, read_poses
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
@@ -41,7 +42,6 @@ from dashcalib_ros.judge.odometry import Odometry, angle_deg, odometry
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.solve import solve
-from dashcalib_ros.solve.field import without_field
 from dashcalib_ros.solve.solution import Solution
 
 # degrees between a turn's first and last keyframe
@@ -85,7 +85,8 @@ def measured(drive: Recorded, data: Path, seed: int) -> dict[str, Any]:
         return row
     sharp = {scene.turn for scene in whole.scenes if sharpness(scene) >= SHARP_DEG}
     row |= {'fx': px * whole.camera.fx, 'sigma': px * whole.sigma[0],
-            'field_px': px * whole.field.rms_over(whole.camera) if has_field(whole) else 0.0,
+            'field_px': px * float(np.sqrt(np.mean(whole.field.over(whole.camera)**2)))
+            if whole.field is not None else 0.0,
             'sharp': len(sharp), 'alone': alone(scenes, whole, config, px),
             'subsets': subsets(scenes, sharp, config, px)}
     if drive.poses is not None:
@@ -96,9 +97,11 @@ def measured(drive: Recorded, data: Path, seed: int) -> dict[str, Any]:
     return row
 
 
-def has_field(solution: Solution) -> bool:
-    """Return whether the turns confirm a field."""
-    return solution.field is not None and solution.field.used
+def without_field(scene: Scene, field: Field) -> Scene:
+    """Return a turn as the lens alone would have seen it."""
+    xy = scene.tracks.xy.copy()
+    xy[scene.tracks.seen] = field.ideal(xy[scene.tracks.seen])
+    return replace(scene, tracks=replace(scene.tracks, xy=xy))
 
 
 def sharpness(scene: Scene) -> float:
@@ -115,9 +118,8 @@ def alone(scenes: Sequence[Scene], whole: Solution, config: Config, px: float
         row: dict[str, Any] = {'turn': scene.turn.number}
         found = solve([scene], config)
         row |= {} if found is None else {'before': px * found.camera.fx}
-        if has_field(whole):
-            assert whole.field is not None
-            found = solve([without_field(scene, whole.field.field)], config)
+        if whole.field is not None:
+            found = solve([without_field(scene, whole.field)], config)
         row |= {} if found is None else {'after': px * found.camera.fx}
         rows.append(row)
     return rows
@@ -134,7 +136,7 @@ def subsets(scenes: Sequence[Scene], sharp: set[Any], config: Config, px: float
                 rows.append({'turns': [scene.turn.number for scene in some], 'count': count,
                              'sharp': sum(scene.turn in sharp for scene in found.scenes),
                              'fx': px * found.camera.fx, 'sigma': px * found.sigma[0],
-                             'field': has_field(found)})
+                             'field': found.field is not None})
     return rows
 
 

@@ -20,8 +20,8 @@ from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import result_json
-from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.solve.spread import PictureSigma
 
 
 @stands_in_for(Calibrator)

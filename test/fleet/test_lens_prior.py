@@ -20,7 +20,7 @@ from dashcalib_ros.fleet.lens_prior import (
 )
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved, final_of, unit_of
 from dashcalib_ros.judge import Calibration, Verdict
-from dashcalib_ros.solve.knowledge import PictureSigma
+from dashcalib_ros.solve.spread import PictureSigma
 
 CONFIG = FleetConfig()
 MEAN = np.array([curvature(0.65), -0.28, 0.09])

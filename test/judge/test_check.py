@@ -14,7 +14,7 @@ from dashcalib_ros.camera.mapping import apart, as_model
 from dashcalib_ros.judge import Verdict, check
 from dashcalib_ros.judge.difference import Difference, answers_of, difference_of, distance
 from dashcalib_ros.report import NamedCamera, compare
-from dashcalib_ros.solve.knowledge import PictureSigma
+from dashcalib_ros.solve.spread import PictureSigma
 
 ACCEPTED = Verdict('accepted')
 
@@ -132,8 +132,8 @@ def test_a_drive_without_a_calibration_of_its_own_cannot_tell(solution):
 
 
 def test_a_drive_that_knows_its_camera_badly_cannot_tell(solution):
-    flat = replace(solution.sigma_map, sigma=np.full(len(solution.sigma_map.sigma), 30.0))
-    found = ask(LENS, replace(solution, sigma_map=flat))
+    written = replace(solution.written, left_px=np.full_like(solution.written.left_px, 30.0))
+    found = ask(LENS, replace(solution, written=written))
     assert found.answer == 'cannot tell' and 'may be there' in found.reasons[2]
 
 
@@ -150,18 +150,18 @@ def test_the_same_lens_in_another_model_is_right(solution, given):
 
 def test_a_decentred_lens_is_compared_as_the_turns_see_it():
     # these turns were taken by a lens whose p1 and p2 the solution does not have
-    true = Brown.of(SIZE, [*LENS.params, 0.0004, -0.0004, 0.0])
-    solution = solved(scenes_of(4, extra=(0.0004, -0.0004, 0.0)),
+    true = Brown.of(SIZE, [*LENS.params, 0.002, -0.002, 0.0])
+    solution = solved(scenes_of(4, extra=(0.002, -0.002, 0.0)),
                       CONFIG.replace({'model': 'radial'}))
     found = difference_of(true, solution, 1.0)
     plain = difference_of(LENS, solution, 1.0)
-    assert found.distance < found.limit and found.distance < plain.distance
+    assert found.distance < found.limit < plain.distance
 
 
 def test_pixels_are_those_of_the_input(solution):
-    whole = LENS.resized(2.0, (1600, 900))
-    small = difference_of(LENS, solution, 1.0)
-    large = difference_of(whole, solution, 2.0)
+    given = LENS.with_focal(1.01 * LENS.fx)
+    small = difference_of(given, solution, 1.0)
+    large = difference_of(given.resized(2.0, (1600, 900)), solution, 2.0)
     assert large.rms_px == pytest.approx(2 * small.rms_px, rel=2e-3)
     assert large.relevant_px == pytest.approx(2 * small.relevant_px, rel=2e-3)
     assert large.offsets[0] == pytest.approx(2 * small.offsets[0], rel=1e-3)

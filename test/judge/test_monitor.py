@@ -14,7 +14,7 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge import Reading, watch
 from dashcalib_ros.judge.monitor import readings_of
 from dashcalib_ros.reconstruct.heading import Heading, heading
-from dashcalib_ros.solve import fitting
+from dashcalib_ros.solve import start
 from dashcalib_ros.solve.quadratic import Quadratic
 
 NOTHING = Quadratic.prior(np.zeros((6, 6)))
@@ -144,7 +144,7 @@ def test_a_chain_that_breaks_where_images_are_lost_is_no_other_camera(monkeypatc
     few = np.arange(len(scene.structure.registered)) < 8
     broken = replace(scene, camera=LENS, structure=replace(
         scene.structure, registered=few, used=scene.structure.used & few[:, None]))
-    monkeypatch.setattr(fitting, 'chain_scene', lambda *arguments: broken)
+    monkeypatch.setattr(start, 'chain_scene', lambda *arguments: broken)
     [reading] = readings_of([scene], LENS, CONFIG)
     assert reading.explained and reading.misfit < CONFIG.monitor.max_misfit
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from made_calibration import make_calibration
 from made_lines import made_lines
 from scipy.spatial.transform import Rotation
-from solving import LENS, scenes_of, solved
+from solving import LENS, scenes_of, solved, with_camera, with_covariance
 from synthetic import KEYFRAME_S
 
 from dashcalib_ros import judge
@@ -69,7 +69,7 @@ def at(speed):
 
 @pytest.mark.parametrize('angles', [(0.0, 0.0, 0.0), (3.5, -2.0, 1.0), (-2.5, 3.0, -3.0)])
 def test_straights_tell_where_it_points(solution, angles):
-    known = replace(solution, camera=LENS, scenes=())
+    known = replace(with_camera(solution, LENS), scenes=())
     found = mount_of(pairs_of(mounted(*angles)), None, known, 'accepted', None)
     axis = np.degrees(np.arccos(np.clip(found.rotation[:, 2] @ mounted(*angles)[:, 2], -1, 1)))
     # without a turn or lines roll is unknown, and counts as none
@@ -80,7 +80,7 @@ def test_straights_tell_where_it_points(solution, angles):
 
 
 def test_points_that_stay_do_not_spoil_it(solution):
-    known = replace(solution, camera=LENS, scenes=())
+    known = replace(with_camera(solution, LENS), scenes=())
     found = mount_of(pairs_of(mounted(2.0, 1.0, 0.0), still=0.2), None, known, 'accepted',
                      None)
     assert abs(found.yaw_left_deg - 2.0) < 0.15 and abs(found.pitch_up_deg - 1.0) < 0.15
@@ -178,7 +178,7 @@ def test_heights_that_differ_make_sigma_larger(height_in):
 
 
 def test_pairs_of_a_braking_car_are_left_out(solution):
-    known = replace(solution, camera=LENS, scenes=())
+    known = replace(with_camera(solution, LENS), scenes=())
     steady, braking = (pairs_of(mounted(0.5, pitch, 0.0), count=30) for pitch in (1.0, -0.5))
     drive = joined(steady, braking)
     begins = drive.stamps_s[len(steady)] - SPACING_S
@@ -207,7 +207,7 @@ def test_nothing_seen_is_no_mount(solution):
 
 def test_it_is_never_better_than_the_lens(solution):
     pairs = pairs_of(mounted(1.0, 0.0, 0.0))
-    known = replace(solution, camera=LENS, scenes=())
+    known = replace(with_camera(solution, LENS), scenes=())
     assert mount_of(pairs, None, known, 'accepted', None).verdict == 'accepted'
     weak = mount_of(pairs, None, known, 'weak', None)
     assert weak.verdict == 'weak' and 'the lens is weak' in weak.reasons[0]
@@ -215,7 +215,7 @@ def test_it_is_never_better_than_the_lens(solution):
     # 5 px of cy are half a degree of pitch, but not of the pixel of travel
     vague = np.array(solution.covariance)
     vague[3, 3] = 5.0**2
-    found = mount_of(pairs, None, replace(known, covariance=vague), 'accepted', None)
+    found = mount_of(pairs, None, with_covariance(known, vague), 'accepted', None)
     assert found.verdict == 'weak' and 'drive more turns' in found.reasons[0]
     assert found.sigma['pitch_up_deg'] > np.degrees(5.0 / LENS.fy)
     assert found.travel_sigma_px == weak.travel_sigma_px
@@ -236,7 +236,7 @@ def drives():
        turns=st.integers(0, 3))
 def test_a_lens_that_is_not_accepted_never_has_an_accepted_mount(
         solution, drives, which, level, scale, px, speed, turns):
-    known = replace(solution, covariance=scale * np.eye(len(solution.covariance)),
+    known = replace(with_covariance(solution, scale * np.eye(len(solution.covariance))),
                     scenes=solution.scenes[:turns], px=px)
     found = mount_of(drives[which], None, known, level, at(speed) if speed else None)
     if found is None:
@@ -250,7 +250,7 @@ def test_a_lens_that_is_not_accepted_never_has_an_accepted_mount(
 
 
 def test_few_straights_say_to_drive_on(solution):
-    known = replace(solution, camera=LENS, scenes=(), covariance=1e-4 * np.eye(6))
+    known = replace(with_covariance(with_camera(solution, LENS), 1e-4 * np.eye(6)), scenes=())
     found = mount_of(pairs_of(mounted(0, 0, 0), count=10, noise_px=4.0), None, known, 'accepted',
                      None)
     assert found.verdict == 'weak' and 'drive straight on' in found.reasons[0]
@@ -298,7 +298,7 @@ def test_a_failure_does_not_cost_the_lens(solution, monkeypatch):
 
 
 def test_a_camera_that_was_moved(solution):
-    known = replace(solution, camera=LENS, scenes=())
+    known = replace(with_camera(solution, LENS), scenes=())
     here, nearby, moved = (mount_of(pairs_of(mounted(yaw, 0.0, 0.0), seed=seed), None, known,
                                     'accepted', None)
                            for seed, yaw in enumerate((0.0, 0.3, 1.0)))
@@ -323,7 +323,7 @@ def joined(before, after):
 
 @pytest.mark.parametrize('moved', [(1.5, 1.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 2.0, 0.0)])
 def test_a_camera_that_is_moved_during_the_drive_begins_anew(solution, moved):
-    known = replace(solution, camera=LENS, scenes=())
+    known = replace(with_camera(solution, LENS), scenes=())
     first, then = pairs_of(mounted(0.5, 1.0, 0.0), count=60), pairs_of(mounted(*moved), count=25,
                                                                        seed=1)
     found = mount_of(joined(first, then), None, known, 'accepted', None)
@@ -338,7 +338,7 @@ def test_a_camera_that_is_moved_during_the_drive_begins_anew(solution, moved):
 
 
 def test_a_camera_that_stays_is_not_said_to_be_moved(solution):
-    known = replace(solution, camera=LENS, scenes=())
+    known = replace(with_camera(solution, LENS), scenes=())
     for seed in range(10):
         # other roads: 0.3 degrees
         first, then = (pairs_of(mounted(0.5 + more, 1.0, 0.0), seed=2 * seed + n)

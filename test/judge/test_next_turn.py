@@ -5,7 +5,7 @@ import dataclasses
 import re
 
 import pytest
-from solving import CONFIG, scenes_of, solved
+from solving import CONFIG, only, scenes_of, solved, with_turns
 
 from dashcalib_ros.judge.agreement import next_turn, with_right_angles
 from dashcalib_ros.judge.verdict import judge
@@ -21,9 +21,7 @@ def four():
 
 def first(solution: Solution, count: int) -> Solution:
     """Return the solution as if only the first turns had been there."""
-    known = dataclasses.replace(solution.known.of(range(count)), one_turn_sigma=0.0)
-    return dataclasses.replace(solution, scenes=solution.scenes[:count], known=known,
-                               covariance=known.covariance[:6, :6])
+    return only(solution, range(count))
 
 
 @pytest.mark.parametrize(('count', 'more'), [(1, 2), (2, 1), (3, 1)])
@@ -41,9 +39,8 @@ def test_a_single_turn_is_told_what_two_more_bring(four):
 def test_where_nothing_is_known_nothing_is_told(four):
     turns = tuple(dataclasses.replace(
         turn, hessian=1e-9 * turn.hessian, by_track=1e-9 * turn.by_track)
-        for turn in four.known.turns)
-    blind = dataclasses.replace(four, known=dataclasses.replace(four.known, turns=turns))
-    assert next_turn(blind) == ''
+        for turn in four.posterior.turns)
+    assert next_turn(with_turns(four, turns)) == ''
 
 
 def test_a_verdict_tells_it_with_the_first_cure(four):

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from made_motion import town
 from scipy.spatial.transform import Rotation
-from solving import CONFIG, YAWS, solved
+from solving import CONFIG, YAWS, solved, with_camera
 from synthetic import LENS, synthetic_turn
 
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.judge.witnesses import PACE, ask_sensors, fit_to, steps_of
-from dashcalib_ros.solve.fitting import scene_with
+from dashcalib_ros.solve.start import scene_with
 
 TURNS = 4
 START_S, APART_S, LATE_S = 1_700_000_000.0, 20.0, 0.04
@@ -63,7 +63,7 @@ def asked(drive, stream, config=CALIBRATED, solution=None):
 def wrong_camera(solution, focal):
     camera = solution.camera.with_focal(focal * solution.camera.fx)
     scenes = tuple(scene_with(camera, scene, CONFIG) for scene in solution.scenes)
-    return dataclasses.replace(solution, camera=camera, scenes=scenes)
+    return dataclasses.replace(with_camera(solution, camera), scenes=scenes)
 
 
 def test_offset_mounting_bias_and_scale_are_found(drive):
@@ -110,10 +110,15 @@ def test_a_contradiction_makes_the_result_weak_with_both_named(drive):
 def test_sigmas_hold(drive):
     pulls, solution = [], drive[0]
     turns = [steps_of(scene, solution, 0.3, START_S) for scene in solution.scenes]
+    # the solution's own error is the same for all
+    exact = fit_to(turns, gyro(drive, density_deg=0.0).rate)
+    apart = exact.by_camera @ solution.covariance @ exact.by_camera
+    assert abs(exact.gyro.inverse_scale - 1) < 2.5 * np.sqrt(apart)
     for seed in range(30):
         said = fit_to(turns, gyro(drive, density_deg=0.1, seed=seed).rate)
         pulls.append([(said.gyro.offset_s - LATE_S) / np.sqrt(said.covariance[7, 7]),
-                      (said.gyro.inverse_scale - 1) / np.sqrt(said.covariance[6, 6]),
+                      (said.gyro.inverse_scale - exact.gyro.inverse_scale)
+                      / np.sqrt(said.covariance[6, 6]),
                       said.gyro.pace / np.sqrt(said.covariance[8, 8])])
     assert (np.abs(pulls) < 2).mean(axis=0).min() >= 0.9
 

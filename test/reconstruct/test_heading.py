@@ -12,10 +12,10 @@ from dashcalib_ros.reconstruct.scene import Scene, errors_px, rms_px
 
 
 def on_a_road(yaw_deg: float, world: int) -> Scene:
-    """Return a turn in which all that is lower than the camera is the road."""
+    """Return a turn in which all that is below the roofs is the road."""
     turn = synthetic_turn(yaw_deg=yaw_deg, world=world, tracks=200, keyframes=14)
     points = turn.structure.points.copy()
-    points[points[:, 1] > 0, 1] = 1.4
+    points[points[:, 1] > -1.5, 1] = 1.4
     scene = turn.scene(LENS, world)
     return replace(scene, structure=replace(turn.structure, points=points))
 

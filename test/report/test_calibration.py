@@ -15,8 +15,8 @@ from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report import load_camera, result_dict
 from dashcalib_ros.report.export import exported
-from dashcalib_ros.solve.knowledge import PictureSigma
 from dashcalib_ros.solve.solution import LeftOut
+from dashcalib_ros.solve.spread import PictureSigma
 
 
 @pytest.fixture(params=EACH_MODEL)

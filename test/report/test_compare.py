@@ -32,7 +32,7 @@ from dashcalib_ros.report import (
 )
 from dashcalib_ros.report.compare import answers
 from dashcalib_ros.report.page import difference_html
-from dashcalib_ros.solve.knowledge import PictureSigma
+from dashcalib_ros.solve.spread import PictureSigma
 
 SIZE = (1242, 375)
 REFERENCE = NamedCamera('truth', TRUTH)

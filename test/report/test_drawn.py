@@ -18,6 +18,7 @@ import yaml
 from drawn import START_S, drawn_calibration, solution
 from made_calibration import EACH_MODEL, calibration_of, make_calibration
 from page_reader import Page
+from solving import only
 
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect import TurnId
@@ -87,7 +88,7 @@ def test_every_unused_turn_has_its_reason(drawn, text):
 
 def test_a_turn_that_contradicts_the_others_says_so():
     found = solution()
-    left = dataclasses.replace(found, scenes=found.scenes[:2], known=found.known.of(range(2)),
+    left = dataclasses.replace(only(found, range(2)),
                                misfits={**found.misfits, found.scenes[2].turn: 7.0})
     *_, contradicts, _, _ = drawn_calibration(left).turns
     assert not contradicts.used and 'does not explain it' in contradicts.unused_because
@@ -168,9 +169,12 @@ def test_the_truth_is_compared_where_it_is_known(drawn):
 
 # what is not known of the lens, in a program's hands
 
-def test_sigma_at_pixels_is_the_map_s_and_samples_scatter_by_it(drawn):
+def test_sigma_at_pixels_is_about_the_map_s_and_samples_scatter_by_it(drawn):
     found = drawn.material.solution.sigma_map
-    np.testing.assert_allclose(drawn.sigma_at(found.pixels), found.sigma, rtol=1e-9)
+    # no lens model has all that the solution does not know
+    at = drawn.sigma_at(found.pixels)
+    np.testing.assert_allclose(at, found.sigma, rtol=0.25)
+    assert np.sqrt(np.mean(at**2)) == pytest.approx(drawn.sigma_px.rms, rel=0.03)
     one = drawn.sigma_at((10.0, 20.0))
     assert one.shape == (1,) and 0 < one[0] < 2 * drawn.sigma_px.worst
     cameras = drawn.samples(60, seed=3)

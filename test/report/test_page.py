@@ -17,7 +17,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.report import report_html
 from dashcalib_ros.report.charts import log_ticks, magnitude_svg, mask_data_uri, ticks
 from dashcalib_ros.report.tables import summary
-from dashcalib_ros.solve.knowledge import PictureSigma
+from dashcalib_ros.solve.spread import PictureSigma
 
 
 def terminal(renderable, **options):

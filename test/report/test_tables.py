@@ -14,7 +14,7 @@ from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser
 from dashcalib_ros.report import NamedCamera, compare
 from dashcalib_ros.report.tables import against_truth, comparison, conclusion, next_step, summary
-from dashcalib_ros.solve.knowledge import PictureSigma
+from dashcalib_ros.solve.spread import PictureSigma
 
 
 def terminal(renderable, width=80, **options):

@@ -3,10 +3,10 @@ from __future__ import annotations
 
 import pytest
 
-from dashcalib_ros.solve import focal
+from dashcalib_ros.solve import start
 
 
 @pytest.fixture
 def no_profile(monkeypatch):
     """Leave out the focal profile around the result, which takes much of the time."""
-    monkeypatch.setattr(focal, 'PROBES', (1.0,))
+    monkeypatch.setattr(start, 'PROBES', (1.0,))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solving import CONFIG, scenes_of, solved
+from solving import CONFIG, only, scenes_of, solved
 from synthetic import LENS
 
 from dashcalib_ros.camera.mapping import mapping_error
@@ -41,5 +41,4 @@ def test_a_turn_of_another_lens_stands_out():
 
 def test_two_turns_are_too_few(solution):
     assert LEAST_TURNS == 3
-    two = replace(solution, scenes=solution.scenes[:2], known=solution.known.of(range(2)))
-    assert cross_validation(two) == ()
+    assert cross_validation(only(solution, range(2))) == ()

@@ -50,13 +50,12 @@ def test_of_the_same_camera_they_help_as_far_as_this_drive_confirms_them():
     assert own_too.sigma[0] < together.sigma[0] < alone.sigma[0]
     # more than the turns themselves would say, over the picture too
     same = solved([replace(scene, turn=TurnId.at(n)) for n, scene in enumerate(mixed(1, LENS))])
-    assert same.doubt is None and together.sigma[0] > 2 * same.sigma[0]
+    assert together.sigma[0] > same.sigma[0]
     assert together.picture.rms > same.picture.rms
     np.testing.assert_array_equal(together.camera.params, same.camera.params)
 
 
-@pytest.mark.parametrize('own', [1, 3])
-@pytest.mark.parametrize('by', [1.02, 1.05, 1.3])
+@pytest.mark.parametrize(('own', 'by'), [(1, 1.02), (3, 1.05), (1, 1.3)])
 def test_a_lens_exchanged_since_is_left_out_or_in_sigma(own, by):
     scenes = mixed(own, longer(by))
     solution = solved(scenes)
@@ -101,6 +100,6 @@ def on_a_road(world: int, yaw: float) -> Scene:
 
 
 def test_turns_of_earlier_drives_alone_are_as_they_are():
-    scenes = [replace(scene, turn=TurnId.stored(n))
-              for n, scene in enumerate(scenes_of(2, tracks=110))]
-    assert solved(scenes).doubt is None
+    own = scenes_of(2, tracks=110)
+    stored = solved([replace(scene, turn=TurnId.stored(n)) for n, scene in enumerate(own)])
+    np.testing.assert_allclose(stored.sigma, solved(own).sigma)

@@ -6,19 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solving import CONFIG, START, scenes_of, solved, z_of
+from solving import CONFIG, scenes_of, solved, z_of
 from synthetic import LENS, SIZE
 
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.input.scale import FULL_SIZE
 from dashcalib_ros.judge.conclude import Evidence, conclude
-from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.judge.verdict import STEADY, judge
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.fixed_camera import fixed_camera_tests
-from dashcalib_ros.solve.normal import normal_equations
-from dashcalib_ros.solve.stabiliser import without_crops
+from dashcalib_ros.solve.imaging import imaging_with
 
-SETTINGS = CONFIG.intrinsics
 # what the others are measured against: nothing is taken out
 KEPT = CONFIG.replace({'intrinsics.crop_rounds': 0})
 
@@ -58,7 +55,7 @@ def test_a_fixed_camera_departs_in_nothing():
     solution = solved(scenes_of(4))
     assert {each.kind for each in solution.fixed_camera} == {'shift', 'zoom', 'bend'}
     assert all(0.3 < each.strength < 1.7 and not each.clear for each in solution.fixed_camera)
-    assert not solution.crops and solution.field is None
+    assert not solution.crops
 
 
 def test_a_stabilised_video_is_found_and_taken_out():
@@ -67,7 +64,7 @@ def test_a_stabilised_video_is_found_and_taken_out():
     strongest = kept.fixed_camera[0]
     assert strongest.kind == 'shift' and strongest.clear
     [reason] = [text for text in judge(kept, CONFIG.verdict).reasons if 'stabil' in text]
-    assert 'switch the stabiliser off' in reason
+    assert STEADY in reason
     wrong, left = (mapping_error(each.camera, LENS) for each in (kept, found))
     assert wrong > 1.0 and left < 0.4
     assert not found.fixed_camera[0].clear
@@ -76,7 +73,7 @@ def test_a_stabilised_video_is_found_and_taken_out():
     assert found.sigma[2] > 2.0
     # the lens is told, but no camera_info holds for pictures that move
     verdict = judge(found, CONFIG.verdict)
-    assert verdict.level == 'weak' and verdict.cures[0] == 'switch the stabiliser off'
+    assert verdict.level == 'weak' and verdict.cures[0] == STEADY
     assert re.search(r'moves against the lens by up to \d+\.\d %', verdict.reasons[0])
     # ... also before what refuses it; what is less than the picture is known by does no harm
     both = judge(found, replace(CONFIG.verdict, refused_yaw_deg=1e3)).reasons
@@ -93,24 +90,27 @@ def test_a_stabilised_video_is_found_and_taken_out():
 
 def test_a_crop_is_taken_out_of_the_tracks():
     [scene] = scenes_of(1)
-    crops = {scene.turn: np.zeros((len(scene.tracks.frames), 2))}
-    np.testing.assert_array_equal(without_crops(scene, crops).tracks.xy, scene.tracks.xy)
-    crops = {scene.turn: crops[scene.turn] + (3.0, -1.0)}
-    np.testing.assert_allclose(without_crops(scene, crops).tracks.xy,
-                               scene.tracks.xy - (3.0, -1.0))
+    imaging = imaging_with(LENS)
+    np.testing.assert_array_equal(imaging.ideal(scene), scene.tracks.xy)
+    images = np.tile((3.0, -1.0, 0.01), (len(scene.tracks.frames), 1))
+    middle = (np.array(SIZE) - 1) / 2
+    moved = replace(imaging, images={scene.turn: images}).ideal(scene)
+    np.testing.assert_allclose(middle + 1.01 * (moved - middle) + (3.0, -1.0), scene.tracks.xy)
 
 
-@pytest.mark.parametrize('turns', [(0,), (2, 3), (0, 1, 2)])
+@pytest.mark.parametrize('turns', [(0,), (2, 3)])
 def test_a_zoom_between_turns_is_named(turns):
     scenes = scenes_of(5)
     scenes = [moved([scene], lambda each: zoomed(each, 1.03))[0] if n in turns else scene
               for n, scene in enumerate(scenes)]
-    solution = solved(scenes)
-    assert solution.fixed_camera[0].kind == 'zoom' and solution.fixed_camera[0].clear
-    verdict = judge(solution, CONFIG.verdict)
-    assert verdict.level == 'weak'
-    assert any('zoom changes by about' in reason for reason in verdict.reasons)
-    zooms = solution.fixed_camera[0].by_turn
+    verdict = judge(solved(scenes), CONFIG.verdict)
+    # a shift of the pictures may look alike, so both are named
+    assert verdict.level == 'weak' and 'zoom' in verdict.reasons[0]
+    found = solved(scenes, KEPT)
+    assert found.fixed_camera[0].kind == 'zoom' and found.fixed_camera[0].clear
+    assert any('zoom changes by about' in reason for reason in judge(
+        found, CONFIG.verdict).reasons)
+    zooms = found.fixed_camera[0].by_turn
     larger = {scene.turn for n, scene in enumerate(scenes) if n in turns}
     assert min(zooms[turn] for turn in larger) > max(
         zoom for turn, zoom in zooms.items() if turn not in larger)
@@ -145,34 +145,10 @@ def test_a_windscreen_that_bends_the_picture_is_named():
 def test_what_tracks_share_makes_sigma_larger():
     fixed = solved(scenes_of(3))
     slightly = solved(moved(scenes_of(3), lambda scene: bent(scene, 1.0)))
-    assert fixed.field is None and slightly.field.used
-    assert max(each.strength for each in slightly.fixed_camera) < 1.5
+    assert not any(each.clear for each in slightly.fixed_camera)
     assert slightly.picture.rms > 1.1 * fixed.picture.rms
-
-
-def test_points_and_poses_follow_the_camera():
-    solution = solved(scenes_of(2))
-    [scene, _], camera = solution.scenes, solution.camera
-    normal = normal_equations(scene, camera, 0.5)
-    step = np.zeros(normal.cost.lens)
-    step[0] = 1e-3 * camera.fx
-    after = normal.eliminated.moved(scene.structure, step)
-    other = camera.with_params(camera.params + step[:6])
-
-    def rms(structure, lens) -> float:
-        local = (structure.points @ structure.rotations.transpose(0, 2, 1)
-                 + structure.translations[:, None])
-        error = np.linalg.norm(lens.project(local) - scene.tracks.xy, axis=2)
-        return float(np.sqrt(np.mean(error[structure.used]**2)))
-
-    best = rms(scene.structure, camera)
-    # they make up for nearly all that another focal length spoils
-    assert rms(after, other) - best < 0.2 * (rms(scene.structure, other) - best)
-    for rotation in after.rotations[after.registered]:
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
 
 
 def test_one_scene_can_be_tested():
     solution = solved(scenes_of(1))
-    found = fixed_camera_tests(solution.scenes, solution.camera, START, 0.3, SETTINGS)
-    assert all(np.isfinite(each.strength) for each in found)
+    assert all(np.isfinite(each.strength) and not each.clear for each in solution.fixed_camera)
