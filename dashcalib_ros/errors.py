@@ -2,6 +2,17 @@
 
 Each message is one line that says what is wrong and names the cure.
 """
+from __future__ import annotations
+
+import re
+
+# control characters, line ends among them, and those that turn the direction of writing
+HIDDEN = re.compile(r'[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]')
+
+
+def visible(text: str) -> str:
+    """Return a text for one line of a terminal or a log: what would act there is written out."""
+    return HIDDEN.sub(lambda found: found[0].encode('unicode_escape').decode(), text)
 
 
 def one_line(error: BaseException, limit: int = 160) -> str:

@@ -1,16 +1,20 @@
 """Limits for all files and messages from outside: sizes, depths and numbers of values.
 
 All code that reads such input checks it here first. Input beyond a limit raises InputError before
-memory or time is spent on it.
+memory or time is spent on it. What comes from outside takes 1 GB of memory at the most beside the
+pictures that are worked on, and time that grows with its size and no faster.
 """
 from __future__ import annotations
 
 import itertools
 import json
 import stat
+import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager
+from io import SEEK_END, TextIOWrapper
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from dashcalib_ros.errors import InputError
 
@@ -21,7 +25,15 @@ SIDE = 65_535
 # of one encoded picture or one unpacked message: 50 million raw pixels of 4 bytes fit
 PICTURE_BYTES = MESSAGE_BYTES = 2**28
 # of one unpacked chunk of a bag: recorders end it at about 1 MB, or after one large message
-CHUNK_BYTES = 2**29
+CHUNK_BYTES = MESSAGE_BYTES + 2**25
+# of one record of an MCAP as it is stored: a chunk, or a file that is attached
+RECORD_BYTES = 2**29
+# of the chunks of an MCAP that overlap in time: all are in memory at once
+OVERLAPPING_BYTES = 2**29
+# of the index of a bag, which takes 12 times as much in memory, and topics of a bag
+INDEX_BYTES, TOPICS = 2**26, 10_000
+# steps of SQLite for a byte of a database: reading a whole bag five times takes one
+SQLITE_STEPS = 20
 # of a calibration, a configuration or the metadata.yaml of 3000 files
 YAML_BYTES = 2**20
 # of a result.json: it has about 100 kB
@@ -34,14 +46,32 @@ YAML_VALUES = 300_000
 YAML_DEPTH = 30
 # of a clip of a fleet, in so many files: a day of 4K video, or of images at 10 Hz
 CLIP_BYTES, CLIP_FILES = 2**38, 1_000_000
+# of a CSV of motion sensors: ten hours of a gyro at 100 Hz
+MOTION_BYTES = 2**29
+# of a GPX: ten hours at 10 Hz; its levels, and names of elements and attributes: some have 50
+GPX_BYTES, GPX_DEPTH, GPX_NAMES = 2**27, 30, 1000
+# characters of a line of a CSV, or of a file of stamps
+LINE = 2**18
+# of one file of a KITTI oxts folder, and how many there may be
+OXTS_BYTES, OXTS_FILES = 2**12, 1_000_000
+# of a table of a fleet's clips, and its rows
+MANIFEST_BYTES, MANIFEST_ROWS = 2**28, 1_000_000
+# of one array of an .npz that may be part of a calibration, and how many an .npz may have
+ARRAY_BYTES, ARRAYS = 4096, 1000
+# px, or a coefficient, of a camera; a rational model's may be thousands
+LENS_NUMBER = 1e7
 # digits of a number in a text: a float has 17 digits and at most 308 zeros
 DIGITS = 300
-# times the size of a .zstd file, once unpacked: raw pictures have 2 to 10, rendered ones 50
+# times the size of a .zstd file, or of a bag whose chunks are packed, once unpacked: raw pictures
+# have 2 to 10, rendered ones 50
 UNPACKED_RATIO = 200
-# bytes to which any .zstd file may be unpacked, however small it is
+# bytes to which any such file may be unpacked, however small it is
 UNPACKED_LEAST = 2**28
 # bytes that unpacking leaves free on the disk
 FREE_BYTES = 2**30
+
+# bytes in which a zip file's end is, of its end without a comment, and of an entry of its list
+ZIP_TAIL, ZIP_END, ZIP_ENTRY = 2**16 + 22, 22, 200
 
 TOO_LARGE = f'more than {PIXELS // 10**6} million pixels are not taken'
 
@@ -74,17 +104,23 @@ def check_file(path: Path, what: str = '', limit: int | None = None) -> None:
 def read_file(path: Path, limit: int, what: str = '') -> bytes:
     """Return the bytes of a regular file, `limit` at the most; raises InputError."""
     what = what or str(path)
+    with _opened(path, limit, what) as file:
+        data = file.read(limit + 1)  # files of /proc have no size, and files may grow
+    if len(data) > limit:
+        raise _too_large(what, limit)
+    return data
+
+
+@contextmanager
+def _opened(path: Path, limit: int, what: str) -> Iterator[BinaryIO]:
     try:
         check_file(path, what, limit)
         with path.open('rb') as file:
-            data = file.read(limit + 1)  # files of /proc have no size, and files may grow
+            yield file
     except FileNotFoundError as error:
         raise InputError(f'cannot read {what}: it does not exist; check the path') from error
     except OSError as error:
         raise InputError(f'cannot read {what} ({error.strerror}); check the path') from error
-    if len(data) > limit:
-        raise _too_large(what, limit)
-    return data
 
 
 def _too_large(what: str, limit: int) -> InputError:
@@ -98,8 +134,29 @@ def read_text(path: Path, limit: int, what: str = '') -> str:
     try:
         return data.decode('utf-8-sig')
     except UnicodeDecodeError as error:
-        raise InputError(f'cannot read {what or path}: it is not a text file (UTF-8); check the '
-                         f'path') from error
+        raise _no_text(what or str(path)) from error
+
+
+def read_lines(path: Path, limit: int, what: str = '') -> Iterator[str]:
+    """Yield the lines of a text file of `limit` bytes at the most; raises InputError.
+
+    One line at a time is in memory. One that is longer than LINE comes in parts.
+    """
+    what = what or str(path)
+    left = limit
+    try:
+        with _opened(path, limit, what) as file, TextIOWrapper(file, 'utf-8-sig') as text:
+            while line := text.readline(LINE):
+                left -= len(line)
+                if left < 0:
+                    raise _too_large(what, limit)
+                yield line.removesuffix('\n')
+    except UnicodeDecodeError as error:
+        raise _no_text(what) from error
+
+
+def _no_text(what: str) -> InputError:
+    return InputError(f'cannot read {what}: it is not a text file (UTF-8); check the path')
 
 
 def parse_yaml(text: str, what: str) -> Any:
@@ -144,6 +201,29 @@ def _nodes(root: Any, level: int = 1) -> Iterator[tuple[Any, int]]:
     if root.id != 'scalar':
         for node in itertools.chain(*root.value) if root.id == 'mapping' else root.value:
             yield from _nodes(node, level + 1)
+
+
+def check_npz(file: BinaryIO, parts: int) -> None:
+    """Raise ValueError for a file of more parts, or packed as numpy packs none.
+
+    zipfile takes memory for each part in its list, and with other kinds any amount to unpack one.
+    """
+    size = file.seek(0, SEEK_END)
+    file.seek(max(0, size - ZIP_TAIL))
+    tail = file.read()
+    end = tail.rfind(b'PK\5\6')
+    if end < 0 or len(tail) - end < ZIP_END or b'PK\6\7' in tail[max(0, end - 20):end]:
+        raise ValueError('it is no .npz, or is cut off')
+    if int.from_bytes(tail[end + 12:end + 16], 'little') > parts * ZIP_ENTRY:
+        raise ValueError('it has too many parts')
+    file.seek(0)
+    with zipfile.ZipFile(file) as packed:
+        if len(packed.infolist()) > parts:
+            raise ValueError('it has too many parts')
+        if any(each.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+               for each in packed.infolist()):
+            raise ValueError('it is compressed in an unknown way')
+    file.seek(0)
 
 
 def parse_json(text: str, what: str) -> Any:

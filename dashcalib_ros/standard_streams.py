@@ -1,4 +1,7 @@
-"""stdin, stdout and stderr, which may be closed, full, or without a reader."""
+"""stdin, stdout and stderr, which may be closed, full, or without a reader.
+
+What other people named and wrote is in our lines: its control characters are written out here.
+"""
 from __future__ import annotations
 
 import os
@@ -6,7 +9,7 @@ import sys
 from contextlib import suppress
 from typing import Any
 
-from dashcalib_ros.errors import OutputError
+from dashcalib_ros.errors import OutputError, visible
 
 STDOUT, STDERR = 1, 2
 
@@ -25,45 +28,69 @@ def open_closed_streams() -> None:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
 
 
-def write_stdout(text: str) -> None:
+def own_stderr() -> None:
+    """Keep stderr for our own lines: what native libraries print on it is dropped.
+
+    libjpeg says `Corrupt JPEG data` there, and not of which file. For a process of our own.
+    """
+    if sys.stderr is None:
+        return
+    with suppress(OSError, ValueError):
+        # sys.stderr goes on with another descriptor
+        own = os.dup(STDERR)
+        sys.stderr = os.fdopen(own, 'w', 1, sys.stderr.encoding, sys.stderr.errors)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, STDERR)
+        os.close(null)
+
+
+def write_stdout(text: str, styled: bool = False) -> None:
     """Print text and a newline. It is no error if the reader has ended (head, less).
 
-    Raises OutputError when stdout is closed or full.
+    styled: it has a terminal's colours, and its texts are visible() already. Raises OutputError
+    when stdout is closed or full.
     """
+    text = text if styled else _visible(text)
     with suppress(AttributeError, ValueError):
         sys.stdout.reconfigure(errors='replace')  # type: ignore[union-attr]
     try:
         sys.stdout.write(text + '\n')
         sys.stdout.flush()
     except BrokenPipeError:
-        _discard(sys.stdout, STDOUT)
+        _discard(sys.stdout)
     except (AttributeError, ValueError) as error:
         # AttributeError: it is None; ValueError: it was closed by this process
         raise OutputError('stdout is closed; give it a terminal, a file or a pipe') from error
     except OSError as error:
-        _discard(sys.stdout, STDOUT)
+        _discard(sys.stdout)
         raise OutputError(f'cannot write to stdout: {error.strerror or error}; send the output '
                           f'to another place') from error
 
 
-def write_stderr(line: str) -> None:
-    """Print text and a newline; nothing is raised if stderr cannot be written."""
+def write_stderr(text: str, styled: bool = False) -> None:
+    """Print text and a newline; nothing is raised if stderr cannot be written.
+
+    styled: as write_stdout()'s.
+    """
     try:
-        sys.stderr.write(line + '\n')
+        sys.stderr.write((text if styled else _visible(text)) + '\n')
         sys.stderr.flush()
     except (AttributeError, ValueError):
         pass
     except OSError:
-        _discard(sys.stderr, STDERR)
+        _discard(sys.stderr)
 
 
-def _discard(stream: Any, number: int) -> None:
+def _visible(text: str) -> str:
+    return '\n'.join(map(visible, text.split('\n')))
+
+
+def _discard(stream: Any) -> None:
     """Let the stream's remaining text go to /dev/null.
 
     Otherwise the interpreter's last flush fails, and its exit code is 120.
     """
     with suppress(OSError, ValueError, AttributeError):
-        if stream.fileno() == number:
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, number)
-            os.close(null)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)

@@ -74,14 +74,16 @@ def apart(camera: Camera, reference: Camera) -> Apart | None:
     """Return how far the images of the same rays are apart in both cameras.
 
     The rays are those of a grid over the reference's image, without those that no camera of this
-    kind can see (unseen_share()). None when the reference has no ray for a pixel of the grid, or
-    the camera cannot see one of the others.
+    kind can see (unseen_share()). None when the reference has no ray for a pixel of the grid, when
+    the camera cannot see one of the others, and where none is left.
     """
     pixels = grid_of(reference)
     rays = reference.rays(pixels)
     if not np.isfinite(rays).all():
         return None
     possible = _possible(camera, rays)
+    if not possible.any():
+        return None
     pixels, rays = pixels[possible], rays[possible]
 
     def off(rays: Floats) -> Floats:

@@ -95,7 +95,9 @@ def whole_numbers(between: str, count: int, like: str) -> Callable[[str], tuple[
     """Return a type of argument: so many whole numbers, such as a size or a part of a picture."""
     def numbers(text: str) -> tuple[int, ...]:
         parts = text.lower().split(between)
-        if len(parts) != count or not all(part.strip().isdecimal() for part in parts):
+        # int() refuses thousands of digits in words of its own
+        if len(parts) != count or not all(
+                part.strip().isdecimal() and len(part) < 20 for part in parts):
             raise argparse.ArgumentTypeError(f'{text!r} is not like {like}')
         return tuple(int(part) for part in parts)
     return numbers

@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 
-from rich.text import Text
-
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
@@ -22,6 +20,7 @@ from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.engine import Engine, LocalEngine, RayEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
 from dashcalib_ros.fleet.storage import joined, remove, write
+from dashcalib_ros.report.tables import line
 from dashcalib_ros.standard_streams import write_stderr
 from dashcalib_ros.workers.child import ChildWorker
 
@@ -57,7 +56,7 @@ def batch(args: argparse.Namespace) -> int:
     name = '' if args.shard is None else f'-{shard[0]}-of-{shard[1]}'
     write(joined(args.out, f'effort{name}.json'), progress.effort_json(engine))
     if files:
-        progress.screen.show(Text(f'written to {args.out}: ' + ', '.join(files)))
+        progress.screen.show(line(f'written to {args.out}: ' + ', '.join(files)))
     return _summarise(cameras, progress.screen)
 
 
@@ -81,7 +80,7 @@ def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
     warn(lines)
     verdicts = [camera.verdict for camera in cameras if camera.name]
     counts = ', '.join(f'{verdicts.count(level)} {level}' for level in LEVELS)
-    screen.show(Text(f'{counted(len(verdicts), "camera")}: {counts}; '
+    screen.show(line(f'{counted(len(verdicts), "camera")}: {counts}; '
                      f'{counted(len(found), "clip")} could not be read'))
     return NOT_ENOUGH if found or 'refused' in verdicts else ACCEPTED
 
@@ -107,7 +106,7 @@ class _Progress:
         """Take the news of a clip, or of a camera that is solved."""
         if clip is None:
             if camera.own is None or not camera.own.again:
-                self.screen.show(Text(f'{camera.name}: {camera.verdict}'))
+                self.screen.show(line(f'{camera.name}: {camera.verdict}'))
             return
         self.done += 1
         if not clip.again:

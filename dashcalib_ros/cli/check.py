@@ -5,8 +5,6 @@ import argparse
 import json
 from collections.abc import Sequence
 
-from rich.text import Text
-
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
 from dashcalib_ros.cli.drive import (
@@ -35,7 +33,7 @@ from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.camera_file import load_with_faults
 from dashcalib_ros.report.compare import mount_dict
-from dashcalib_ros.report.tables import TextTable, labelled
+from dashcalib_ros.report.tables import TextTable, labelled, line
 from dashcalib_ros.report.wording import mounts_text
 from dashcalib_ros.standard_streams import write_stdout
 
@@ -91,9 +89,9 @@ def check(args: argparse.Namespace) -> int:
     else:
         _show(found, motion, changes)
         if now is not None and before is not None:
-            show(Text(f'- {mounts_text(now, before)}'))
+            show(line(f'- {mounts_text(now, before)}'))
         elif args.mounting:
-            show(Text('- mounting: the drive does not tell it: drive straight on for longer'))
+            show(line('- mounting: the drive does not tell it: drive straight on for longer'))
     if motion is not None and args.out is not None:
         for name, text in path_files(motion).items():
             write_text(args.out / name, text)
@@ -131,7 +129,7 @@ def _changes(questions: Questions, given: Camera, calibration: Calibration) -> l
 def _show(found: Check, motion: Odometry | None, changes: Sequence[str]) -> None:
     show(labelled('answer', found.answer, COLOURS[found.answer]))
     for reason in (*found.reasons, *changes):
-        show(Text(f'- {reason}'))
+        show(line(f'- {reason}'))
     if motion is None:
         return
     medians = motion.medians()

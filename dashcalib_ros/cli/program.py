@@ -12,14 +12,23 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any, NoReturn
 
-from dashcalib_ros.cli.arguments import BAD_INPUT, COMMANDS, INTERRUPTED, PROGRAM, make_parser
+from dashcalib_ros.cli.arguments import (
+    BAD_INPUT,
+    COMMANDS,
+    INTERRUPTED,
+    PROGRAM,
+    VERBOSE,
+    make_parser,
+)
 from dashcalib_ros.errors import DashcalibError
-from dashcalib_ros.standard_streams import open_closed_streams, write_stderr
+from dashcalib_ros.standard_streams import open_closed_streams, own_stderr, write_stderr
 from dashcalib_ros.workers.worker import one_thread_for_numpy
 
 
 def command() -> NoReturn:
     """Run main() as a process of its own, the installed command."""
+    if VERBOSE[0] not in sys.argv:
+        own_stderr()
     code = main()
     if code == INTERRUPTED:
         # Ctrl-C in the middle of a lock's own code leaves it locked: no thread is waited for

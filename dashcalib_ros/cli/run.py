@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from time import perf_counter
 
-from rich.console import RenderableType
+from rich.console import Group, RenderableType
 from rich.text import Text
 
 from dashcalib_ros.camera import Radial, camera_of
@@ -35,7 +35,14 @@ from dashcalib_ros.report import (
 from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE
 from dashcalib_ros.report.files import TRUTH
 from dashcalib_ros.report.result import plain_values
-from dashcalib_ros.report.tables import TextTable, against_truth, conclusion, next_step, summary
+from dashcalib_ros.report.tables import (
+    TextTable,
+    against_truth,
+    conclusion,
+    line,
+    next_step,
+    summary,
+)
 from dashcalib_ros.standard_streams import write_stdout
 from dashcalib_ros.whole_files import temporary_folder
 
@@ -90,13 +97,13 @@ def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration, s
     assert calibration.camera is not None
     count = write_bag(args.input[0], topic, calibration.camera, args.write_bag,
                       calibration.config.rectified)
-    screen.show(Text(f'written: {args.write_bag} with {count} messages on '
+    screen.show(line(f'written: {args.write_bag} with {count} messages on '
                      f'{camera_info_topic(topic)}'))
 
 
 def _files(folder: Path, files: Sequence[Path]) -> Text:
     """Return a line that tells which files are in the output folder now."""
-    return Text(f'written to {folder}: {", ".join(file.name for file in files)}')
+    return line(f'written to {folder}: {", ".join(file.name for file in files)}')
 
 
 def _warn(calibration: Calibration, written: Written) -> None:
@@ -139,16 +146,16 @@ def turns(args: argparse.Namespace) -> int:
         show(TextTable(COLUMNS, [
             (f'{turn.stamp_s - detection.start_s:.1f}', str(turn.center), str(turn.first),
              str(turn.last), str(turn.images), f'{turn.prominence:.4f}') for turn in found]))
-        show(Text(PROMINENCE))
-    show(Text(_conclusion(len(found), config.turns.wanted, frames)))
+        show(line(PROMINENCE))
+    show(Group(*map(line, _conclusion(len(found), config.turns.wanted, frames))))
     return ACCEPTED
 
 
-def _conclusion(found: int, wanted: int, frames: int) -> str:
-    text = f'{found} of {counted(wanted, "turn")} wanted, in {counted(frames, "frame")}'
-    if found:
-        return f'{text}\nnext: dashcalib run, with the same INPUT'
-    return f'{text}\nnext: record a drive with turns at crossings, in daylight'
+def _conclusion(found: int, wanted: int, frames: int) -> tuple[str, str]:
+    """Return what there is, and what to do next."""
+    return (f'{found} of {counted(wanted, "turn")} wanted, in {counted(frames, "frame")}',
+            'next: dashcalib run, with the same INPUT' if found else
+            'next: record a drive with turns at crossings, in daylight')
 
 
 def demo(args: argparse.Namespace) -> int:
@@ -169,14 +176,14 @@ def demo(args: argparse.Namespace) -> int:
         values = {**drive.truth, 'width': size[0], 'height': size[1]}
         write_text(out / TRUTH, json.dumps(values, allow_nan=False) + '\n')
     _warn(calibration, written)
-    compared: list[RenderableType] = [Text('no estimate to compare with the truth')]
+    compared: list[RenderableType] = [line('no estimate to compare with the truth')]
     if calibration.camera is not None:
-        compared = [Text('\nagainst the truth'),
+        compared = [line(''), line('against the truth'),
                     against_truth(compare(calibrated_camera(calibration), truth))]
     files = [*written.files, out / TRUTH, *([out / 'bag'] if args.keep_bag else [])]
     Screen(args.quiet).show(
         conclusion(calibration.verdict), summary(calibration), *compared, _files(out, files),
-        Text(f'rendered and calibrated in {perf_counter() - started:.0f} s'),
+        line(f'rendered and calibrated in {perf_counter() - started:.0f} s'),
         next_step(calibration.verdict))
     return exit_code(calibration.verdict.level)
 

@@ -21,7 +21,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from dashcalib_ros.errors import OutputError
+from dashcalib_ros.errors import OutputError, visible
 from dashcalib_ros.standard_streams import write_stderr, write_stdout
 
 PIPE_WIDTH = 80  # columns where there is no terminal
@@ -39,7 +39,7 @@ def show(renderable: RenderableType, to_stderr: bool = False) -> None:
                       color_system='auto' if terminal else None)
     console.print(renderable)
     plain = '\n'.join(line.rstrip() for line in text.getvalue().splitlines())
-    (write_stderr if to_stderr else write_stdout)(plain)
+    (write_stderr if to_stderr else write_stdout)(plain, styled=bool(terminal))
 
 
 class Screen:
@@ -98,7 +98,7 @@ class Stages:
 
     def show(self, stage: str, fraction: float | None = None, note: str = '') -> None:
         """Show a stage at fraction 0..1 (None: unknown), and a note beside its name."""
-        text = f'{stage}: {note}' if note else stage
+        text = visible(f'{stage}: {note}' if note else stage)
         done = None if fraction is None else min(max(fraction, 0.0), 1.0)
         if self._lines:
             self._tell(text, done)

@@ -8,16 +8,25 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError, one_line
 from dashcalib_ros.fleet import lens_prior, overview, solved, tables
-from dashcalib_ros.fleet.clips import ClipResult, gather_clip, gathered, hash_of, set_aside
+from dashcalib_ros.fleet.clips import (
+    GONE,
+    ClipResult,
+    gather_clip,
+    gathered,
+    hash_of,
+    looked_at,
+    set_aside,
+)
 from dashcalib_ros.fleet.engine import DiedError, Engine, Task
 from dashcalib_ros.fleet.fuse import fuse
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.storage import is_url, joined, read, remove, write
+from dashcalib_ros.fleet.storage import is_url, joined, read, remove, stamp, write
 from dashcalib_ros.judge.conclude import versions
 from dashcalib_ros.report import write_results
 from dashcalib_ros.report.files import ACCEPTED, WEAK
@@ -99,10 +108,15 @@ def batch(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
 
 def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
                       tell: Told) -> None:
+    known: list[tuple[tuple[Camera, Row], ClipResult]] = []
     for camera in cameras:
         for row in camera.rows:
-            engine.submit(Task(gather_clip, (row, out, config), (camera, row)))
-    for (camera, row), outcome in engine.outcomes():
+            found = looked_at(row, out, config) if engine.here or row.problem else None
+            if found is None:
+                engine.submit(Task(gather_clip, (row, out, config), (camera, row)))
+            else:
+                known.append(((camera, row), found))
+    for (camera, row), outcome in chain(known, engine.outcomes()):
         if row is None:
             if isinstance(outcome, Exception):
                 _failed(camera, outcome)
@@ -120,7 +134,12 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
         tell(camera, outcome)
         if len(camera.results) == len(camera.rows):
             camera.clips = tables.clip_rows(camera.name, camera.make, camera.gathered, {})
-            if camera.name:
+            # where it has files of earlier, they must not stay as they are
+            if (all(result.problem == GONE for _, result in camera.gathered)
+                    and not stamp(joined(out, tables.camera_folder(camera.name)))):
+                _failed(camera, InputError('none of its clips is there; check the paths'))
+                tell(camera, None)
+            elif camera.name:
                 engine.submit(Task(solve_camera, (camera.name, camera.make, camera.gathered, out,
                                                   config), (camera, None)), first=True)
 

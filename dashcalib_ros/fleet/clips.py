@@ -14,7 +14,15 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import detect
 from dashcalib_ros.errors import DashcalibError, InputError, one_line
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.storage import clip_files, joined, local_copy, read, stamp, write
+from dashcalib_ros.fleet.storage import (
+    clip_files,
+    is_url,
+    joined,
+    local_copy,
+    read,
+    stamp,
+    write,
+)
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.limits import read_file
 from dashcalib_ros.reconstruct import reconstruct
@@ -32,6 +40,7 @@ from dashcalib_ros.reconstruct.scene_file import (
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.')
 LATER_NAMES = ('threads', 'rectified', 'turns.store')
+GONE = 'there is no such file; check the path'
 # bytes of a file that are hashed at a time
 BLOCK = 2**20
 
@@ -60,10 +69,20 @@ class ClipResult:
     again: bool = False
 
 
-def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
-    """Read a clip, unless that was done; never raises what a clip can cause."""
+def looked_at(row: Row, out: str, config: Config) -> ClipResult | None:
+    """Return what became of a clip that no worker need read; None where one must.
+
+    A file of this machine that has gone, or never was, costs two looks and no task.
+    """
     if row.problem:
         return ClipResult(row.problem, again=True)
+    if is_url(row.place) or os.path.lexists(row.place) or read(clip_file(row, out, config)):
+        return None
+    return ClipResult(GONE)
+
+
+def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
+    """Read a clip, unless that was done; never raises what a clip can cause."""
     name, now = clip_file(row, out, config), ''
     try:
         # before it is read: what changes later is read again
@@ -122,7 +141,7 @@ def _noted(name: str, result: ClipResult) -> ClipResult:
 def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
     """Write a clip's turns to their file. Raises DashcalibError, OSError."""
     if not now:
-        raise InputError('there is no such file; check the path')
+        raise InputError(GONE)
     with local_copy(row.place) as path:
         try:
             content = content_hash(path)

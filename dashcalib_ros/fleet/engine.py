@@ -56,7 +56,10 @@ class Engine(ABC):
     """Runs tasks; outcomes come in any order.
 
     cpu_s: of the tasks so far, by their function. peak_mb: of memory, of one worker at the most.
+    here: the workers see this machine's files.
     """
+
+    here = True
 
     def __init__(self, attempts: int) -> None:
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
@@ -175,6 +178,8 @@ class RayEngine(Engine):
 
     A task whose node was lost is tried again without being counted: that is no fault of its own.
     """
+
+    here = False
 
     def __init__(self, attempts: int, memory_mb: int, address: str) -> None:
         """Raise ConfigError without Ray, WorkerError where the cluster cannot be reached."""

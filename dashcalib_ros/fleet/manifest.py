@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from itertools import islice
 from typing import Any
 
 from dashcalib_ros.errors import ConfigError, InputError, one_line, shortened
@@ -17,15 +18,14 @@ from dashcalib_ros.fleet import storage
 from dashcalib_ros.fleet.storage import needs
 from dashcalib_ros.input.inputs import VIDEO_SUFFIXES
 from dashcalib_ros.input.source import IMAGE_SUFFIXES, is_bag_file
+from dashcalib_ros.limits import MANIFEST_BYTES, MANIFEST_ROWS
 from dashcalib_ros.reconstruct.scene_file import LAST_S
 from dashcalib_ros.reconstruct.scene_file import SUFFIX as GATHERED
 
-# bytes of a manifest: ten million rows
-LARGEST = 2**31
 COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time')
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Row:
     """A clip. number: of the manifest's row, from 1. place: its path or URL; clip: as written.
 
@@ -67,12 +67,14 @@ def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
     if reader is None or storage.is_folder(place):
         rows = [Row(number, found, found) for number, found in enumerate(_found(place), 1)]
     else:
-        data = storage.read(place, LARGEST)
+        data = storage.read(place, MANIFEST_BYTES)
         if data is None:
             raise InputError(f'there is no manifest {place}; check the path')
         folder = posixpath.dirname(place)
-        rows = [_row(number, values, folder)
-                for number, values in enumerate(reader(place, data), 1)]
+        rows = [_row(number, values, folder) for number, values in enumerate(
+            islice(reader(place, data), MANIFEST_ROWS + 1), 1)]
+        if len(rows) > MANIFEST_ROWS:
+            raise InputError(f'{place} has more than {MANIFEST_ROWS} rows: cut it into parts')
     if not rows:
         raise InputError(f'{place} names no clip; give a CSV with a column clip, a folder or a '
                          f'glob')

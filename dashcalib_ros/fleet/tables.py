@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from dashcalib_ros.camera import calibrated_models
+from dashcalib_ros.errors import visible
 from dashcalib_ros.fleet.clips import ClipResult, hash_of
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.solved import ClipShare, Final, Solved
@@ -30,6 +31,9 @@ YEAR_S = 365.25 * 86400
 LEAST_CLIPS = 3
 # the end of a camera's folder whose name is not the camera's
 HASHED = re.compile(r'-[0-9a-f]{32}$')
+
+# how a text begins that a spreadsheet runs
+FORMULA = ('=', '+', '-', '@')
 
 # each column's type
 CAMERA_COLUMNS = {
@@ -166,7 +170,7 @@ def write_table(out: str, name: str, rows: Sequence[Mapping[str, Any]],
     plain = [{key: _plain(row[key]) for key in columns} for row in rows]
     text = io.StringIO()
     csv.writer(text, lineterminator='\n').writerows([columns, *(
-        ['; '.join(value) if isinstance(value, list) else value for value in row.values()]
+        [_cell('; '.join(value) if isinstance(value, list) else value) for value in row.values()]
         for row in plain)])
     typed = {f'{name}.parquet': _parquet(plain, columns)} if has('pyarrow') else {
         f'{name}.jsonl': ''.join(json.dumps(row, ensure_ascii=False) + '\n' for row in plain
@@ -187,6 +191,14 @@ def _parquet(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> b
     data = io.BytesIO()
     parquet.write_table(table, data, compression='zstd')
     return data.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    """Return a value that is one cell to every program, and text to a spreadsheet."""
+    if not isinstance(value, str):
+        return value
+    text = visible(value)
+    return f"'{text}" if text.startswith(FORMULA) else text
 
 
 def _plain(value: Any) -> Any:

@@ -9,28 +9,29 @@ import bz2
 import errno
 import os
 import shutil
-import sqlite3
 import struct
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from io import BufferedReader, BytesIO
-from itertools import chain
+from itertools import accumulate, chain, islice
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
 
+import apsw
 import lz4.frame
 from mcap.exceptions import McapError
 from mcap.reader import FOOTER_SIZE
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from rosbags import rosbag2
+from rosbags.interfaces import Connection
 from rosbags.rosbag1 import reader as rosbag1
-from rosbags.rosbag2 import storage_mcap
+from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
@@ -40,7 +41,12 @@ from dashcalib_ros.input.source import first_of
 from dashcalib_ros.limits import (
     CHUNK_BYTES,
     FREE_BYTES,
+    INDEX_BYTES,
     MESSAGE_BYTES,
+    OVERLAPPING_BYTES,
+    RECORD_BYTES,
+    SQLITE_STEPS,
+    TOPICS,
     UNPACKED_LEAST,
     UNPACKED_RATIO,
 )
@@ -54,6 +60,8 @@ else:
 Damage = Callable[[str], None]
 # bytes of a file that are unpacked at once
 PIECE = 2**20
+# of the head of a record of a ROS 1 bag's index
+INDEX_HEAD = 55
 UNPACKERS: dict[str, Callable[[], Any]] = {
     'zstd': zstd.ZstdDecompressor, 'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor}
@@ -66,23 +74,50 @@ def unpack(kind: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
     kind: as bags name it; '' or none: it is not packed. Raises InputError beyond the limit; for
     damage what the libraries raise, and EOFError where it is cut off.
     """
-    if kind in ('', 'none'):
-        return data
     limit = min(limit, CHUNK_BYTES)
-    unpacker = UNPACKERS[kind]()
-    plain: bytes = unpacker.decompress(data, limit + 1)
+    unpacker = UNPACKERS[kind]() if kind not in ('', 'none') else None
+    plain: bytes = data if unpacker is None else unpacker.decompress(data, limit + 1)
     if len(plain) > limit:
         raise InputError(f'a part of the bag unpacks to more than {limit / 2**20:.0f} MB')
-    if not unpacker.eof:
+    if unpacker is not None and not unpacker.eof:
         raise EOFError('a packed part is cut off')
     return plain
 
 
-class _WithinLimit:
-    """Lets rosbags unpack within our limit, which it has not, while a reader of ours is open.
+class _Unpacking:
+    """Lets the chunks of a file unpack to no more, together, than a recording has."""
 
-    It finds its unpackers in two tables. What else uses rosbags in this process keeps its own
-    as soon as the last reader is closed, in whatever order they are.
+    def __init__(self, path: Path) -> None:
+        self._limit = self._left = unpacked_limit(path)
+
+    def check(self, size: int) -> None:
+        """Raise InputError where so many bytes are too many."""
+        if size > self._left:
+            raise InputError(f'its chunks unpack to more than {self._limit / 2**20:.0f} MB, which '
+                             f'is no recording')
+
+    def through(self, unpacker: Callable[[bytes, int], bytes], data: bytes) -> bytes:
+        """Return unpacked data, as unpack() does; raises InputError beyond the limit."""
+        try:
+            plain = unpacker(data, self._left)
+        except InputError:
+            self._left -= min(self._left, CHUNK_BYTES)
+            raise
+        self._left -= len(plain)
+        return plain
+
+
+def unpacked_limit(path: Path) -> int:
+    """Return the bytes to which a file may be unpacked; raises OSError."""
+    return max(UNPACKED_LEAST, UNPACKED_RATIO * path.stat().st_size)
+
+
+class _WithinLimit:
+    """Lets rosbags read within our limits, which it has not, while a reader of ours is open.
+
+    It finds its unpackers in two tables, and SQLite its limits in a list of hooks. What else uses
+    them in this process keeps its own as soon as the last reader is closed, in whatever order
+    they are.
     """
 
     def __init__(self) -> None:
@@ -93,17 +128,145 @@ class _WithinLimit:
 
     def __enter__(self) -> None:
         self._readers += 1
+        apsw.connection_hooks.append(_whole)
         for table, own in self._tables:
-            table.update({kind: partial(unpack, kind) for kind in own if kind in UNPACKERS})
+            table.update({kind: partial(unpack, kind) for kind in own})
 
     def __exit__(self, *error: object) -> None:
         self._readers -= 1
+        apsw.connection_hooks.remove(_whole)
         if not self._readers:
             for table, own in self._tables:
                 table.update(own)
 
 
-_WITHIN_LIMIT = _WithinLimit()
+WITHIN_LIMIT = _WithinLimit()
+
+
+# views, virtual tables, generated columns and long defaults make contents that a file has not
+_MADE = '''
+    SELECT 1 FROM pragma_table_list AS t, pragma_table_xinfo(t.name) AS c WHERE t.schema = 'main'
+    AND (t.type != 'table' OR c.hidden > 1 OR length(c.dflt_value) > 100) LIMIT 1'''
+# several rows of a damaged file may have the same bytes
+_SIZES = '''
+    SELECT total(octet_length(data)), (SELECT count(*) FROM topics), (SELECT
+    total(octet_length(name) + octet_length(type)) FROM topics) FROM messages'''
+
+
+def _limited(database: apsw.Connection) -> None:
+    """Let a database give what is stored in its tables, and its queries end.
+
+    Raises apsw.Error where there is more, here and in its queries.
+    """
+    left = SQLITE_STEPS * max(Path(database.filename).stat().st_size, PIECE) // PIECE
+
+    def endless() -> bool:
+        nonlocal left
+        left -= 1
+        return left < 0
+    database.limit(apsw.SQLITE_LIMIT_LENGTH, MESSAGE_BYTES)
+    database.set_progress_handler(endless, PIECE)
+    if list(database.execute(_MADE)):
+        raise apsw.SQLError('it has more than tables')
+
+
+def _whole(database: apsw.Connection) -> None:
+    """Limit a database that is to be read by its index; raises apsw.Error also for damage."""
+    _limited(database)
+    size = Path(database.filename).stat().st_size
+    [(contents, topics, names)] = database.execute(_SIZES)
+    if max(contents, names) > size or topics > TOPICS:
+        raise apsw.SQLError('its rows have more than the file')
+
+
+class _McapReader(storage_mcap.McapReader):
+    """rosbags' reader of an MCAP file that has an index of its chunks, within limits."""
+
+    def read_index(self) -> None:
+        """Read the index, and check it before anything is unpacked; raises InputError."""
+        if Path(str(self.path)).stat().st_size - self.data_end > INDEX_BYTES:
+            raise InputError('the index is too large')
+        super().read_index()
+        sizes = [chunk.uncompressed_size for chunk in self.chunks]
+        _Unpacking(Path(str(self.path))).check(sum(sizes))
+        # the reader has all chunks of one time in memory
+        ends = sorted((time, size) for chunk in self.chunks for time, size in (
+            (chunk.message_start_time, chunk.uncompressed_size),
+            (chunk.message_end_time + 1, -chunk.uncompressed_size)))
+        if max(accumulate(size for _, size in ends), default=0) > max(
+                OVERLAPPING_BYTES, max(sizes, default=0)):
+            raise InputError('too many chunks overlap')
+
+    def meta_scan(self) -> None:
+        """Leave a file without an index to scan_mcap()."""
+        raise InputError('there is no index')
+
+
+class _Ros1Reader(rosbag1.Reader):
+    """rosbags' reader of a ROS 1 bag whose index names each part of the file once.
+
+    _end: of the chunk before, with its index; _index_end: of what the counts of the head are of.
+    """
+
+    _end = _entries = _index_end = 0
+
+    def read_connection(self) -> Connection:
+        """Read a topic; raises InputError beyond limits."""
+        assert self.bio is not None
+        if Path(str(self.path)).stat().st_size - self.bio.tell() > INDEX_BYTES:
+            raise InputError('the index is too large')
+        return super().read_connection()
+
+    def read_chunk_info(self) -> rosbag1.ChunkInfo:
+        """Read where a chunk is."""
+        info = super().read_chunk_info()
+        assert self.bio is not None
+        self._index_end = self.bio.tell()
+        return info
+
+    def read_chunk(self) -> rosbag1.Chunk:
+        """Read a chunk's head; raises InputError where it is a part of the one before."""
+        assert self.bio is not None
+        if self.bio.tell() < self._end:
+            raise InputError('chunks overlap')
+        return super().read_chunk()
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[rosbag1.IndexData]]) -> None:
+        """Read where a topic's messages are in a chunk; raises InputError beyond limits."""
+        assert self.bio is not None
+        head = self.bio.read(INDEX_HEAD)
+        self._entries += int.from_bytes(head[-4:], 'little')
+        if self._entries > INDEX_BYTES:
+            raise InputError('the index is too large')
+        self.bio.seek(-len(head), os.SEEK_CUR)
+        super().read_index_data(pos, indexes)
+        self._end = self.bio.tell()
+
+    def open(self) -> None:
+        """Open the file; its chunks are unpacked within limits."""
+        super().open()
+        if self._index_end != Path(str(self.path)).stat().st_size:
+            self.close()
+            raise InputError('there is more than the head says')
+        unpacking = _Unpacking(Path(str(self.path)))
+        for pos, chunk in self.chunks.items():
+            # the one of the table, which takes a limit
+            own: Any = chunk.decompressor
+            self.chunks[pos] = chunk._replace(decompressor=partial(unpacking.through, own))
+
+
+class _FolderReader(rosbag2.reader.DirectoryReader):
+    """rosbags' reader of a folder with metadata.yaml, within limits."""
+
+    STORAGE_PLUGINS: Mapping[str, Any] = {'mcap': _McapReader,
+                                          'sqlite3': storage_sqlite3.Sqlite3Reader}
+
+
+class Reader2(rosbag2.Reader):
+    """rosbags' reader of a ROS 2 bag; within limits while WITHIN_LIMIT is entered."""
+
+    STORAGE_PLUGINS: Mapping[str, Any] = {'dir': _FolderReader, '.mcap': _McapReader,
+                                          '.db3': storage_sqlite3.Sqlite3Reader}
 
 
 @contextmanager
@@ -129,7 +292,7 @@ def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
                        f'{first_of([each.name for each in journals])}')
         except (zstd.ZstdError, EOFError):
             damage(f'{file.name} is damaged')
-        except sqlite3.DatabaseError as error:
+        except apsw.Error as error:
             damage(f'{file.name} was not closed, and {journals[0].name}, which has its end, '
                    f'cannot be used ({one_line(error)})')
             plain = file
@@ -145,7 +308,7 @@ def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
 
 
 def _unpack_file(packed: Path, plain: Path) -> None:
-    limit = max(UNPACKED_LEAST, UNPACKED_RATIO * packed.stat().st_size)
+    limit = unpacked_limit(packed)
     with zstd.open(packed, 'rb') as source:
         for size in _copied(source.read1, plain):
             if size > limit:
@@ -174,7 +337,7 @@ def _journals(file: Path) -> list[Path]:
 
 
 def _complete(file: Path, journals: Sequence[Path], plain: Path) -> None:
-    """Make a copy of a database with what its journals have; raises OSError, sqlite3's errors.
+    """Make a copy of a database with what its journals have; raises OSError, apsw.Error.
 
     Opening the file itself would write to it.
     """
@@ -183,11 +346,11 @@ def _complete(file: Path, journals: Sequence[Path], plain: Path) -> None:
             target = plain.with_name(f'{plain.name}{source.name.removeprefix(file.name)}')
             for _ in _copied(stream.read, target):
                 pass
-    with closing(sqlite3.connect(plain)) as database:
+    with closing(apsw.Connection(str(plain))) as database:
         database.execute('PRAGMA schema_version').fetchone()  # takes a rollback journal
         _, frames, _ = database.execute('PRAGMA wal_checkpoint').fetchone()
         if not frames:
-            raise sqlite3.DatabaseError('nothing in it is whole')
+            raise apsw.Error('nothing in it is whole')
         database.execute('PRAGMA journal_mode = DELETE')
 
 
@@ -235,7 +398,7 @@ def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]]
     counts = Counter[tuple[str, str]]()
     with unpacked(file, damage) as path:
         try:
-            with _WITHIN_LIMIT, _reader(path) as reader:
+            with WITHIN_LIMIT, _reader(path) as reader:
                 for connection in reader.connections:
                     counts[connection.topic, connection.msgtype] += connection.msgcount
             # what a journal has that cannot be used is not counted
@@ -264,7 +427,7 @@ def records(file: Path, topics: Collection[str], damage: Damage) -> Iterator[Rec
 
 
 def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
-    with _WITHIN_LIMIT, _reader(path) as reader:
+    with WITHIN_LIMIT, _reader(path) as reader:
         wanted = [each for each in reader.connections if each.topic in topics]
         missing = sum(connection.msgcount for connection in wanted)
         if not wanted:
@@ -279,7 +442,7 @@ def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
 
 def _reader(path: Path) -> rosbag1.Reader | rosbag2.Reader:
     with path.open('rb') as file:
-        return rosbag1.Reader(path) if file.read(7) == b'#ROSBAG' else rosbag2.Reader(path)
+        return _Ros1Reader(path) if file.read(7) == b'#ROSBAG' else Reader2(path)
 
 
 def scan(path: Path, damage: Damage) -> Iterator[Record]:
@@ -301,10 +464,10 @@ def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
     schemas: dict[int, str] = {}
     channels: dict[int, Channel] = {}
     with path.open('rb') as file:
-        limit = path.stat().st_size
+        limit = min(path.stat().st_size, RECORD_BYTES)
         repeated = _repeated(file, limit)
         reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
-        for record in chain(repeated, _mcap_records(reader, path.name, damage)):
+        for record in chain(repeated, _mcap_records(reader, _Unpacking(path), path.name, damage)):
             if isinstance(record, Schema):
                 schemas[record.id] = normalize_msgtype(record.name)
             elif isinstance(record, Channel):
@@ -323,6 +486,8 @@ def _repeated(file: BinaryIO, limit: int) -> list[McapRecord]:
     try:
         file.seek(-FOOTER_SIZE - MAGIC_SIZE, os.SEEK_END)
         footer: Any = next(StreamReader(file, skip_magic=True, record_size_limit=limit).records)
+        if file.seek(0, os.SEEK_END) - footer.summary_start > INDEX_BYTES:
+            return []
         file.seek(footer.summary_start)
         reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=limit)
         return [record for record in reader.records if isinstance(record, (Schema, Channel))]
@@ -332,7 +497,8 @@ def _repeated(file: BinaryIO, limit: int) -> list[McapRecord]:
         file.seek(0)
 
 
-def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[McapRecord]:
+def _mcap_records(reader: StreamReader, unpacking: _Unpacking, name: str, damage: Damage
+                  ) -> Iterator[McapRecord]:
     records = reader.records
     while True:
         # damaged lengths and texts come out as any of these: the library does not wrap them
@@ -347,7 +513,7 @@ def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[M
             yield record
             continue
         try:
-            plain = unpack(record.compression, record.data)
+            plain = unpacking.through(partial(unpack, record.compression), record.data)
             inner = breakup_chunk(replace(record, compression='', data=plain), validate_crc=True)
         except Exception as error:  # also the unpackers' own errors
             damage(f'{name} has a broken chunk ({one_line(error)})')
@@ -357,22 +523,27 @@ def _mcap_records(reader: StreamReader, name: str, damage: Damage) -> Iterator[M
 
 _ROWS = '''
     SELECT topic_id, timestamp, data FROM messages
-    WHERE typeof(timestamp) = 'integer' AND typeof(data) = 'blob' ORDER BY id'''
+    WHERE typeof(timestamp) = 'integer' AND typeof(data) = 'blob' AND octet_length(data) <= ?'''
 
 
 def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
     """Yield the messages of an SQLite bag, by row."""
     uri = f'file:{quote(str(path.absolute()))}?mode=ro&immutable=1'
-    database = sqlite3.connect(uri, uri=True)
+    database = apsw.Connection(uri, apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI)
+    left = path.stat().st_size
     try:
         # else SQLite refuses a file that is shorter than its header says
         database.execute('PRAGMA writable_schema = ON')
+        _limited(database)
         topics = {key: (name, kind) for key, name, kind in
-                  database.execute('SELECT id, name, type FROM topics')}
-        for topic, receive_ns, data in database.execute(_ROWS):
+                  islice(database.execute('SELECT id, name, type FROM topics'), TOPICS)}
+        for topic, receive_ns, data in database.execute(_ROWS, (left,)):
+            left -= len(data)
+            if left < 0:
+                raise apsw.SQLError('its rows have more than the file')
             if topic in topics:
                 yield Record(*topics[topic], receive_ns, data)
-    except sqlite3.DatabaseError as error:
+    except apsw.Error as error:
         damage(f'{path.name}: {one_line(error)}')
     finally:
         database.close()
@@ -383,13 +554,13 @@ def scan_bag(path: Path, damage: Damage) -> Iterator[Record]:
     with path.open('rb') as file:
         file.readline()
         try:
-            yield from _bag_messages(file, {})
+            yield from _bag_messages(file, {}, _Unpacking(path))
         except Exception as error:  # rosbags' errors, and those of what unpacks
             damage(f'{path.name} is cut off ({one_line(error)})')
 
 
-def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]]
-                  ) -> Iterator[Record]:
+def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]],
+                  unpacking: _Unpacking, inside: bool = False) -> Iterator[Record]:
     while file.peek(1):
         head = rosbag1.Header.read(file)
         kind = head.get_uint8('op')
@@ -400,10 +571,10 @@ def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]]
             continue
         size = rosbag1.read_uint32(file)
         data = file.read(size)
-        if kind == rosbag1.RecordType.CHUNK:
+        if kind == rosbag1.RecordType.CHUNK and not inside:
             # a chunk that is cut off may have complete messages at its start
-            plain = BytesIO(unpack(head.get_string('compression'), data))
-            yield from _bag_messages(BufferedReader(plain), connections)
+            plain = unpacking.through(partial(unpack, head.get_string('compression')), data)
+            yield from _bag_messages(BufferedReader(BytesIO(plain)), connections, unpacking, True)
         if len(data) < size:
             raise EOFError(f'{size - len(data)} bytes are missing')
         if kind == rosbag1.RecordType.MSGDATA:

@@ -112,8 +112,10 @@ def _metadata(path: Path) -> tuple[tuple[Path, ...], tuple[Topic, ...]]:
     try:
         text = read_text(path, YAML_BYTES)
         content = parse_yaml(text, str(path))['rosbag2_bagfile_information']
-        # older versions wrote the folder's name too, which may have changed since
-        files = tuple(path.parent / PurePath(name).name for name in content['relative_file_paths'])
+        # older versions wrote the folder's name too, which may have changed since; a file counts
+        # once
+        files = tuple(dict.fromkeys(
+            path.parent / PurePath(name).name for name in content['relative_file_paths']))
         counts = Counter[tuple[str, str]]()
         for item in content['topics_with_message_count']:
             about = item['topic_metadata']

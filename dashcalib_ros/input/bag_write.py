@@ -3,19 +3,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, get_typestore
 
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.camera_info import SAME, RosCamera
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.input.bag_read import unpacked
+from dashcalib_ros.input.bag_read import WITHIN_LIMIT, Reader2, unpacked
 from dashcalib_ros.input.bag_storage import open_bag
 from dashcalib_ros.input.source import METADATA
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
@@ -128,7 +128,7 @@ def _unwritable(path: Path, error: Exception) -> OutputError:
                        f'the room on that disk')
 
 
-def _messages(reader: Reader, connections: list[Connection], source: str | os.PathLike[str]
+def _messages(reader: Reader2, connections: list[Connection], source: str | os.PathLike[str]
               ) -> Iterator[tuple[Connection, int, bytes]]:
     try:
         yield from reader.messages(connections)
@@ -154,20 +154,20 @@ def _declared(writer: Writer, connection: Connection) -> Connection:
 
 
 @contextmanager
-def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator[Reader]:
+def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator[Reader2]:
     if image_topic is None:
         raise InputError(f'{source} is no bag: only of a bag a bag can be made')
     path = Path(source)
     if path.suffix == '.bag' or (path.is_dir() and not any(path.glob('*.yaml'))
                                  and any(path.glob('*.bag'))):
         raise InputError(f'{source} is a ROS 1 bag: convert it first (rosbags-convert)')
-    try:
-        _check_limits(path)
-        reader = Reader(path)
-        reader.open()
-    except Exception as error:  # a damaged file makes rosbags raise nearly anything
-        raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
-    with closing(reader):
+    with ExitStack() as opened:
+        try:
+            _check_limits(path)
+            opened.enter_context(WITHIN_LIMIT)
+            reader = opened.enter_context(Reader2(path))
+        except Exception as error:  # a damaged file makes rosbags raise nearly anything
+            raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
         topic = camera_info_topic(image_topic)
         wrong = [each.msgtype for each in reader.connections
                  if each.topic == topic and each.msgtype != CAMERA_INFO]

@@ -1,11 +1,15 @@
 """Motion streams: from CSV, GPX, KITTI's oxts folders, inside videos, and a bag's own topics."""
 from __future__ import annotations
 
+import re
+from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime, timezone
+from datetime import datetime
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -22,18 +26,29 @@ from dashcalib_ros.input.motion import (
     values_in,
 )
 from dashcalib_ros.input.source import os_error
-from dashcalib_ros.limits import check_file, read_text
+from dashcalib_ros.limits import (
+    DIGITS,
+    GPX_BYTES,
+    GPX_DEPTH,
+    GPX_NAMES,
+    MOTION_BYTES,
+    OXTS_BYTES,
+    OXTS_FILES,
+    check_file,
+    read_lines,
+    read_text,
+)
 
-# of a CSV or GPX: ten hours of a gyro at 100 Hz
-MOTION_BYTES = 2**29
-# of one file of a KITTI oxts folder, and how many there may be
-OXTS_BYTES, OXTS_FILES = 2**12, 1_000_000
 # columns of a CSV by their stream
 COLUMNS = {'rate': ('gyro_x', 'gyro_y', 'gyro_z'), 'speed': ('speed',),
            'position': ('latitude', 'longitude', 'altitude')}
 HEAD = f'stamp_s and any of {", ".join(name for names in COLUMNS.values() for name in names)}'
 # places in a line of KITTI's oxts: latitude, longitude, altitude; forward speed; rates x, y, z
 OXTS_POSITION, OXTS_SPEED, OXTS_RATE, OXTS_VALUES = slice(0, 3), 8, slice(17, 20), 30
+# characters of a GPX that are parsed at once
+GPX_PIECE = 2**22
+# 2011-09-26T13:02:25.964Z: date, time, part of a second, zone
+STAMP = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(\.\d*)?(Z|[+-]\d\d:\d\d)?')
 # of a GoPro's blocks of GPS: the key of the kind of fix (2: without height, 3: with it), and s
 GOPRO_FIX, GOPRO_BLOCK_S = '0x47505346', 1.0
 # message types by the option that chooses one of their topics
@@ -51,20 +66,21 @@ def read_motion(path: Path) -> SensorStream:
         return _oxts(path)
     if is_video(path):
         return _inside_video(path)
-    text = read_text(path, MOTION_BYTES, f'the motion file {path}')
+    what = f'the motion file {path}'
     if path.suffix.lower() == '.gpx':
-        return _gpx(text, path)
-    return _csv(text, path)
+        return _gpx(read_text(path, GPX_BYTES, what), path)
+    return _csv(read_lines(path, MOTION_BYTES, what), path)
 
 
-def _csv(text: str, path: Path) -> SensorStream:
-    head, _, rest = text.partition('\n')
-    names = [name.strip() for name in head.split(',')]
+def _csv(lines: Iterator[str], path: Path) -> SensorStream:
+    names = [name.strip() for name in next(lines, '').split(',')]
     if 'stamp_s' not in names or len(set(names)) < len(names):
         raise InputError(f'{path} is no CSV of motion sensors: its first line must name its '
                          f'columns: {HEAD}')
-    table = _table(rest.splitlines(), len(names))
-    column = {name: table[:, place] for place, name in enumerate(names)}
+    # only what is used: a file may have any number of columns
+    used = [name for name in names if name in ('stamp_s', *chain(*COLUMNS.values()))]
+    table = _table(lines, len(names), [names.index(name) for name in used])
+    column = dict(zip(used, table.T, strict=True))
     stamps = column['stamp_s']
     values: dict[str, tuple[Floats, Floats]] = {}
     for kind, wanted in COLUMNS.items():
@@ -88,41 +104,94 @@ def _csv(text: str, path: Path) -> SensorStream:
     return sensor_stream(values, str(path), bool(len(late) and late[0] > EPOCH_S))
 
 
-def _table(lines: Sequence[str], width: int) -> Floats:
-    """Return (n, width) numbers; NaN for what is none, and for all of a broken line."""
-    def number(cell: str) -> float:
-        try:
-            return float(cell)
-        except ValueError:
-            return np.nan
-    rows = [[number(cell) for cell in line.split(',')] if line.count(',') == width - 1
-            else [np.nan] * width for line in lines if line.strip()]
-    return np.array(rows, np.float64).reshape(-1, width)
+def _table(lines: Iterable[str], width: int, places: Sequence[int]) -> Floats:
+    """Return numbers (n, k) of these places of lines, SAMPLES + 1 lines at the most.
+
+    width: values of a line. NaN for what is no number, and for all of a broken line.
+    """
+    found = array('d')
+    for line in islice(filter(str.strip, lines), SAMPLES + 1):
+        if line.count(',') == width - 1:
+            cells = line.split(',')
+            found.extend(_number(cells[place]) for place in places)
+        else:
+            found.extend([np.nan] * len(places))
+    return np.array(found).reshape(-1, len(places))
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan
+
+
+class _TrackPoints:
+    """Takes stamps and places of a GPX's track points from ElementTree's parser, as they come.
+
+    rows: stamp, latitude, longitude and altitude of each point with a time, one after the other;
+    NaN for what is missing. The tree of the file would take 50 times its size.
+    """
+
+    def __init__(self) -> None:
+        self.rows = array('d')
+        self._depth = 0
+        self._names: set[str] = set()
+        self._point: dict[str, str] | None = None
+        self._text: str | None = None
+
+    def doctype(self, name: str, *about: str | None) -> None:
+        """Refuse entities, which could be made to grow."""
+        raise ValueError('it defines entities')
+
+    def start(self, tag: str, attributes: Mapping[str, str]) -> None:
+        """Take the beginning of an element."""
+        self._depth += 1
+        self._names.update((tag, *attributes))
+        # the parser remembers all of them
+        if self._depth > GPX_DEPTH or len(self._names) > GPX_NAMES:
+            raise ValueError(f'more than {GPX_DEPTH} levels or {GPX_NAMES} names')
+        if _plain(tag) == 'trkpt':
+            self._point = dict(attributes)
+        self._text = '' if self._point is not None and _plain(tag) in ('ele', 'time') else None
+
+    def data(self, text: str) -> None:
+        """Take a text, or a part of it."""
+        if self._text is not None and len(self._text) < DIGITS:
+            self._text += text
+
+    def end(self, tag: str) -> None:
+        """Take the end of an element."""
+        self._depth -= 1
+        if self._point is not None and self._text is not None:
+            self._point[_plain(tag)] = self._text
+        self._text = None
+        if _plain(tag) == 'trkpt' and self._point is not None:
+            point, self._point = self._point, None
+            if 'time' in point:
+                self.rows.append(_epoch_s(point['time']))
+                self.rows.extend(_number(point.get(key, '')) for key in ('lat', 'lon', 'ele'))
+
+
+def _plain(tag: str) -> str:
+    return tag.rpartition('}')[2]
 
 
 def _gpx(text: str, path: Path) -> SensorStream:
+    points = _TrackPoints()
     try:
-        import gpxpy
-        import gpxpy.gpx
-    except ImportError as error:
-        raise InputError(f"{path} is a GPX file, which needs gpxpy: pip install "
-                         f"'dashcalib_ros[motion]'") from error
-    if '<!DOCTYPE' in text[:10_000].upper() or '<!ENTITY' in text.upper():
-        raise InputError(f'{path} is no plain GPX: it defines entities; export the track anew')
-    try:
-        found = gpxpy.parse(text)
-    except Exception as error:  # a damaged XML makes parsers raise nearly anything
+        parser = ElementTree.XMLParser(target=points)
+        # it raises what its target raises at the end of a piece
+        for start in range(0, len(text), GPX_PIECE):
+            parser.feed(text[start:start + GPX_PIECE])
+        parser.close()
+    except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f'{path} is no valid GPX ({shortened(str(error))}): export the track '
                          f'anew') from error
-    points = [point for track in found.tracks for segment in track.segments
-              for point in segment.points if point.time is not None]
-    if len(points) < 2:
+    stamps, *places = np.array(points.rows).reshape(-1, 4).T
+    if len(stamps) < 2:
         raise InputError(f'{path} has no track with times: export it with them')
-    stamps = np.array([_epoch_s(point.time) for point in points])
-    # None becomes NaN
-    places = np.array([(point.latitude, point.longitude, point.elevation) for point in points],
-                      np.float64)
-    return sensor_stream({'position': (stamps, local_metres(*places.T))}, str(path), absolute=True)
+    return sensor_stream({'position': (stamps, local_metres(*places))}, str(path), absolute=True)
 
 
 def _inside_video(path: Path) -> SensorStream:
@@ -166,8 +235,17 @@ def _gopro_fixes(block: Mapping[str, Any] | None) -> Iterator[tuple[float, ...]]
         yield (stamp_s, *(np.array(row[:4], np.float64) / scale).tolist())
 
 
-def _epoch_s(time: Any) -> float:
-    return float((time if time.tzinfo else time.replace(tzinfo=timezone.utc)).timestamp())
+def _epoch_s(text: str) -> float:
+    """Return s since 1970 of a date and time, in UTC where it names no zone; NaN for none."""
+    found = STAMP.fullmatch(text.strip())
+    if found is None:
+        return np.nan
+    date, time, part, zone = found.groups()
+    try:
+        whole = datetime.fromisoformat(f'{date}T{time}{(zone or "Z").replace("Z", "+00:00")}')
+    except ValueError:
+        return np.nan
+    return whole.timestamp() + float(f'0{part or ""}')
 
 
 def _oxts(folder: Path) -> SensorStream:
@@ -184,7 +262,8 @@ def _oxts(folder: Path) -> SensorStream:
     for row, file in zip(rows, files, strict=True):
         if not file.is_file():
             continue
-        values = _table([read_text(file, OXTS_BYTES).strip().replace(' ', ',')], OXTS_VALUES)
+        values = _table([read_text(file, OXTS_BYTES).strip().replace(' ', ',')], OXTS_VALUES,
+                        range(OXTS_VALUES))
         row[:] = values[0] if len(values) else np.nan
     count = min(len(rows), len(stamps))
     rows, stamps = rows[:count], stamps[:count]
@@ -198,14 +277,7 @@ def _oxts(folder: Path) -> SensorStream:
 
 def _kitti_stamps(path: Path) -> Floats:
     """Return seconds from lines like 2011-09-26 13:02:25.964389445; NaN for other lines."""
-    found = []
-    for line in read_text(path, MOTION_BYTES).splitlines():
-        whole, _, part = line.strip().partition('.')
-        try:
-            start = datetime.strptime(whole, '%Y-%m-%d %H:%M:%S').replace(tzinfo=timezone.utc)
-            found.append(start.timestamp() + float(f'0.{part or 0}'))
-        except ValueError:
-            found.append(np.nan)
+    found = [_epoch_s(line) for line in islice(read_lines(path, MOTION_BYTES), OXTS_FILES)]
     if not found:
         raise InputError(f'{path} has no stamps: give a whole KITTI drive')
     return np.array(found)

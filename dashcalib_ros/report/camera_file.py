@@ -12,7 +12,6 @@ import os
 import re
 import struct
 import xml.etree.ElementTree as ElementTree
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -35,6 +34,7 @@ from dashcalib_ros.camera import (
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.camera.field import Field
+from dashcalib_ros.camera.mapping import grid_of
 from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.input.bag_write import first_camera_info
 from dashcalib_ros.input.inputs import fits_bag
@@ -43,9 +43,13 @@ from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import ANGLES, Mount
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import (
+    ARRAY_BYTES,
+    ARRAYS,
     JSON_BYTES,
-    SIDE,
+    LENS_NUMBER,
     check_file,
+    check_npz,
+    check_pixels,
     parse_json,
     parse_yaml,
     read_file,
@@ -87,8 +91,6 @@ MRCAL = {'LENSMODEL_PINHOLE': PLUMB_BOB, 'LENSMODEL_OPENCV4': PLUMB_BOB,
 # how files name OpenCV's values, in small letters without anything between them
 MATRIX = ('cameramatrix', 'intrinsicmatrix', 'intrinsics', 'k', 'mtx')
 DISTORTION = ('distortioncoefficients', 'distortioncoeffs', 'distcoeffs', 'distcoeff', 'dist', 'd')
-# bytes of one array of an .npz that may be part of a calibration
-ARRAY_BYTES = 4096
 
 
 def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
@@ -112,6 +114,10 @@ def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedC
 
 def load_with_faults(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
     """Read a camera as load_camera() does; what stands wrong beside it is in its faults."""
+    return _seeing(_loaded(path, name))
+
+
+def _loaded(path: str | os.PathLike[str], name: str | None) -> NamedCamera:
     text = os.fspath(path)
     before, _, after = text.rpartition(':')
     # lexists() takes any text, also one that is too long for a name
@@ -232,9 +238,28 @@ def _camera(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequence[f
     check_focal(fx, fy, path)
     width, height = read_size(*size, path=path)
     try:
-        return camera_from_ros((width, height), kind, [fx, 0, cx, 0, fy, cy, 0, 0, 1], d)
+        camera = camera_from_ros((width, height), kind, [fx, 0, cx, 0, fy, cy, 0, 0, 1], d)
     except InputError as error:
         raise InputError(f'{path}: {error}') from error
+    _check_lens(camera, path)
+    return camera
+
+
+def _check_lens(camera: Camera, path: str | Path) -> None:
+    """Raise InputError for numbers that no lens has: nothing can be computed with them."""
+    for name, value in camera.named.items():
+        if abs(value) > LENS_NUMBER:
+            raise InputError(f'{path} has {name} = {value:.4g}, which no lens has; give a '
+                             f'complete calibration in px')
+
+
+def _seeing(found: NamedCamera) -> NamedCamera:
+    """Return it; raises InputError where no pixel of its picture has a ray."""
+    with np.errstate(all='ignore'):
+        if not np.isfinite(found.camera.rays(grid_of(found.camera))).all(axis=1).any():
+            raise InputError(f'{found.name} is of a lens that sees no ray in its picture of '
+                             f'{found.image_size[0]}x{found.image_size[1]}; calibrate anew')
+    return found
 
 
 def _view(k: Sequence[float]) -> list[float]:
@@ -435,6 +460,7 @@ def _result(data: Data, path: Path) -> NamedCamera:
     camera = MODELS[name].of(
         size, [read_number(given, each, path) for each in MODELS[name].names()])
     check_focal(camera.fx, camera.fy, path)
+    _check_lens(camera, path)
     sigma = read_sigma(data.get('sigma'), camera)
     return NamedCamera(str(path), camera, sigma, str(data['verdict']),
                        read_covariance(data.get('details'), camera, sigma),
@@ -472,11 +498,12 @@ def _arrays(path: Path) -> Data:
     """Return the small arrays of an .npz, as lists."""
     try:
         check_file(path)
-        with zipfile.ZipFile(path) as packed:
-            names = [info.filename.removesuffix('.npy') for info in packed.infolist()
-                     if info.file_size <= ARRAY_BYTES]
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name].tolist() for name in names}
+        with path.open('rb') as file:
+            check_npz(file, ARRAYS)
+            with np.load(file, allow_pickle=False) as arrays:
+                small = [info.filename.removesuffix('.npy') for info in arrays.zip.infolist()
+                         if info.file_size <= ARRAY_BYTES]
+                return {name: arrays[name].tolist() for name in small}
     except InputError:
         raise
     except Exception as error:  # a damaged file makes numpy raise nearly anything
@@ -504,8 +531,7 @@ def read_size(width: Any, height: Any, *, path: str | Path) -> tuple[int, int]:
         if type(value) is not int or value <= 0:
             raise InputError(f'{path}: the image {key} must be a positive integer, not '
                              f'{shortened(repr(value))}')
-        if value > SIDE:
-            raise InputError(f'{path}: the image {key} must be {SIDE} at the most; is it in px?')
+    check_pixels(int(width), int(height), f'{path}: the image')
     return int(width), int(height)
 
 

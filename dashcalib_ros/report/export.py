@@ -22,6 +22,7 @@ from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.limits import check_pixels
 from dashcalib_ros.report.camera_file import EQUIDISTANT, RATIONAL, TERMS
 from dashcalib_ros.report.result import camera_info_yaml
 
@@ -44,8 +45,12 @@ def exported(camera: Camera, kind: str, field: Field | None = None) -> str | byt
 def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     """Return the camera of pictures that were resized to (width, height).
 
-    Raises ConfigError where that would stretch them.
+    Raises ConfigError where that would stretch them, and InputError beyond limits.
     """
+    if min(size) < 1:
+        raise ConfigError(f'{size[0]}x{size[1]} is no size of a picture; give its width and '
+                          f'height in px')
+    check_pixels(*size, 'the resized picture')
     width, height = camera.image_size
     x, y = size[0] / width, size[1] / height
     if abs(size[1] - x * height) > ROUNDING_PX and abs(size[0] - y * width) > ROUNDING_PX:

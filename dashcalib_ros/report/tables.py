@@ -11,6 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from dashcalib_ros.errors import visible
 from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
 from dashcalib_ros.report.compare import (
     Comparison,
@@ -33,6 +34,11 @@ NEXT = {
 COLOURS = {'accepted': 'bold green', 'weak': 'bold yellow', 'refused': 'bold red'}
 
 
+def line(text: str) -> Text:
+    """Return one literal line: names of topics, files and cameras cannot act on the terminal."""
+    return Text(visible(text))
+
+
 def summary(calibration: Calibration) -> RenderableType:
     """Return the estimate with its sigma, the table of turns, and a few facts."""
     c = calibration
@@ -40,10 +46,10 @@ def summary(calibration: Calibration) -> RenderableType:
     if c.camera is not None:
         parts.append(TextTable(('', 'estimate', 'sigma', 'relative'), parameter_rows(c)))
         if c.caveat:
-            parts.append(Text(f'{c.caveat}\n'))
+            parts += [line(c.caveat), line('')]
     if c.turns:
         parts.append(TextTable(TURNS, [_turn_row(turn, c.start_s) for turn in c.turns]))
-    return Group(*parts, *(Text(f'{name}: {text}') for name, text in run_facts(c)))
+    return Group(*parts, *(line(f'{name}: {text}') for name, text in run_facts(c)))
 
 
 def conclusion(verdict: Verdict) -> RenderableType:
@@ -51,7 +57,7 @@ def conclusion(verdict: Verdict) -> RenderableType:
     parts: list[RenderableType] = [labelled('verdict', verdict.level, COLOURS[verdict.level])]
     for reason in verdict.reasons:
         cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), None)
-        parts.append(Padding.indent(Text(reason.removesuffix(f': {cure}')), 2))
+        parts.append(Padding.indent(line(reason.removesuffix(f': {cure}')), 2))
     return Group(*parts)
 
 
@@ -62,7 +68,7 @@ def labelled(label: str, word: str, colour: str) -> Text:
 
 def next_step(verdict: Verdict) -> Text:
     """Return what to do next."""
-    return Text(f'next: {(verdict.cures or (NEXT[verdict.level],))[0]}')
+    return line(f'next: {(verdict.cures or (NEXT[verdict.level],))[0]}')
 
 
 def _turn_row(turn: TurnSummary, start_s: float) -> tuple[str, ...]:
@@ -73,10 +79,9 @@ def _turn_row(turn: TurnSummary, start_s: float) -> tuple[str, ...]:
 
 def comparison(found: Comparison) -> RenderableType:
     """Return two calibrations side by side, and the mapping error."""
-    sides = Text('\n'.join(
-        f'{side}: {camera.name}' + (f' ({camera.verdict})' if camera.verdict else '')
-        for side, camera in (('A', found.a), ('B', found.b))))
-    return Group(sides, *map(Text, answers(found)), TextTable(*comparison_rows(found)))
+    sides = (f'{side}: {camera.name}' + (f' ({camera.verdict})' if camera.verdict else '')
+             for side, camera in (('A', found.a), ('B', found.b)))
+    return Group(*map(line, sides), *map(line, answers(found)), TextTable(*comparison_rows(found)))
 
 
 def against_truth(found: Comparison) -> RenderableType:
@@ -88,7 +93,7 @@ def against_truth(found: Comparison) -> RenderableType:
     known = found.mapping_px is not None and math.isfinite(found.mapping_px)
     mapping = (f'{found.mapping_px:.2f} px{unseen_text(found)}' if known else
                'unknown, a lens model folds over inside the image')
-    return Group(TextTable(head, rows), Text(f'mapping error: {mapping}'))
+    return Group(TextTable(head, rows), line(f'mapping error: {mapping}'))
 
 
 class TextTable:
@@ -106,14 +111,14 @@ class TextTable:
         while others:
             room = options.max_width - _width(first)
             table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-            table.add_column(Text(first[0]), no_wrap=True)
+            table.add_column(line(first[0]), no_wrap=True)
             shown = [first]
             while others and (len(shown) == 1 or APART + _width(others[0]) <= room):
                 shown.append(others.pop(0))
                 room -= APART + _width(shown[-1])
-                table.add_column(Text(shown[-1][0]), justify='right', no_wrap=True)
+                table.add_column(line(shown[-1][0]), justify='right', no_wrap=True)
             for row in zip(*(column[1:] for column in shown), strict=True):
-                table.add_row(*map(Text, row))
+                table.add_row(*map(line, row))
             yield table
 
 

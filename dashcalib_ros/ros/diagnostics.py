@@ -6,11 +6,12 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
-from dashcalib_ros.errors import one_line
+from dashcalib_ros.errors import one_line, visible
 from dashcalib_ros.report import NamedCamera
 
 # s between two lines of one kind of problem
@@ -19,6 +20,22 @@ EVERY_S = 10.0
 REMEMBERED = 100
 OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR,
                           DiagnosticStatus.STALE)
+
+
+class Log(RcutilsLogger):  # type: ignore[misc]
+    """rclpy's log, in which other people's names and texts cannot make lines of their own."""
+
+    def info(self, message: str, **filters: Any) -> bool:
+        """Log for information."""
+        return bool(super().info(visible(message), **filters))
+
+    def warning(self, message: str, **filters: Any) -> bool:
+        """Log a warning."""
+        return bool(super().warning(visible(message), **filters))
+
+    def error(self, message: str, **filters: Any) -> bool:
+        """Log an error."""
+        return bool(super().error(visible(message), **filters))
 
 
 def log_line(log: RcutilsLogger, severe: bool, text: str) -> None:
@@ -66,7 +83,8 @@ class Complaints:
             return
         self._places.add(place)
         self.counts[kind] += 1
-        self._log('\n'.join([text, *traceback.format_exception(error)]).rstrip())
+        for line in '\n'.join([text, *traceback.format_exception(error)]).splitlines():
+            self._log(line)
 
     def once(self, text: str) -> None:
         """Log a line unless it was logged before."""

@@ -29,7 +29,7 @@ from dashcalib_ros.report.result import check_camera_name
 from dashcalib_ros.report.wording import witness_texts
 from dashcalib_ros.ros.background import Learner, Moved, News, Result, Trouble, Watched
 from dashcalib_ros.ros.car import Sensors
-from dashcalib_ros.ros.diagnostics import ERROR, STALE, WARN, Complaints, Health, log_line
+from dashcalib_ros.ros.diagnostics import ERROR, STALE, WARN, Complaints, Health, Log, log_line
 from dashcalib_ros.ros.images import CURES, ImageInput, Intake, Source, since_text
 from dashcalib_ros.ros.parameters import (
     OVERRIDES,
@@ -65,6 +65,7 @@ class CameraNode(Node, ABC):
 
     # what the node does with the camera, for its first line in the log
     doing: str
+    _visible: Log | None = None
 
     def __init__(self, listen: bool = True) -> None:
         """listen: subscribe the images at once."""
@@ -75,6 +76,11 @@ class CameraNode(Node, ABC):
             # a node that is left half made may crash rclpy at the end of the process
             self.destroy_node()
             raise
+
+    def get_logger(self) -> Log:
+        """Return the node's log."""
+        self._visible = self._visible or Log(super().get_logger().name)
+        return self._visible
 
     def _make(self, listen: bool) -> None:
         self._core, self._own = declare(self)

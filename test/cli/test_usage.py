@@ -8,8 +8,10 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
+import unicodedata
 
 import cv2
 import numpy as np
@@ -18,7 +20,9 @@ from made_calibration import TRUTH, make_calibration
 
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.cli import main
+from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.report import write_results
+from dashcalib_ros.report.tables import line
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 HEAVY = ('numpy', 'cv2', 'scipy', 'yaml', 'rich', 'matplotlib', 'pycolmap', 'rosbags', 'rclpy')
@@ -307,3 +311,40 @@ def test_an_interrupt_while_a_module_is_imported_has_its_own_exit_code(tmp_path)
     done = subprocess.run([sys.executable, '-m', 'interrupted'], cwd=tmp_path, timeout=60,
                           capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, 'dashcalib: error: interrupted\n')
+
+
+# clears a screen, sets its title, turns the direction of writing, and forges a line
+FORGED = 'a\x1b[2J\x1b]0;b\x07\x9b1m\u202eb\u2066\u2028\x85\nverdict: accepted'
+
+
+def acts(text):
+    return [sign for sign in text if sign != '\n' and (
+        unicodedata.category(sign) in ('Cc', 'Zl', 'Zp')
+        or unicodedata.bidirectional(sign) in ('RLO', 'LRI'))]
+
+
+@pytest.mark.parametrize('terminal', [False, True])
+def test_names_cannot_act_on_a_terminal(results, tmp_path, capsys, monkeypatch, terminal):
+    assert len(acts(FORGED)) == 8
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(results / 'a', FORGED)
+    main(['compare', FORGED, FORGED])
+    main(['compare', f'{FORGED}/gone', FORGED])
+    warn([f'{FORGED} is odd'])
+    monkeypatch.setattr(sys.stdout, 'isatty', lambda: terminal)
+    show(line(FORGED))
+    said = ''.join(capsys.readouterr())
+    # a name's own line ends, too
+    assert not acts(said) and '\nverdict' not in said and said.count(r'\x1b[2J') >= 4
+
+
+def test_native_libraries_say_nothing_on_stderr(tmp_path):
+    whole = cv2.imencode('.jpg', np.random.default_rng(0).integers(
+        256, size=(240, 320), dtype=np.uint8))[1].tobytes()
+    for n in range(12):
+        spoiled = bytearray(whole)
+        spoiled[2000 + n] ^= 255
+        (tmp_path / f'{n}.jpg').write_bytes(spoiled)
+    done = dashcalib('turns', tmp_path, '--fps', '10')
+    assert done.returncode == 0
+    assert all(each.startswith('dashcalib: ') for each in done.stderr.splitlines()), done.stderr

@@ -145,8 +145,8 @@ def test_killed_at_any_time_it_does_only_what_is_missing(manifest, reference, tm
     assert same(tmp_path, reference[0])
     again = Counting()
     run(manifest, tmp_path, again)
-    # what is not there may be there the next time
-    assert again.done == ['gather_clip']
+    # what is not there is looked for each time, without a task
+    assert again.done == []
     assert same(tmp_path, reference[0])
 
 
@@ -155,7 +155,7 @@ def test_shards_and_a_merge_give_the_same_tables(manifest, reference, tmp_path):
     assert [len(cameras) for cameras, _ in parts] == [2, 2, 2] and not parts[0][1]
     worker = Counting()
     run(manifest, tmp_path, worker)
-    assert worker.done == ['gather_clip'] and same(tmp_path, reference[0])
+    assert worker.done == [] and same(tmp_path, reference[0])
 
 
 def test_input_and_output_may_be_addresses(manifest, reference):
@@ -224,6 +224,23 @@ def test_ten_thousand_unreadable_clips(tmp_path):
     cameras, _ = calibrate(few, tmp_path / 'out')
     assert len(list(problems(cameras))) == 10_001
     assert cameras[0].verdict == 'refused'
+
+
+def test_clips_that_are_not_there_cost_no_task_and_no_files(tmp_path):
+    class NoWorker(Here):
+        def call(self, function, *arguments, progress=None):
+            raise AssertionError(arguments)
+    rows = [Row(n, f'{n}.avi', str(tmp_path / f'{n}.avi'), f'cam{n % 7}') for n in range(2000)]
+    rows += [Row(2000, '', '', problem='names no clip'), Row(2001, 'a\0b', 'a\0b', 'cam0')]
+    cameras, _ = calibrate(rows, tmp_path / 'out', NoWorker())
+    found = list(problems(cameras))
+    assert len(found) == 2002 and {why for row, why in found if row.clip} == {
+        'there is no such file; check the path'}
+    assert not any((tmp_path / 'out' / each).exists() for each in ('cameras', 'clips'))
+    told = {row['camera']: row for row in csv.DictReader(
+        (tmp_path / 'out' / 'cameras.csv').read_text().splitlines())}
+    assert told['cam1']['verdict'] == 'refused' and told['cam1']['clips_unreadable'] == '286'
+    assert told['cam1']['reasons'] == 'none of its clips is there; check the paths'
 
 
 def test_without_pyarrow_the_tables_are_json_lines(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import json
 import pytest
 
 from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.fleet import manifest
 from dashcalib_ros.fleet.batch import cameras_of
 from dashcalib_ros.fleet.manifest import read_manifest
 
@@ -68,6 +69,13 @@ def test_a_manifest_that_is_bad_altogether(tmp_path, data, match):
     with pytest.raises(InputError, match=match) as caught:
         rows_of(tmp_path, data)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_manifest_has_only_so_many_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr(manifest, 'MANIFEST_ROWS', 3)
+    assert len(rows_of(tmp_path, 'clip\n' + 'a.mp4\n' * 3)) == 3
+    with pytest.raises(InputError, match='more than 3 rows: cut it into parts'):
+        rows_of(tmp_path, 'clip\n' + 'a.mp4\n' * 4)
 
 
 def test_no_manifest(tmp_path):

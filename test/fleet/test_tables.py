@@ -14,7 +14,13 @@ from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.overview import overview_html
 from dashcalib_ros.fleet.solved import ClipShare
-from dashcalib_ros.fleet.tables import CAMERA_COLUMNS, CLIP_COLUMNS, clip_rows, failed_row
+from dashcalib_ros.fleet.tables import (
+    CAMERA_COLUMNS,
+    CLIP_COLUMNS,
+    clip_rows,
+    failed_row,
+    write_table,
+)
 
 START_S = 1.7e9
 
@@ -76,6 +82,19 @@ def test_texts_that_are_no_unicode_and_numbers_that_are_none(tmp_path, monkeypat
     with (tmp_path / 'cameras.csv').open(newline='') as stream:
         read, = csv.DictReader(stream)
     assert (read['camera'], read['fx'], read['reasons']) == ('b?<script>.mp4', '', 'why')
+
+
+def test_a_spreadsheet_runs_no_text(tmp_path):
+    bad = ["=cmd|'/c calc'!A1", '+1', '-cam', '@sum']
+    good = ['cam=1', '', 'x-y', '\t=1', 'a\r=1', 'a\n=1']
+    rows = [{'name': text, 'more': [text, 'and'], 'x': -1.5} for text in (*bad, *good)]
+    write_table(str(tmp_path), 'out', rows, {'name': 'text', 'more': 'texts', 'x': 'real'})
+    read = list(csv.DictReader((tmp_path / 'out.csv').read_text().splitlines()))
+    plain = [*(f"'{text}" for text in bad), *good[:3], r'\t=1', r'a\r=1', r'a\n=1']
+    assert [row['name'] for row in read] == plain
+    assert [row['more'] for row in read] == [f'{text}; and' for text in plain]
+    # numbers stay numbers
+    assert {row['x'] for row in read} == {'-1.5'}
 
 
 def drawn_fleet():

@@ -1,8 +1,8 @@
 """Motion streams from files, bags and live samples."""
 from __future__ import annotations
 
-import builtins
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from dashcalib_ros.input.motion import (
     speeds_of,
 )
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
+from dashcalib_ros.limits import LINE, read_lines
 
 NONE: dict[str, str | None] = {}
 
@@ -89,7 +90,6 @@ def gpx(points):
 
 
 def test_a_gpx_has_times_of_day(tmp_path):
-    pytest.importorskip('gpxpy')
     times = [f'<time>2023-11-14T22:13:{20 + n}Z</time>' for n in range(5)]
     found = read_motion(write(tmp_path / 'track.gpx', gpx(times)))
     assert found.absolute
@@ -104,21 +104,63 @@ def test_a_gpx_has_times_of_day(tmp_path):
 
 @pytest.mark.parametrize('text', ['<gpx', gpx(['']), '<!DOCTYPE x [<!ENTITY a "b">]><gpx/>'])
 def test_what_is_no_gpx_with_times_is_named(tmp_path, text):
-    pytest.importorskip('gpxpy')
     with pytest.raises(InputError, match=r'track\.gpx'):
         read_motion(write(tmp_path / 'track.gpx', text))
 
 
-def test_without_gpxpy_the_line_says_what_to_install(tmp_path, monkeypatch):
-    real = builtins.__import__
+def test_a_gpx_may_have_any_prefix_fractions_zones_and_damaged_points(tmp_path):
+    text = ('<?xml version="1.0" encoding="UTF-8"?><g:gpx xmlns:g="http://example.com/g">'
+            '<g:wpt lat="1" lon="1"><g:time>2020-01-01T00:00:00Z</g:time></g:wpt><g:trk>'
+            '<g:trkseg><g:trkpt lat="1" lon="1"/>' + ''.join(
+                f'<g:trkpt lat="{lat}" lon="8.{n:03d}"><g:ele>1{n}.5</g:ele><x><x y="1">7'
+                f'</x></x><g:time> {time} </g:time></g:trkpt>'
+                for n, (lat, time) in enumerate([
+                    ('49', '2023-11-14T23:13:20.250+01:00'), ('49.1', '2023-11-14T22:13:21.5Z'),
+                    *[('49.1', f'2023-11-14T22:13:{n}') for n in range(22, 32)],
+                    ('x', '2023-11-14T22:13:40Z'), ('49', '2023-13-99T22:13:41Z')]))
+            + '</g:trkseg></g:trk></g:gpx>')
+    found = read_motion(write(tmp_path / 'track.gpx', text)).position
+    np.testing.assert_allclose(found.stamps_s[:3] - START / 1e9, [0.25, 1.5, 2.0])
+    assert len(found.stamps_s) == 12 and found.values[1, 2] == 1.0
 
-    def without(name, *rest, **more):
-        if name.startswith('gpxpy'):
-            raise ImportError(name)
-        return real(name, *rest, **more)
-    monkeypatch.setattr(builtins, '__import__', without)
-    with pytest.raises(InputError, match=r'dashcalib_ros\[motion\]'):
-        read_motion(write(tmp_path / 'track.gpx', gpx([])))
+
+def test_more_columns_than_are_used_take_no_memory(tmp_path):
+    names = ','.join(['stamp_s', 'speed', *(f'c{n}' for n in range(5000))])
+    rows = [f'{n},10' + ',' * 5000 for n in range(20)]
+    tracemalloc.start()
+    found = read_motion(write(tmp_path / 'wide.csv', '\n'.join([names, *rows, *'x' * 3])))
+    assert tracemalloc.get_traced_memory()[1] < 4e6
+    tracemalloc.stop()
+    assert len(found.speed.values) == 20
+    names += ',c' * 2**17
+    with pytest.raises(InputError, match='its first line must name its columns'):
+        read_motion(write(tmp_path / 'wide.csv', names[::-1]))
+
+
+def test_a_line_without_an_end_comes_in_parts(tmp_path):
+    path = write(tmp_path / 'long.csv', 'stamp_s,speed\n' + '\n'.join(
+        [*(f'{n},10' for n in range(50)), '7' * 3 * LINE]))
+    assert len(read_motion(path).speed.values) == 50
+    assert max(map(len, read_lines(path, 2**20))) == LINE
+    for limit, content in ((100, None), (2**20, b'\xff\xfe')):
+        if content:
+            path.write_bytes(content)
+        with pytest.raises(InputError, match='too large' if content is None else 'no.* text file'):
+            list(read_lines(path, limit))
+    with pytest.raises(InputError, match='does not exist'):
+        list(read_lines(tmp_path / 'gone.csv', 10))
+
+
+@pytest.mark.parametrize('text', [
+    '<gpx ' + ' '.join(f'xmlns:n{n}="u{n}"' for n in range(20_000)) + '>',
+    '<n:gpx>', '<a>' * 50_000,
+    '<!DOCTYPE gpx><gpx></gpx>', '<gpx>' + '<trkpt/>' * 1000 + '</gpx>', '\0',
+    '<gpx>' + ''.join(f'<a{n}/>' for n in range(2000)) + '</gpx>',
+    '<gpx ' + ' '.join(f'a{n}=""' for n in range(2000)) + '/>'])
+def test_a_hostile_gpx_is_one_line(tmp_path, text):
+    with pytest.raises(InputError, match=r'track\.gpx') as caught:
+        read_motion(write(tmp_path / 'track.gpx', text))
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_a_gopro_has_gyro_and_gps_inside(tmp_path):

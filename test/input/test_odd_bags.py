@@ -2,10 +2,13 @@
 from __future__ import annotations
 
 import bz2
+import io
 import os
+import sqlite3
 
 import lz4.frame
 import pytest
+import yaml
 import zstandard
 from made_drives import (
     ROS2,
@@ -21,6 +24,7 @@ from made_drives import (
 )
 from mcap.writer import CompressionType, IndexType
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag1.reader import Header
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from dashcalib_ros.errors import InputError
@@ -70,6 +74,109 @@ def test_a_chunk_that_is_a_bomb_is_left_out(tmp_path, compression, options, smal
 @pytest.mark.parametrize('compression', Writer1.CompressionFormat)
 def test_a_chunk_of_a_ros1_bag_that_is_a_bomb_is_left_out(tmp_path, compression, small_chunks):
     fails('unpacks to more than 0 MB', write_ros1(tmp_path / 'drive.bag', drive(5), compression))
+
+
+@pytest.mark.parametrize('options', [{}, NO_INDEX])
+def test_chunks_are_unpacked_while_all_of_them_are_a_recording(tmp_path, options, monkeypatch):
+    frames = drive(10)
+    file = write_mcap(tmp_path / 'drive.mcap', frames, compression=CompressionType.ZSTD,
+                      chunk_size=4000, **options)
+    same(list(open_frames(file)), frames)
+    monkeypatch.setattr(bag_read, 'UNPACKED_RATIO', 0)
+    monkeypatch.setattr(bag_read, 'UNPACKED_LEAST', 15_000)
+    source = open_frames(file)
+    read = list(source)
+    assert 0 < len(read) < 5
+    same(read, frames[:len(read)])
+    assert 'damaged' in source.warnings[-1] and 'unpacks to more than' in source.warnings[-1]
+
+
+def test_a_ros1_bag_s_chunks_are_unpacked_while_all_of_them_are_a_recording(tmp_path, monkeypatch):
+    monkeypatch.setattr(bag_read, 'UNPACKED_RATIO', 0)
+    monkeypatch.setattr(bag_read, 'UNPACKED_LEAST', 15_000)
+    file = write_ros1(tmp_path / 'drive.bag', drive(10), Writer1.CompressionFormat.BZ2)
+    fails('unpacks to more than', file)
+
+
+def test_only_so_many_overlapping_chunks_are_in_memory(tmp_path, monkeypatch):
+    frames = drive(6)
+    file = write_mcap(tmp_path / 'drive.mcap', [frames[n] for n in (0, 3, 1, 4, 2, 5)],
+                      chunk_size=4000)
+    with bag_read.WITHIN_LIMIT, bag_read._reader(file):
+        pass
+    monkeypatch.setattr(bag_read, 'OVERLAPPING_BYTES', 1)
+    with bag_read.WITHIN_LIMIT, pytest.raises(InputError, match='overlap'):
+        bag_read._reader(file).open()
+    # in the order of the file, where what comes late is left out
+    read = [frame.stamp_ns for frame in open_frames(file)]
+    assert read == [frames[n].stamp_ns for n in (0, 3, 4, 5)]
+
+
+TOPICS = """CREATE TABLE topics(id, name, type, serialization_format, offered_qos_profiles);
+    INSERT INTO topics VALUES(1, '/camera', 'sensor_msgs/msg/Image', 'cdr', '');"""
+COUNTED = 'WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c{})'
+BLOB = "x'" + 10_000 * '00' + "'"
+
+
+@pytest.mark.parametrize('made', [
+    f'CREATE VIEW messages AS {COUNTED.format("")} SELECT n id, 1 topic_id, n timestamp, x data '
+    f'FROM c, (SELECT zeroblob(1000) x)',
+    'CREATE VIEW messages AS SELECT 1 id, 1 topic_id, 1 timestamp, randomblob(900000000) data',
+    'CREATE TABLE messages(id, topic_id, timestamp, data AS (zeroblob(900000000))); '
+    'INSERT INTO messages VALUES(1, 1, 1)',
+    f'CREATE TABLE messages(id, topic_id, timestamp, data DEFAULT {BLOB}); '
+    f'INSERT INTO messages(id, topic_id, timestamp) VALUES(1, 1, 1)'])
+def test_only_what_is_stored_in_tables_is_read(tmp_path, made):
+    with sqlite3.connect(tmp_path / 'odd.db3') as database:
+        database.executescript(f'{TOPICS} {made};')
+    fails('it has more than tables', tmp_path / 'odd.db3')
+
+
+def test_a_query_of_a_database_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(bag_read, 'PIECE', 1000)
+    with sqlite3.connect(tmp_path / 'odd.db3') as database:
+        database.executescript(
+            f'{TOPICS} INSERT INTO topics {COUNTED.format(" LIMIT 500")} SELECT 1, n, "", "", "" '
+            f'FROM c; CREATE TABLE messages(id, topic_id, timestamp, data); INSERT INTO messages '
+            f'{COUNTED.format(" LIMIT 5000")} SELECT n, 1, n, x\'00\' FROM c;')
+    with bag_read.WITHIN_LIMIT, pytest.raises(Exception, match='interrupted'):
+        bag_read._reader(tmp_path / 'odd.db3').open()
+    fails('has no image topic', tmp_path / 'odd.db3')
+
+
+def test_a_ros1_bag_s_index_names_each_chunk_once(tmp_path):
+    file = write_ros1(tmp_path / 'drive.bag', drive(400), Writer1.CompressionFormat.BZ2)
+    data = file.read_bytes()
+    # the last record tells of the last chunk: all of it again, as often as one likes
+    record = next(data[at:] for at in range(len(data), 0, -1) if is_chunk_info(data[at:]))
+    place = data.index(b'chunk_count=') + 12
+    count = int.from_bytes(data[place:place + 4], 'little') + 50
+    file.write_bytes(data[:place] + count.to_bytes(4, 'little') + data[place + 4:] + 50 * record)
+    with bag_read.WITHIN_LIMIT, pytest.raises(InputError, match='chunks overlap'):
+        bag_read._reader(file).open()
+    same(list(open_frames(file)), drive(400))
+
+
+def is_chunk_info(data):
+    """Return whether this is one whole record of a chunk's place."""
+    stream = io.BytesIO(data)
+    try:
+        kind = Header.read(stream).get_uint8('op')
+        return kind == 6 and len(stream.read(4)) == 4 and len(stream.read()) % 8 == 0
+    except Exception:
+        return False
+
+
+@pytest.mark.parametrize('field', [b'conn_count=', b'chunk_count=', b'index_pos='])
+@pytest.mark.parametrize('count', [0, 1, 2**31, 2**32 - 1])
+def test_counts_of_a_ros1_bag_are_no_more_than_a_hint(tmp_path, field, count):
+    file = write_ros1(tmp_path / 'drive.bag', drive(400), Writer1.CompressionFormat.BZ2)
+    data = bytearray(file.read_bytes())
+    place = data.index(field) + len(field)
+    data[place:place + 4] = count.to_bytes(4, 'little')
+    assert data.count(b'op=\x05') > 1
+    file.write_bytes(data)
+    same(list(open_frames(file)), drive(400))
 
 
 def test_messages_of_overlapping_chunks_come_by_time(tmp_path):
@@ -133,6 +240,32 @@ def test_a_count_that_is_none_is_no_obstacle(tmp_path, count):
     source = open_frames(bag)
     same(list(source), drive(3))
     assert 'no usable metadata.yaml' in source.warnings[0]
+
+
+@pytest.mark.parametrize('names', [
+    ['../../etc/passwd'], ['/etc/passwd', '/dev/zero'], ['..', '.', ''],
+    [f'f{n}.mcap' for n in range(1000)]])
+def test_a_metadata_file_that_names_other_files_is_not_used(tmp_path, names):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)))
+    source = open_frames(listing(bag, names))
+    same(list(source), drive(3))
+    assert 'no usable metadata.yaml' in source.warnings[0]
+
+
+def test_a_file_that_is_listed_a_thousand_times_is_read_once(tmp_path):
+    bag = write_bag(tmp_path / 'bag', images(drive(3)))
+    source = open_frames(listing(bag, 1000 * [storage(bag).name]))
+    same(list(source), drive(3))
+    assert source.warnings == ()
+
+
+def listing(bag, names):
+    """Let a bag's metadata.yaml list these files."""
+    path = bag / 'metadata.yaml'
+    content = yaml.safe_load(path.read_text())
+    content['rosbag2_bagfile_information']['relative_file_paths'] = names
+    path.write_text(yaml.safe_dump(content))
+    return bag
 
 
 def test_a_metadata_file_that_is_a_pipe_is_no_obstacle(tmp_path):

@@ -19,8 +19,8 @@ from made_calibration import (
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from dashcalib_ros.camera import Brown, Fisheye, Radial
-from dashcalib_ros.camera.mapping import mapping_error
+from dashcalib_ros.camera import Brown, Fisheye, Radial, camera_from_ros
+from dashcalib_ros.camera.mapping import apart, mapping_error
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.report import (
     NamedCamera,
@@ -256,6 +256,26 @@ def test_a_truth_has_numbers_that_a_computer_can_hold(tmp_path, number):
     with pytest.raises(InputError, match='finite numbers') as caught:
         load_camera(path)
     assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(('change', 'complaint'), [
+    ({'k1': 1e300}, 'k1 = 1e.300, which no lens has'), ({'k2': -1e300}, 'k2 = -1e'),
+    ({'fx': 1e300}, 'fx = 1e'), ({'cy': -1e9}, 'cy = -1e'), ({'fx': 1e-300}, 'sees no ray'),
+    ({'cx': 1e6, 'k1': -1}, 'sees no ray'), ({'width': 60_000, 'height': 60_000}, 'million')])
+def test_numbers_that_no_lens_has_are_one_line(tmp_path, change, complaint):
+    path = tmp_path / 'truth.json'
+    path.write_text(json.dumps({'width': 640, 'height': 480, 'fx': 400, 'fy': 400, 'cx': 320,
+                                'cy': 240, 'k1': 0, 'k2': 0, **change}))
+    with pytest.raises(InputError, match=complaint) as caught:
+        load_camera(path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_lens_whose_rays_no_other_kind_has_is_not_compared():
+    given = camera_from_ros((320, 180), 'equidistant', [200, 0, -1e6, 0, 200, 90, 0, 0, 1],
+                            [0, 10, 0, 10])
+    assert apart(camera_from_ros((320, 180), 'plumb_bob', [200, 0, 160, 0, 200, 90, 0, 0, 1],
+                                 [0.1]), given) is None
 
 
 @pytest.mark.parametrize('missing', ['width', 'height', 'k2'])

@@ -16,7 +16,7 @@ from made_calibration import EACH_MODEL, TRUTH
 from dashcalib_ros.camera import camera_from_ros
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.camera.field import Field
-from dashcalib_ros.errors import ConfigError, InputError, OutputError
+from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, OutputError
 from dashcalib_ros.report import NamedCamera, compare, load_camera, write_text
 from dashcalib_ros.report.export import EXPORTS, cropped, exported, resized
 
@@ -241,6 +241,12 @@ def test_a_resized_picture_s_camera(lens):
     np.testing.assert_allclose(small.project(POINTS), seen, atol=1e-9)
     with pytest.raises(ConfigError, match='--crop'):
         resized(lens, (640, 480))
+
+
+@pytest.mark.parametrize('size', [(0, 0), (0, 10), (10, 0), (10**9, 10**9)])
+def test_a_size_that_is_none(lens, size):
+    with pytest.raises(DashcalibError, match=r'no size of a picture|million pixels'):
+        resized(lens, size)
 
 
 def test_a_part_s_camera(lens):

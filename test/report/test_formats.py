@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 
 import numpy as np
 import pycolmap
@@ -231,3 +232,33 @@ def test_a_bag_whose_camera_info_is_not_clear_is_refused(tmp_path, infos, compla
                              for topic, changes in infos.items())])
     with pytest.raises(InputError, match=complaint):
         load_camera(path)
+
+
+class Opened:
+    """A pickle that would make a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), 'w')
+
+
+def hostile_npz(kind, path):
+    small = {'fx': np.array(1.0)}
+    if kind == 'pickled':
+        np.savez(path, allow_pickle=True, K=np.array([Opened(path.with_name('made'))]), **small)
+    elif kind == 'parts':
+        np.savez(path, **{f'a{n}': np.array(n) for n in range(1100)})
+    else:
+        with zipfile.ZipFile(path, 'w', getattr(zipfile, kind)) as packed:
+            packed.writestr('K.npy', bytes(2**20))
+
+
+@pytest.mark.parametrize('kind', ['pickled', 'parts', 'ZIP_BZIP2', 'ZIP_LZMA', 'ZIP_STORED'])
+def test_a_hostile_npz_is_one_line_and_runs_nothing(tmp_path, kind):
+    hostile_npz(kind, tmp_path / 'a.npz')
+    with pytest.raises(InputError, match=r'a\.npz is no') as caught:
+        load_camera(tmp_path / 'a.npz')
+    assert len(str(caught.value).splitlines()) == 1
+    assert [each.name for each in tmp_path.iterdir()] == ['a.npz']
