@@ -37,7 +37,7 @@ class Status:
     would use now; ready: their turns; yaw_deg: the sum of their yaw. stored: how many turns are of
     earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
     yaws_deg: of the turns in ready, in their order. reconstructed: the turns that watch() has
-    scenes of, chosen or not.
+    scenes of, chosen or not. two_cameras: what the newest images show, if they are of two.
     """
 
     frames: int
@@ -50,6 +50,7 @@ class Status:
     stored: int = 0
     yaws_deg: tuple[float, ...] = ()
     reconstructed: tuple[TurnId, ...] = ()
+    two_cameras: str = ''
 
 
 class Calibrator:
@@ -189,15 +190,20 @@ class Calibrator:
         return self.detection.turns()
 
     def status(self) -> Status:
-        """Return the present state; scenes that are new are written to turns.store."""
-        self.scenes.store_new()
-        chosen, stored = self.scenes.chosen(), len(self.scenes.stored())
+        """Return the present state; scenes that are new are written to turns.store.
+
+        Those of a drive of two cameras are not.
+        """
         found = self.detection
+        if found.other_camera is None:
+            self.scenes.store_new()
+        chosen, stored = self.scenes.chosen(), len(self.scenes.stored())
         return Status(found.frames, len(found.turns()) + stored, len(chosen),
                       sum(scene.yaw_deg for scene in chosen), found.magnitude,
                       found.standing, tuple(scene.turn for scene in chosen), stored,
                       tuple(scene.yaw_deg for scene in chosen),
-                      tuple(self.scenes.all_scenes()))
+                      tuple(self.scenes.all_scenes()),
+                      str(found.other_camera) if found.mixed else '')
 
     def close(self) -> None:
         """End threads and child processes; a calibrate() elsewhere raises WorkerError."""

@@ -24,6 +24,10 @@ PIXELS = 50_000_000
 SIDE = 65_535
 # of one encoded picture or one unpacked message: 50 million raw pixels of 4 bytes fit
 PICTURE_BYTES = MESSAGE_BYTES = 2**28
+# of one encoded picture, as each takes its time however small it is: passes over a JPEG (6 to 20
+# in progressive ones), packed texts of a PNG (0 to 4), its parts (25,000 of 8 kB for 50 million
+# raw pixels of 4 bytes), and entries of a TIFF's directory (20)
+JPEG_SCANS, PNG_TEXTS, PNG_PARTS, TIFF_ENTRIES = 100, 16, 50_000, 1000
 # of one unpacked chunk of a bag: recorders end it at about 1 MB, or after one large message
 CHUNK_BYTES = MESSAGE_BYTES + 2**25
 # of one record of an MCAP as it is stored: a chunk, or a file that is attached

@@ -106,8 +106,8 @@ class Bench:
     """A camera and a listener in one node; nothing waits without a limit."""
 
     def __init__(self, context, namespace='', image_type=Image, topic='image_raw',
-                 reliable=True, listen=True):
-        self.node = rclpy.create_node('bench', context=context, namespace=namespace)
+                 reliable=True, listen=True, name='bench'):
+        self.node = rclpy.create_node(name, context=context, namespace=namespace)
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
         kind = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT

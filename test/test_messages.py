@@ -44,6 +44,7 @@ PARTS = {
         '… of … images; … are lost', '… of … images; none is lost',
         "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again or record it again'},
+    'detect/one_camera.py': {'the same view from another mounting', 'the same view … % …'},
     'detect/turn.py': {'the turn at frame …'},
     'reconstruct/scene_file.py': {
         'it is too large when unpacked', 'it is too large', 'it has too many parts',

@@ -32,6 +32,8 @@ AGREES_PX, AGREES_SHARE = 1.0, 0.15
 STILL_PX = 0.3
 # of reweighted least squares; it has settled after half of them
 ROUNDS = 10
+# px²; what no point tells is 0
+LEAST_NORMAL = 1e-6
 
 
 def goes_on(first: Floats32, middle: Floats32, last: Floats32, followed: float, usual: float
@@ -64,15 +66,27 @@ def _ratio(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
     one, none = np.ones(len(xy)), np.zeros(len(xy))
     design = np.stack([before, np.stack([one, none], 1), np.stack([none, one], 1),
                        np.stack([-around[:, 1], around[:, 0]], 1)], axis=2)
-    # the first parameter is the ratio less 1: 0 where nothing tells it
+    # the first parameter is the ratio less 1: 0 where nothing tells it. As if each point had moved
+    # by STILL_PX more; and equal points determine no roll
     wanted = now - before
-    params = np.array([0.0, *np.median(wanted, axis=0), 0.0])
+    params, off = reweighted(design, wanted, np.array([0.0, *np.median(wanted, axis=0), 0.0]),
+                             np.array([STILL_PX ** 2, 0.0, 0.0, 0.0]))
+    return 1.0 + float(params[0]), off
+
+
+def reweighted(design: Floats, wanted: Floats, start: Floats, prior: Floats
+               ) -> tuple[Floats, Floats]:
+    """Return the parameters (k,) that explain most points' steps, and (n,) how far each is off.
+
+    design: (n, 2, k) px for a unit of each parameter. wanted: (n, 2) px. start: (k,), the first
+    guess. prior: (k,), px² for a unit, of each point: what pulls a parameter to 0.
+    """
+    params = start
     for _ in range(ROUNDS):
         off = np.linalg.norm(wanted - design @ params, axis=1)
         # Cauchy's weights: points on other cars and wrong matches count little
         weights = 1.0 / (1.0 + (off / max(float(np.median(off)), STILL_PX)) ** 2)
         normal = np.einsum('nik,n,nil->kl', design, weights, design)
-        # as if each point had moved that much more; and equal points determine no roll
-        normal += np.diag([weights.sum() * STILL_PX ** 2, 0.0, 0.0, 1e-6])
+        normal += np.diag(weights.sum() * prior + LEAST_NORMAL)
         params = np.linalg.solve(normal, np.einsum('nik,n,ni->k', design, weights, wanted))
-    return 1.0 + float(params[0]), np.linalg.norm(wanted - design @ params, axis=1)
+    return params, np.linalg.norm(wanted - design @ params, axis=1)

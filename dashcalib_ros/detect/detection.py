@@ -12,6 +12,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detector import TurnDetector
 from dashcalib_ros.detect.edges import LineCollector, Lines
 from dashcalib_ros.detect.estimator import MotionEstimator, TrackedPoints
+from dashcalib_ros.detect.one_camera import APART, OtherCamera
 from dashcalib_ros.detect.straights import PAIRS, Straights
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import InputError
@@ -132,7 +133,18 @@ class Detection:
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings for the user, one line each."""
-        return tuple(self._motion.warnings())
+        found = self.other_camera
+        return (*((f'{found}: {APART}',) if found else ()), *self._motion.warnings())
+
+    @property
+    def other_camera(self) -> OtherCamera | None:
+        """Return what images show that are left out; None where they are of the same camera."""
+        return self._motion.one_camera.other
+
+    @property
+    def mixed(self) -> bool:
+        """Return whether the newest images are of two cameras."""
+        return self._motion.one_camera.mixed
 
     def _fixed(self, new: list[Turn]) -> list[Turn]:
         """Fix the frames of all turns: a later turn that overlaps one of them is trimmed.

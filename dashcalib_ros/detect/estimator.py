@@ -14,13 +14,14 @@ from dashcalib_ros.config import MaskConfig, MotionConfig
 from dashcalib_ros.detect.continuity import goes_on
 from dashcalib_ros.detect.epipoles import epipoles_of, turning
 from dashcalib_ros.detect.mask import CELL, EgoMask
+from dashcalib_ros.detect.one_camera import OneCamera
 from dashcalib_ros.detect.points import Tracking, find_clear_corners, follow_points
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
 from dashcalib_ros.detect.straights import PAIRS, STRAIGHT, StraightCollector, Straights
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.scale import shrink_image
-from dashcalib_ros.input.stamps import EARLY, least_step_ns
+from dashcalib_ros.input.stamps import EARLY, Looks, least_step_ns
 
 # px; smaller pictures have no room for points
 LEAST_SIDE = 20
@@ -85,7 +86,10 @@ class _Seen:
 
 
 class MotionEstimator:
-    """Tracks points through the drive and measures how much the car turns."""
+    """Tracks points through the drive and measures how much the car turns.
+
+    one_camera: whether the images that are left out are of the same camera as the others.
+    """
 
     _last: GreyImage | None = None
     _ego: EgoMask | None = None
@@ -93,6 +97,8 @@ class MotionEstimator:
     _valid: Mask | None = None
     _factor: int = 1
     _perhaps_gap: bool = False
+    # the newest image that is left out and looked at
+    _between: GreyImage | None = None
 
     def __init__(self, config: MotionConfig, mask: MaskConfig | None = None,
                  valid: Mask | None = None) -> None:
@@ -110,6 +116,8 @@ class MotionEstimator:
         self._tracking = Tracking(window=(9, 9), levels=3, steps=12, step_px=0.02, border=5)
         self._shape: tuple[int, int] | None = None
         self._straights = StraightCollector()
+        self._looks = Looks()
+        self.one_camera = OneCamera()
         self._reset()
 
     def push(self, frame: Frame) -> Motion | None:
@@ -125,6 +133,8 @@ class MotionEstimator:
             if after_gap:
                 self._reset()
             elif step < least_step_ns(self.config.rate):
+                if self._looks.due(frame.stamp_ns):
+                    self._between = shrink_image(frame.image, self._factor)
                 return None
         image = shrink_image(frame.image, self._factor)
         followed = self._follow(image)
@@ -135,6 +145,10 @@ class MotionEstimator:
         before = self._seen[-1] if self._seen else None
         now = _Seen(frame.index, frame.stamp_ns, self._ids, self._xy, followed)
         moved = math.nan if before is None else _median_shift(*_common(before, now))
+        if before is not None and self._last is not None and self._between is not None:
+            self.one_camera.look((self._last, self._between), *_common(before, now),
+                                 self._tracking)
+        self._between = None
         self._seen.append(now)
         first, middle = self._triplet()
         standing = moved < self.config.standing_px

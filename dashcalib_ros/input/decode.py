@@ -5,6 +5,7 @@ rclpy and of rosbags alike. Needs neither ROS nor cv_bridge.
 """
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import struct
@@ -19,7 +20,15 @@ import numpy.typing as npt
 
 from dashcalib_ros.arrays import GreyImage, Mask, Pixels
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.limits import PICTURE_BYTES, check_pixels, read_file
+from dashcalib_ros.limits import (
+    JPEG_SCANS,
+    PICTURE_BYTES,
+    PNG_PARTS,
+    PNG_TEXTS,
+    TIFF_ENTRIES,
+    check_pixels,
+    read_file,
+)
 
 # OpenCV reports every defect of a file on stderr; what a user must know comes as our own errors.
 # Who wants to see the rest sets OPENCV_LOG_LEVEL
@@ -30,6 +39,11 @@ if 'OPENCV_LOG_LEVEL' not in os.environ:
 
 _DEPTHS = (8, 10, 12, 14, 16)
 _JPEG_START, _JPEG_END = b'\xff\xd8', b'\xff\xd9'
+_JPEG_SCAN = b'\xff\xda'
+_PNG_START = b'\x89PNG\r\n\x1a\n'
+_TIFF_STARTS = (b'II*\0', b'MM\0*')
+# parts of a PNG that are packed
+_PACKED = (b'zTXt', b'iTXt', b'iCCP')
 _VIDEO_FORMATS = ('h264', 'h265', 'hevc', 'av1', 'vp9', 'theora')
 
 
@@ -148,9 +162,12 @@ def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = 
     """Decode the bytes of an image file: (height, width) of 8 or 16 bits.
 
     colour: as for decode. what: the image's name in errors. Raises InputError when the bytes
-    are cut off or no image, or have more pixels than limits allow.
+    are cut off or no image, or have more pixels or parts than limits allow.
     """
-    _encoded_size(memoryview(data), what)  # check the size before memory is used
+    data = bytes(data)
+    # before memory and time are used
+    _encoded_size(memoryview(data), what)
+    _check_parts(data, what)
     buffer = np.frombuffer(data, np.uint8)
     head, tail = buffer[:2].tobytes(), buffer[-4096:].tobytes()
     if head == _JPEG_START and _JPEG_END not in tail:
@@ -174,6 +191,36 @@ def _encoded_size(data: memoryview, what: str) -> tuple[int, int]:
         raise _damaged(what, len(data))
     check_pixels(*size, what)
     return size
+
+
+def _check_parts(data: bytes, what: str) -> None:
+    """Raise InputError for a file of which decoding would take far longer than its size tells."""
+    if data[:2] == _JPEG_START:
+        # also those of a thumbnail in it
+        _check_count(data.count(_JPEG_SCAN), JPEG_SCANS, 'scans', what)
+    elif data[:8] == _PNG_START:
+        texts = 0
+        place = len(_PNG_START)
+        for count in itertools.count(1):
+            if place + 8 > len(data):
+                return
+            size, kind = struct.unpack_from('>I4s', data, place)
+            texts += kind in _PACKED
+            _check_count(count, PNG_PARTS, 'parts', what)
+            _check_count(texts, PNG_TEXTS, 'packed texts', what)
+            place += size + 12
+    elif data[:4] in _TIFF_STARTS:
+        entries = _tiff_entries(data)
+        # each is read for itself, also where many name the same bytes
+        if sum(count * TIFF_BYTES.get(kind, 1) for _, kind, count, _ in entries) > 2 * len(data):
+            raise InputError(f'{what} is damaged: its directory names more than it has; save it '
+                             f'anew')
+
+
+def _check_count(count: int, limit: int, parts: str, what: str) -> None:
+    if count > limit:
+        raise InputError(f'{what} has more than {limit} {parts}, which takes too long to decode: '
+                         f'save it anew')
 
 
 def _damaged(what: str, size: int) -> InputError:
@@ -251,13 +298,14 @@ Size = tuple[int, int]
 
 # start-of-frame markers of a JPEG; C4, C8 and CC are tables
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+MARKER = re.compile(rb'\xff[^\xff]')
 BARE = frozenset((0x01, *range(0xD0, 0xD8)))
 # markers before the size of a JPEG, at the most; cameras write 5 to 20
 MARKERS = 1000
 # width, height, tile width and tile height of a TIFF
 TIFF_TAGS = (256, 257, 322, 323)
-# entries of a TIFF's directory, at the most; cameras write 20
-TIFF_ENTRIES = 1000
+# bytes of a value of each type; others have 1
+TIFF_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 # P1 to P6, width and height, comments between them
 PNM = re.compile(rb'P[1-6](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s')
 
@@ -271,13 +319,13 @@ def encoded_size(data: memoryview) -> Size | None:
     try:
         if start[:2] == b'\xff\xd8':
             return _jpeg_size(bytes(data))
-        if start[:8] == b'\x89PNG\r\n\x1a\n':
+        if start[:8] == _PNG_START:
             return _pair('>II', start, 16)
         if start[:4] == b'RIFF' and start[8:12] == b'WEBP':
             return _webp_size(start)
         if start[:2] == b'BM':
             return _bmp_size(start)
-        if start[:4] in (b'II*\0', b'MM\0*'):
+        if start[:4] in _TIFF_STARTS:
             return _tiff_size(bytes(data))
     except struct.error:
         return None  # cut off before the size
@@ -294,10 +342,8 @@ def _jpeg_size(data: bytes) -> Size | None:
     place = 2
     for _ in range(MARKERS):
         # decoders skip what is between the segments, and markers may be padded
-        place = data.find(b'\xff', place)
-        while place >= 0 and data[place + 1:place + 2] == b'\xff':
-            place += 1
-        if place < 0 or place + 9 > len(data):
+        found = MARKER.search(data, place)
+        if found is None or (place := found.start()) + 9 > len(data):
             return None
         marker = data[place + 1]
         if marker in FRAMES:
@@ -332,17 +378,28 @@ def _bmp_size(data: bytes) -> Size:
 
 
 def _tiff_size(data: bytes) -> Size | None:
-    order = '<' if data[:2] == b'II' else '>'
-    place, = struct.unpack_from(f'{order}I', data, 4)
-    count, = struct.unpack_from(f'{order}H', data, place)
     sides = dict.fromkeys(TIFF_TAGS, 0)
-    for entry in range(min(count, TIFF_ENTRIES)):
-        tag, kind, _ = struct.unpack_from(f'{order}HHI', data, place + 2 + 12 * entry)
+    for tag, _, _, value in _tiff_entries(data):
         if tag in sides:
-            value, = struct.unpack_from(
-                order + ('H' if kind == 3 else 'I'), data, place + 10 + 12 * entry)
             sides[tag] = max(sides[tag], value)
     width, height, tile_width, tile_height = sides.values()
     if not width or not height:
         return None
     return max(width, tile_width), max(height, tile_height)
+
+
+def _tiff_entries(data: bytes) -> list[tuple[int, int, int, int]]:
+    """Return tag, type, count and value of each entry of the first directory.
+
+    Raises InputError for too many, struct.error where the file ends before the last.
+    """
+    order = '<' if data[:2] == b'II' else '>'
+    place, = struct.unpack_from(f'{order}I', data, 4)
+    count, = struct.unpack_from(f'{order}H', data, place)
+    _check_count(count, TIFF_ENTRIES, 'entries', 'a TIFF')
+    entries = []
+    for start in range(place + 2, place + 2 + 12 * count, 12):
+        tag, kind, values = struct.unpack_from(f'{order}HHI', data, start)
+        value, = struct.unpack_from(order + ('H' if kind == 3 else 'I'), data, start + 8)
+        entries.append((tag, kind, values, value))
+    return entries

@@ -15,6 +15,24 @@ GAP = 1.5
 EARLY = 0.25
 
 
+# between two looks at images that are left out: in a few seconds, at any place between those used
+LOOK_NS = 1_020_000_000
+
+
+class Looks:
+    """Chooses among the images that thinning leaves out those that are looked at: one a second."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+
+    def due(self, stamp_ns: int) -> bool:
+        """Return whether this image, which is left out, is to be looked at."""
+        if self._last is not None and 0 <= stamp_ns - self._last < LOOK_NS:
+            return False
+        self._last = stamp_ns
+        return True
+
+
 def least_step_ns(rate: float) -> float:
     """Return how far apart images must be to be used when they are thinned to a rate in Hz."""
     return (1 - EARLY) * 1e9 / rate
@@ -27,11 +45,12 @@ class StampGate:
     image that is not later than the one before is a repetition or came late: it is left out.
 
     rate: Hz, of a live stream, whose images are thinned to it as in MotionEstimator, but before
-    they are decoded; None: a recording, of which all are used. After the clock was set back, a
-    recording's later stamps are shifted so that time goes on; a live stream's stay as they are:
-    the core then begins its tracking anew and keeps its turns. In a live stream an image without a
-    stamp is left out where others have one, also if the first stamp comes late; in a recording the
-    first image decides whether stamps or times of reception are used.
+    they are decoded, and those that it looks at are not left out; None: a recording, of which all
+    are used. After the clock was set back, a recording's later stamps are shifted so that time
+    goes on; a live stream's stay as they are: the core then begins its tracking anew and keeps
+    its turns. In a live stream an image without a stamp is left out where others have one, also if
+    the first stamp comes late; in a recording the first image decides whether stamps or times of
+    reception are used.
 
     unstamped: times of reception are used. repeated: number of images left out as not later than
     the one before; zero: of those left out as without a stamp. set_back: how often the clock was
@@ -45,6 +64,7 @@ class StampGate:
         self.furthest_back_ns = 0
         self._least_ns = least_step_ns(rate) if rate else 0.0
         self._steps: deque[int] = deque(maxlen=31)
+        self._looks = Looks()
         self.forget()
 
     def forget(self) -> None:
@@ -61,7 +81,7 @@ class StampGate:
         if stamp_ns is None:
             return None
         if self._used is not None and 0 <= stamp_ns - self._used < self._least_ns:
-            return None
+            return stamp_ns if self._looks.due(stamp_ns) else None
         self._used = stamp_ns
         return stamp_ns
 

@@ -16,6 +16,7 @@ from dashcalib_ros.camera import AUTO
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.input.motion import SensorStream, speeds_of
@@ -38,6 +39,7 @@ from dashcalib_ros.judge.verdict import (
     Finding,
     judge,
     profile_contrast,
+    two_cameras,
     verdict_of,
 )
 from dashcalib_ros.judge.witnesses import Asked
@@ -69,7 +71,8 @@ class Evidence:
     out, in words. pictures: of turns whose images are gone; None: the report is not wanted.
     start_s: stamp of the first image. lines: upright ones, in the resized images; None where they
     were not looked for. straights: pairs of images of straight driving, likewise. motion: of the
-    car's sensors; asked: what they say.
+    car's sensors; asked: what they say. other_camera: that the stream has,
+    too.
     """
 
     image_size: tuple[int, int]
@@ -89,6 +92,7 @@ class Evidence:
     straights: Straights | None = None
     motion: SensorStream | None = None
     asked: Asked = default(default_factory=Asked)
+    other_camera: OtherCamera | None = None
 
 
 def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] = ()) -> Evidence:
@@ -96,11 +100,15 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
 
     scenes: in any order; a turn without one is listed as not reconstructed.
     """
+    other = detection.other_camera
     return Evidence(
         image_size=detection.size or (0, 0), scale=detection.scale, frames=detection.frames,
         turns=detection.turns(), magnitudes=detection.magnitudes(), mask=detection.valid(),
         built={scene.turn: scene for scene in scenes if scene is not None}, timing={},
-        warnings=detection.warnings(), start_s=detection.start_s, lines=detection.lines(),
+        # the verdict says it
+        warnings=tuple(line for line in detection.warnings()
+                       if not other or not line.startswith(str(other))),
+        other_camera=other, start_s=detection.start_s, lines=detection.lines(),
         straights=detection.straights())
 
 
@@ -113,8 +121,8 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     lines = _straight_lines(solution, evidence, config)
     said = evidence.asked.witnesses
     found = Calibration(
-        verdict=(judge(solution, config.verdict, lines, True, said) if solution
-                 else _verdict_without_solution(evidence)),
+        verdict=(judge(solution, config.verdict, lines, True, said, evidence.other_camera)
+                 if solution else _verdict_without_solution(evidence)),
         image_size=evidence.image_size, camera=None, sigma=None,
         turns=tuple(_summary(turn, scenes.get(turn.id), evidence, solution)
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
@@ -261,7 +269,9 @@ def _verdict_without_solution(evidence: Evidence) -> Verdict:
         what = (f'none of the {len(evidence.turns)} turns could be reconstructed: the pictures '
                 f'are too dark or blurred, or the camera turned without moving')
         cure = 'drive through turns at town speed, in daylight'
-    return verdict_of([Finding('refused', what, cure)])
+    found = [Finding('refused', what, cure)]
+    return verdict_of([two_cameras(evidence.other_camera), *found] if evidence.other_camera
+                      else found)
 
 
 def _summary(turn: Turn, scene: Scene | None, evidence: Evidence, solution: Solution | None

@@ -17,6 +17,7 @@ from dashcalib_ros.camera import MODELS
 from dashcalib_ros.camera.camera import PINHOLE
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect import Bend
+from dashcalib_ros.detect.one_camera import APART, OtherCamera
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.agreement import (
     focal_disagreement,
@@ -64,15 +65,19 @@ class Finding:
 
 
 def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
-          outlook: bool = False, witnesses: Witnesses | None = None) -> Verdict:
+          outlook: bool = False, witnesses: Witnesses | None = None,
+          other_camera: OtherCamera | None = None) -> Verdict:
     """Return the verdict on a solution, its reasons sorted: causes, then those that refuse it.
 
     lines: what straight lines say of it, if there are enough of them. outlook: to tell what one
     more turn would bring, where only knowledge is missing. witnesses: what sensors say of it.
+    other_camera: that is in the stream, too.
     """
     of_lines: tuple[Rule, ...] = () if lines is None else (partial(_lines_disagree, lines),)
     if witnesses is not None:
         of_lines += (partial(_sensors_disagree, witnesses),)
+    if other_camera is not None:
+        of_lines += (lambda *_: two_cameras(other_camera),)
     findings = [found for rule in (*RULES, *of_lines)
                 if (found := rule(solution, config)) is not None]
     findings.sort(key=lambda found: (not found.cause, found.level != 'refused'))
@@ -350,6 +355,11 @@ def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> F
                            f'{lines.sigmas:.0f} times what both may be off)',
                    'look for a curved windscreen or cover before the lens, try another --model, '
                    'or drive more turns')
+
+
+def two_cameras(found: OtherCamera) -> Finding:
+    """Refuse a stream of two cameras: a calibration of one would be given to both."""
+    return Finding('refused', str(found), APART, cause=True)
 
 
 def _sensors_disagree(witnesses: Witnesses, solution: Solution, config: VerdictConfig

@@ -15,7 +15,8 @@ INSTALL = ("calibrator: error: the Python package {name} is missing: source your
 ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
                 'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
                 'std_srvs')
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# SIGHUP: the terminal was closed, or its connection lost
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -24,7 +25,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     # rclpy's own handlers, installed later by rclpy.init, end the spinning and call these too
     signals: list[int] = []
     for each in SIGNALS:
-        signal.signal(each, lambda number, frame: signals.append(number))
+        # nohup: the node outlives its terminal
+        if each != signal.SIGHUP or signal.getsignal(each) is not signal.SIG_IGN:
+            signal.signal(each, lambda number, frame: signals.append(number))
     open_closed_streams()
     one_thread_for_numpy()
     try:

@@ -154,7 +154,7 @@ class CalibratorNode(CameraNode):
 
     def _adopt(self, calibration: Calibration) -> None:
         frame_id = self._intake.source.frame_id if self._intake.source else ''
-        kept = Kept.of(calibration, self._whose, frame_id)
+        kept = Kept.of(calibration, self._whose, frame_id, *self._images.publishers)
         info = self._use(kept)
         self._log.info(f'accepted: {sigma_text(kept.camera)}; {self._save()[1]}')
         if self._own.commit:
@@ -225,6 +225,8 @@ class CalibratorNode(CameraNode):
 
     def _save(self) -> tuple[bool, str]:
         """Write the file; return whether it was written, and a line about it."""
+        if self._held:
+            return False, self._held
         if self._kept is None:
             return False, 'there is no accepted calibration yet'
         if self._stale:

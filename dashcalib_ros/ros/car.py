@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
+from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.input.motion import values_in
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report.wording import mount_text
@@ -138,12 +140,20 @@ class Sensors:
     """Subscribes the sensors that are named, and passes on what they say."""
 
     def __init__(self, node: Node, own: NodeConfig, take: Take) -> None:
-        """take: called as SensorBuffer.add(): with a kind, the stamp in s and the values."""
-        for topic, kind, option in ((own.imu_topic, Imu, 'imu'),
-                                    (own.odom_topic, Odometry, 'odom'),
-                                    (own.fix_topic, NavSatFix, 'gps')):
-            if topic:
+        """take: called as SensorBuffer.add(): with a kind, the stamp in s and the values.
+
+        Raises ConfigError for what is no name of a topic.
+        """
+        for name, kind, option in (('imu_topic', Imu, 'imu'), ('odom_topic', Odometry, 'odom'),
+                                   ('fix_topic', NavSatFix, 'gps')):
+            topic = getattr(own, name)
+            if not topic:
+                continue
+            try:
                 node.create_subscription(kind, topic, partial(_pass_on, take, option), SENSOR)
+            except NameValidationException as error:
+                raise ConfigError(f'{name} {topic!r} is no name of a topic: set one that ros2 '
+                                  f'topic list tells') from error
 
 
 def _pass_on(take: Take, option: str, message: Any) -> None:

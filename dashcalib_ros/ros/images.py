@@ -174,8 +174,8 @@ class ImageInput:
     but loses large images that a reliable one would receive. So it is reliable if all publishers
     are. An override of its QoS comes first: then nothing is followed.
 
-    topic: its full name. compressed: whether it has compressed images. publishers: how many there
-    are. reliability: of the present subscription.
+    topic: its full name. compressed: whether it has compressed images. publishers: the names of
+    their nodes. reliability: of the present subscription.
     """
 
     def __init__(self, node: Node, config: NodeConfig, callback: Callable[[Any], None],
@@ -186,7 +186,7 @@ class ImageInput:
         # as image_transport does: remap the base topic, then append the transport
         base = node.resolve_topic_name('image_raw')
         self.topic = f'{base}/compressed' if self._kind is CompressedImage else base
-        self.publishers = 0
+        self.publishers: tuple[str, ...] = ()
         override = node._parameter_overrides.get(
             f'qos_overrides.{self.topic}.subscription.reliability')
         # without an override, rclpy's parameter would hold the first value for each later one
@@ -226,7 +226,7 @@ class ImageInput:
 
     def _look(self) -> None:
         infos = self._node.get_publishers_info_by_topic(self.topic)
-        self.publishers = len(infos)
+        self.publishers = tuple(sorted(map(_node_name, infos)))
         if not self._auto or not infos or not self.listening:
             return
         fitting = 'reliable' if all(map(_reliable, infos)) else 'best_effort'
@@ -282,6 +282,13 @@ class ImageInput:
 def since_text(silent_s: float | None) -> str:
     """Return since when there are no images, None: none came."""
     return 'yet' if silent_s is None else f'for {silent_s:.0f} s'
+
+
+def _node_name(info: TopicEndpointInfo) -> str:
+    # for a moment, and of programs without ROS, the middleware does not know it
+    if info.node_name.startswith('_NODE_NAME_UNKNOWN'):
+        return 'unknown node'
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 def _reliable(info: TopicEndpointInfo) -> bool:

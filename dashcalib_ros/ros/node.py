@@ -97,6 +97,8 @@ class CameraNode(Node, ABC):
         # in words, as straight stretches show it
         self._moved = ''
         self._verdict: Verdict | None = None
+        # why nothing is learned, published and saved now; '' where all is well
+        self._held = ''
         # what the car's own sensors say of the last calibration, in words
         self._witnesses: list[str] = []
         # not the ROS clock: diagnostics must also be published while a simulation is paused
@@ -236,10 +238,36 @@ class CameraNode(Node, ABC):
         if taken is None:
             return
         index, source = taken
-        self._accompany(message.header, source.size)
+        self._hold()
+        if not self._held:
+            self._accompany(message.header, source.size)
         stamp_ns = self._intake.stamp_ns(message)
-        if stamp_ns is not None:
+        # where one publisher mixes two cameras, its images must tell when that ends
+        if stamp_ns is not None and len(self._images.publishers) < 2:
             self._learner.offer(index, stamp_ns, message, source.size, source.frame_id)
+
+    def _hold(self) -> None:
+        """Look whether the images are of one camera; when they are again, begin anew with turns.
+
+        The camera in use stays.
+        """
+        images, mixed = self._images, self._learner.activity.status.two_cameras
+        before, self._held = self._held, ''
+        if len(images.publishers) > 1:
+            self._held = (f'{len(images.publishers)} publishers on {images.topic} '
+                          f'({", ".join(images.publishers)}): nothing is learned, published or '
+                          f'saved until one is left; remap the others')
+        elif mixed:
+            self._held = (f'{mixed}: nothing is published or saved until one is left; give each '
+                          f'a topic of its own')
+        if self._held and not before:
+            self._log.error(self._held)
+        elif before and not self._held:
+            self._log.warning(f'{images.topic} has the images of one camera again: the turns are '
+                              f'dropped')
+            self._verdict = None
+            self._learner.restart(keep_stored=True)
+            self._intake.forget()
 
     def _on_source(self, before: Source | None, source: Source) -> None:
         """Handle the first source, or a change of it, which drops the turns and the calibration.
@@ -291,7 +319,7 @@ class CameraNode(Node, ABC):
 
     def _on_watched(self, watched: Watched) -> None:
         """Take what turns say of the camera in use; each change is told once in the log."""
-        if watched.camera is not self._trusted():
+        if watched.camera is not self._trusted() or self._held:
             return
         known = self._changes()
         self._monitor = watched.monitor
@@ -302,7 +330,7 @@ class CameraNode(Node, ABC):
             self._log.info('the newest turns fit the calibration again')
 
     def _on_moved(self, moved: Moved) -> None:
-        if moved.camera is self._trusted() and 'mount' not in self._changes():
+        if moved.camera is self._trusted() and not (self._held or 'mount' in self._changes()):
             self._moved = moved.text
             self._log.info(moved.text)
 
@@ -316,8 +344,8 @@ class CameraNode(Node, ABC):
             self._monitor.changes if self._monitor else ())}
 
     def _on_result(self, result: Result) -> None:
-        if result.bank != self._learner.bank:
-            return  # a reset came in between
+        if result.bank != self._learner.bank or self._held:
+            return  # a reset came in between, or nobody knows of which camera it is
         self._verdict = result.calibration.verdict
         self._witnesses = witness_texts(result.calibration.witnesses)
         for text in self._witnesses:
@@ -356,6 +384,8 @@ class CameraNode(Node, ABC):
         return answer
 
     def _calibrate(self) -> tuple[bool, str]:
+        if self._held:
+            return False, self._held
         if self._learner.goal is None:
             return False, '; '.join(self._warnings())
         refused = self._learner.request()
@@ -389,10 +419,8 @@ class CameraNode(Node, ABC):
         intake.complain(learner.inbox.dropped)
         if images.listening:
             images.tell_silence(intake.silent_s)
-        warnings = self._warnings()
-        if images.publishers > 1:
-            warnings.append(f'{images.publishers} publishers on {images.topic}: remap all but one '
-                            f'camera')
+        self._hold()
+        warnings = [*([self._held] if self._held else ()), *self._warnings()]
         now, wanted = learner.activity.status, self._core.turns.wanted
         health = self._health(f'{min(now.built, wanted)} of {wanted} turns, {now.yaw_deg:.0f}° of '
                               f'yaw')
@@ -417,6 +445,7 @@ class CameraNode(Node, ABC):
                 str(each) for each in (self._monitor.lens, self._monitor.mount)
                 if each and not each.confirmed) if self._monitor else '',
             'topic': images.topic,
+            'publishers': ', '.join(images.publishers),
             'reliability': images.reliability,
             'motion sensors': '; '.join(self._witnesses),
             'received': intake.received,
@@ -438,6 +467,8 @@ class CameraNode(Node, ABC):
             return WARN, 'inactive: the node subscribes no images until it is activated'
         if silent_s is None or silent_s > SILENT_S:
             return STALE, f'no image on {self._images.topic} {since_text(silent_s)}'
+        if self._held:
+            return ERROR, self._held
         if health.level != ERROR and warnings:
             return WARN, f'{health.state}: {warnings[0]}'
         if health.level != ERROR and 'lens' in self._changes():

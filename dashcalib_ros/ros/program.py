@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import rclpy
 import rclpy.utilities
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -68,6 +69,17 @@ class Managed(LifecycleNodeMixin, CameraNode):  # type: ignore[misc]
         CameraNode.__init__(self, listen=False)
         LifecycleNodeMixin.__init__(self)
         self.answer_always()
+
+    def _answering(self, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except RuntimeError:
+                # of rcl, which says in one line that there is no such transition
+                if not isinstance(request, ChangeState.Request):
+                    raise
+                return response
+        return super()._answering(answer)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe the images."""

@@ -79,11 +79,13 @@ class Kept:
     mount: Mount | None = None
 
     @classmethod
-    def of(cls, calibration: Calibration, whose: Whose, frame_id: str) -> Kept:
-        """Make it of a calibration that was accepted just now."""
+    def of(cls, calibration: Calibration, whose: Whose, frame_id: str, publisher: str = ''
+           ) -> Kept:
+        """Make it of a calibration that was accepted just now; publisher: the images' node."""
         now = datetime.now(timezone.utc).isoformat(timespec='seconds')
         content = yaml.safe_load(calibration_yaml(calibration, whose.name, now))
-        content['dashcalib'] |= {'topic': whose.topic, 'frame_id': frame_id}
+        content['dashcalib'] |= {'topic': whose.topic, 'frame_id': frame_id,
+                                 'publisher': publisher}
         content['dashcalib'][CHECKSUM] = _checksum(content)
         return cls(calibrated_camera(calibration, whose.name), frame_id, content,
                    mount=calibration.mount)

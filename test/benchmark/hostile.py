@@ -58,9 +58,11 @@ from ros_bench import (
     noise,
     ros_environment,
 )
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
 
+from dashcalib_ros import Calibrator
 from dashcalib_ros.camera import Radial, ros_camera
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.errors import DashcalibError
@@ -69,12 +71,15 @@ from dashcalib_ros.report import load_camera
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.calibrator_node import camera_info
 from dashcalib_ros.ros.images import LASTING
+from dashcalib_ros.ros.settings import specs
 from dashcalib_ros.ros.store import Store, Whose
 
 KEPT = CAMERA_FILE.format(width=320) + OURS
 FX = 200.0
 # s of the soak; quick
 SOAK_S, SHORT_SOAK_S = 900.0, 60.0
+# s; what takes longer waited for a picture: machines are slow
+SLOW_S = 15.0
 # the memory of a soak's end, of that after its first quarter
 FLAT = 1.1
 
@@ -829,6 +834,135 @@ LEFT = [
     Attack('a bag into nowhere', 8, 8, bags_into_nowhere),
     Attack('an old turn store of another camera', 32, 2, old_stores)]
 
+
+# two cameras, and pictures that take long ------------------------------------------------------
+
+def other_view(n: int) -> Callable[[Any], Any]:
+    """Return what another camera shows: longer lenses, mirrored, another mounting."""
+    size, middle = (640, 360), np.array([319.5, 179.5])
+    if n % 6 == 5:
+        return lambda image: np.ascontiguousarray(image[:, ::-1])
+    zoom, roll = ((1.1, 0.0), (1.03, 0.0), (0.95, 0.0), (1.0, 4.0), (1.05, 2.0))[n % 6]
+    matrix = cv2.getRotationMatrix2D(tuple(middle), roll, zoom)
+    return lambda image: cv2.warpAffine(image, matrix, size, borderMode=cv2.BORDER_REFLECT)
+
+
+def two_cameras(_: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Images of another camera where thinning leaves images out: refused; without them not."""
+    lens = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
+    films = {rate: [frame.image for frame in Drive(lens, DriveSpec(
+        seed=0, turns=2, rate=rate, rolling_shutter_ms=20.0)).frames()] for rate in (20.0, 30.0)}
+    sound = len(films)
+    for n in tries:
+        rate = (20.0, 30.0)[n % 2]
+        pattern = ('AB', 'ABA', 'AB', 'AAB')[n % 4]
+        other = other_view(n // 2)
+        with Calibrator() as calibrator:
+            for number, image in enumerate(films[rate]):
+                is_other = n >= sound and pattern[number % len(pattern)] == 'B'
+                calibrator.push(Frame(number, round(number * 1e9 / rate),
+                                      other(image) if is_other else image))
+            found = calibrator.calibrate()
+        told = any('two cameras' in reason for reason in found.verdict.reasons)
+        assert (found.verdict.level, told) == (
+            ('accepted', False) if n < sound else ('refused', True)), found.verdict
+        yield
+
+
+def two_publishers(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """A second publisher comes and goes: no camera_info meanwhile, and no save; then all again."""
+    with running(folder) as (node, camera):
+        still_calibrated(node, camera, 0)
+        for n in tries:
+            second = Bench(camera.node.context, listen=False, name='rear')
+            camera.until(lambda: '/rear' in camera.values.get('publishers', ''), node=node)
+            camera.infos.clear()
+            for number in range(5):
+                for each in (camera, second):
+                    each.publish(image_message(noise(number), START + (100 * n + number) * SECOND))
+            answer = call(node, camera, Trigger, 'save')
+            assert not answer.success and '/rear' in answer.message and not camera.infos
+            second.close()
+            camera.until(lambda: '/rear' not in camera.values['publishers'], node=node)
+            still_calibrated(node, camera, n + 1)
+            yield
+
+
+def slow_pictures(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Small pictures that take a second to a minute to decode: all else goes on meanwhile."""
+    from hostile_pictures import SLOW
+    pictures = [make() for make in SLOW.values()]
+    with running(folder, CompressedImage) as (node, camera):
+        still_calibrated(node, camera, 0)
+        for n in tries:
+            message = compressed_odd(0)
+            message.format, message.data = 'jpeg', []
+            message.data.frombytes(pictures[n % len(pictures)])
+            for _ in range(LASTING):
+                camera.publish(message)
+            begun = time.monotonic()
+            assert call(node, camera, Trigger, 'save').success
+            still_calibrated(node, camera, n + 1)
+            assert time.monotonic() - begun < SLOW_S, 'the node waited for a picture'
+            yield
+
+
+def hangups(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """SIGHUP at any moment of the first seconds: the node ends cleanly, its children too."""
+    for n in tries:
+        node = NodeProcess(folder, command=COMMAND)
+        try:
+            node.wait_for('learning the camera')
+            time.sleep(np.random.default_rng(n).uniform(0.0, 1.0))
+            assert node.stop(signal.SIGHUP) == 0, node.text
+            assert not processes_of(node.process.pid) and 'Traceback' not in node.text
+        finally:
+            node.kill()
+        yield
+
+
+def jumping_clock(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """With use_sim_time, a clock that stands, leaps and goes back: each image is answered."""
+    with running(folder, use_sim_time=True) as (node, camera):
+        clock = camera.node.create_publisher(Clock, '/clock', 10)
+        for n in tries:
+            rng = np.random.default_rng(n)
+            now = int(rng.choice([0, 1, START // SECOND, 2**31 - 1, START // SECOND - 10**6]))
+            for _ in range(int(rng.integers(1, 5))):
+                message = Clock()
+                message.clock.sec = now
+                clock.publish(message)
+            camera.status = None
+            still_calibrated(node, camera, n)
+            camera.until(lambda: camera.status, what='/diagnostics', node=node)
+            yield
+
+
+def odd_parameters(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Any parameter with any value at the start: the node runs, or ends with one line."""
+    names = sorted(specs())
+    odd = ['-1', '0', '1e308', '.nan', '.inf', '99999999999999999999', "''", "'/'", "'a b'", '[]',
+           "['a', 'b']", 'true', "'~nobody/x'", "'../../x'", "'é\\n'", '[1.5, 2.5]']
+    for n in tries:
+        name, value = names[37 * n % len(names)], odd[n % len(odd)]
+        node = NodeProcess(folder, '-p', f'{name}:={value}', command=COMMAND)
+        try:
+            end = time.monotonic() + 30
+            while node.process.poll() is None and 'learning the camera' not in node.text:
+                assert time.monotonic() < end, node.text
+                time.sleep(0.05)
+            if node.process.poll() is None:
+                assert node.stop(signal.SIGTERM) == 0
+            else:
+                assert node.process.returncode == 2, f'{name}:={value}: {node.text}'
+                lines = node.text.splitlines()
+                assert lines[-1].startswith('calibrator: error: '), f'{name}:={value}: {node.text}'
+            assert 'Traceback' not in node.text, f'{name}:={value}: {node.text}'
+        finally:
+            node.kill()
+        yield
+
+
 ATTACKS = [
     *LEFT,
     Attack('SIGKILL while it saves', 20, 1, kills_while_saving),
@@ -848,6 +982,12 @@ ATTACKS = [
     Attack('Ctrl-C at any line', 100, 4, interrupts),
     Attack('a FIFO for a file', 11, 11, pipes),
     Attack('clips of scenes', 88, 6, scene_files),
+    Attack('two cameras on one stream', 26, 4, two_cameras),
+    Attack('two publishers', 20, 3, two_publishers),
+    Attack('pictures that take long', 20, 5, slow_pictures),
+    Attack('SIGHUP', 20, 2, hangups),
+    Attack('a clock that jumps', 40, 5, jumping_clock),
+    Attack('odd parameters at the start', 120, 8, odd_parameters),
     Attack('soak with lost images', 2, 1, soaks)]
 
 

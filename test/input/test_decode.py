@@ -5,12 +5,14 @@ import cv2
 import numpy as np
 import pytest
 from fakes import compressed_message, image_message
+from hostile_pictures import QUICK, SLOW, empty_scans
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.decode import (
     BitDepth,
     decode,
     decode_file,
+    encoded_size,
 )
 
 WIDTH, HEIGHT = 8, 6
@@ -247,3 +249,22 @@ def test_files_are_read_in_colour_where_they_have_it(kind):
     for image in (GREY // 9, colour(BLUE, GREEN, RED)):
         found = decode_file(cv2.imencode(kind, image)[1].tobytes(), colour=True)
         assert np.abs(found.astype(int) - image).max() < 4
+
+
+@pytest.mark.parametrize('kind', SLOW)
+def test_what_takes_long_is_refused_before_it_is_decoded(kind, monkeypatch):
+    monkeypatch.setattr(cv2, 'imdecode', None)
+    with pytest.raises(InputError, match='save it anew'):
+        decode_file(SLOW[kind]())
+
+
+@pytest.mark.parametrize('kind', QUICK)
+def test_what_looks_alike_and_is_quick_is_decoded(kind):
+    data = QUICK[kind]()
+    assert decode_file(data).shape[::-1] == encoded_size(memoryview(data))
+
+
+def test_a_message_that_takes_long_is_refused():
+    with pytest.raises(InputError, match='jpeg image has more than 100 scans'):
+        decode(compressed_message(
+            format='jpeg', data=np.frombuffer(empty_scans(4000), np.uint8)))

@@ -128,6 +128,8 @@ def test_an_invalid_transition_is_answered(managed):
                for number in (Transition.TRANSITION_ACTIVATE, 11, 99, 255)]
     camera.until(lambda: all(each.done() for each in answers), node=node)
     assert not any(each.result().success for each in answers)
+    # each in one line
+    assert node.text.count('No transition matching') == 4 and 'Traceback' not in node.text
     good = client.call_async(ChangeState.Request(
         transition=Transition(id=Transition.TRANSITION_CONFIGURE)))
     camera.until(good.done, node=node)

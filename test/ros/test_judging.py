@@ -11,10 +11,12 @@ import os
 from pathlib import Path
 
 import pytest
+import yaml
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from ros_desk import FIRST, SIGMA
 from sensor_msgs.srv import SetCameraInfo
 from synthetic import synthetic_turn
@@ -22,6 +24,8 @@ from synthetic import synthetic_turn
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
+from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Mount
@@ -62,6 +66,27 @@ def test_its_life_with_a_camera_that_is_bumped(make_desk):
     desk.give(fx=403.0, cx=350.0)
     assert desk.show() == 403.0
     desk.until(lambda: desk.bench.latched[-1].k[0] == 403.0)
+
+
+def test_images_of_two_cameras_get_nothing(make_desk, monkeypatch):
+    desk, found = make_desk(), OtherCamera(10, 20, 'another view')
+    desk.until(lambda: desk.bench.values['publishers'] == '/bench')
+    desk.give()
+    assert desk.show() == 400.0
+    assert yaml.safe_load(desk.file.read_text())['dashcalib']['publisher'] == '/bench'
+    with monkeypatch.context() as patched:
+        patched.setattr(Detection, 'other_camera', found)
+        patched.setattr(Detection, 'mixed', True)
+        desk.until(lambda: 'two cameras' in desk.bench.values['warnings'])
+        assert desk.bench.status.level == DiagnosticStatus.ERROR
+        # neither published, nor accepted, nor saved
+        assert desk.show() is None
+        desk.give(fx=402.0, sigma={**SIGMA, 'fx': 1.0})
+        assert not desk.call('save').success and load_camera(desk.file).camera.fx == 400.0
+    bank = desk.node._learner.bank
+    desk.until(lambda: not desk.bench.values['warnings'])
+    # the turns of the time with two cameras are dropped, what was known before is used again
+    assert desk.node._learner.bank == bank + 1 and desk.show() == 400.0
 
 
 def test_each_outcome_is_one_line_that_says_what_comes_next(make_desk, capfd):

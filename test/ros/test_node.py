@@ -14,6 +14,7 @@ import yaml
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from ros_bench import (
@@ -40,8 +41,8 @@ from dashcalib_ros.report import load_camera
 # -- the end ----------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('signals', [
-    (signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT),
-    (signal.SIGTERM, signal.SIGINT)], ids=['SIGINT', 'SIGTERM', 'two SIGINT', 'both'])
+    (signal.SIGINT,), (signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGINT, signal.SIGINT),
+    (signal.SIGTERM, signal.SIGINT)], ids=['SIGINT', 'SIGTERM', 'SIGHUP', 'two SIGINT', 'both'])
 def test_it_ends_cleanly_while_it_collects(start_node, make_bench, signals):
     node, camera = start_node(command=COMMAND), make_bench()
     camera.connect(node)
@@ -50,7 +51,16 @@ def test_it_ends_cleanly_while_it_collects(start_node, make_bench, signals):
     assert 'Traceback' not in node.text
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_nohup_lets_it_outlive_its_terminal(start_node, make_bench):
+    node, camera = start_node(command=['nohup', *COMMAND]), make_bench()
+    camera.connect(node)
+    node.process.send_signal(signal.SIGHUP)
+    stream(camera, 5)
+    camera.counted('received', 5, node)
+    assert node.stop(signal.SIGTERM) == 0
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('delay', [0.0, 0.2, 0.4])
 def test_it_ends_cleanly_while_it_starts(start_node, number, delay):
     """From the node's own first line on: before that it is Python that starts."""
@@ -251,6 +261,30 @@ def test_two_publishers_of_different_sizes_do_not_reset_it(start_node, make_benc
     node.wait_for('is there a second publisher?')
 
 
+def test_two_publishers_get_nothing_until_one_is_left(start_node, make_bench, tmp_path):
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS)
+    node, first = start_node(), make_bench()
+    first.connect(node)
+    stream(first, 3)
+    first.until(lambda: len(first.infos) == 3, node=node)
+    second = make_bench(listen=False, name='rear_driver')
+    first.until(lambda: '(/bench, /rear_driver)' in first.values['warnings'], node=node)
+    assert first.status.level == DiagnosticStatus.ERROR
+    stream(second, 20, 3)
+    first.counted('received', 23, node)
+    answers = [first.call(name, node) for name in ('save', 'calibrate')]
+    for answer in answers:
+        assert not answer.success
+        assert answer.message.startswith('2 publishers on /image_raw (/bench, /rear_driver): ')
+    assert len(first.infos) == 3
+    second.close()
+    first.until(lambda: first.values['publishers'] == '/bench', node=node)
+    stream(first, 3, 23)
+    first.until(lambda: len(first.infos) == 6, node=node)
+    assert first.call('save', node).success and not first.values['warnings']
+    assert node.text.count('[ERROR]') == 1
+
+
 @pytest.mark.parametrize('change', [{'size': (640, 240)}, {'frame_id': 'rear'}],
                          ids=['size', 'frame'])
 def test_a_change_of_size_or_frame_resets_it_loudly(start_node, make_bench, tmp_path, change):
@@ -341,6 +375,8 @@ def test_services_say_why_not(plain):
     ({'rectified': 'whole'}, 'must be one of same, crop, all'),
     ({'reliability': 'perfect'}, 'must be one of'),
     ({'camera_name': 'narrow_stereo'}, 'belongs to image_pipeline'),
+    ({'imu_topic': "'a b'"}, "imu_topic 'a b' is no name of a topic"),
+    ({'fix_topic': '/'}, "fix_topic '/' is no name of a topic"),
     ({'mask_file': 'missing.png'}, 'cannot read the mask'),
     ({'mask_file': '~nobody-of-this-name/mask.png'}, 'cannot read the mask'),
     ({'mask__segmentation': '~nobody-of-this-name/m.onnx'}, 'there is no segmentation model'),

@@ -1,0 +1,149 @@
+"""Whether all images of a stream are of one camera: some of those left out are compared.
+
+A camera faster than motion.rate is thinned, and what is used may all be of one camera while the
+images between are of another. So one of these is looked at now and then: its points must lie where
+the images before and after it say. Let u be a point's step between these two, and v its step from
+the first to the image between. The car's speed hardly changes in so short a time; the road shifts
+and turns the picture a little, now to one side, now to the other:
+
+    v = share u + shift + roll + zoom
+
+Another lens zooms the picture, another mounting shifts or turns it, each time by the same; of
+another view no point is found again. Measured on rendered and real drives (lessons.md): sound
+cameras zoom by 0.1 % and shift by 1 px, a lens 3 % longer by 3.0 ± 0.1 %.
+"""
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
+from dashcalib_ros.detect.continuity import MIN_POINTS, reweighted
+from dashcalib_ros.detect.points import Tracking, follow_points
+
+APART = 'record each camera on its own, or give each a topic of its own'
+# looks that count, and how many of them must show the same other camera: where it sends every
+# fourth of the images between, a quarter of the looks
+RECENT, SAME = 20, 5
+# of the points that the images before and after have: another view has fewer of them, and fewer of
+# these on their way. Of sound cameras 0.5 to 1 are found. Where the images between were mixed from
+# those around, as for another rate, few are found, but on their way
+LEAST_FOUND, LEAST_NEAR = 0.35, 0.06
+# px, and of its step: how far from its way a point may be found
+NEAR_PX, NEAR_STEP = 2.0, 0.15
+# of the working width, and of the median point's step; an image that is off by more is of another
+# camera, where others are off by the same
+OFF_WIDTH, OFF_STEP = 0.005, 0.15
+# of their median; looks that are nearer to it show the same camera
+ALIKE = 0.5
+# of the grey values' spread; a darker image, as black ones of a broken driver, shows nothing
+LEAST_CONTRAST = 0.3
+# px², as in reweighted(): while the car turns, its motion explains a shift before a mounting does
+SPEED_PRIOR, CAMERA_PRIOR = 1e-3, 1e-4
+
+
+@dataclass(frozen=True)
+class OtherCamera:
+    """What looks at images between those used show: that they are of two cameras.
+
+    shown: how many of the newest looks show the other camera, looks: of how many. what: they show,
+    in words.
+    """
+
+    shown: int
+    looks: int
+    what: str
+
+    def __str__(self) -> str:
+        return (f'the images are of two cameras: between those that are used, {self.shown} of '
+                f'{self.looks} that were looked at show {self.what}')
+
+
+class OneCamera:
+    """Compares images with those around them.
+
+    other: the other camera, from when it was first seen on. mixed: whether the newest looks show
+    it.
+    """
+
+    def __init__(self) -> None:
+        self.other: OtherCamera | None = None
+        # of each look: None for another view; else how far the image is off, as _off() has it, and
+        # whether that is too far
+        self._looks: deque[tuple[Floats, bool] | None] = deque(maxlen=RECENT)
+        self.mixed = False
+
+    def look(self, images: Sequence[GreyImage], before: Floats32, after: Floats32,
+             tracking: Tracking) -> None:
+        """Look at an image between.
+
+        images: the one before it, and itself. before, after: (n, 2) px, where the same points are
+        in the images before and after it.
+        """
+        first, between = images
+        if len(before) < MIN_POINTS or between.std() < LEAST_CONTRAST * first.std():
+            return
+        there, found = follow_points(first, between, before, tracking)
+        at, half, last = (np.asarray(xy[found], np.float64) for xy in (before, there, after))
+        if found.mean() >= LEAST_FOUND:
+            size = np.array(first.shape[::-1])
+            off = _off(at - size / 2, half - at, last - at, size[0] / 2)
+            step = np.linalg.norm(last - at, axis=1)
+            most = OFF_WIDTH * size[0] + OFF_STEP * float(np.median(step))
+            self._looks.append((off, bool(np.linalg.norm(off) * size[0] / 2 > most)))
+        elif _near(half - at, last - at).sum() < LEAST_NEAR * len(before):
+            self._looks.append(None)
+        else:
+            self._looks.append((np.zeros(4), False))
+        now = self._judge()
+        self.mixed, self.other = now is not None, now or self.other
+
+    def _judge(self) -> OtherCamera | None:
+        views = sum(each is None for each in self._looks)
+        if views >= SAME:
+            return OtherCamera(views, len(self._looks), 'another view')
+        off = [each[0] for each in self._looks if each is not None and each[1]]
+        if len(off) < SAME:
+            return None
+        middle = np.median(off, axis=0)
+        alike = np.linalg.norm(off - middle, axis=1) < ALIKE * np.linalg.norm(middle)
+        if alike.sum() < SAME:
+            return None
+        return OtherCamera(int(alike.sum()), len(self._looks), _in_words(middle))
+
+
+def _in_words(off: Floats) -> str:
+    """Return what an image shows that is so far off: (4,) as _off() has it."""
+    zoom = float(off[3])
+    if abs(zoom) < np.linalg.norm(off[:3]):
+        return 'the same view from another mounting'
+    return f'the same view {100 * abs(zoom):.1f} % {"larger" if zoom > 0 else "smaller"}'
+
+
+def _near(to_between: Floats, to_after: Floats) -> Mask:
+    """Return (n,) whether points lie near their way from the image before to the one after.
+
+    to_between, to_after: (n, 2) px, their steps.
+    """
+    length = np.maximum(np.linalg.norm(to_after, axis=1, keepdims=True), 1e-6)
+    share = np.clip((to_between * to_after).sum(1, keepdims=True) / length**2, 0.0, 1.0)
+    aside = np.linalg.norm(to_between - share * to_after, axis=1)
+    return np.asarray(aside < NEAR_PX + NEAR_STEP * length[:, 0])
+
+
+def _off(at: Floats, to_between: Floats, to_after: Floats, half: float) -> Floats:
+    """Return how far the image between is off: (4,) two shifts, of half a width, roll and zoom.
+
+    at: (n, 2) px in the image before, from its centre; to_between, to_after: (n, 2) px, the
+    points' steps from there; half: px, half a width.
+    """
+    around = at / half
+    one, none = np.ones(len(at)), np.zeros(len(at))
+    design = np.stack([to_after, np.stack([one, none], 1), np.stack([none, one], 1),
+                       np.stack([-around[:, 1], around[:, 0]], 1), around], axis=2)
+    params, _ = reweighted(design, to_between, np.zeros(5), np.array(
+        [SPEED_PRIOR, *[CAMERA_PRIOR] * 4]))
+    return params[1:] / half
