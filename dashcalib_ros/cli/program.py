@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -40,6 +41,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code; argv: arguments without the program's name."""
     open_closed_streams()
     one_thread_for_numpy()
+    try:
+        return _main(argv)
+    except Exception as error:
+        # a defect of ours; Python's own exit code, 1, would be an answer: the calibration is wrong
+        write_stderr(''.join(traceback.format_exception(error)).rstrip())
+        return _fail(f'this is a defect of dashcalib_ros ({type(error).__name__}): report it with '
+                     f'the lines above, and the input if you can')
+
+
+def _main(argv: Sequence[str] | None) -> int:
     # the handler is set inside try: a signal may also come while it is set or restored
     try:
         parser = make_parser()

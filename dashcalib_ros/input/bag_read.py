@@ -348,7 +348,7 @@ def _complete(file: Path, journals: Sequence[Path], plain: Path) -> None:
                 pass
     with closing(apsw.Connection(str(plain))) as database:
         database.execute('PRAGMA schema_version').fetchone()  # takes a rollback journal
-        _, frames, _ = database.execute('PRAGMA wal_checkpoint').fetchone()
+        _, frames, _ = database.execute('PRAGMA wal_checkpoint').fetchone() or (0, 0, 0)
         if not frames:
             raise apsw.Error('nothing in it is whole')
         database.execute('PRAGMA journal_mode = DELETE')

@@ -206,3 +206,26 @@ def test_bad_input_is_one_line(files, capfd, arguments, match):
     assert main(arguments) == 2
     errors = capfd.readouterr().err.strip().splitlines()
     assert len(errors) == 1 and match in errors[0]
+
+
+def test_what_nobody_expected_is_no_answer(files, monkeypatch, capfd):
+    def fail(*_):
+        raise ZeroDivisionError('of a defect')
+    monkeypatch.setattr(FakeQuestions, 'check', fail)
+    # Python's own exit code, 1, would be "wrong"
+    assert main(files) == 2
+    error = capfd.readouterr().err
+    assert 'Traceback' in error and error.splitlines()[-1].startswith('dashcalib: error: this is')
+
+
+@pytest.mark.parametrize('name', ['track.txt', 'track.csv'])
+def test_a_track_and_poses_are_known_by_their_content(files, tmp_path, capfd, name):
+    rows = '\n'.join(f'{n / 10},49.0,{8 + n * 1e-5}' for n in range(60))
+    (tmp_path / name).write_text(f'stamp_s,latitude,longitude\n{rows}\n')
+    assert main([*files, '--poses', name]) == 0 and 'turn' in capfd.readouterr().out
+    (tmp_path / name).write_text(''.join(
+        f'{(1700000000 + n) * 10**9},{n},0,0,0,0,0,1\n' for n in range(5)))
+    assert main([*files, '--poses', name]) == 0
+    assert 'taken as nanoseconds' in capfd.readouterr().err
+    assert main([*files, '--motion', name]) == 2
+    assert '--poses' in capfd.readouterr().err
