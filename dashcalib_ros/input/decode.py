@@ -44,6 +44,8 @@ _PNG_START = b'\x89PNG\r\n\x1a\n'
 _TIFF_STARTS = (b'II*\0', b'MM\0*')
 # parts of a PNG that are packed
 _PACKED = (b'zTXt', b'iTXt', b'iCCP')
+# how the EXIF data of a JPEG, a PNG and a WebP begin
+_EXIF = (b'Exif\0\0', b'eXIf', b'EXIF')
 _VIDEO_FORMATS = ('h264', 'h265', 'hevc', 'av1', 'vp9', 'theora')
 
 
@@ -104,7 +106,7 @@ def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) ->
     """Decode a sensor_msgs/Image or CompressedImage: (height, width) uint8, a copy.
 
     message: has encoding, height, width, step, is_bigendian and data; or format and data: a JPEG,
-    PNG, TIFF, WebP, BMP, PGM or PPM.
+    PNG, TIFF, WebP, BMP, PGM or PPM, whose EXIF orientation is not applied: nothing in ROS does.
     depth: the stream's bit depth, for 16-bit encodings; without it, only this image counts.
     colour: (height, width, 3) BGR uint8, unless the image is grey.
 
@@ -112,7 +114,9 @@ def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) ->
     video streams, data that is cut off or damaged, and for more pixels than limits allow.
     """
     if not hasattr(message, 'encoding'):
-        return decode_file(memoryview(message.data), depth, _name(message), colour)
+        # what turns images with their EXIF data are programs for photographs, not those of ROS
+        pixels = decode_pixels(memoryview(message.data), _name(message), colour, as_stored=True)
+        return _to_8_bits(pixels, depth)
     layout = _LAYOUTS.get(str(message.encoding).lower())
     if layout is None:
         raise InputError(f'encoding {message.encoding!r} is not supported: '
@@ -158,11 +162,27 @@ def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
     return _to_8_bits(decode_pixels(data, what, colour), depth)
 
 
-def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = False) -> Pixels:
+def turned_text(data: bytes, what: str) -> str:
+    """Return what a file says to do with its picture, and decode_file() does; '' for nothing."""
+    if not any(mark in data for mark in _EXIF):
+        return ''
+    try:
+        shown, stored = (decode_pixels(data, what, as_stored=stored) for stored in (False, True))
+    except InputError:
+        return ''
+    turns = [90 * n for n in range(4) if np.array_equal(np.rot90(stored, -n), shown)]
+    if not turns:
+        return 'mirror its pictures'
+    return f'turn its pictures by {turns[0]} degrees' if turns[0] else ''
+
+
+def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = False,
+                  as_stored: bool = False) -> Pixels:
     """Decode the bytes of an image file: (height, width) of 8 or 16 bits.
 
-    colour: as for decode. what: the image's name in errors. Raises InputError when the bytes
-    are cut off or no image, or have more pixels or parts than limits allow.
+    colour: as for decode. what: the image's name in errors. as_stored: an EXIF orientation is not
+    applied. Raises InputError when the bytes are cut off or no image, or have more pixels or parts
+    than limits allow.
     """
     data = bytes(data)
     # before memory and time are used
@@ -174,8 +194,10 @@ def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = 
         # OpenCV would fill the rest with grey
         raise InputError(f'{what} is cut off: record or copy it again')
     try:
-        image = cv2.imdecode(buffer, cv2.IMREAD_ANYDEPTH | (
-            cv2.IMREAD_ANYCOLOR if colour else cv2.IMREAD_GRAYSCALE))
+        image = cv2.imdecode(
+            buffer, cv2.IMREAD_ANYDEPTH
+            | (cv2.IMREAD_ANYCOLOR if colour else cv2.IMREAD_GRAYSCALE)
+            | (cv2.IMREAD_IGNORE_ORIENTATION if as_stored else 0))
     except cv2.error:
         image = None
     if image is None:
