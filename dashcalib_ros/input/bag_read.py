@@ -12,7 +12,7 @@ import shutil
 import struct
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -25,6 +25,7 @@ from urllib.parse import quote
 import apsw
 import lz4.frame
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
@@ -196,6 +197,25 @@ class _McapReader(storage_mcap.McapReader):
         if max(accumulate(size for _, size in ends), default=0) > max(
                 OVERLAPPING_BYTES, max(sizes, default=0)):
             raise InputError('too many chunks overlap')
+
+    def messages_scan(self, *which: Any) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """Read a file without an index of its chunks, once it is known what they unpack to."""
+        _Unpacking(Path(str(self.path))).check(sum(self._chunk_sizes()))
+        yield from super().messages_scan(*which)
+
+    def _chunk_sizes(self) -> Iterator[int]:
+        assert self.bio is not None
+        place = self.data_start
+        while place < self.data_end:
+            self.bio.seek(place)
+            head = self.bio.read(33)
+            size = int.from_bytes(head[1:9], 'little')
+            if size > RECORD_BYTES and head[0] in (Opcode.CHUNK, Opcode.MESSAGE):
+                raise InputError('a record is too large')
+            if head[0] == Opcode.CHUNK:
+                # behind the times of its first and last message
+                yield int.from_bytes(head[25:33], 'little')
+            place += 9 + size
 
     def meta_scan(self) -> None:
         """Leave a file without an index to scan_mcap()."""

@@ -13,11 +13,15 @@ import contextlib
 import json
 import os
 import re
+import resource
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
+import unicodedata
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,6 +71,7 @@ from dashcalib_ros.camera import Radial, ros_camera
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.motion_files import read_motion
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.calibrator_node import camera_info
@@ -963,6 +968,155 @@ def odd_parameters(folder: Path, tries: Sequence[int]) -> Iterator[None]:
         yield
 
 
+# small files that become large, and texts that act ------------------------------------------
+
+# bytes of memory and s that the smallest command may take with any small file
+MOST_BYTES, MOST_S = 4 * 2**30, 60
+FORGED = 'a\x1b[2J\x9b1m\u202eb\nverdict: accepted'
+
+
+def limited(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command within memory and time; it ends with one line, without a traceback."""
+    done = subprocess.run(
+        dashcalib(*arguments), capture_output=True, text=True, timeout=MOST_S, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES)))
+    assert 'Traceback' not in done.stderr and 'out of memory' not in done.stderr, done.stderr
+    acting = [sign for sign in done.stdout + done.stderr
+              if sign != '\n' and unicodedata.category(sign) in ('Cc', 'Cf')]
+    assert not acting, acting
+    return done
+
+
+def endless_databases() -> list[str]:
+    """Return SQL that makes bags of more than they store."""
+    topics = ("CREATE TABLE topics(id, name, type, serialization_format, offered_qos_profiles); "
+              "INSERT INTO topics VALUES(1, '/camera', 'sensor_msgs/msg/Image', 'cdr', '');")
+    count = 'WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c{}) '
+    blob = 10**6 * '00'
+    return [
+        f'{topics} CREATE VIEW messages AS {count.format("")} SELECT n id, 1 topic_id, n '
+        f'timestamp, zeroblob(1000) data FROM c',
+        f'{topics} CREATE VIEW messages AS SELECT 1 id, 1 topic_id, 1 timestamp, '
+        f'randomblob(900000000) data',
+        f'{topics} CREATE TABLE messages(id, topic_id, timestamp, data AS '
+        f'(zeroblob(900000000))); INSERT INTO messages {count.format(" LIMIT 10000")} '
+        f'SELECT n, 1, n FROM c',
+        f"{topics} CREATE TABLE messages(id, topic_id, timestamp, data DEFAULT x'{blob}'); INSERT "
+        f"INTO messages(id, topic_id, timestamp) {count.format(' LIMIT 10000')} SELECT n, 1, n "
+        f"FROM c",
+        f"{topics} INSERT INTO topics {count.format(' LIMIT 9000')} SELECT 1, n, '', '', '' FROM "
+        f"c; CREATE TABLE messages(id, topic_id, timestamp, data); INSERT INTO messages "
+        f"{count.format(' LIMIT 100000')} SELECT n, 1, n, x'00' FROM c"]
+
+
+def packed_bag(path: Path, same_time: bool, indexed: bool) -> None:
+    """Write an MCAP of 200 chunks of 256 MB each, in less than 10 MB."""
+    from mcap.writer import CompressionType, IndexType, Writer
+    with path.open('wb') as stream:
+        writer = Writer(stream, chunk_size=1, compression=CompressionType.ZSTD,
+                        index_types=IndexType.ALL if indexed else IndexType.NONE)
+        writer.start('ros2', 'hostile')
+        schema = writer.register_schema('sensor_msgs/msg/Image', 'ros2msg', b'')
+        channel = writer.register_channel('/camera', 'cdr', schema)
+        data = bytes(2**28 - 100)
+        for n in range(200):
+            stamp_ns = 1 if same_time else n + 1
+            writer.add_message(channel, stamp_ns, data, stamp_ns)
+        writer.finish()
+
+
+def bombs(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Small files of each kind that become large, or take for ever; the bound is the command's."""
+    csv, gpx, npz = folder / 'm.csv', folder / 'm.gpx', folder / 'm.npz'
+    for n in tries:
+        path = folder / f'{n}'
+        match n:
+            case 0 | 1 | 2 | 3 | 4:
+                path = path.with_suffix('.db3')
+                with sqlite3.connect(path) as database:
+                    database.executescript(endless_databases()[n] + ';')
+                assert limited('turns', path).returncode == 2
+            case 5 | 6 | 7:
+                path = path.with_suffix('.mcap')
+                packed_bag(path, n == 6, n != 7)
+                assert path.stat().st_size < 10**7
+                assert limited('turns', path).returncode == 2
+            case 8:
+                names = ','.join(['stamp_s', 'speed', *(f'a{k}' for k in range(20_000))])
+                csv.write_text('\n'.join([names, *20_000 * ['1']]))
+                assert read_motion(csv).empty
+            case 9 | 10 | 11 | 12:
+                gpx.write_text('<gpx ' + [
+                    ' '.join(f'xmlns:n{k}="u{k}"' for k in range(100_000)) + '/>',
+                    '>' + 10**6 * '<a>', '>' + ''.join(f'<a{k}/>' for k in range(10**6)),
+                    'a="' + 10**8 * 'x' + '"/>'][n - 9])
+                try:
+                    read_motion(gpx)
+                except DashcalibError:
+                    pass
+                else:
+                    raise AssertionError('it is taken')
+            case 13:
+                csv.write_text('clip,camera\n' + ''.join(f'{k}.mp4,{k}\n' for k in range(10**5)))
+                done = limited('batch', csv, '--out', folder / 'out', '--workers', 1, '--quiet')
+                assert done.returncode == 3, done.stderr
+            case 14:
+                np.savez(npz, allow_pickle=True, K=np.array([Path]), fx=np.array(1.0))
+                assert limited('export', npz, '--to', 'ros').returncode == 2
+            case _:
+                with zipfile.ZipFile(npz, 'w', zipfile.ZIP_BZIP2) as packed:
+                    packed.writestr('K.npy', bytes(2**30))
+                assert limited('export', npz, '--to', 'ros').returncode == 2
+        yield
+
+
+def numbers(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Numbers that a file may say and no lens has, in compare and export."""
+    right, wrong = folder / 'right.yaml', folder / 'wrong.yaml'
+    right.write_text(KEPT)
+    places = ('200.0, 0.0, 160.0', '0.0, 201.0, 120.0', '-0.1, 0.01')
+    for n in tries:
+        value = ('1e300', '-1e300', '1e-300', '1e12', '.inf', '.nan')[n // 3 % 6]
+        wrong.write_text(KEPT.replace(places[n % 3], ', '.join(
+            [value, *places[n % 3].split(', ')[1:]])))
+        for arguments in (('compare', right, wrong), ('compare', wrong, right), (
+                'export', wrong, '--to', 'rays', '--out', folder / 'rays.npz')):
+            assert limited(*arguments).returncode in (0, 2)
+        assert limited('export', right, '--to', 'ros', '--size', '0x0').returncode == 2
+        yield
+
+
+def forged_texts(folder: Path, tries: Sequence[int]) -> Iterator[None]:
+    """Names that clear a screen, forge a line or are formulas: they are shown, and do nothing."""
+    kept, bag = folder / FORGED, folder / 'bag.mcap'
+    kept.write_text(KEPT)
+    write_mcap_of(bag, FORGED)
+    csv = folder / 'm.csv'
+    csv.write_text(f'clip,camera,make\ngone.mp4,"{FORGED}","=cmd|\'/c calc\'!A1"\n')
+    given = [('compare', kept, kept), ('compare', folder / f'{FORGED}.gone', kept),
+             ('export', kept, '--to', 'ros'), ('turns', kept), ('turns', bag),
+             ('turns', bag, '--topic', FORGED), ('check', kept, bag),
+             ('batch', csv, '--out', folder / 'out', '--workers', 1)]
+    for n in tries:
+        done = limited(*given[n])
+        assert '\nverdict: accepted' not in done.stdout + done.stderr
+        if given[n][0] == 'batch':
+            assert ',"\'=cmd' in (table := (folder / 'out' / 'cameras.csv').read_text()) or (
+                ",'=cmd" in table)
+        yield
+
+
+def write_mcap_of(path: Path, topic: str) -> None:
+    """Write a bag with a message on a topic of any name."""
+    from mcap.writer import Writer
+    with path.open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2', 'hostile')
+        schema = writer.register_schema(f'std_msgs/msg/{FORGED}', 'ros2msg', b'')
+        writer.add_message(writer.register_channel(topic, 'cdr', schema), 1, b'', 1)
+        writer.finish()
+
+
 ATTACKS = [
     *LEFT,
     Attack('SIGKILL while it saves', 20, 1, kills_while_saving),
@@ -988,6 +1142,11 @@ ATTACKS = [
     Attack('SIGHUP', 20, 2, hangups),
     Attack('a clock that jumps', 40, 5, jumping_clock),
     Attack('odd parameters at the start', 120, 8, odd_parameters),
+
+
+    Attack('small files that become large', 16, 16, bombs),
+    Attack('numbers that no lens has', 18, 3, numbers),
+    Attack('names that act', 8, 8, forged_texts),
     Attack('soak with lost images', 2, 1, soaks)]
 
 

@@ -76,7 +76,7 @@ def test_a_chunk_of_a_ros1_bag_that_is_a_bomb_is_left_out(tmp_path, compression,
     fails('unpacks to more than 0 MB', write_ros1(tmp_path / 'drive.bag', drive(5), compression))
 
 
-@pytest.mark.parametrize('options', [{}, NO_INDEX])
+@pytest.mark.parametrize('options', [{}, NO_INDEX, {'index_types': IndexType.NONE}])
 def test_chunks_are_unpacked_while_all_of_them_are_a_recording(tmp_path, options, monkeypatch):
     frames = drive(10)
     file = write_mcap(tmp_path / 'drive.mcap', frames, compression=CompressionType.ZSTD,

@@ -26,6 +26,8 @@ from ros_bench import (
 )
 from sensor_msgs.msg import CompressedImage
 
+from dashcalib_ros.ros.diagnostics import Complaints, Log
+
 CONFIG = REPOSITORY / 'config'
 
 
@@ -197,3 +199,24 @@ def test_the_configuration_for_rviz_has_what_rviz_writes():
     for each in manager['Displays']:
         assert each['Class'] == 'rviz_default_plugins/Image' and each['Enabled']
         assert each['Topic']['Reliability Policy'] in ('Reliable', 'Best Effort')
+
+
+def test_texts_of_others_make_no_lines_of_their_own_in_the_log(capfd):
+    log = Log('odd')
+    for write in (log.info, log.warning, log.error):
+        # one line of code, and three severities
+        assert write('the driver refused: no\x1b[2K\r\n[INFO] [calibrator]: accepted\u202e')
+    lines = ''.join(capfd.readouterr()).splitlines()
+    assert len(lines) == 3
+    assert all(r'refused: no\x1b[2K\r\n[INFO] [calibrator]: accepted\u202e' in each
+               for each in lines)
+
+
+def test_an_unexpected_failure_is_logged_line_by_line(capfd):
+    said = []
+    try:
+        raise ValueError('a\nb')
+    except ValueError as error:
+        Complaints(said.append).failure('kind', error)
+    assert said[0] == 'the node goes on after ValueError: a b' and len(said) > 3
+    assert not any('\n' in each for each in said)
