@@ -49,6 +49,14 @@ _EXIF = (b'Exif\0\0', b'eXIf', b'EXIF')
 _VIDEO_FORMATS = ('h264', 'h265', 'hevc', 'av1', 'vp9', 'theora')
 
 
+# of a 16-bit image: pixels between those that are looked at, and the percentiles of their range
+STEP, OF_PIXELS = 4, (1, 99)
+# bits by which a range is far from 0, and smaller than the values that the depth has
+FAR_FROM_0, FEW = 3, 2
+# values of a range that is stretched, and of an image that tells it; in fewer there is noise only
+LEAST_RANGE, FLAT = 64, 16
+
+
 class BitDepth:
     """How many bits of a stream's 16-bit images are used: one object per stream.
 
@@ -56,16 +64,51 @@ class BitDepth:
     message says so. The depth is the smallest of 8, 10, 12, 14, 16 that holds every value seen so
     far. It never shrinks: the brightness changes at most four times in a drive, each time because
     a pixel did not fit the old depth.
+
+    A thermal camera's values are temperatures: a few, far from 0. If the first image is such a
+    one, of those that are not flat, the range of its values is stretched to 8 bits instead. It
+    never shrinks either.
     """
 
     def __init__(self) -> None:
         self.bits = _DEPTHS[0]
+        self._window: tuple[int, int] | None = None
+        self._undecided = True
 
     def to_8_bits(self, pixels: npt.NDArray[np.uint16]) -> GreyImage:
-        """Return the upper 8 bits in use, same shape."""
+        """Return the upper 8 bits in use, or the range that is, same shape."""
         needed = int(pixels.max()).bit_length()
         self.bits = max(self.bits, next(depth for depth in _DEPTHS if depth >= needed))
+        if self._undecided or self._window:
+            # dead pixels are not counted
+            low, high = map(int, np.percentile(pixels[::STEP, ::STEP], OF_PIXELS))
+            if self._window:
+                self._window = _widened(self._window, low, high)
+            elif high - low >= FLAT:
+                self._undecided = False
+                if low << FAR_FROM_0 >= 1 << self.bits and (high - low) << FEW <= 1 << self.bits:
+                    self._window = _widened((low, low + 1), low, high)
+        if self._window:
+            start, end = self._window
+            scaled = (pixels.astype(np.int32) - start) * 256 // (end - start)
+            return np.clip(scaled, 0, 255).astype(np.uint8)
         return (pixels >> (self.bits - 8)).astype(np.uint8)
+
+
+def _widened(window: tuple[int, int], low: int, high: int) -> tuple[int, int]:
+    """Return a range [start, end) with this one, and with low and high, in it; itself if it has.
+
+    Its length is a power of two, and a quarter of that divides its start: it rarely changes.
+    """
+    start, end = window
+    if start <= low and high < end and end - start >= LEAST_RANGE:
+        return window
+    low, high = min(start, low), max(end - 1, high)
+    size = max(LEAST_RANGE, 1 << (high - low).bit_length())
+    while low // (size // 4) * (size // 4) + size <= high:
+        size *= 2
+    start = low // (size // 4) * (size // 4)
+    return start, start + size
 
 
 @dataclass(frozen=True)

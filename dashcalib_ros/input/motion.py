@@ -152,12 +152,15 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
     for kind, (stamps_s, rows) in values.items():
         stamps_s, rows = np.asarray(stamps_s, np.float64), np.asarray(rows, np.float64)
         # whole seconds of a GPS at 10 Hz: the first one is at its time
-        again = np.diff(stamps_s, prepend=np.nan) == 0
-        if again.sum() > DAMAGED * len(again):
-            warnings.append(f'of the {NAMES[kind]} of {what} several have one stamp: the first of '
-                            f'each is used')
+        with np.errstate(invalid='ignore'):
+            again = np.diff(stamps_s, prepend=np.nan) == 0
+        thinned = again.sum() > DAMAGED * len(again)
+        if thinned:
             stamps_s, rows = stamps_s[~again], rows[~again]
         samples, trouble = _cleaned(stamps_s, rows, kind)
+        if thinned and samples is not None:
+            warnings.append(f'of the {NAMES[kind]} of {what} several have one stamp: the first of '
+                            f'each is used')
         if trouble:
             warnings.append(f'the {NAMES[kind]} of {what} are not used: {trouble}')
         if samples is not None:

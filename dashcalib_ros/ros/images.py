@@ -161,10 +161,14 @@ class Intake:
     def complain(self, dropped: int) -> None:
         """Tell what went wrong since the last call; dropped: images dropped by the detection."""
         stamps = self._stamps
+        if stamps.fault:
+            self._complaints.once(f'{stamps.fault}: the times of reception are used instead; '
+                                  f'repair the driver')
         for kind, count in (('lost', stamps.lost), ('dropped', dropped),
                             ('repeated', stamps.repeated), ('unstamped', stamps.zero),
                             ('set_back', stamps.set_back)):
-            self._complaints.total(kind, count, CURES[kind])
+            if kind != 'repeated' or not stamps.fault:
+                self._complaints.total(kind, count, CURES[kind])
 
 
 class ImageInput:
@@ -174,8 +178,8 @@ class ImageInput:
     but loses large images that a reliable one would receive. So it is reliable if all publishers
     are. An override of its QoS comes first: then nothing is followed.
 
-    topic: its full name. compressed: whether it has compressed images. publishers: the names of
-    their nodes. reliability: of the present subscription.
+    topic: its full name; base: without the transport. compressed: whether it has compressed
+    images. publishers: the names of their nodes. reliability: of the present subscription.
     """
 
     def __init__(self, node: Node, config: NodeConfig, callback: Callable[[Any], None],
@@ -184,7 +188,7 @@ class ImageInput:
         self._callback = callback
         self._kind = CompressedImage if config.image_transport == 'compressed' else Image
         # as image_transport does: remap the base topic, then append the transport
-        base = node.resolve_topic_name('image_raw')
+        self.base = base = node.resolve_topic_name('image_raw')
         self.topic = f'{base}/compressed' if self._kind is CompressedImage else base
         self.publishers: tuple[str, ...] = ()
         override = node._parameter_overrides.get(
@@ -272,11 +276,17 @@ class ImageInput:
         own = {name for name, _ in node.get_publisher_names_and_types_by_node(
             node.get_name(), node.get_namespace())}
         found = [(name, KINDS[kind]) for name, kinds in node.get_topic_names_and_types()
-                 for kind in kinds if kind in KINDS and name not in own]
+                 for kind in kinds if kind in KINDS and name not in own and not self._drawn(name)]
         return [f'-r image_raw:={name.removesuffix("/compressed")} -p image_transport:={transport}'
                 for name, transport in sorted(found) if node.count_publishers(name)
                 # image_transport knows a compressed topic by its name only
                 and (transport == 'raw' or name.endswith('/compressed'))][:MOST_TOPICS]
+
+
+    def _drawn(self, topic: str) -> bool:
+        """Return whether another node like this one draws what is on a topic, for people."""
+        place, _, _ = topic.removesuffix('/compressed').rpartition('/')
+        return self._node.count_publishers(f'{place}/turn_magnitude') > 0
 
 
 def since_text(silent_s: float | None) -> str:

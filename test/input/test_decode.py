@@ -310,3 +310,36 @@ def test_a_folder_tells_that_its_pictures_are_turned(tmp_path):
     assert source.warnings == (
         f'{tmp_path} says (EXIF) to turn its pictures by 90 degrees: the calibration is for the '
         f'pictures as they are shown so',)
+
+
+def thermal(low, high, seed=0, **changes):
+    """Return a 16-bit image whose values are temperatures, with a dead pixel."""
+    noise = np.random.default_rng(seed).integers(0, 3, (40, 60))
+    values = np.linspace(low, high, 60)[None] + noise
+    pixels = values.astype(np.uint16)
+    pixels[3, 5] = 0
+    return message('16UC1', pixels, **changes)
+
+
+@pytest.mark.parametrize('big', [False, True])
+@pytest.mark.parametrize('low, high', [(7400, 7527), (29000, 31000), (7000, 9000)])
+def test_temperatures_are_stretched(low, high, big):
+    image = decode(thermal(low, high, big=big), BitDepth())
+    assert np.ptp(np.percentile(image, (2, 98))) > 90
+    columns = image.mean(axis=0)
+    assert (np.diff(columns[1:-1]) > 0).all()
+
+
+def test_the_range_of_temperatures_grows_rarely_and_never_shrinks():
+    depth, maps = BitDepth(), set()
+    for n in range(200):
+        decode(thermal(7400 - n, 7500 + n, n), depth)
+        maps.add(depth._window)
+    assert len(maps) <= 5
+    again = decode(thermal(7400, 7500), depth)
+    assert np.ptp(again) < 100 and len({depth._window} | maps) == len(maps)
+
+
+def test_cameras_whose_values_begin_at_0_are_as_before():
+    pixels = np.linspace(100, 4000, 2400).reshape(40, 60).astype(np.uint16)
+    np.testing.assert_array_equal(decode(message('mono16', pixels), BitDepth()), pixels >> 4)
