@@ -191,8 +191,9 @@ def _name(message: Any) -> str:
     if 'compresseddepth' in name.lower():
         raise InputError(f'format {name!r} is a depth image: choose the topic of a camera image')
     if any(video in name.lower() for video in _VIDEO_FORMATS):
-        raise InputError(f'format {name!r} is a video stream: republish it as jpeg '
-                         f'(image_transport republish)')
+        raise InputError(f'format {name!r} is a video, of which no picture stands alone: set '
+                         f'image_transport:=video, or republish it as jpeg (image_transport '
+                         f'republish)')
     return f'{name or "compressed"} image'
 
 
