@@ -62,7 +62,7 @@ PARTS = {
     'workers/worker.py': {' in the environment before Python starts'},
     'workers/pool.py': {'…; … is tried again'},
 }
-NO_MESSAGE = re.compile(r'\s*(SELECT|PRAGMA|import) ')
+NO_MESSAGE = re.compile(r'\s*(SELECT|PRAGMA|import|time timestamp|std_msgs/Header header)\s')
 MODULES = sorted(path for name in EXPLAINED for path in
                  ([PACKAGE / name] if name.endswith('.py') else (PACKAGE / name).glob('*.py')))
 

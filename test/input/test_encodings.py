@@ -3,9 +3,7 @@ from __future__ import annotations
 
 import base64
 import json
-from fractions import Fraction
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from made_drives import COMPRESSED, ROS2, START, STEP, head, info_of
+from made_packets import SIZE, encoded, levels
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -29,30 +28,8 @@ from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.report.export import exported
 
-SIZE = (64, 48)
 LENS = Radial(SIZE, 50.0, 51.0, 31.0, 23.0, -0.1, 0.01)
 FURTHER = types(Stores.ROS2_JAZZY)
-
-
-def levels(count=20):
-    """Return pictures that tell their number: each of another brightness."""
-    return [np.full(SIZE[::-1], 40 + 8 * n, np.uint8) for n in range(count)]
-
-
-def encoded(pictures, codec='libx264', key_every=8, **options):
-    """Return a packet of each picture, as a publisher of a video makes them."""
-    context = av.CodecContext.create(codec, 'w')
-    context.width, context.height, context.pix_fmt = *SIZE, 'yuv420p'
-    context.time_base, context.gop_size = Fraction(1, 10), key_every
-    context.options = options or {'tune': 'zerolatency', 'x265-params': 'log-level=none'}
-    packets = []
-    for n, picture in enumerate(pictures):
-        frame = av.VideoFrame.from_ndarray(np.repeat(picture[..., None], 3, 2), 'bgr24')
-        frame.pts = n
-        packets += context.encode(frame)
-    packets += context.encode(None)
-    # of H.264 with pictures between others: in the order in which they are decoded
-    return [(packet.pts, bytes(packet)) for packet in packets]
 
 
 def video_message(kind, number, data, name):
