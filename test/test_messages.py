@@ -30,7 +30,7 @@ PARTS = {
         'there are more than … of them', '… of … are damaged, doubled or out of order',
         'no car turns at … rad/s; write rad/s, not degrees a second',
         'they are not of one drive'},
-    'input/motion_files.py': {'stamp_s and any of …'},
+    'input/motion_files.py': {'stamp_s and any of …', 'more than … levels or … names'},
     'input/bag_write.py': {
         "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"},
     'input/bag_read.py': {
@@ -38,8 +38,13 @@ PARTS = {
         'nothing in it is whole', '… was not closed, and its end is taken from …',
         '… was not closed, and …, which has its end, cannot be used (…)',
         'a part of the bag unpacks to more than … MB',
-        'the index does not lead to all messages'},
+        'the index does not lead to all messages', 'its rows have more than the file',
+        'there is no index', 'its chunks unpack to more than … MB, which is no recording',
+        'the index is too large', 'too many chunks overlap', 'there is more than the head says',
+        'a record is too large'},
     'input/bag_storage.py': {
+        'does not start like a bag|more than|too large|too many',
+        'is it a recording? copy it again or record it again',
         '… images; how many are lost is not known',
         '… of … images; … are lost', '… of … images; none is lost',
         "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
@@ -47,15 +52,15 @@ PARTS = {
     'detect/one_camera.py': {'the same view from another mounting', 'the same view … % …'},
     'detect/turn.py': {'the turn at frame …'},
     'reconstruct/scene_file.py': {
-        'it is too large when unpacked', 'it is too large', 'it has too many parts',
+        'it is too large when unpacked', 'it is too large',
         'it has format …, this version has …', 'its numbers are no valid scene',
         'it is no file of turns, or one of an older version', '… is not finite, or too large',
-        'it is compressed in an unknown way', '… is smaller than its header says'},
+        '… is smaller than its header says'},
     'turn_store.py': {'set turns.store to a folder you may write to'},
     'cli/run.py': {
         'written: … with … messages on …', 'rendered and calibrated in … s',
-        'no estimate to compare with the truth', '…\nnext: dashcalib run, with the same INPUT',
-        '…\nnext: record a drive with turns at crossings, in daylight',
+        'no estimate to compare with the truth', 'next: dashcalib run, with the same INPUT',
+        'next: record a drive with turns at crossings, in daylight',
         'prominence: how far a turn stands out from the driving before and after it, as a share '
         'of the picture width; frames are counted from 0'},
     'workers/child.py': {'used no processor time for … s'},

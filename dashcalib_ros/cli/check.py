@@ -4,7 +4,6 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
@@ -62,6 +61,7 @@ def check(args: argparse.Namespace) -> int:
         raise UsageError(f'{named.name} does not say how the camera sits on the car: give a '
                          f'result.json or calibration.yaml that dashcalib run has written')
     poses, track = _poses(args)
+    warn(poses.warnings if poses else ())
     if args.out is not None:
         if args.poses is None:
             raise UsageError('--out is for the paths that --poses compares; add --poses FILE')
@@ -80,11 +80,10 @@ def check(args: argparse.Namespace) -> int:
         if track is not None:
             track = track.since(calibration.start_s)
             assert track.position is not None
-            poses = replace(track_poses(track.position, calibration.start_s),
-                            warnings=track.warnings)
+            poses = track_poses(track.position, calibration.start_s)
         if poses is not None and given.image_size == calibration.image_size:
             motion = questions.odometry(given, calibration, poses, stages.show)
-    warn((*source.warnings, *calibration.warnings, *(poses.warnings if poses else ())))
+    warn((*source.warnings, *calibration.warnings, *(track.warnings if track else ())))
     now, before = calibration.mount, named.mount
     if args.json:
         write_stdout(json.dumps(answer_dict(found, changes, motion, mount_dict(now, before)),

@@ -7,6 +7,7 @@ its start to where it breaks (salvage).
 """
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator
 from dataclasses import dataclass
@@ -37,6 +38,11 @@ from dashcalib_ros.limits import YAML_BYTES, check_file, parse_yaml, read_text
 
 CURE = ("repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again or record it again')
+
+
+# reasons that no repair mends
+NO_CURE = 'is it a recording? copy it again or record it again'
+NO_RECORDING = re.compile('does not start like a bag|more than|too large|too many')
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,8 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
         counts.update(found)
         indexed &= by_index
     if problems and not counts:
-        raise InputError(f'{bag} cannot be read ({problems[0]}): {CURE}')
+        cure = NO_CURE if NO_RECORDING.search(problems[0]) else CURE
+        raise InputError(f'{bag} cannot be read ({problems[0]}): {cure}')
     return _sorted(counts), indexed
 
 

@@ -142,8 +142,8 @@ class StampGate:
         if self.unstamped:
             lines.append('the image headers have no stamps: the times of reception were used')
         if self.fault:
-            lines.append(f'{self.fault}: the times of reception are used from the image on that '
-                         f'shows it; repair the driver')
+            lines.append(f'{self.fault}; from there on the times of reception are used: repair '
+                         f'the driver')
         elif self.repeated:
             lines.append(f'{self.repeated} images were skipped: their stamps are not later than '
                          f'those before')
