@@ -279,7 +279,7 @@ COMMANDS = {
                        'help': f'left away: the bag that CALIBRATION is; else: {INPUT_HELP}'}),
             *DRIVE, *MOTION, MODEL, SEED,
             ('--poses', {'type': Path, 'metavar': 'FILE',
-                         'help': "true poses, in KITTI's or TUM's format, or a GPS track (GPX, a "
+                         'help': 'true poses, as KITTI, TUM or EuRoC, or a GPS track (GPX, a '
                                  'bag with NavSatFix): compare the rotation and the scale that '
                                  'each camera finds with them'}),
             ('--mount', {**FLAG, 'dest': 'mounting',

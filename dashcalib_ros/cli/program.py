@@ -30,7 +30,13 @@ def command() -> NoReturn:
     """Run main() as a process of its own, the installed command."""
     if VERBOSE[0] not in sys.argv:
         own_stderr()
-    code = main()
+    try:
+        code = main()
+    except Exception as error:
+        # a defect of ours; Python's own exit code, 1, would be an answer: the calibration is wrong
+        write_stderr(''.join(traceback.format_exception(error)).rstrip())
+        code = _fail(f'this is a defect of dashcalib_ros ({type(error).__name__}): report it with '
+                     f'the lines above, and the input if you can')
     if code == INTERRUPTED:
         # Ctrl-C in the middle of a lock's own code leaves it locked: no thread is waited for
         os._exit(code)
@@ -41,16 +47,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code; argv: arguments without the program's name."""
     open_closed_streams()
     one_thread_for_numpy()
-    try:
-        return _main(argv)
-    except Exception as error:
-        # a defect of ours; Python's own exit code, 1, would be an answer: the calibration is wrong
-        write_stderr(''.join(traceback.format_exception(error)).rstrip())
-        return _fail(f'this is a defect of dashcalib_ros ({type(error).__name__}): report it with '
-                     f'the lines above, and the input if you can')
-
-
-def _main(argv: Sequence[str] | None) -> int:
     # the handler is set inside try: a signal may also come while it is set or restored
     try:
         parser = make_parser()

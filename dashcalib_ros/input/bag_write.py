@@ -50,7 +50,8 @@ def first_camera_info(path: Path, topic: str | None = None) -> tuple[str, Any]:
     camera_info. Raises InputError, OSError.
     """
     bag = open_bag(path)
-    infos = [each.name for each in bag.topics if each.msgtype in CAMERA_INFOS and each.count]
+    infos = list(dict.fromkeys(
+        each.name for each in bag.topics if each.msgtype in CAMERA_INFOS and each.count))
     if topic is None:
         wanted = {camera_info_topic(each.name) for each in bag.topics if each.is_image}
         found = [name for name in infos if name in wanted] or infos

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 
 import cv2
@@ -13,7 +14,7 @@ from made_drives import START, TIMES, drive, images, info_of, write_bag, write_t
 
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
-from dashcalib_ros.cli import main
+from dashcalib_ros.cli import command, main
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
@@ -212,8 +213,11 @@ def test_what_nobody_expected_is_no_answer(files, monkeypatch, capfd):
     def fail(*_):
         raise ZeroDivisionError('of a defect')
     monkeypatch.setattr(FakeQuestions, 'check', fail)
+    monkeypatch.setattr(sys, 'argv', ['dashcalib', *files, '--verbose'])
     # Python's own exit code, 1, would be "wrong"
-    assert main(files) == 2
+    with pytest.raises(SystemExit) as ended:
+        command()
+    assert ended.value.code == 2
     error = capfd.readouterr().err
     assert 'Traceback' in error and error.splitlines()[-1].startswith('dashcalib: error: this is')
 

@@ -317,7 +317,8 @@ def test_a_repair_is_advised_where_it_may_help_only(tmp_path, content, cure):
 def test_pictures_of_another_kind_are_not_to_be_repaired(tmp_path):
     frames = drive(3)
     bag = write_bag(tmp_path / 'bag', [
-        ('/camera', frame.stamp_ns, made_drives.image(frame, encoding='32FC1')) for frame in frames])
+        ('/camera', frame.stamp_ns, made_drives.image(frame, encoding='32FC1'))
+        for frame in frames])
     with pytest.raises(InputError, match='publish mono8') as caught:
         list(open_frames(bag))
     assert 'recover' not in str(caught.value)
