@@ -50,6 +50,7 @@ PARTS = {
         "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again or record it again'},
     'detect/one_camera.py': {'the same view from another mounting', 'the same view … % …'},
+    'detect/detection.py': {'they seem to be …', 'they do not rise, or count images'},
     'detect/turn.py': {'the turn at frame …'},
     'reconstruct/scene_file.py': {
         'it is too large when unpacked', 'it is too large',

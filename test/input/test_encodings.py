@@ -11,10 +11,11 @@ from google.protobuf import descriptor_pb2, timestamp_pb2
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
-from made_drives import COMPRESSED, ROS2, START, STEP, head, info_of
+from made_drives import COMPRESSED, ROS1, ROS2, START, STEP, head, info_of
 from made_packets import SIZE, encoded, levels
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores
@@ -76,6 +77,25 @@ def test_a_video_in_messages_is_decoded(tmp_path, kind, codec, name, plugin):
     assert {(frame.size, frame.frame_id) for frame in frames} == {(SIZE, 'camera')}
     colours = source.in_colour({3: START + 3 * STEP})
     assert colours[3].shape == (*SIZE[::-1], 3)
+
+
+@pytest.mark.parametrize('kind', [PACKET, 'foxglove_msgs/msg/CompressedVideo'])
+def test_a_video_in_a_bag_of_ros_1(tmp_path, kind):
+    store = types(Stores.ROS1_NOETIC)
+    with Writer1(tmp_path / 'drive.bag') as writer:
+        connection = writer.add_connection('/cam/video', kind, typestore=store)
+        for number, data in encoded(levels()):
+            stamp = head(START + number * STEP, ROS1)
+            values = {'data': np.frombuffer(data, np.uint8)}
+            if kind == PACKET:
+                values |= {'header': stamp, 'width': 64, 'height': 48, 'encoding': 'h264',
+                           'pts': number, 'flags': 0, 'is_bigendian': False}
+            else:
+                values |= {'timestamp': stamp.stamp, 'frame_id': 'camera', 'format': 'h264'}
+            message = store.types[kind](**values)
+            writer.write(connection, START + number * STEP, store.serialize_ros1(message, kind))
+    frames = list(open_frames(tmp_path / 'drive.bag'))
+    assert brightness(frames) == list(range(20)) and frames[3].stamp_ns == START + 3 * STEP
 
 
 def test_pictures_between_others_get_their_own_stamps(tmp_path):

@@ -113,14 +113,25 @@ def rounded(times):
     return [round(time / 1e9) * 10**9 + time % 10**9 for time in times]
 
 
+def late(times):
+    """Return stamps whose seconds come 0.35 s late."""
+    return [(time - 35 * 10**7) // 10**9 * 10**9 + time % 10**9 for time in times]
+
+
+def standing(times):
+    """Return stamps whose seconds stand still."""
+    return [times[0] // 10**9 * 10**9 + time % 10**9 for time in times]
+
+
 TIMES = [START + n * 10**8 for n in range(300)]
 LATE = [time + (n * 37 % 20) * 10**6 for n, time in enumerate(TIMES)]
 
 
 @pytest.mark.parametrize('rate', [None, 100.0])
-def test_stamps_that_fall_back_once_a_second_are_named_and_not_used(rate):
+@pytest.mark.parametrize('fault', [rounded, late, standing])
+def test_stamps_that_fall_back_once_a_second_are_named_and_not_used(rate, fault):
     gate = StampGate(rate)
-    found = beside(gate, rounded(TIMES), LATE)
+    found = beside(gate, fault(TIMES), LATE)
     kept = [stamp for stamp in found if stamp is not None]
     assert 'fall back by 0.9 s once a second' in gate.fault
     assert len(kept) > 270 and all(b > a for a, b in pairwise(kept))
