@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.limits import YAML_BYTES
+from dashcalib_ros.limits import JSON_MESSAGE_BYTES, YAML_BYTES
 
 CDR, ROS1, PROTOBUF, JSON = 'cdr', 'ros1', 'protobuf', 'json'
 ENCODINGS = (CDR, ROS1, PROTOBUF, JSON)
@@ -72,6 +72,9 @@ def message_of(kind: str, encoding: str, raw: bytes, schema: bytes = b'') -> Any
         message = _protobuf_class(kind, schema).FromString(raw)
         return _of_foxglove(kind, partial(getattr, message))
     if encoding == JSON:
+        if len(raw) > JSON_MESSAGE_BYTES:
+            raise InputError(f'more than {JSON_MESSAGE_BYTES / 2**20:.0f} MB of JSON: record it '
+                             f'in another encoding')
         return _of_foxglove(kind, json.loads(raw).__getitem__)
     if encoding == ROS1:
         return _as_ros(types(Stores.ROS1_NOETIC).deserialize_ros1(raw, kind))

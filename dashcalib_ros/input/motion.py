@@ -129,8 +129,9 @@ def in_seconds(stamps: Floats, what: str) -> tuple[Floats, tuple[str, ...]]:
     known = stamps[np.isfinite(stamps)]
     if not len(known):
         return stamps, ()
-    size = float(np.median(np.abs(known)))
-    step = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
+    with np.errstate(over='ignore'):
+        size = float(np.median(np.abs(known)))
+        step = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
     for name, unit in UNITS.items():
         if EPOCH_S < size * unit <= LATEST_S and step * unit <= LONGEST_STEP_S:
             return stamps * unit, (f'the stamps of {what} are taken as {name} since 1970',)

@@ -271,8 +271,10 @@ def track_poses(position: Samples, start_s: float) -> Poses:
 def _kitti(table: Floats, path: Path) -> Poses:
     poses = table.reshape(-1, 3, 4)
     rotations = poses[:, :, :3]
-    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
-    if off > NOT_A_ROTATION or (np.linalg.det(rotations) < 0).any():
+    with np.errstate(all='ignore'):
+        off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
+    # NaN is none, either
+    if not off <= NOT_A_ROTATION or (np.linalg.det(rotations) < 0).any():
         raise InputError(f'{path} has matrices that are no rotations: are they 3x4, row by row?')
     return Poses(rotations, _places(poses[:, :, 3], path))
 
@@ -289,7 +291,9 @@ def _tum(table: Floats, path: Path) -> Poses:
     (stamps, warnings), quaternions = in_seconds(table[:, 0], str(path)), table[:, 4:]
     if not (np.diff(stamps) > 0).all():
         raise InputError(f'{path}: the stamps of the poses do not ascend; sort them')
-    if (np.abs(np.linalg.norm(quaternions, axis=1) - 1) > 0.5).any():
+    with np.errstate(all='ignore'):
+        lengths = np.linalg.norm(quaternions, axis=1)
+    if (np.abs(lengths - 1) > 0.5).any():
         raise InputError(f'{path} has quaternions that are no rotations: is the order t x y z qx '
                          f'qy qz qw?')
     return Poses(Rotation.from_quat(quaternions).as_matrix(), _places(table[:, 1:4], path), stamps,

@@ -24,7 +24,7 @@ from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.cli import main
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.bag_write import check_bag, first_camera_info, write_bag
-from dashcalib_ros.input.encodings import types
+from dashcalib_ros.input.encodings import message_of, types
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.report.export import exported
@@ -316,6 +316,11 @@ def test_damaged_messages_and_schemas_are_one_line(tmp_path, encoding, schema):
     with pytest.raises(InputError, match='gave no image') as caught:
         list(open_frames(path))
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_message_in_json_is_limited():
+    with pytest.raises(InputError, match='of JSON'):
+        message_of('foxglove.RawImage', 'json', b'[' + b'[],' * 12_000_000)
 
 
 # a bag with camera_info ------------------------------------------------------------------------

@@ -68,7 +68,11 @@ def test_tums_poses_are_interpolated_at_the_frames_stamps(tmp_path):
     ('5e10 0 0 0 0 0 0 1\n6e10 0 0 0 0 0 0 1\n', 'write seconds'),
     ('1e300 0 0 0 0 0 0 1\n2e300 0 0 0 0 0 0 1\n', 'write seconds'),
     ('0 0 0 0 0 0 0 1\n1e300 0 0 0 0 0 0 1\n', 'write seconds'),
+    ('1 0 0 0 1e200 -1e200 0 1\n2 0 0 0 0 0 0 1\n', 'no rotations'),
+    (f'{"1e300 -1e300 " * 6}\n' * 2, 'no rotations'),
+    ('-1e308 0 0 0 0 0 0 1\n1e308 0 0 0 0 0 0 1\n', 'write seconds'),
     ('t x y z qx qy qz qw\n' * 2, 'not all numbers')])
+@pytest.mark.filterwarnings('error')
 def test_what_is_no_file_of_poses_is_named(tmp_path, text, match):
     path = tmp_path / 'poses.txt'
     path.write_text(text)
