@@ -158,8 +158,9 @@ POSE_COLUMNS = KITTI, KITTI_TIMED, TUM, EUROC = 12, 13, 8, 17
 REAL_FIRST = re.compile(r'q\w*w\b.*q\w*x\b', re.IGNORECASE)
 # m; UTM counts up to ten million
 FARTHEST_M = 1e9
-# s between two poses; over more they are not interpolated
-LONGEST_GAP_S = 0.5
+# s between two poses; over more they are not interpolated. A track's headings are smoothed over
+# longer anyway, and GPS comes once a second
+LONGEST_GAP_S, TRACK_GAP_S = 0.5, 1.5
 # s to either side, over which a track has a heading; m in that time, with less it stands
 COURSE_S, STANDING_M = 1.0, 2.0
 # of a rotation matrix; KITTI rounds them to 7 digits
@@ -172,13 +173,14 @@ class Poses:
 
     rotations: (n, 3, 3) to the world; positions: (n, 3) in metres. stamps_s: (n,) ascending, or
     None where the poses are those of the input's frames, one by one. warnings: what the user
-    should know of them.
+    should know of them. longest_gap_s: between two, over which they are not interpolated.
     """
 
     rotations: Floats
     positions: Floats
     stamps_s: Floats | None = None
     warnings: tuple[str, ...] = ()
+    longest_gap_s: float = LONGEST_GAP_S
 
     def at(self, frames: Ints, stamps_ns: Ints) -> tuple[Floats, Floats, Mask]:
         """Return rotations (k, 3, 3), positions (k, 3) and which of them are known (k,).
@@ -196,7 +198,7 @@ class Poses:
         wanted = (np.asarray(stamps_ns) - start * 10**9) / 1e9
         after = np.clip(np.searchsorted(own, wanted), 1, len(own) - 1)
         inside = (wanted >= own[0]) & (wanted <= own[-1])
-        known = np.asarray(inside & (own[after] - own[after - 1] <= LONGEST_GAP_S), bool)
+        known = np.asarray(inside & (own[after] - own[after - 1] <= self.longest_gap_s), bool)
         held = np.clip(wanted, own[0], own[-1])
         rotations = Slerp(own, Rotation.from_matrix(self.rotations))(held).as_matrix()
         return np.asarray(rotations), Samples(own, self.positions).at(held), known
@@ -265,7 +267,8 @@ def track_poses(position: Samples, start_s: float) -> Poses:
     last = np.maximum.accumulate(np.where(moves, np.arange(len(moves)), int(np.argmax(moves))))
     # to the world (east, north, up), from axes as a camera's
     turned = Rotation.from_rotvec(heading[last][:, None] * [0.0, 0.0, 1.0]).as_matrix() @ OPTICAL
-    return Poses(np.asarray(turned), position.at(inside), inside + start_s)
+    return Poses(np.asarray(turned), position.at(inside), inside + start_s,
+                 longest_gap_s=TRACK_GAP_S)
 
 
 def _kitti(table: Floats, path: Path) -> Poses:

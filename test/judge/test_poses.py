@@ -136,6 +136,13 @@ def test_a_gps_track_has_headings_and_places():
     np.testing.assert_allclose(turned[1][:, 1], [0.0, 0.0, -1.0], atol=1e-6)
 
 
+def test_a_gps_that_comes_once_a_second_has_headings_between():
+    when = np.arange(0.0, 20.0, 1.0)
+    poses = track_poses(Samples(when, np.stack([5 * when, 0 * when, 0 * when], axis=1)), 0.0)
+    _, places, known = poses.at(np.arange(1), np.array([9_500_000_000]))
+    assert known.all() and abs(places[0, 0] - 47.5) < 1e-6
+
+
 @pytest.mark.parametrize(('places', 'match'), [
     (np.zeros((60, 3)), 'does not move'), (np.zeros((3, 3)), 'too short')])
 def test_a_track_without_headings_is_named(places, match):
