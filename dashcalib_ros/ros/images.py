@@ -200,7 +200,7 @@ class ImageInput:
         # as image_transport does: remap the base topic, then append the transport
         self.base = base = node.resolve_topic_name('image_raw')
         self.topic = f'{base}/compressed' if self._kind == COMPRESSED else base
-        self._depth = VIDEO_DEPTH if self._kind is None else DEPTH
+        self._is_video = self._kind is None
         self.publishers: tuple[str, ...] = ()
         override = node._parameter_overrides.get(
             f'qos_overrides.{self.topic}.subscription.reliability')
@@ -238,7 +238,7 @@ class ImageInput:
             self._subscription = None
 
     def _subscribe(self, kind: str) -> Subscription:
-        profile = QoSProfile(depth=self._depth,
+        profile = QoSProfile(depth=VIDEO_DEPTH if self._is_video else DEPTH,
                              reliability=ReliabilityPolicy[self.reliability.upper()])
         return self._node.create_subscription(_class(kind), self.topic, self._callback, profile,
                                               qos_overriding_options=self._overridable)
@@ -309,7 +309,7 @@ class ImageInput:
         if self.reliability == 'reliable' and not all(map(_reliable, infos)):
             return ('its publisher is best effort, which a reliable subscription does not hear: '
                     'set -p reliability:=auto')
-        if self._depth == VIDEO_DEPTH:
+        if self._is_video:
             return ('its publisher sent no key picture: let the encoder make one every few '
                     'seconds (gop_size), or look at the camera driver')
         return f'its {counted(len(infos), "publisher")} sent nothing: look at the camera driver'

@@ -232,6 +232,8 @@ def test_reset_takes_everything_back(driven):
     assert not bench.call('save', driven.node).success
     assert driven.node.stop() == 0
     assert 'Traceback' not in driven.node.text
+    # else the next camera is a second publisher, to which the node gives nothing
+    bench.node.destroy_publisher(bench.images)
 
 
 def test_turns_outlive_the_node_and_add_up(start_node, make_bench, rendered, tmp_path):
