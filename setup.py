@@ -44,6 +44,8 @@ setup(
         'rosbags>=0.11.9',
         'apsw',
         'mcap>=1.2',
+        # of Foxglove's messages: a wheel of 0.3 MB without dependencies
+        'protobuf>=4.22',
         'backports.zstd>=1; python_version < "3.14"',
         'lz4>=4',
         'PyYAML>=6',

@@ -43,6 +43,8 @@ SQLITE_STEPS = 20
 YAML_BYTES = 2**20
 # of a result.json: it has about 100 kB
 JSON_BYTES = 2**22
+# of a bag's message in JSON: a raw 4K picture; in memory other values take 20 times as much
+JSON_MESSAGE_BYTES = 2**25
 # of a segmentation network: ONNX keeps no larger ones in one file
 MODEL_BYTES = 2**31
 # values in a YAML text, repetitions by aliases included: as many as 1 MB can have

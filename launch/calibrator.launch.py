@@ -11,7 +11,7 @@ ARGUMENTS = (
     ('namespace', '', "the camera's namespace; it names the camera, too"),
     ('image', 'image_raw', 'its image topic, without /compressed'),
     ('camera_info', 'camera_info', 'where its calibration is published'),
-    ('image_transport', 'raw', 'raw or compressed, whatever the file of parameters says'),
+    ('image_transport', 'raw', 'raw, compressed or video, whatever the file of parameters says'),
     ('use_sim_time', 'false', 'true with a bag that is played with --clock; not from the file'),
     ('config', PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'config',
                                      'calibrator.yaml']), 'the file of parameters'),

@@ -27,8 +27,13 @@ STAMPS = iter(range(START, START + 10**12, 10**8))
 class Desk:
     """The node and a bench, spun in turns."""
 
-    def __init__(self, context, home, **parameters):
+    def __init__(self, context, home, topic='image_raw', remapped='', **parameters):
+        """topic: of the images. remapped: where the node's set_camera_info is, if it is."""
         arguments = ['--ros-args', '-p', f'camera_info_url:={home}/camera.yaml']
+        if topic != 'image_raw':
+            arguments += ['-r', f'image_raw:={topic}']
+        if remapped:
+            arguments += ['-r', f'set_camera_info:={remapped}']
         for name, value in parameters.items():
             arguments += ['-p', f'{name}:={value}']
         rclpy.init(args=['calibrator', *arguments])
@@ -36,7 +41,7 @@ class Desk:
         self.node = make_node(lifecycle=False)
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self.node)
-        self.bench = Bench(context)
+        self.bench = Bench(context, topic=topic)
         self.until(lambda: self.bench.images.get_subscription_count() > 0
                    and self.bench.values.get('reliability') == 'reliable')
         self.show()

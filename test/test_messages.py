@@ -38,16 +38,19 @@ PARTS = {
         'nothing in it is whole', '… was not closed, and its end is taken from …',
         '… was not closed, and …, which has its end, cannot be used (…)',
         'a part of the bag unpacks to more than … MB',
-        'its chunks unpack to more than … MB, which is no recording', 'too many chunks overlap',
-        'its rows have more than the file', 'there is more than the head says',
-        'the index is too large', 'there is no index', 'a record is too large',
-        'the index does not lead to all messages'},
+        'the index does not lead to all messages', 'its rows have more than the file',
+        'there is no index', 'its chunks unpack to more than … MB, which is no recording',
+        'the index is too large', 'too many chunks overlap', 'there is more than the head says',
+        'a record is too large'},
     'input/bag_storage.py': {
+        'does not start like a bag|more than|too large|too many',
+        'is it a recording? copy it again or record it again',
         '… images; how many are lost is not known',
         '… of … images; … are lost', '… of … images; none is lost',
         "repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again or record it again'},
     'detect/one_camera.py': {'the same view from another mounting', 'the same view … % …'},
+    'detect/detection.py': {'they seem to be …', 'they do not rise, or count images'},
     'detect/turn.py': {'the turn at frame …'},
     'reconstruct/scene_file.py': {
         'it is too large when unpacked', 'it is too large',
@@ -65,7 +68,7 @@ PARTS = {
     'workers/worker.py': {' in the environment before Python starts'},
     'workers/pool.py': {'…; … is tried again'},
 }
-NO_MESSAGE = re.compile(r'\s*(SELECT|PRAGMA|import) ')
+NO_MESSAGE = re.compile(r'\s*(SELECT|PRAGMA|import|time timestamp|std_msgs/Header header)\s')
 MODULES = sorted(path for name in EXPLAINED for path in
                  ([PACKAGE / name] if name.endswith('.py') else (PACKAGE / name).glob('*.py')))
 

@@ -5,6 +5,7 @@ from dashcalib_ros.camera.fisheye import Fisheye
 from dashcalib_ros.camera.models import (
     AUTO,
     MODELS,
+    NO_DISTORTION,
     calibrated_models,
     camera_from_ros,
     camera_of,
@@ -14,6 +15,6 @@ from dashcalib_ros.camera.models import (
 )
 from dashcalib_ros.camera.pinhole import Brown, Radial, Rational
 
-__all__ = ['AUTO', 'FISHEYE', 'MODELS', 'PINHOLE', 'RECTIFIED', 'Brown', 'Camera', 'Fisheye',
-           'Radial', 'Rational', 'calibrated_models', 'camera_from_ros', 'camera_of',
+__all__ = ['AUTO', 'FISHEYE', 'MODELS', 'NO_DISTORTION', 'PINHOLE', 'RECTIFIED', 'Brown', 'Camera',
+           'Fisheye', 'Radial', 'Rational', 'calibrated_models', 'camera_from_ros', 'camera_of',
            'larger_models', 'model_named', 'ros_camera', 'ros_faults', 'searched']

@@ -63,13 +63,16 @@ def ros_faults(camera: Camera, k: Sequence[float] | None = None, r: Sequence[flo
                p: Sequence[float] | None = None) -> tuple[str, ...]:
     """Return in words what is wrong with CameraInfo's K (9,), R (9,) and P (12,) beside a camera.
 
-    The camera has their focal lengths, centre and distortion, of which this says nothing. None:
-    not known, and no fault. R and P of one camera are meant: those of a pair are faults.
+    The camera has their focal lengths, centre and distortion, of which this says nothing. None, or
+    nothing in it: not known, and no fault. So are R and P of zeros where there is no distortion,
+    as simulators have them: nothing is to be rectified. R and P of one camera are meant: those of
+    a pair are faults.
     """
+    distorted = any(camera.ros_distortion())
     faults = []
-    if k is not None:
+    if k:
         faults += _odd('K', np.reshape(k, (3, 3)), camera.matrix)
-    if r is not None:
+    if r and (distorted or any(r)):
         rotation = np.reshape(r, (3, 3))
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > EXACT or np.linalg.det(rotation) < 0:
             faults.append('R is no rotation: of one camera, it is the identity')
@@ -77,7 +80,7 @@ def ros_faults(camera: Camera, k: Sequence[float] | None = None, r: Sequence[flo
             angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
             faults.append(f'R turns the rectified picture by {angle:.1f} degrees: of one camera, '
                           f'it is the identity')
-    if p is not None:
+    if p and (distorted or any(p)):
         view = np.reshape(p, (3, 4))
         wanted = np.diag([view[0, 0], view[1, 1], 1.0, 0.0])[:3]
         wanted[:2, 2] = view[:2, 2]

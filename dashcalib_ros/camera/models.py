@@ -1,6 +1,8 @@
 """The table of camera models. A new model is a class in the file of its family and a row here."""
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import numpy.typing as npt
 
@@ -60,6 +62,7 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
                     d: npt.ArrayLike) -> Camera:
     """Return the simplest camera that CameraInfo's K (9,) and D (n,) describe.
 
+    distortion_model: also by another of its names; where there is no distortion, it may be none.
     Raises InputError where no model here has such a distortion.
     """
     matrix = np.asarray(k, np.float64)
@@ -68,19 +71,26 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
         raise InputError('the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1], and no model here '
                          'has skew: calibrate without it')
     wanted = np.trim_zeros(np.asarray(d, np.float64), 'b')
+    name = re.sub('[ -]', '_', distortion_model.strip().lower())
+    if name in NO_DISTORTION and not len(wanted):
+        name = Radial.ros_model
     # fewer parameters come first in the table
     for model in MODELS.values():
-        if distortion_model not in (model.ros_model, *ALIASES.get(model.ros_model, ())):
+        if name not in (model.ros_model, *ALIASES.get(model.ros_model, ())):
             continue
         size = len(model.names()) - 4
         camera = model.of(image_size, [fx, fy, cx, cy, *wanted[:size],
                                        *np.zeros(max(0, size - len(wanted)))])
         if np.array_equal(np.trim_zeros(np.array(camera.ros_distortion()), 'b'), wanted):
             return camera
-    raise InputError(f'a camera of {shortened(distortion_model)} with {len(wanted)} coefficients '
-                     f'is none of the models here; calibrate it as one of {", ".join(ROS_MODELS)}')
+    raise InputError(f'a camera of {shortened(repr(distortion_model))} with {len(wanted)} '
+                     f'coefficients is none of the models here; calibrate it as one of '
+                     f'{", ".join(ROS_MODELS)}')
 
 
 ROS_MODELS = tuple(dict.fromkeys(model.ros_model for model in MODELS.values()))
-# other names that ROS has for a model, or for one that contains it
-ALIASES = {'plumb_bob': ('rational_polynomial',), 'equidistant': ('fisheye',)}
+# other names that ROS, Foxglove and Kalibr have for a model, or for one that contains it
+ALIASES = {'plumb_bob': ('rational_polynomial', 'radtan', 'radial_tangential'),
+           'equidistant': ('fisheye', 'equi', 'kannala_brandt')}
+# names of what has no distortion: simulators and ideal lenses
+NO_DISTORTION = ('', 'none', 'null', 'pinhole', 'perspective', 'ideal')

@@ -33,7 +33,8 @@ BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera refused; 3 s
                    '2 bad manifest or usage')
 # the names of models and exports are not taken from their tables: that would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
-KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'rays', 'maps')
+KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'foxglove',
+         'rays', 'maps')
 
 def exit_code(verdict: str) -> int:
     """Return the exit code of a verdict."""
@@ -278,7 +279,7 @@ COMMANDS = {
                        'help': f'left away: the bag that CALIBRATION is; else: {INPUT_HELP}'}),
             *DRIVE, *MOTION, MODEL, SEED,
             ('--poses', {'type': Path, 'metavar': 'FILE',
-                         'help': "true poses, in KITTI's or TUM's format, or a GPS track (GPX, a "
+                         'help': 'true poses, as KITTI, TUM or EuRoC, or a GPS track (GPX, a '
                                  'bag with NavSatFix): compare the rotation and the scale that '
                                  'each camera finds with them'}),
             ('--mount', {**FLAG, 'dest': 'mounting',

@@ -4,6 +4,7 @@ from __future__ import annotations
 import argparse
 import json
 
+from dashcalib_ros.camera.mapping import rayless_share
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
 from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.report import compare as compare_cameras
@@ -43,6 +44,10 @@ def export(args: argparse.Namespace) -> int:
     if found.field is not None and args.to not in WITH_FIELD:
         warn([f'{found.name} has a field over the picture, for which {args.to} has no place: it '
               f'is left out; {", ".join(WITH_FIELD)} have it'])
+    unseen = rayless_share(camera)
+    if unseen:
+        warn([f'{found.name} has no ray for {100 * unseen:.0f} % of the picture: there its model '
+              f'folds over; calibrate anew, unless nothing is seen there'])
     if found.verdict == 'weak':
         warn([f'{found.name} is weak: look at its sigmas before you use it'])
     if args.out is not None:

@@ -18,7 +18,7 @@ from dashcalib_ros.cli.terminal import Stages, show, warn
 from dashcalib_ros.errors import InputError, counted
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.motion import SensorStream
-from dashcalib_ros.input.motion_files import bag_motion, read_motion
+from dashcalib_ros.input.motion_files import bag_motion, is_motion, read_motion
 from dashcalib_ros.judge import (
     Calibration,
     Check,
@@ -61,6 +61,7 @@ def check(args: argparse.Namespace) -> int:
         raise UsageError(f'{named.name} does not say how the camera sits on the car: give a '
                          f'result.json or calibration.yaml that dashcalib run has written')
     poses, track = _poses(args)
+    warn(poses.warnings if poses else ())
     if args.out is not None:
         if args.poses is None:
             raise UsageError('--out is for the paths that --poses compares; add --poses FILE')
@@ -76,12 +77,13 @@ def check(args: argparse.Namespace) -> int:
         found = with_faults(questions.check(given, calibration, stages.show), named.faults)
         # one for pictures of another size is wrong, and explains no motion
         changes = _changes(questions, given, calibration)
-        if track is not None and track.position is not None:
-            since = track.since(calibration.start_s).position or track.position
-            poses = track_poses(since, calibration.start_s)
+        if track is not None:
+            track = track.since(calibration.start_s)
+            assert track.position is not None
+            poses = track_poses(track.position, calibration.start_s)
         if poses is not None and given.image_size == calibration.image_size:
             motion = questions.odometry(given, calibration, poses, stages.show)
-    warn((*source.warnings, *calibration.warnings))
+    warn((*source.warnings, *calibration.warnings, *(track.warnings if track else ())))
     now, before = calibration.mount, named.mount
     if args.json:
         write_stdout(json.dumps(answer_dict(found, changes, motion, mount_dict(now, before)),
@@ -109,13 +111,13 @@ def _poses(args: argparse.Namespace) -> tuple[Poses | None, SensorStream | None]
     if path is None:
         return None, None
     is_bag = path.exists() and fits_bag(path)
-    if not is_bag and path.suffix.lower() not in ('.gpx', '.csv'):
+    if not is_bag and not is_motion(path):
         return read_poses(path), None
     track = bag_motion([path], {'gps': args.gps}) if is_bag else read_motion(path)
     if track is None or track.position is None:
         why = '; '.join(() if track is None else track.warnings)
         raise InputError(f'{path} has no GPS track{why and f" ({why})"}: give one with positions '
-                         f'(NavSatFix, GPX), or poses in the format of KITTI or TUM')
+                         f'(NavSatFix, GPX), or poses in the format of KITTI, TUM or EuRoC')
     return None, track
 
 

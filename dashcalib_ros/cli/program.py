@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -29,7 +30,13 @@ def command() -> NoReturn:
     """Run main() as a process of its own, the installed command."""
     if VERBOSE[0] not in sys.argv:
         own_stderr()
-    code = main()
+    try:
+        code = main()
+    except Exception as error:
+        # a defect of ours; Python's own exit code, 1, would be an answer: the calibration is wrong
+        write_stderr(''.join(traceback.format_exception(error)).rstrip())
+        code = _fail(f'this is a defect of dashcalib_ros ({type(error).__name__}): report it with '
+                     f'the lines above, and the input if you can')
     if code == INTERRUPTED:
         # Ctrl-C in the middle of a lock's own code leaves it locked: no thread is waited for
         os._exit(code)

@@ -24,6 +24,9 @@ from dashcalib_ros.input.scale import FULL_SIZE, Scale
 # microseconds, any camera above 2 Hz seems to be faster
 FIRST_FRAMES = 10
 SHORTEST_NS = 500_000
+# other units in which somebody may count, and how long so many images take at the most
+UNITS_NS = {'microseconds': 10**3, 'milliseconds': 10**6, 'seconds': 10**9}
+LONGEST_NS = 60 * 10**9
 
 
 class Detection:
@@ -180,9 +183,12 @@ class Detection:
         passed = frame.stamp_ns - self._first_ns
         too_short = 0 <= passed < FIRST_FRAMES * SHORTEST_NS
         if self.frames == FIRST_FRAMES and (too_short or self._rises < FIRST_FRAMES // 2):
+            unit = next((name for name, ns in UNITS_NS.items()
+                         if FIRST_FRAMES * SHORTEST_NS <= passed * ns < LONGEST_NS), '')
+            what = f'they seem to be {unit}' if unit else 'they do not rise, or count images'
             raise InputError(
-                f'{FIRST_FRAMES} images pass in {passed} ns: Frame.stamp_ns must rise, and count '
-                f'nanoseconds, not seconds, milliseconds or images')
+                f'{FIRST_FRAMES} images pass in {passed} ns: their stamps (Frame.stamp_ns) must '
+                f'rise, and be nanoseconds; {what}; mend what writes them')
 
 
 def detect(frames: Iterable[Frame], config: Config, mask: Mask | None = None) -> Detection:

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from io import BufferedReader, BytesIO
 from itertools import accumulate, chain, islice
 from pathlib import Path
@@ -33,11 +33,10 @@ from rosbags import rosbag2
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import storage_mcap, storage_sqlite3
-from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
-from rosbags.typesys.store import Typestore
 
 from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.input.encodings import CDR, ENCODINGS, PROTOBUF, ROS1, message_of
 from dashcalib_ros.input.source import first_of
 from dashcalib_ros.limits import (
     CHUNK_BYTES,
@@ -380,37 +379,28 @@ class Record:
 
     msgtype: as ROS 2 writes it (sensor_msgs/msg/Image), also for ROS 1.
     receive_ns: when the recorder got it, in nanoseconds.
-    raw: serialised; ros1 tells how. Bags that compress each message have it compressed here.
+    raw: serialised; encoding tells how (input/encodings.py), and of protobuf schema. Bags that
+    compress each message have it compressed here.
     """
 
     topic: str
     msgtype: str
     receive_ns: int
     raw: bytes
-    ros1: bool = False
+    encoding: str = CDR
+    schema: bytes = b''
 
     def message(self) -> Any:
-        """Return the message itself; raises InputError when its bytes make none.
-
-        The types are ROS's own, not the bag's: sensor_msgs' images never changed, and a bag with
-        an invalid definition of another type can still be read.
-        """
+        """Return the message itself; raises InputError when its bytes make none."""
         try:
-            if self.ros1:
-                return _types(Stores.ROS1_NOETIC).deserialize_ros1(self.raw, self.msgtype)
             raw = self.raw
-            if raw[:4] == _ZSTD_MAGIC:  # a CDR message never starts so
+            if self.encoding == CDR and raw[:4] == _ZSTD_MAGIC:  # a CDR message never starts so
                 raw = unpack('zstd', raw, MESSAGE_BYTES)
-            return _types(Stores.ROS2_JAZZY).deserialize_cdr(raw, self.msgtype)
+            return message_of(self.msgtype, self.encoding, raw, self.schema)
         except InputError as error:
             raise InputError(f'a message on {self.topic}: {error}') from error
-        except Exception as error:  # rosbags lets struct.error, AssertionError ... out
+        except Exception as error:  # struct.error, AssertionError, DecodeError ...
             raise InputError(f'a damaged message on {self.topic}: record it again') from error
-
-
-@lru_cache
-def _types(store: Stores) -> Typestore:
-    return get_typestore(store)
 
 
 def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]], bool]:
@@ -452,10 +442,10 @@ def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
         missing = sum(connection.msgcount for connection in wanted)
         if not wanted:
             return
-        ros1 = isinstance(reader, rosbag1.Reader)
+        encoding = ROS1 if isinstance(reader, rosbag1.Reader) else CDR
         for connection, receive_ns, raw in reader.messages(wanted):
             missing -= 1
-            yield Record(connection.topic, connection.msgtype, receive_ns, bytes(raw), ros1)
+            yield Record(connection.topic, connection.msgtype, receive_ns, bytes(raw), encoding)
         if missing > 0:
             raise ValueError('the index does not lead to all messages')
 
@@ -481,7 +471,24 @@ def scan(path: Path, damage: Damage) -> Iterator[Record]:
 
 def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
     """Yield the messages of an MCAP file; a damaged chunk is left out, the next is tried."""
-    schemas: dict[int, str] = {}
+    for schema, channel, message in mcap_contents(path, damage):
+        yield record_of(schema, channel, message)
+
+
+def record_of(schema: Schema | None, channel: Channel, message: Message) -> Record:
+    """Return what an MCAP file stores, as a record."""
+    encoding = channel.message_encoding
+    name = schema.name if schema else ''
+    name = normalize_msgtype(name) if '/' in name else name
+    # one that is not read here is told with the type
+    kind = name if encoding in ENCODINGS else f'{name} in {encoding or "no encoding"}'
+    return Record(channel.topic, kind, message.log_time, message.data, encoding,
+                  schema.data if schema and encoding == PROTOBUF else b'')
+
+
+def mcap_contents(path: Path, damage: Damage) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """Yield the messages of an MCAP file with their topics and types, as scan_mcap() does."""
+    schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     with path.open('rb') as file:
         limit = min(path.stat().st_size, RECORD_BYTES)
@@ -489,13 +496,19 @@ def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
         reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
         for record in chain(repeated, _mcap_records(reader, _Unpacking(path), path.name, damage)):
             if isinstance(record, Schema):
-                schemas[record.id] = normalize_msgtype(record.name)
+                schemas[record.id] = record
             elif isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Message) and record.channel_id in channels:
                 channel = channels[record.channel_id]
-                yield Record(channel.topic, schemas.get(channel.schema_id, ''), record.log_time,
-                             record.data, ros1=channel.message_encoding == 'ros1')
+                yield schemas.get(channel.schema_id), channel, record
+
+
+def has_other_encodings(path: Path) -> bool:
+    """Return whether an MCAP file's index names messages that are no CDR."""
+    with path.open('rb') as file:
+        return any(isinstance(each, Channel) and each.message_encoding != CDR
+                   for each in _repeated(file, min(path.stat().st_size, RECORD_BYTES)))
 
 
 def _repeated(file: BinaryIO, limit: int) -> list[McapRecord]:
@@ -599,4 +612,4 @@ def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]],
             raise EOFError(f'{size - len(data)} bytes are missing')
         if kind == rosbag1.RecordType.MSGDATA:
             yield Record(*connections[head.get_uint32('conn')], head.get_time('time'), data,
-                         ros1=True)
+                         ROS1)

@@ -7,16 +7,21 @@ its start to where it breaks (salvage).
 """
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import starmap
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
+from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.bag_read import Damage, Record, message_counts, records
 from dashcalib_ros.input.decode import BitDepth, decode
+from dashcalib_ros.input.encodings import ENCODINGS, PICTURES
+from dashcalib_ros.input.packets import PacketDecoder, codec_of
 from dashcalib_ros.input.source import (
     METADATA,
     FrameSource,
@@ -28,12 +33,16 @@ from dashcalib_ros.input.source import (
     is_bag_file,
 )
 from dashcalib_ros.input.stamps import StampGate
+from dashcalib_ros.input.video import FramePicture
 from dashcalib_ros.limits import YAML_BYTES, check_file, parse_yaml, read_text
 
-IMAGE = 'sensor_msgs/msg/Image'
-COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 CURE = ("repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
         'copy it again or record it again')
+
+
+# reasons that no repair mends
+NO_CURE = 'is it a recording? copy it again or record it again'
+NO_RECORDING = re.compile('does not start like a bag|more than|too large|too many')
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,7 @@ class Topic:
     @property
     def is_image(self) -> bool:
         """Tell whether these are a camera's pictures (not its depth)."""
-        return (self.msgtype in (IMAGE, COMPRESSED_IMAGE)
+        return (self.msgtype in PICTURES
                 and not self.name.endswith('/compressedDepth'))
 
 
@@ -135,12 +144,23 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
         counts.update(found)
         indexed &= by_index
     if problems and not counts:
-        raise InputError(f'{bag} cannot be read ({problems[0]}): {CURE}')
+        cure = NO_CURE if NO_RECORDING.search(problems[0]) else CURE
+        raise InputError(f'{bag} cannot be read ({problems[0]}): {cure}')
     return _sorted(counts), indexed
 
 
 def _sorted(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
     return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+
+class _Shot(NamedTuple):
+    """An image that was recorded. number: its place; decode: as Picture's."""
+
+    number: int
+    header_ns: int
+    receive_ns: int
+    frame_id: str
+    decode: Callable[..., Pixels]
 
 
 class BagSource(FrameSource):
@@ -171,28 +191,41 @@ class BagSource(FrameSource):
         return None if first is None else first.receive_ns
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
-        gate, depth = StampGate(), BitDepth()
+        gate = StampGate()
         damage: list[str] = []
         first_ns: int | None = None
         try:
-            for record in self._bag.records([str(self.topic)], damage.append):
-                index = reading.images
-                reading.images += 1
-                try:
-                    message = record.message()
-                except InputError as error:
-                    reading.failed(index, error)
-                    continue
-                stamp_ns = gate.take(_header_ns(message), record.receive_ns)
+            for shot in self._shots(reading, damage):
+                stamp_ns = gate.take(shot.header_ns, shot.receive_ns)
                 if stamp_ns is None:
                     continue
                 first_ns = stamp_ns if first_ns is None else first_ns
                 if stamp_ns - first_ns >= start_ns:
-                    yield Picture(index, stamp_ns, partial(decode, message, depth),
-                                  str(message.header.frame_id))
+                    yield Picture(shot.number, stamp_ns, shot.decode, shot.frame_id)
             reading.warnings += self._losses(reading.images, damage)
         finally:
             reading.warnings += gate.warnings()
+
+    def _shots(self, reading: Reading, damage: list[str]) -> Iterator[_Shot]:
+        """Yield the images in the order in which they are shown; a video has packets for them."""
+        depth, packets = BitDepth(), PacketDecoder()
+        for record in self._bag.records([str(self.topic)], damage.append):
+            index = reading.images
+            reading.images += 1
+            try:
+                message = record.message()
+                shot = _Shot(index, _header_ns(message), record.receive_ns,
+                             str(message.header.frame_id), partial(decode, message, depth))
+                codec = codec_of(message)
+                shown = None if codec is None else packets.take(codec, message.data, shot)
+            except InputError as error:
+                reading.failed(index, error)
+                continue
+            yield from [shot] if shown is None else starmap(_of_video, shown)
+        yield from starmap(_of_video, packets.rest())
+        if packets.waited:
+            reading.warnings.append(f'the first {packets.waited} images of the video are left '
+                                    f'out: they need a picture before the recording began')
 
     def _losses(self, read: int, damage: list[str]) -> list[str]:
         lost = (self._promised or 0) - read if self._bag.indexed else 0
@@ -207,6 +240,11 @@ class BagSource(FrameSource):
         return [f'{start} images; how many are lost is not known']
 
 
+def _of_video(shot: _Shot, frame: Any) -> _Shot:
+    """Return a shot with the picture that its packet led to."""
+    return shot._replace(decode=partial(FramePicture(), frame))
+
+
 def _header_ns(message: Any) -> int:
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
@@ -218,7 +256,8 @@ def _choose(path: Path, bag: Bag, name: str | None) -> Topic:
         there = ', '.join(f'{topic.name} ({topic.msgtype})' for topic in bag.topics[:8])
         there = ' '.join(there.split())  # a damaged bag's names may hold anything
         raise InputError(f'{path} has no image topic: it has {there or "no messages at all"}; '
-                         f'record the camera (Image or CompressedImage) too')
+                         f'record the camera (Image, CompressedImage or a video) too, as '
+                         f'{", ".join(ENCODINGS)}')
     if name is not None:
         found = [topic for topic in images if topic.name.strip('/') == name.strip('/')]
         if not found:

@@ -10,24 +10,36 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores
 
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.camera.camera_info import SAME, RosCamera
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.input.bag_read import WITHIN_LIMIT, Reader2, unpacked
+from dashcalib_ros.input.bag_read import (
+    WITHIN_LIMIT,
+    Reader2,
+    has_other_encodings,
+    mcap_contents,
+    record_of,
+    unpacked,
+)
 from dashcalib_ros.input.bag_storage import open_bag
+from dashcalib_ros.input.encodings import CAMERA_INFOS, CDR, message_of
+from dashcalib_ros.input.encodings import types as types_of
 from dashcalib_ros.input.source import METADATA
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.whole_files import temporary_folder
 
-CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+CAMERA_INFO = CAMERA_INFOS[0]
+# what image_transport adds to the name of a topic
+TRANSPORTS = ('compressed', 'ffmpeg', 'foxglove')
 REPAIR = "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
 
 
 def camera_info_topic(image_topic: str) -> str:
     """Return the camera_info topic that image_transport expects for an image topic."""
-    base = image_topic.removesuffix('/compressed')
+    base, _, transport = image_topic.rpartition('/')
+    base = base if transport in TRANSPORTS else image_topic
     return f'{base.rpartition("/")[0]}/camera_info'
 
 
@@ -38,7 +50,8 @@ def first_camera_info(path: Path, topic: str | None = None) -> tuple[str, Any]:
     camera_info. Raises InputError, OSError.
     """
     bag = open_bag(path)
-    infos = [each.name for each in bag.topics if each.msgtype == CAMERA_INFO and each.count]
+    infos = list(dict.fromkeys(
+        each.name for each in bag.topics if each.msgtype in CAMERA_INFOS and each.count))
     if topic is None:
         wanted = {camera_info_topic(each.name) for each in bag.topics if each.is_image}
         found = [name for name in infos if name in wanted] or infos
@@ -64,8 +77,11 @@ def check_bag(source: str | os.PathLike[str], image_topic: str | None,
     """
     path = Path(out).absolute()
     _check_free(path)
-    with _opened(source, image_topic):
-        pass
+    if image_topic is not None and _is_mixed(Path(source)):
+        _checked_topic(source, image_topic)
+    else:
+        with _opened(source, image_topic):
+            pass
     try:
         with temporary_folder(path.parent) as draft:
             (draft / f'{path.name}.mcap').touch()  # so is the file in it called
@@ -83,7 +99,9 @@ def write_bag(source: str | os.PathLike[str], image_topic: str, camera: Camera,
     Raises InputError, OutputError.
     """
     topic, ros = camera_info_topic(image_topic), ros_camera(camera, rectified)
-    types = get_typestore(Stores.ROS2_JAZZY)
+    if _is_mixed(Path(source)):
+        return _write_mixed(Path(source), image_topic, ros, Path(out))
+    types = types_of(Stores.ROS2_JAZZY)
     count = 0
     with _opened(source, image_topic) as reader, new_bag(Path(out)) as writer:
         kept = [each for each in reader.connections if each.topic != topic]
@@ -92,10 +110,53 @@ def write_bag(source: str | os.PathLike[str], image_topic: str, camera: Camera,
         for connection, stamp_ns, raw in _messages(reader, kept, source):
             writer.write(copies[connection.id], stamp_ns, raw)
             if connection.topic == image_topic:
-                image: Any = types.deserialize_cdr(raw, connection.msgtype)
-                info = _camera_info(types.types, ros, image.header)
-                writer.write(infos, stamp_ns, types.serialize_cdr(info, CAMERA_INFO))
+                image = message_of(connection.msgtype, CDR, bytes(raw))
+                writer.write(infos, stamp_ns, _camera_info(ros, image.header))
                 count += 1
+    return count
+
+
+def _is_mixed(source: Path) -> bool:
+    """Return whether a bag has messages that rosbags cannot copy: MCAP takes any encoding."""
+    try:
+        files = open_bag(source).files
+        return all(file.suffix == '.mcap' for file in files) and any(
+            map(has_other_encodings, files))
+    except (InputError, OSError):
+        return False  # told where it is opened
+
+
+def _write_mixed(source: Path, image_topic: str, ros: RosCamera, out: Path) -> int:
+    """Write the same as write_bag() of a bag with other encodings, which stay as they are.
+
+    The new bag is a folder with one MCAP file, without metadata.yaml: that has no place for them.
+    """
+    from mcap.writer import Writer as McapWriter
+    topic, count = _checked_topic(source, image_topic), 0
+    definition, _ = types_of(Stores.ROS2_JAZZY).generate_msgdef(CAMERA_INFO, ros_version=2)
+    with _new_folder(out) as folder, (folder / f'{folder.name}.mcap').open('wb') as file:
+        writer = McapWriter(file)
+        writer.start(library='dashcalib_ros')
+        infos = writer.register_channel(topic, CDR, writer.register_schema(
+            CAMERA_INFO, 'ros2msg', definition.encode()))
+        for path in open_bag(source).files:
+            channels: dict[int, int] = {}
+            for schema, channel, message in mcap_contents(path, _refuse):
+                if channel.topic == topic:
+                    continue
+                if channel.id not in channels:
+                    channels[channel.id] = writer.register_channel(
+                        channel.topic, channel.message_encoding, 0 if schema is None else
+                        writer.register_schema(schema.name, schema.encoding, schema.data),
+                        channel.metadata)
+                writer.add_message(channels[channel.id], message.log_time, message.data,
+                                   message.publish_time, message.sequence)
+                if channel.topic == image_topic:
+                    header = record_of(schema, channel, message).message().header
+                    writer.add_message(infos, message.log_time, _camera_info(ros, header),
+                                       message.log_time)
+                    count += 1
+        writer.finish()
     return count
 
 
@@ -105,15 +166,27 @@ def new_bag(path: Path) -> Iterator[Writer]:
 
     Raises OutputError when it exists or cannot be written.
     """
+    # rosbags makes the folder, and names the file inside after it
+    with _new_folder(path, made=False) as folder, Writer(
+            folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        yield writer
+
+
+@contextmanager
+def _new_folder(path: Path, made: bool = True) -> Iterator[Path]:
+    """Give a folder with the last name of a path, which appears there when all went well.
+
+    made: it is there already. Raises OutputError when it exists or cannot be written.
+    """
     path = path.absolute()
     _check_free(path)
     try:
         with temporary_folder(path.parent) as draft:
-            # rosbags names the file inside after the folder: it has its last name already
-            with Writer(draft / path.name, version=9,
-                        storage_plugin=StoragePlugin.MCAP) as writer:
-                yield writer
-            (draft / path.name).rename(path)
+            folder = draft / path.name
+            if made:
+                folder.mkdir()
+            yield folder
+            folder.rename(path)
     except (OSError, WriterError) as error:
         raise _unwritable(path, error) from error
 
@@ -145,7 +218,7 @@ def _declared(writer: Writer, connection: Connection) -> Connection:
         return writer.add_connection(connection.topic, connection.msgtype,
                                      msgdef=connection.msgdef.data, rihs01=connection.digest,
                                      **common)
-    types = get_typestore(Stores.ROS2_JAZZY)
+    types = types_of(Stores.ROS2_JAZZY)
     if connection.msgtype not in types.types:
         raise InputError(f'the bag does not say what a {connection.msgtype} is (topic '
                          f"{connection.topic}): convert it on a machine that has that type with "
@@ -168,13 +241,19 @@ def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator
             reader = opened.enter_context(Reader2(path))
         except Exception as error:  # a damaged file makes rosbags raise nearly anything
             raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
-        topic = camera_info_topic(image_topic)
-        wrong = [each.msgtype for each in reader.connections
-                 if each.topic == topic and each.msgtype != CAMERA_INFO]
-        if wrong:
-            raise InputError(f'{source} has {wrong[0]} on {topic}, where camera_info belongs: '
-                             f'rename that topic')
+        _checked_topic(source, image_topic)
         yield reader
+
+
+def _checked_topic(source: str | os.PathLike[str], image_topic: str) -> str:
+    """Return the topic of a new camera_info; raises InputError where the bag has others there."""
+    topic = camera_info_topic(image_topic)
+    wrong = [each.msgtype for each in open_bag(Path(source)).topics
+             if each.name == topic and each.msgtype not in CAMERA_INFOS]
+    if wrong:
+        raise InputError(f'{source} has {wrong[0]} on {topic}, where camera_info belongs: '
+                         f'rename that topic')
+    return topic
 
 
 def _check_limits(path: Path) -> None:
@@ -190,11 +269,19 @@ def _refuse(damage: str) -> None:
     raise InputError(damage)
 
 
-def _camera_info(types: Any, c: RosCamera, header: Any) -> Any:
+def _camera_info(c: RosCamera, header: Any) -> bytes:
+    """Return a serialised CameraInfo."""
+    store = types_of(Stores.ROS2_JAZZY)
+    types: Any = store.types
     width, height = c.image_size
-    return types[CAMERA_INFO](
-        header=header, height=height, width=width, distortion_model=c.distortion_model,
+    info = types[CAMERA_INFO](
+        header=types['std_msgs/msg/Header'](
+            stamp=types['builtin_interfaces/msg/Time'](
+                sec=int(header.stamp.sec), nanosec=int(header.stamp.nanosec)),
+            frame_id=str(header.frame_id)),
+        height=height, width=width, distortion_model=c.distortion_model,
         d=np.array(c.d), k=np.array(c.k), r=np.array(c.r), p=np.array(c.p),
         binning_x=0, binning_y=0,
         roi=types['sensor_msgs/msg/RegionOfInterest'](
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False))
+    return bytes(store.serialize_cdr(info, CAMERA_INFO))

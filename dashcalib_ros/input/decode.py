@@ -44,7 +44,17 @@ _PNG_START = b'\x89PNG\r\n\x1a\n'
 _TIFF_STARTS = (b'II*\0', b'MM\0*')
 # parts of a PNG that are packed
 _PACKED = (b'zTXt', b'iTXt', b'iCCP')
+# how the EXIF data of a JPEG, a PNG and a WebP begin
+_EXIF = (b'Exif\0\0', b'eXIf', b'EXIF')
 _VIDEO_FORMATS = ('h264', 'h265', 'hevc', 'av1', 'vp9', 'theora')
+
+
+# of a 16-bit image: pixels between those that are looked at, and the percentiles of their range
+STEP, OF_PIXELS = 4, (1, 99)
+# bits by which a range is far from 0, and smaller than the values that the depth has
+FAR_FROM_0, FEW = 3, 2
+# values of a range that is stretched, and of an image that tells it; in fewer there is noise only
+LEAST_RANGE, FLAT = 64, 16
 
 
 class BitDepth:
@@ -54,16 +64,51 @@ class BitDepth:
     message says so. The depth is the smallest of 8, 10, 12, 14, 16 that holds every value seen so
     far. It never shrinks: the brightness changes at most four times in a drive, each time because
     a pixel did not fit the old depth.
+
+    A thermal camera's values are temperatures: a few, far from 0. If the first image is such a
+    one, of those that are not flat, the range of its values is stretched to 8 bits instead. It
+    never shrinks either.
     """
 
     def __init__(self) -> None:
         self.bits = _DEPTHS[0]
+        self._window: tuple[int, int] | None = None
+        self._undecided = True
 
     def to_8_bits(self, pixels: npt.NDArray[np.uint16]) -> GreyImage:
-        """Return the upper 8 bits in use, same shape."""
+        """Return the upper 8 bits in use, or the range that is, same shape."""
         needed = int(pixels.max()).bit_length()
         self.bits = max(self.bits, next(depth for depth in _DEPTHS if depth >= needed))
+        if self._undecided or self._window:
+            # dead pixels are not counted
+            low, high = map(int, np.percentile(pixels[::STEP, ::STEP], OF_PIXELS))
+            if self._window:
+                self._window = _widened(self._window, low, high)
+            elif high - low >= FLAT:
+                self._undecided = False
+                if low << FAR_FROM_0 >= 1 << self.bits and (high - low) << FEW <= 1 << self.bits:
+                    self._window = _widened((low, low + 1), low, high)
+        if self._window:
+            start, end = self._window
+            scaled = (pixels.astype(np.int32) - start) * 256 // (end - start)
+            return np.clip(scaled, 0, 255).astype(np.uint8)
         return (pixels >> (self.bits - 8)).astype(np.uint8)
+
+
+def _widened(window: tuple[int, int], low: int, high: int) -> tuple[int, int]:
+    """Return a range [start, end) with this one, and with low and high, in it; itself if it has.
+
+    Its length is a power of two, and a quarter of that divides its start: it rarely changes.
+    """
+    start, end = window
+    if start <= low and high < end and end - start >= LEAST_RANGE:
+        return window
+    low, high = min(start, low), max(end - 1, high)
+    size = max(LEAST_RANGE, 1 << (high - low).bit_length())
+    while low // (size // 4) * (size // 4) + size <= high:
+        size *= 2
+    start = low // (size // 4) * (size // 4)
+    return start, start + size
 
 
 @dataclass(frozen=True)
@@ -104,7 +149,7 @@ def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) ->
     """Decode a sensor_msgs/Image or CompressedImage: (height, width) uint8, a copy.
 
     message: has encoding, height, width, step, is_bigendian and data; or format and data: a JPEG,
-    PNG, TIFF, WebP, BMP, PGM or PPM.
+    PNG, TIFF, WebP, BMP, PGM or PPM, whose EXIF orientation is not applied: nothing in ROS does.
     depth: the stream's bit depth, for 16-bit encodings; without it, only this image counts.
     colour: (height, width, 3) BGR uint8, unless the image is grey.
 
@@ -112,7 +157,9 @@ def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) ->
     video streams, data that is cut off or damaged, and for more pixels than limits allow.
     """
     if not hasattr(message, 'encoding'):
-        return decode_file(memoryview(message.data), depth, _name(message), colour)
+        # what turns images with their EXIF data are programs for photographs, not those of ROS
+        pixels = decode_pixels(memoryview(message.data), _name(message), colour, as_stored=True)
+        return _to_8_bits(pixels, depth)
     layout = _LAYOUTS.get(str(message.encoding).lower())
     if layout is None:
         raise InputError(f'encoding {message.encoding!r} is not supported: '
@@ -144,8 +191,9 @@ def _name(message: Any) -> str:
     if 'compresseddepth' in name.lower():
         raise InputError(f'format {name!r} is a depth image: choose the topic of a camera image')
     if any(video in name.lower() for video in _VIDEO_FORMATS):
-        raise InputError(f'format {name!r} is a video stream: republish it as jpeg '
-                         f'(image_transport republish)')
+        raise InputError(f'format {name!r} is a video, of which no picture stands alone: set '
+                         f'image_transport:=video, or republish it as jpeg (image_transport '
+                         f'republish)')
     return f'{name or "compressed"} image'
 
 
@@ -158,11 +206,27 @@ def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
     return _to_8_bits(decode_pixels(data, what, colour), depth)
 
 
-def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = False) -> Pixels:
+def turned_text(data: bytes, what: str) -> str:
+    """Return what a file says to do with its picture, and decode_file() does; '' for nothing."""
+    if not any(mark in data for mark in _EXIF):
+        return ''
+    try:
+        shown, stored = (decode_pixels(data, what, as_stored=stored) for stored in (False, True))
+    except InputError:
+        return ''
+    turns = [90 * n for n in range(4) if np.array_equal(np.rot90(stored, -n), shown)]
+    if not turns:
+        return 'mirror its pictures'
+    return f'turn its pictures by {turns[0]} degrees' if turns[0] else ''
+
+
+def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = False,
+                  as_stored: bool = False) -> Pixels:
     """Decode the bytes of an image file: (height, width) of 8 or 16 bits.
 
-    colour: as for decode. what: the image's name in errors. Raises InputError when the bytes
-    are cut off or no image, or have more pixels or parts than limits allow.
+    colour: as for decode. what: the image's name in errors. as_stored: an EXIF orientation is not
+    applied. Raises InputError when the bytes are cut off or no image, or have more pixels or parts
+    than limits allow.
     """
     data = bytes(data)
     # before memory and time are used
@@ -174,8 +238,10 @@ def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = 
         # OpenCV would fill the rest with grey
         raise InputError(f'{what} is cut off: record or copy it again')
     try:
-        image = cv2.imdecode(buffer, cv2.IMREAD_ANYDEPTH | (
-            cv2.IMREAD_ANYCOLOR if colour else cv2.IMREAD_GRAYSCALE))
+        image = cv2.imdecode(
+            buffer, cv2.IMREAD_ANYDEPTH
+            | (cv2.IMREAD_ANYCOLOR if colour else cv2.IMREAD_GRAYSCALE)
+            | (cv2.IMREAD_IGNORE_ORIENTATION if as_stored else 0))
     except cv2.error:
         image = None
     if image is None:

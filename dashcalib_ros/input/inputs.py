@@ -319,8 +319,18 @@ class FolderSource(FrameSource):
                             f'give --fps if it is not')
         if topic is not None:
             warnings.append(f'{path} is a folder of images: topic {topic} is ignored')
+        if turned := self._turned():
+            warnings.append(f'{path} says (EXIF) to {turned}: the calibration is for the pictures '
+                            f'as they are shown so')
         super().__init__(str(path), len(self._names), warnings=tuple(warnings))
         self.length_ns = round(len(self._names) * 1e9 / self._fps)
+
+    def _turned(self) -> str:
+        """Return what the first picture says to do with it, in words; '' for nothing."""
+        from dashcalib_ros.input.decode import turned_text
+        with suppress(InputError):  # told when it is read
+            return turned_text(read_file(self._path / self._names[0], PICTURE_BYTES), '')
+        return ''
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
         from dashcalib_ros.input.decode import BitDepth, decode_file

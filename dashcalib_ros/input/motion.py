@@ -14,9 +14,16 @@ from typing import Any
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
+from dashcalib_ros.errors import InputError
 
 # s; stamps beyond it are times of day, since 1970
 EPOCH_S = 1e8
+# s since 1970, and from the first image on: the year 2286
+LATEST_S = 1e10
+# what other units of stamps since 1970 are, in s
+UNITS = {'milliseconds': 1e-3, 'microseconds': 1e-6, 'nanoseconds': 1e-9}
+# s between two stamps of a sensor; by this, ns since a computer was started are no ms since 1970
+LONGEST_STEP_S = 60.0
 # metres of a degree of latitude
 DEGREE_M = 111_320.0
 # of the Earth's radius, by which positions of another drive would be off: not this car's
@@ -25,7 +32,7 @@ FARTHEST_M = 1e6
 SAMPLES = 7_200_000
 # samples of a stream at the least; fewer say nothing of a turn
 LEAST_SAMPLES = 10
-# share of samples that may be damaged before the stream is not used
+# share of samples that may be damaged before the stream is not used, or doubled without a word
 DAMAGED = 0.2
 # rad/s; no car turns faster: degrees were written for radians
 FASTEST_TURN = 6.0
@@ -114,6 +121,26 @@ class SensorStream:
                             'sensors is taken to be of the first image'))
 
 
+def in_seconds(stamps: Floats, what: str) -> tuple[Floats, tuple[str, ...]]:
+    """Return stamps (n,) in s, and a warning where those since 1970 are of another unit.
+
+    what: where they are from, for messages. Raises InputError for those of no known unit.
+    """
+    known = stamps[np.isfinite(stamps)]
+    if not len(known):
+        return stamps, ()
+    with np.errstate(over='ignore'):
+        size = float(np.median(np.abs(known)))
+        step = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
+    for name, unit in UNITS.items():
+        if EPOCH_S < size * unit <= LATEST_S and step * unit <= LONGEST_STEP_S:
+            return stamps * unit, (f'the stamps of {what} are taken as {name} since 1970',)
+    if size > LATEST_S:
+        raise InputError(f'{what} has stamps such as {known[0]:.10g}, which are no seconds, '
+                         f'milliseconds, microseconds or nanoseconds since 1970; write seconds')
+    return stamps, ()
+
+
 def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
                   absolute: bool = False) -> SensorStream:
     """Return a stream from raw values, with what is damaged left out.
@@ -124,8 +151,17 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
     found: dict[str, Samples] = {}
     warnings: list[str] = []
     for kind, (stamps_s, rows) in values.items():
-        samples, trouble = _cleaned(np.asarray(stamps_s, np.float64),
-                                    np.asarray(rows, np.float64), kind)
+        stamps_s, rows = np.asarray(stamps_s, np.float64), np.asarray(rows, np.float64)
+        # whole seconds of a GPS at 10 Hz: the first one is at its time
+        with np.errstate(invalid='ignore'):
+            again = np.diff(stamps_s, prepend=np.nan) == 0
+        thinned = again.sum() > DAMAGED * len(again)
+        if thinned:
+            stamps_s, rows = stamps_s[~again], rows[~again]
+        samples, trouble = _cleaned(stamps_s, rows, kind)
+        if thinned and samples is not None:
+            warnings.append(f'of the {NAMES[kind]} of {what} several have one stamp: the first of '
+                            f'each is used')
         if trouble:
             warnings.append(f'the {NAMES[kind]} of {what} are not used: {trouble}')
         if samples is not None:

@@ -21,6 +21,7 @@ from dashcalib_ros.input.motion import (
     SAMPLES,
     SensorBuffer,
     SensorStream,
+    in_seconds,
     local_metres,
     sensor_stream,
     values_in,
@@ -40,9 +41,10 @@ from dashcalib_ros.limits import (
 )
 
 # columns of a CSV by their stream
+STAMP_COLUMN = 'stamp_s'
 COLUMNS = {'rate': ('gyro_x', 'gyro_y', 'gyro_z'), 'speed': ('speed',),
            'position': ('latitude', 'longitude', 'altitude')}
-HEAD = f'stamp_s and any of {", ".join(name for names in COLUMNS.values() for name in names)}'
+HEAD = f'stamp_s and any of {", ".join(chain(*COLUMNS.values()))}'
 # places in a line of KITTI's oxts: latitude, longitude, altitude; forward speed; rates x, y, z
 OXTS_POSITION, OXTS_SPEED, OXTS_RATE, OXTS_VALUES = slice(0, 3), 8, slice(17, 20), 30
 # characters of a GPX that are parsed at once
@@ -67,21 +69,37 @@ def read_motion(path: Path) -> SensorStream:
     if is_video(path):
         return _inside_video(path)
     what = f'the motion file {path}'
-    if path.suffix.lower() == '.gpx':
+    if _first_line(path, what).startswith('<'):
         return _gpx(read_text(path, GPX_BYTES, what), path)
     return _csv(read_lines(path, MOTION_BYTES, what), path)
 
 
+def is_motion(path: Path) -> bool:
+    """Return whether read_motion() is for this, as its content tells, and not read_poses()."""
+    if path.is_dir() or is_video(path):
+        return True
+    line = _first_line(path, str(path))
+    return line.startswith('<') or STAMP_COLUMN in _names(line)
+
+
+def _first_line(path: Path, what: str) -> str:
+    return next(read_lines(path, MOTION_BYTES, what), '').lstrip()
+
+
+def _names(line: str) -> list[str]:
+    return [name.strip() for name in line.removeprefix('#').split(',')]
+
+
 def _csv(lines: Iterator[str], path: Path) -> SensorStream:
-    names = [name.strip() for name in next(lines, '').split(',')]
-    if 'stamp_s' not in names or len(set(names)) < len(names):
+    names = _names(next(lines, ''))
+    if STAMP_COLUMN not in names or len(set(names)) < len(names):
         raise InputError(f'{path} is no CSV of motion sensors: its first line must name its '
-                         f'columns: {HEAD}')
+                         f'columns: {HEAD}; poses are given with --poses')
     # only what is used: a file may have any number of columns
-    used = [name for name in names if name in ('stamp_s', *chain(*COLUMNS.values()))]
+    used = [name for name in names if name in (STAMP_COLUMN, *chain(*COLUMNS.values()))]
     table = _table(lines, len(names), [names.index(name) for name in used])
     column = dict(zip(used, table.T, strict=True))
-    stamps = column['stamp_s']
+    stamps, warnings = in_seconds(column[STAMP_COLUMN], str(path))
     values: dict[str, tuple[Floats, Floats]] = {}
     for kind, wanted in COLUMNS.items():
         there = [name for name in wanted if name in column]
@@ -101,7 +119,8 @@ def _csv(lines: Iterator[str], path: Path) -> SensorStream:
     if not values:
         raise InputError(f'{path} has no column of a sensor: its first line must name {HEAD}')
     late = stamps[np.isfinite(stamps)]
-    return sensor_stream(values, str(path), bool(len(late) and late[0] > EPOCH_S))
+    found = sensor_stream(values, str(path), bool(len(late) and late[0] > EPOCH_S))
+    return replace(found, warnings=(*warnings, *found.warnings))
 
 
 def _table(lines: Iterable[str], width: int, places: Sequence[int]) -> Floats:

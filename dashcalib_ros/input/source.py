@@ -310,7 +310,9 @@ class FrameSource(ABC):
                     f'give a smaller --start')
         reasons = [reading.first_failure] if reading.first_failure else reading.warnings
         why = '; '.join(reasons) or 'it has none'
-        return f'{self.name} gave no image ({why}): {self._cure}'
+        # what is wrong with a picture has a cure of its own
+        cure = '' if reading.first_failure else f': {self._cure}'
+        return f'{self.name} gave no image ({why}){cure}'
 
     @abstractmethod
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:

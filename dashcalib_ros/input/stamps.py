@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import statistics
 from collections import deque
+from itertools import pairwise
 
 SECOND_NS = 1_000_000_000
 # a stamp further back means a clock that was set back (a bag that loops), not a late image
@@ -38,6 +39,52 @@ def least_step_ns(rate: float) -> float:
     return (1 - EARLY) * 1e9 / rate
 
 
+# images whose stamps are compared with the times at which they came, and how many at the least
+COMPARED, LEAST_COMPARED = 50, 8
+# how much longer or shorter the time between stamps is, and what a driver then writes as what
+WRONG_UNITS = {1e-9: 'seconds as nanoseconds', 1e-6: 'milliseconds as nanoseconds',
+               1e-3: 'microseconds as nanoseconds', 1e3: 'milliseconds as seconds',
+               1e6: 'microseconds as seconds'}
+# of it, by which the ratio may be off
+ALIKE = 0.2
+# ns that images may come late, where stamps are otherwise whole seconds off; falls, to be believed
+LATE_NS, FALLS = 200_000_000, 2
+
+
+class Comparison:
+    """Compares stamps with the times at which the images came: faults that drivers have."""
+
+    def __init__(self) -> None:
+        self._pairs: deque[tuple[int, int]] = deque(maxlen=COMPARED)
+
+    def fault(self, stamp_ns: int, received_ns: int) -> str:
+        """Take an image; return in words what is wrong with the stamps, '' for nothing."""
+        self._pairs.append((stamp_ns, received_ns))
+        if len(self._pairs) < LEAST_COMPARED:
+            return ''
+        stamps, came = zip(*self._pairs, strict=True)
+        steps, passed = ([b - a for a, b in pairwise(each)] for each in (stamps, came))
+        if min(passed) <= 0:  # there are no times of reception
+            return ''
+        ratio = (stamps[-1] - stamps[0]) / (came[-1] - came[0])
+        for factor, units in WRONG_UNITS.items():
+            if min(steps) >= 0 and abs(ratio / factor - 1) < ALIKE:
+                how = 'fast' if factor > 1 else 'slow'
+                return (f'the stamps run {max(factor, 1 / factor):.0f} times too {how}: the '
+                        f'driver writes {units}')
+        # seconds that are rounded up while their fraction is not: 1 s too late, for a part of
+        # each; or that stand still
+        apart = [stamp - time - stamps[0] + came[0] for stamp, time in self._pairs]
+        seconds = [round(each / SECOND_NS) for each in apart]
+        falls = sum(b < a for a, b in pairwise(seconds))
+        if (falls >= FALLS and abs(falls - (came[-1] - came[0]) / SECOND_NS) <= 1
+                and all(abs(each - n * SECOND_NS) < LATE_NS
+                        for each, n in zip(apart, seconds, strict=True))):
+            return (f'the stamps fall back by {-min(steps) / SECOND_NS:.1f} s once a second: the '
+                    f'driver gives them wrong seconds')
+        return ''
+
+
 class StampGate:
     """Gives each image of a stream its time, and leaves out those that cannot be used.
 
@@ -55,6 +102,7 @@ class StampGate:
     unstamped: times of reception are used. repeated: number of images left out as not later than
     the one before; zero: of those left out as without a stamp. set_back: how often the clock was
     set back, and furthest_back_ns by how much at the most. lost: images missing between stamps.
+    fault: of the stamps beside the times of reception, in words; from then on those are used.
     """
 
     def __init__(self, rate: float | None = None) -> None:
@@ -62,6 +110,7 @@ class StampGate:
         self.unstamped = False
         self.repeated = self.zero = self.lost = self.set_back = 0
         self.furthest_back_ns = 0
+        self._received: int | None = None
         self._least_ns = least_step_ns(rate) if rate else 0.0
         self._steps: deque[int] = deque(maxlen=31)
         self._looks = Looks()
@@ -70,10 +119,12 @@ class StampGate:
     def forget(self) -> None:
         """Begin anew with the next image; the counts stay."""
         self.unstamped = False
+        self.fault = ''
         self._last: int | None = None
         self._used: int | None = None
         self._step = self._shift = 0
         self._steps.clear()
+        self._comparison = Comparison()
 
     def take(self, header_ns: int, received_ns: int) -> int | None:
         """Return the next image's time in ns, or None when it is not to be used."""
@@ -90,7 +141,10 @@ class StampGate:
         lines = []
         if self.unstamped:
             lines.append('the image headers have no stamps: the times of reception were used')
-        if self.repeated:
+        if self.fault:
+            lines.append(f'{self.fault}; from there on the times of reception are used: repair '
+                         f'the driver')
+        elif self.repeated:
             lines.append(f'{self.repeated} images were skipped: their stamps are not later than '
                          f'those before')
         if self.set_back:
@@ -103,7 +157,10 @@ class StampGate:
         if not self._choose_clock(header_ns):
             self.zero += 1
             return None
-        now = (received_ns if self.unstamped else header_ns) + self._shift
+        if not (self.unstamped or self.fault):
+            self._doubt(header_ns, received_ns)
+        self._received = received_ns
+        now = (received_ns if self.unstamped or self.fault else header_ns) + self._shift
         if self._last is None:
             self._last = now
             return now
@@ -123,6 +180,13 @@ class StampGate:
         self._step = step
         self._last += step
         return self._last
+
+    def _doubt(self, header_ns: int, received_ns: int) -> None:
+        """Look whether the stamps are wrong; then time goes on with that of reception."""
+        self.fault = self._comparison.fault(header_ns, received_ns)
+        if self.fault and self._last is not None and self._received is not None:
+            self._shift = self._last - self._received
+            self._steps.clear()
 
     def _choose_clock(self, header_ns: int) -> bool:
         """Decide between stamps and times of reception; return False to leave the image out."""

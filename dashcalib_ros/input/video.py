@@ -108,7 +108,7 @@ class VideoSource(FrameSource):
         return None if created.year <= 2000 else round(created.timestamp()) * SECOND_NS
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
-        gate, picture = StampGate(), _Picture(self._stretch)
+        gate, picture = StampGate(), FramePicture(self._stretch)
         read, index = self._before(start_ns) if start_ns else (0, 0)
         reading.images = index
         with _opened(self._path, self._stream) as (container, stream):
@@ -158,14 +158,18 @@ class VideoSource(FrameSource):
         return skipped, index
 
 
-class _Picture:
-    """Frame -> picture, as a player shows it; BGR where colour is asked for. Raises InputError."""
+class FramePicture:
+    """Frame -> picture, as a player shows it; BGR where colour is asked for. Raises InputError.
 
-    def __init__(self, stretch: tuple[float, float]) -> None:
+    stretch: by how much its columns and rows are stretched.
+    """
+
+    def __init__(self, stretch: tuple[float, float] = SQUARE) -> None:
         self._reformatter = VideoReformatter()
         self._stretch = stretch
 
     def __call__(self, frame: av.VideoFrame, colour: bool = False) -> Pixels:
+        """Return (h, w) grey, or (h, w, 3) BGR where colour is asked for and there is some."""
         check_pixels(*_stretched(frame, self._stretch))
         kind = frame.format
         image: Pixels

@@ -132,6 +132,8 @@ def size_reason(given: Camera, image_size: tuple[int, int], compare: Compare | N
     width, height = image_size
     theirs = f'{given.image_size[0]}x{given.image_size[1]}'
     text = f'it is for {theirs} pictures, and those of the drive have {width}x{height}'
+    if width != height and given.image_size == (height, width):
+        return f'{text}: are width and height exchanged, or the pictures turned by 90 degrees?'
     factor = width / given.image_size[0]
     if abs(height / given.image_size[1] / factor - 1) <= SAME_ASPECT:
         if compare is None:

@@ -1,13 +1,15 @@
 """How well a camera finds the car's true motion: the turns' rotations and scales beside poses.
 
-The poses are of GPS/IMU, lidar or SLAM, in KITTI's or TUM's format, or a GPS track. The turns'
-paths become files in TUM's format, which evo reads, and a plot.
+The poses are of GPS/IMU, lidar or SLAM, in the format of KITTI, TUM or EuRoC, or a GPS track. The
+turns' paths become files in TUM's format, which evo reads, and a plot.
 
 Each turn is adjusted with each camera held, all alike. The angle of a turn's rotation is the same
 in every frame that is fixed to the car: nothing has to be known of where the poses' sensor sits.
 """
 from __future__ import annotations
 
+import re
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -20,9 +22,9 @@ from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.input.motion import Samples
+from dashcalib_ros.input.motion import Samples, in_seconds
 from dashcalib_ros.judge.calibration import OPTICAL
-from dashcalib_ros.limits import read_text
+from dashcalib_ros.limits import read_lines
 from dashcalib_ros.reconstruct.scene import Scene
 
 # keyframes with poses; a turn with fewer says nothing
@@ -149,10 +151,16 @@ def length(positions: Floats) -> float:
 
 # of a file of poses: an hour at 100 Hz
 POSES_BYTES = 2**26
-# values in a line; KITTI's 12 may have a time before them, which is not used
-KITTI, KITTI_TIMED, TUM = 12, 13, 8
-# s between two poses; over more they are not interpolated
-LONGEST_GAP_S = 0.5
+# values in a line; KITTI's 12 may have a time before them, which is not used; EuRoC's have speeds
+# and biases behind them
+POSE_COLUMNS = KITTI, KITTI_TIMED, TUM, EUROC = 12, 13, 8, 17
+# a head that names the real part of the quaternions first, as EuRoC's does
+REAL_FIRST = re.compile(r'q\w*w\b.*q\w*x\b', re.IGNORECASE)
+# m; UTM counts up to ten million
+FARTHEST_M = 1e9
+# s between two poses; over more they are not interpolated. A track's headings are smoothed over
+# longer anyway, and GPS comes once a second
+LONGEST_GAP_S, TRACK_GAP_S = 0.5, 1.5
 # s to either side, over which a track has a heading; m in that time, with less it stands
 COURSE_S, STANDING_M = 1.0, 2.0
 # of a rotation matrix; KITTI rounds them to 7 digits
@@ -164,12 +172,15 @@ class Poses:
     """Poses of a vehicle, or of anything that is fixed to the camera.
 
     rotations: (n, 3, 3) to the world; positions: (n, 3) in metres. stamps_s: (n,) ascending, or
-    None where the poses are those of the input's frames, one by one.
+    None where the poses are those of the input's frames, one by one. warnings: what the user
+    should know of them. longest_gap_s: between two, over which they are not interpolated.
     """
 
     rotations: Floats
     positions: Floats
     stamps_s: Floats | None = None
+    warnings: tuple[str, ...] = ()
+    longest_gap_s: float = LONGEST_GAP_S
 
     def at(self, frames: Ints, stamps_ns: Ints) -> tuple[Floats, Floats, Mask]:
         """Return rotations (k, 3, 3), positions (k, 3) and which of them are known (k,).
@@ -187,30 +198,52 @@ class Poses:
         wanted = (np.asarray(stamps_ns) - start * 10**9) / 1e9
         after = np.clip(np.searchsorted(own, wanted), 1, len(own) - 1)
         inside = (wanted >= own[0]) & (wanted <= own[-1])
-        known = np.asarray(inside & (own[after] - own[after - 1] <= LONGEST_GAP_S), bool)
+        known = np.asarray(inside & (own[after] - own[after - 1] <= self.longest_gap_s), bool)
         held = np.clip(wanted, own[0], own[-1])
         rotations = Slerp(own, Rotation.from_matrix(self.rotations))(held).as_matrix()
         return np.asarray(rotations), Samples(own, self.positions).at(held), known
 
 
 def read_poses(path: Path) -> Poses:
-    """Read poses in KITTI's format (12 numbers a line) or TUM's (t x y z qx qy qz qw).
+    """Read poses as KITTI (12 numbers a line), TUM (t x y z qx qy qz qw) or EuRoC writes them.
 
-    Raises InputError for anything else.
+    Between them are spaces or commas. Raises InputError for anything else.
     """
-    lines = read_text(path, POSES_BYTES, f'the poses {path}').splitlines()
-    rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith('#')]
-    columns = {len(row) for row in rows}
-    if len(rows) < 2 or columns not in ({KITTI}, {KITTI_TIMED}, {TUM}):
-        raise InputError(f"{path} has no poses in KITTI's format (12 numbers a line, one line for "
-                         f"each frame) nor in TUM's (t x y z qx qy qz qw)")
-    try:
-        table = np.array(rows, np.float64)
-    except ValueError as error:
-        raise InputError(f'{path} has a line that is not all numbers: {error}') from error
+    values, columns, heads = array('d'), 0, ''
+    for line in read_lines(path, POSES_BYTES, f'the poses {path}'):
+        cells = line.replace(',', ' ').split()
+        if not cells or cells[0].startswith('#'):
+            heads += line
+            continue
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError as error:
+            if not columns and not heads:
+                heads = line
+                continue
+            if len(cells) in POSE_COLUMNS:
+                raise InputError(f'{path} has a line that is not all numbers: {error}') from error
+            raise _no_poses(path) from error
+        columns = columns or len(row)
+        if columns not in POSE_COLUMNS or len(row) != columns:
+            raise _no_poses(path)
+        values.extend(row)
+    if len(values) < 2 * max(columns, 1):
+        raise _no_poses(path)
+    table = np.array(values).reshape(-1, columns)
     if not np.isfinite(table).all():
         raise InputError(f'{path} has numbers that are not finite; leave these poses out')
-    return _tum(table, path) if columns == {TUM} else _kitti(table[:, -KITTI:], path)
+    if columns in (KITTI, KITTI_TIMED):
+        return _kitti(table[:, -KITTI:], path)
+    if columns == EUROC or REAL_FIRST.search(heads):
+        table[:, 4:8] = table[:, [5, 6, 7, 4]]
+    return _tum(table[:, :TUM], path)
+
+
+def _no_poses(path: Path) -> InputError:
+    return InputError(f"{path} has no poses in KITTI's format (12 numbers a line, one line for "
+                      f"each frame), in TUM's (t x y z qx qy qz qw) nor in EuRoC's, and no line "
+                      f"that names stamp_s, latitude and longitude")
 
 
 def track_poses(position: Samples, start_s: float) -> Poses:
@@ -234,27 +267,40 @@ def track_poses(position: Samples, start_s: float) -> Poses:
     last = np.maximum.accumulate(np.where(moves, np.arange(len(moves)), int(np.argmax(moves))))
     # to the world (east, north, up), from axes as a camera's
     turned = Rotation.from_rotvec(heading[last][:, None] * [0.0, 0.0, 1.0]).as_matrix() @ OPTICAL
-    return Poses(np.asarray(turned), position.at(inside), inside + start_s)
+    return Poses(np.asarray(turned), position.at(inside), inside + start_s,
+                 longest_gap_s=TRACK_GAP_S)
 
 
 def _kitti(table: Floats, path: Path) -> Poses:
     poses = table.reshape(-1, 3, 4)
     rotations = poses[:, :, :3]
-    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
-    if off > NOT_A_ROTATION or (np.linalg.det(rotations) < 0).any():
+    with np.errstate(all='ignore'):
+        off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
+    # NaN is none, either
+    if not off <= NOT_A_ROTATION or (np.linalg.det(rotations) < 0).any():
         raise InputError(f'{path} has matrices that are no rotations: are they 3x4, row by row?')
-    return Poses(rotations, poses[:, :, 3])
+    return Poses(rotations, _places(poses[:, :, 3], path))
+
+
+def _places(positions: Floats, path: Path) -> Floats:
+    farthest = np.abs(positions).max()
+    if farthest > FARTHEST_M:
+        raise InputError(f'{path} has a position {farthest:.4g} m away; write metres')
+    return positions
 
 
 def _tum(table: Floats, path: Path) -> Poses:
     from scipy.spatial.transform import Rotation
-    stamps, quaternions = table[:, 0], table[:, 4:]
+    (stamps, warnings), quaternions = in_seconds(table[:, 0], str(path)), table[:, 4:]
     if not (np.diff(stamps) > 0).all():
         raise InputError(f'{path}: the stamps of the poses do not ascend; sort them')
-    if (np.linalg.norm(quaternions, axis=1) < 0.5).any():
+    with np.errstate(all='ignore'):
+        lengths = np.linalg.norm(quaternions, axis=1)
+    if (np.abs(lengths - 1) > 0.5).any():
         raise InputError(f'{path} has quaternions that are no rotations: is the order t x y z qx '
                          f'qy qz qw?')
-    return Poses(Rotation.from_quat(quaternions).as_matrix(), table[:, 1:4], stamps)
+    return Poses(Rotation.from_quat(quaternions).as_matrix(), _places(table[:, 1:4], path), stamps,
+                 warnings)
 
 
 TRUE = 'poses'

@@ -23,6 +23,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import (
     FISHEYE,
     MODELS,
+    NO_DISTORTION,
     Brown,
     Camera,
     Fisheye,
@@ -34,11 +35,11 @@ from dashcalib_ros.camera import (
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.camera.field import Field
-from dashcalib_ros.camera.mapping import grid_of
+from dashcalib_ros.camera.mapping import rayless_share
 from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.input.bag_write import first_camera_info
 from dashcalib_ros.input.inputs import fits_bag
-from dashcalib_ros.input.source import os_error
+from dashcalib_ros.input.source import by, os_error
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import ANGLES, Mount
 from dashcalib_ros.judge.difference import NamedCamera
@@ -82,16 +83,33 @@ COLMAP = (('SIMPLE_PINHOLE', 1, PLUMB_BOB, 0), ('PINHOLE', 2, PLUMB_BOB, 0),
           ('FULL_OPENCV', 2, RATIONAL, 8), ('FOV', 2, None, 1),
           ('SIMPLE_RADIAL_FISHEYE', 1, EQUIDISTANT, 1), ('RADIAL_FISHEYE', 1, EQUIDISTANT, 2),
           ('THIN_PRISM_FISHEYE', 2, None, 8))
-KALIBR = {'radtan': PLUMB_BOB, 'equidistant': EQUIDISTANT, 'equi': EQUIDISTANT, 'none': PLUMB_BOB}
+KALIBR = {'radtan': PLUMB_BOB, 'equidistant': EQUIDISTANT, 'equi': EQUIDISTANT,
+          **dict.fromkeys(NO_DISTORTION, PLUMB_BOB)}
 OPENSFM = {'perspective': PLUMB_BOB, 'simple_radial': PLUMB_BOB, 'radial': PLUMB_BOB,
            'brown': PLUMB_BOB, 'fisheye': EQUIDISTANT, 'fisheye_opencv': EQUIDISTANT}
 NERFSTUDIO = {name: kind for name, _, kind, _ in COLMAP[:6]}
 MRCAL = {'LENSMODEL_PINHOLE': PLUMB_BOB, 'LENSMODEL_OPENCV4': PLUMB_BOB,
          'LENSMODEL_OPENCV5': PLUMB_BOB, 'LENSMODEL_OPENCV8': RATIONAL,
          'LENSMODEL_OPENCV12': RATIONAL}
-# how files name OpenCV's values, in small letters without anything between them
-MATRIX = ('cameramatrix', 'intrinsicmatrix', 'intrinsics', 'k', 'mtx')
-DISTORTION = ('distortioncoefficients', 'distortioncoeffs', 'distcoeffs', 'distcoeff', 'dist', 'd')
+# how files name OpenCV's values, in small letters without anything between them; in a shape the
+# height comes first
+MATRIX = ('cameramatrix', 'camerainternalmatrix', 'intrinsicmatrix', 'intrinsicsmatrix',
+          'intrinsics', 'intrinsic', 'cameraintrinsics', 'cameramat', 'cammatrix', 'cameramtx',
+          'kmatrix', 'matrixk', 'k', 'mtx')
+DISTORTION = tuple(f'{start}{end}' for start in ('distortion', 'dist') for end in (
+    'coefficients', 'coefficient', 'coeffs', 'coeff', 'coefs', 'coef', 'parameters', 'params',
+    'vector', '')) + ('coefficients', 'coeffs', 'd')
+SIZES = tuple(f'{start}{end}' for start in ('image', 'img', 'camera', 'frame', 'picture', '')
+              for end in ('size', 'resolution', 'dimensions'))
+SHAPES = tuple(f'{start}shape' for start in ('image', 'img', 'frame', ''))
+WIDTHS, HEIGHTS = (tuple(f'{start}{end}' for end in ends for start in (
+    'image', 'img', 'frame', 'camera', 'resolution', '')) for ends in (
+    ('width', 'w', 'cols', 'x'), ('height', 'h', 'rows', 'y')))
+# the section of an INI file that is no camera
+INI_IMAGE = 'image'
+# of the picture, by which its middle is off: less than the first for width and height exchanged,
+# and more than the second as they are
+EXCHANGED, AS_GIVEN = 0.06, 0.1
 
 
 def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
@@ -154,10 +172,8 @@ def camera_of_message(message: Any, name: str) -> NamedCamera:
                                                      getattr(message, key.upper(), ()))]
                   for key in 'kdrp')
     size, roi = (int(message.width), int(message.height)), message.roi
-    cut = (roi.x_offset, roi.y_offset, roi.width, roi.height) not in ((0, 0, 0, 0), (0, 0, *size))
-    if cut or max(message.binning_x, message.binning_y) > 1:
-        raise InputError(f'{name} has binning or a region of interest: give the calibration of '
-                         f'the images as they are')
+    _check_whole(size, (message.binning_x, message.binning_y),
+                 (roi.x_offset, roi.y_offset, roi.width, roi.height), name)
     if not k or not k[0] > 0:
         raise InputError(f'{name} is uncalibrated: K[0] is not positive; give the driver a '
                          f'calibration')
@@ -165,6 +181,17 @@ def camera_of_message(message: Any, name: str) -> NamedCamera:
         raise InputError(f'{name} has numbers that are not finite; give a calibration')
     camera = _camera(size, _view(k), str(message.distortion_model), d, name)
     return NamedCamera(name, camera, faults=ros_faults(camera, k, r, p))
+
+
+def _check_whole(size: tuple[int, int], binning: Sequence[float], roi: Sequence[float],
+                 name: str | Path) -> None:
+    """Raise InputError for a CameraInfo of a part of the sensor, or of one that is binned.
+
+    roi: x, y, width, height.
+    """
+    if tuple(roi) not in ((0, 0, 0, 0), (0, 0, *size)) or max(binning) > 1:
+        raise InputError(f'{name} has binning or a region of interest: give the calibration of '
+                         f'the images as they are')
 
 
 def _chosen(cameras: Mapping[str, Reader], name: str | None, path: str | Path) -> NamedCamera:
@@ -193,14 +220,45 @@ def _parsed(text: str, path: Path) -> Mapping[str, Reader]:
         return {line[0]: partial(_colmap, line[1:], path) for line in lines}
     if start[:1] in ('{', '['):
         return _cameras_of(parse_json(text, str(path)), path)
-    # OpenCV writes a head and a tag of its own
-    plain = re.sub(r'\A%YAML[^\n]*', '', text).replace('!!opencv-matrix', '')
+    if re.search(rf'^\s*\[{INI_IMAGE}\]\s*$', text, re.MULTILINE):
+        return _cameras_of_ini(text, path)
     try:
-        return _cameras_of(parse_yaml(plain, str(path)), path)
+        return _cameras_of(parse_yaml(_first_document(text), str(path)), path)
     except InputError as error:
         if 'not valid YAML' in str(error):
             raise InputError(f'{error}; give {KNOWN}') from error
         raise
+
+
+def _first_document(text: str) -> str:
+    """Return a YAML text's first document: `ros2 topic echo` ends each message with ---."""
+    # OpenCV writes a head and a tag of its own
+    plain = re.sub(r'\A%YAML[^\n]*', '', text).replace('!!opencv-matrix', '')
+    documents = re.split(r'^(?:---|\.\.\.)[ \t]*\r?$', plain, flags=re.MULTILINE)
+    # comments may stand before the first
+    return next((each for each in documents if re.sub(r'#[^\n]*', '', each).strip()), '')
+
+
+def _cameras_of_ini(text: str, path: Path) -> Mapping[str, Reader]:
+    """Return the readers of the cameras of ROS's INI file: a line of words, then its numbers."""
+    sections: dict[str, dict[str, Any]] = {}
+    section: dict[str, Any] = {}
+    values: list[float] = []
+    for line in (re.sub('[#;].*', '', line).strip() for line in text.splitlines()):
+        key, sign, value = (part.strip() for part in (line.partition('=') if '=' in line else
+                                                      line.partition(':')))
+        numbers = _numbers_in(line)
+        if line.startswith('[') and line.endswith(']'):
+            section = sections.setdefault(line[1:-1].strip(), {})
+        elif sign:
+            section[key] = _numbers_in(value) or value
+        elif numbers is None:
+            section[line] = values = []
+        else:
+            values += numbers
+    image = {key: values[0] for key, values in sections.pop(INI_IMAGE, {}).items() if values}
+    return {name: partial(_opencv, {**image, **section}, path)
+            for name, section in sections.items()}
 
 
 def _cameras_of(data: Any, path: Path) -> Mapping[str, Reader]:
@@ -226,9 +284,8 @@ def _cameras_of(data: Any, path: Path) -> Mapping[str, Reader]:
                 if isinstance(each, Mapping) and key in each}
             if found:
                 return found
-        keys = {re.sub('[^a-z0-9]', '', str(key).lower()): key for key in data}
-        if any(each in keys for each in MATRIX):
-            return {'': partial(_opencv, data, keys, path)}
+        if any(each in _plain_keys(data) for each in MATRIX):
+            return {'': partial(_opencv, data, path)}
     raise InputError(f'{path} is no camera calibration known here; give {KNOWN}')
 
 
@@ -238,6 +295,12 @@ def _camera(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequence[f
     fx, fy, cx, cy = view
     check_focal(fx, fy, path)
     width, height = read_size(*size, path=path)
+    off, exchanged = (max(abs(cx / across - 0.5), abs(cy / down - 0.5))
+                      for across, down in ((width, height), (height, width)))
+    if exchanged < EXCHANGED and off > AS_GIVEN:
+        raise InputError(f'{path} is for pictures of {width}x{height}, but the centre ({cx:.0f}, '
+                         f'{cy:.0f}) is that of {height}x{width}: are width and height '
+                         f'exchanged? give the width first')
     try:
         camera = camera_from_ros((width, height), kind, [fx, 0, cx, 0, fy, cy, 0, 0, 1], d)
     except InputError as error:
@@ -256,10 +319,9 @@ def _check_lens(camera: Camera, path: str | Path) -> None:
 
 def _seeing(found: NamedCamera) -> NamedCamera:
     """Return it; raises InputError where no pixel of its picture has a ray."""
-    with np.errstate(all='ignore'):
-        if not np.isfinite(found.camera.rays(grid_of(found.camera))).all(axis=1).any():
-            raise InputError(f'{found.name} is of a lens that sees no ray in its picture of '
-                             f'{found.image_size[0]}x{found.image_size[1]}; calibrate anew')
+    if rayless_share(found.camera) == 1:
+        raise InputError(f'{found.name} is of a lens that sees no ray in its picture of '
+                         f'{by(found.image_size)}; calibrate anew')
     return found
 
 
@@ -308,22 +370,47 @@ def _values(data: Data, key: str, count: int, path: Path) -> list[float]:
     return found
 
 
-def _opencv(data: Data, keys: Mapping[str, str], path: Path) -> NamedCamera:
-    """Read a camera matrix and distortion coefficients: those of ROS, OpenCV, and scripts.
+def _plain_keys(data: Data) -> dict[str, Any]:
+    """Return the file's keys by what they are without capitals and signs."""
+    return {re.sub('[^a-z0-9]', '', str(key).lower()): key for key in data}
 
-    keys: the file's, by what they are without capitals and signs.
-    """
+
+def _opencv(data: Data, path: Path) -> NamedCamera:
+    """Read a camera matrix and distortion coefficients: those of ROS, OpenCV, and scripts."""
+    keys = _plain_keys(data)
+
     def first(*names: str) -> Any:
         return next((data[keys[name]] for name in names if name in keys), None)
 
-    k = _values(data, next(keys[name] for name in MATRIX if name in keys), 9, path)
-    names = [keys[name] for name in DISTORTION if name in keys]
-    d = _numbers(data[names[0]] if names else None, names[0] if names else
-                 'distortion_coefficients', path)
-    both = first('imagesize', 'imgsize', 'resolution')
-    size = both if isinstance(both, list) and len(both) == 2 else (
-        first('imagewidth', 'width', 'w'), first('imageheight', 'height', 'h'))
+    def numbers(names: Sequence[str], *counts: int) -> list[float]:
+        """Return those of the first name that there is, nothing where there is none."""
+        key = next((keys[name] for name in names if name in keys), None)
+        if key is None or data[key] is None:
+            return []
+        found = _numbers(data[key], key, path)
+        if counts and len(found) not in counts:
+            raise InputError(f'{path}: {key} must have data of {counts[-1]} numbers')
+        return found
+
+    k = numbers(MATRIX, 4, 9)
+    k = k if len(k) == 9 else [k[0], 0, k[2], 0, k[1], k[3], 0, 0, 1]
+    d, r, p = (numbers(DISTORTION), numbers(('rectificationmatrix', 'rectification'), 0, 9),
+               numbers(('projectionmatrix', 'projection'), 0, 12))
+    size = _size_in(first)
     kind, lens = first('distortionmodel'), str(first('cameramodel')).lower()
+    if not any(name in keys for name in DISTORTION) and str(kind).lower() not in NO_DISTORTION:
+        raise InputError(f'{path} has no distortion_coefficients, a list of numbers; give a '
+                         f'complete calibration')
+    if 'binningx' in keys or 'roi' in keys:
+        # the fields of a CameraInfo
+        r, p = r or numbers(('r',), 0, 9), p or numbers(('p',), 0, 12)
+        part = first('roi')
+        part = part if isinstance(part, Mapping) else {}
+        _check_whole(read_size(*size, path=path),
+                     [read_number(data, keys.get(key, ''), path, 0.0)
+                      for key in ('binningx', 'binningy')],
+                     [read_number(part, key, path, 0.0)
+                      for key in ('x_offset', 'y_offset', 'width', 'height')], path)
     if kind is None:
         fisheye = 'fisheye' in lens or first('fisheyemodel', 'fisheye') in (1, '1', True)
         if len(d) == 4 and any(d) and not fisheye and 'pinhole' not in lens:
@@ -331,14 +418,22 @@ def _opencv(data: Data, keys: Mapping[str, str], path: Path) -> NamedCamera:
                              f'add a line distortion_model: {PLUMB_BOB}, or {EQUIDISTANT}')
         kind = EQUIDISTANT if fisheye else PLUMB_BOB if len(d) <= 5 else RATIONAL
     camera = _camera(size, _view(k), str(kind), d, path)
-    r, p = (_values(data, key, count, path) if key in data else None
-            for key, count in (('rectification_matrix', 9), ('projection_matrix', 12)))
     own = data.get('dashcalib')
     own = own if isinstance(own, Mapping) else {}
     verdict = own.get('verdict')
     return NamedCamera(str(path), camera, read_sigma(own.get('sigma'), camera),
                        None if verdict is None else str(verdict),
                        mount=read_mount(own.get('mount')), faults=ros_faults(camera, k, r, p))
+
+
+def _size_in(first: Callable[..., Any]) -> Sequence[Any]:
+    """Return width and height, as they are written. first: the first of these names' values."""
+    for names, order in ((SIZES, 1), (SHAPES, -1)):
+        both = first(*names)
+        both = both.get('data') if isinstance(both, Mapping) else both
+        if isinstance(both, list) and 2 <= len(both) <= 2 + (order < 0):
+            return both[:2][::order]
+    return first(*WIDTHS), first(*HEIGHTS)
 
 
 def _kalibr(data: Data, path: Path) -> Camera:
@@ -431,6 +526,8 @@ def _mrcal(text: str, path: Path) -> Camera:
 def _plain(data: Data, path: Path) -> NamedCamera:
     """Read fx, fy, cx, cy and coefficients by name; those after k2 may be left out."""
     name = data.get('model', data.get('distortion_model'))
+    ideal = isinstance(name, str) and name.lower() in NO_DISTORTION
+    name = 'pinhole' if ideal else name
     models = [model for model in MODELS.values()
               if name in (None, model.model, model.ros_model, model.family)]
     if not models:
@@ -440,7 +537,7 @@ def _plain(data: Data, path: Path) -> NamedCamera:
                          f'"{RATIONAL}"')
     kind = (EQUIDISTANT if models[0].family == FISHEYE else
             PLUMB_BOB if name == PLUMB_BOB else RATIONAL)
-    for needed in Radial.names()[4:]:
+    for needed in () if ideal else Radial.names()[4:]:
         read_number(data, needed, path)
     camera = _camera((data.get('width'), data.get('height')),
                      [read_number(data, key, path) for key in Radial.names()[:4]], kind,
@@ -487,12 +584,20 @@ def _xml(text: str, path: Path) -> Any:
 def _element(node: ElementTree.Element) -> Any:
     if len(node):
         return {child.tag: _element(child) for child in node}
-    words = (node.text or '').split()
-    try:
-        numbers = [int(word) if word.lstrip('+-').isdecimal() else float(word) for word in words]
-    except ValueError:
-        return (node.text or '').strip().strip('"')
+    text = node.text or ''
+    numbers = _numbers_in(text)
+    if numbers is None:
+        return text.strip().strip('"')
     return numbers[0] if len(numbers) == 1 and node.tag != 'data' else numbers
+
+
+def _numbers_in(text: str) -> list[float] | None:
+    """Return the numbers of a text, None where it has other words."""
+    try:
+        return [int(word) if word.lstrip('+-').isdecimal() else float(word)
+                for word in text.split()]
+    except ValueError:
+        return None
 
 
 def _arrays(path: Path) -> Data:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import yaml
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import FISHEYE, Camera
+from dashcalib_ros.camera import FISHEYE, Camera, ros_camera
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import ConfigError
@@ -125,6 +125,16 @@ def _nerfstudio(camera: Camera) -> str:
         **_coefficients(camera, 5, 'nerfstudio'), 'frames': []}, indent=2) + '\n'
 
 
+def _foxglove(camera: Camera) -> str:
+    """Return Foxglove's CameraCalibration as JSON, where a fisheye is kannala_brandt."""
+    ros = ros_camera(camera)
+    width, height = ros.image_size
+    return json.dumps({
+        'timestamp': {'sec': 0, 'nsec': 0}, 'frame_id': 'camera', 'width': width, 'height': height,
+        'distortion_model': 'kannala_brandt' if _is_fisheye(camera) else ros.distortion_model,
+        'D': ros.d, 'K': ros.k, 'R': ros.r, 'P': ros.p}, indent=2) + '\n'
+
+
 def _mrcal(camera: Camera, field: Field | None = None) -> str:
     """Return mrcal's .cameramodel: the splined one for a fisheye, which it has not, and a field.
 
@@ -204,8 +214,8 @@ def _is_fisheye(camera: Camera) -> bool:
 
 EXPORTS: dict[str, Callable[[Camera], str | bytes]] = {
     'opencv': _opencv, 'colmap': _colmap, 'kalibr': _kalibr, 'opensfm': _opensfm,
-    'nerfstudio': _nerfstudio, 'mrcal': _mrcal, 'ros': camera_info_yaml, 'rays': rays_file,
-    'maps': maps_file}
+    'nerfstudio': _nerfstudio, 'mrcal': _mrcal, 'ros': camera_info_yaml, 'foxglove': _foxglove,
+    'rays': rays_file, 'maps': maps_file}
 # those that can tell a field
 WITH_FIELD: dict[str, Callable[[Camera, Field | None], str | bytes]] = {
     'mrcal': _mrcal, 'rays': rays_file, 'maps': maps_file}

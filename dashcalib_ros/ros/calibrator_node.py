@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from rclpy.clock import Clock
@@ -20,7 +21,7 @@ from dashcalib_ros.report.wording import mount_text, mounts_text
 from dashcalib_ros.ros.background import Result, Watched
 from dashcalib_ros.ros.car import Mounting
 from dashcalib_ros.ros.diagnostics import ERROR, OK, WARN, Health, log_line
-from dashcalib_ros.ros.images import Source
+from dashcalib_ros.ros.images import ImageInput, Source
 from dashcalib_ros.ros.node import CameraNode
 from dashcalib_ros.ros.parameters import latched
 from dashcalib_ros.ros.state import Judgement, judge, outcome_text, sigma_text
@@ -160,7 +161,8 @@ class CalibratorNode(CameraNode):
         if self._own.commit:
             if self._commit is not None:
                 self._commit.end()
-            self._commit = Commit(self, info, self._own.commit_timeout, self._steady)
+            self._commit = Commit(self, info, self._own.commit_timeout, self._steady,
+                                  driver_services(self, self._images))
 
     def _give_up(self) -> None:
         self._retire()
@@ -295,9 +297,12 @@ class Commit:
     There is one warning if the driver has no service, does not answer, or dies meanwhile.
     """
 
-    def __init__(self, node: Node, info: CameraInfo, timeout_s: float, clock: Clock) -> None:
+    def __init__(self, node: Node, info: CameraInfo, timeout_s: float, clock: Clock,
+                 names: Sequence[str]) -> None:
+        """names: of services, of which the first that there is is called."""
         self._node, self._info, self._timeout_s = node, info, timeout_s
-        self._client = node.create_client(SetCameraInfo, 'set_camera_info')
+        self._clients = {name: node.create_client(SetCameraInfo, name) for name in names}
+        self._name = ' or '.join(names)
         self._answer: Any = None
         self._deadline = time.monotonic() + timeout_s
         self._timer = node.create_timer(LOOK_S, self._look, clock=clock)
@@ -305,17 +310,19 @@ class Commit:
     def end(self) -> None:
         """Wait for an answer no longer."""
         self._node.destroy_timer(self._timer)
-        self._node.destroy_client(self._client)
+        for client in self._clients.values():
+            self._node.destroy_client(client)
 
     def _look(self) -> None:
-        if self._answer is None and self._client.service_is_ready():
-            self._answer = self._client.call_async(SetCameraInfo.Request(camera_info=self._info))
+        for name, client in self._clients.items():
+            if self._answer is None and client.service_is_ready():
+                self._name = name
+                self._answer = client.call_async(SetCameraInfo.Request(camera_info=self._info))
         answered = self._answer is not None and self._answer.done()
         if not answered and time.monotonic() < self._deadline:
             return
         self.end()
-        log = self._node.get_logger()
-        name = self._node.resolve_service_name('set_camera_info')
+        log, name = self._node.get_logger(), self._name
         if self._answer is None:
             trouble = f'there is no service {name}'
         elif not answered:
@@ -329,6 +336,21 @@ class Commit:
             trouble = f'{name} refused: {self._answer.result().status_message}'
         log.warning(f'{trouble}: the camera driver does not have the calibration; start a driver '
                     f'with that service, or set commit to false')
+
+
+def driver_services(node: Node, images: ImageInput) -> tuple[str, ...]:
+    """Return where the driver's set_camera_info may be: where it was remapped to, if it was.
+
+    Else the publisher's own, as camera_info_manager names it, the one beside the images, and that
+    of this node's namespace.
+    """
+    name = 'set_camera_info'
+    own = node.resolve_service_name(name)
+    if own != node.resolve_service_name(name, only_expand=True):
+        return (own,)
+    drivers = [f'{each}/{name}' for each in images.publishers if each.startswith('/')]
+    beside = f'{images.base.rpartition("/")[0]}/{name}'
+    return tuple(dict.fromkeys((*drivers, beside, own)))
 
 
 def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Generic, Literal, TypeVar
 
 from rclpy.clock import Clock
@@ -16,9 +17,9 @@ from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-from sensor_msgs.msg import CompressedImage, Image
 
 from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.input.bag_write import TRANSPORTS
 from dashcalib_ros.input.decode import message_size
 from dashcalib_ros.input.stamps import StampGate
 from dashcalib_ros.ros.background import whole
@@ -43,14 +44,20 @@ CURES = {
     'set_back': 'the stamps were set back (a bag that loops?): tracking begins anew, the turns '
                 'are kept',
 }
-# images a subscription holds for a callback that is late
-DEPTH = 5
+# images a subscription holds for a callback that is late; of a video, where a lost one costs more
+DEPTH, VIDEO_DEPTH = 5, 50
 # s between two checks of the publishers: images before the right subscription are lost
 LOOK_S = 0.25
 # s without an image before it is told, and between two such lines
 SILENT_S, AGAIN_S = 4.0, 60.0
 # types of topics, and their transports
-KINDS = {'sensor_msgs/msg/Image': 'raw', 'sensor_msgs/msg/CompressedImage': 'compressed'}
+PACKET, VIDEO = ('ffmpeg_image_transport_msgs/msg/FFMPEGPacket',
+                 'foxglove_msgs/msg/CompressedVideo')
+IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
+KINDS = {IMAGE: 'raw', COMPRESSED: 'compressed', PACKET: 'video', VIDEO: 'video'}
+# where image_transport has videos: what is added to the name of a topic, and the type there
+VIDEOS = (('/ffmpeg', PACKET), ('/foxglove', VIDEO), ('', VIDEO), ('', PACKET),
+          ('/compressed', COMPRESSED), ('', COMPRESSED))
 # that are listed in one line
 MOST_TOPICS = 8
 
@@ -161,10 +168,14 @@ class Intake:
     def complain(self, dropped: int) -> None:
         """Tell what went wrong since the last call; dropped: images dropped by the detection."""
         stamps = self._stamps
+        if stamps.fault:
+            self._complaints.once(f'{stamps.fault}: the times of reception are used instead; '
+                                  f'repair the driver')
         for kind, count in (('lost', stamps.lost), ('dropped', dropped),
                             ('repeated', stamps.repeated), ('unstamped', stamps.zero),
                             ('set_back', stamps.set_back)):
-            self._complaints.total(kind, count, CURES[kind])
+            if kind != 'repeated' or not stamps.fault:
+                self._complaints.total(kind, count, CURES[kind])
 
 
 class ImageInput:
@@ -174,23 +185,27 @@ class ImageInput:
     but loses large images that a reliable one would receive. So it is reliable if all publishers
     are. An override of its QoS comes first: then nothing is followed.
 
-    topic: its full name. compressed: whether it has compressed images. publishers: the names of
-    their nodes. reliability: of the present subscription.
+    Of a video, the topic and its type are those of the first publisher that there is.
+
+    topic: its full name; base: without the transport. publishers: the names of its nodes.
+    reliability: of the present subscription.
     """
 
     def __init__(self, node: Node, config: NodeConfig, callback: Callable[[Any], None],
                  clock: Clock) -> None:
         self._node = node
         self._callback = callback
-        self._kind = CompressedImage if config.image_transport == 'compressed' else Image
+        self._kind: str | None = {'raw': IMAGE, 'compressed': COMPRESSED}.get(
+            config.image_transport)
         # as image_transport does: remap the base topic, then append the transport
-        base = node.resolve_topic_name('image_raw')
-        self.topic = f'{base}/compressed' if self._kind is CompressedImage else base
+        self.base = base = node.resolve_topic_name('image_raw')
+        self.topic = f'{base}/compressed' if self._kind == COMPRESSED else base
+        self._is_video = self._kind is None
         self.publishers: tuple[str, ...] = ()
         override = node._parameter_overrides.get(
             f'qos_overrides.{self.topic}.subscription.reliability')
         # without an override, rclpy's parameter would hold the first value for each later one
-        self._overridable = QoSOverridingOptions(
+        self._overridable = None if self._kind is None else QoSOverridingOptions(
             (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
              *([QoSPolicyKind.RELIABILITY] if override else [])))
         self.reliability = override.value if override else config.reliability
@@ -198,33 +213,64 @@ class ImageInput:
         if self._auto:
             self.reliability = 'best_effort'
         self._subscription: Subscription | None = None
+        self._active = False
+        self._missing = ''
         self._started = time.monotonic()
         self._said: float | None = None
         self._timer = node.create_timer(LOOK_S, self._look, clock=clock)
 
     @property
     def listening(self) -> bool:
-        """Return whether the images are subscribed."""
-        return self._subscription is not None
+        """Return whether the images are subscribed, or will be as soon as there are any."""
+        return self._active
 
     def start(self) -> None:
         """Subscribe."""
-        if self._subscription is None:
-            self._subscription = self._subscribe()
+        self._active = True
+        if self._subscription is None and self._kind is not None:
+            self._subscription = self._subscribe(self._kind)
 
     def stop(self) -> None:
         """End the subscription."""
+        self._active = False
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
-    def _subscribe(self) -> Subscription:
-        profile = QoSProfile(depth=DEPTH,
+    def _subscribe(self, kind: str) -> Subscription:
+        profile = QoSProfile(depth=VIDEO_DEPTH if self._is_video else DEPTH,
                              reliability=ReliabilityPolicy[self.reliability.upper()])
-        return self._node.create_subscription(self._kind, self.topic, self._callback, profile,
+        return self._node.create_subscription(_class(kind), self.topic, self._callback, profile,
                                               qos_overriding_options=self._overridable)
 
+    def _find_video(self) -> None:
+        """Look for the packets of a video."""
+        for transport, kind in VIDEOS:
+            topic = f'{self.base}{transport}'
+            if any(info.topic_type == kind
+                   for info in self._node.get_publishers_info_by_topic(topic)):
+                try:
+                    _class(kind)
+                except ImportError:
+                    self._tell_missing(topic, kind)
+                    continue
+                self.topic, self._kind = topic, kind
+                self._node.get_logger().info(f'the video is {kind} on {topic}')
+                if self._active:
+                    self.start()
+                return
+
+    def _tell_missing(self, topic: str, kind: str) -> None:
+        """Tell once that a package is not installed."""
+        if self._missing != kind:
+            self._missing = kind
+            package = kind.partition('/')[0].replace('_', '-')
+            self._node.get_logger().error(f'{topic} has {kind}, whose package is not installed: '
+                                          f'apt install ros-$ROS_DISTRO-{package}')
+
     def _look(self) -> None:
+        if self._kind is None:
+            self._find_video()
         infos = self._node.get_publishers_info_by_topic(self.topic)
         self.publishers = tuple(sorted(map(_node_name, infos)))
         if not self._auto or not infos or not self.listening:
@@ -256,14 +302,16 @@ class ImageInput:
             return (f'publishers of images: {" or ".join(found)}' if found else
                     'there are no publishers of images: start the camera driver or play a bag, '
                     'with the same ROS_DOMAIN_ID as this node')
-        others = {info.topic_type for info in infos if not info.topic_type.endswith(
-            f'/{self._kind.__name__}')}
+        others = {info.topic_type for info in infos} - {self._kind}
         if others:
             return (f'its publisher sends {", ".join(sorted(others))}: remap another topic with '
                     f'-r image_raw:=TOPIC')
         if self.reliability == 'reliable' and not all(map(_reliable, infos)):
             return ('its publisher is best effort, which a reliable subscription does not hear: '
                     'set -p reliability:=auto')
+        if self._is_video:
+            return ('its publisher sent no key picture: let the encoder make one every few '
+                    'seconds (gop_size), or look at the camera driver')
         return f'its {counted(len(infos), "publisher")} sent nothing: look at the camera driver'
 
     def _published(self) -> list[str]:
@@ -272,11 +320,28 @@ class ImageInput:
         own = {name for name, _ in node.get_publisher_names_and_types_by_node(
             node.get_name(), node.get_namespace())}
         found = [(name, KINDS[kind]) for name, kinds in node.get_topic_names_and_types()
-                 for kind in kinds if kind in KINDS and name not in own]
-        return [f'-r image_raw:={name.removesuffix("/compressed")} -p image_transport:={transport}'
+                 for kind in kinds if kind in KINDS and name not in own and not self._drawn(name)]
+        return [f'-r image_raw:={_base(name)} -p image_transport:={transport}'
                 for name, transport in sorted(found) if node.count_publishers(name)
                 # image_transport knows a compressed topic by its name only
-                and (transport == 'raw' or name.endswith('/compressed'))][:MOST_TOPICS]
+                and (transport != 'compressed' or name.endswith('/compressed'))][:MOST_TOPICS]
+
+    def _drawn(self, topic: str) -> bool:
+        """Return whether another node like this one draws what is on a topic, for people."""
+        place, _, _ = _base(topic).rpartition('/')
+        return self._node.count_publishers(f'{place}/turn_magnitude') > 0
+
+
+def _base(topic: str) -> str:
+    """Return a topic without the transport that image_transport adds to its name."""
+    base, _, last = topic.rpartition('/')
+    return base if last in TRANSPORTS else topic
+
+
+def _class(kind: str) -> Any:
+    """Return the class of a message type; raises ImportError where its package is missing."""
+    package, _, name = kind.split('/')
+    return getattr(import_module(f'{package}.msg'), name)
 
 
 def since_text(silent_s: float | None) -> str:

@@ -41,6 +41,7 @@ from dashcalib_ros.ros.parameters import (
     why_read_only,
 )
 from dashcalib_ros.ros.preview import Preview
+from dashcalib_ros.ros.video import VideoDecoding
 
 # s between two messages on /diagnostics
 PERIOD_S = 1.0
@@ -110,7 +111,13 @@ class CameraNode(Node, ABC):
             self, self._own, self._core.rectified,
             lambda error: self._later(lambda: self.survive(error, 'preview')))
         self._intake = Intake(self._core.motion.rate, self._complaints, self._on_source)
-        self._images = ImageInput(self, self._own, self._on_image, steady)
+        self._video = None
+        if self._own.image_transport == 'video':
+            self._video = VideoDecoding(
+                lambda image: self._later(partial(self._on_decoded, image)),
+                lambda text: self._later(partial(self._complaints.say, 'undecodable', text)))
+        self._images = ImageInput(
+            self, self._own, self._video.put if self._video else self._on_image, steady)
         self._images.start()
         # all parameters are declared now, those of qos_overrides too
         check_known(self._parameter_overrides, self._parameters)
@@ -191,6 +198,8 @@ class CameraNode(Node, ABC):
 
     def close(self) -> None:
         """End the background thread with its child processes, the drawing, then the node."""
+        if self._video is not None:
+            self._video.close()
         self._learner.close()
         self._preview.close()
         self.destroy_node()
@@ -231,6 +240,10 @@ class CameraNode(Node, ABC):
                     self.survive(error)
 
     # images ----------------------------------------------------------------------------------
+
+    def _on_decoded(self, image: Any) -> None:
+        if self._images.listening:
+            self._on_image(image)
 
     def _on_image(self, message: Any) -> None:
         self._empty()
@@ -416,7 +429,7 @@ class CameraNode(Node, ABC):
     def _on_tick(self) -> None:
         self._empty()
         images, intake, learner = self._images, self._intake, self._learner
-        intake.complain(learner.inbox.dropped)
+        intake.complain(learner.inbox.dropped + (self._video.dropped if self._video else 0))
         if images.listening:
             images.tell_silence(intake.silent_s)
         self._hold()

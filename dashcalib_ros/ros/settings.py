@@ -78,8 +78,9 @@ class NodeConfig:
     """The node's own settings. Raises ConfigError like Config."""
 
     image_transport: str = setting(
-        'raw', 'compressed subscribes image_raw/compressed instead',
-        choices=('raw', 'compressed'))
+        'raw', 'compressed subscribes image_raw/compressed instead; video: packets of H.264 or '
+               'H.265 on image_raw/ffmpeg, /foxglove or /compressed, or on image_raw itself',
+        choices=('raw', 'compressed', 'video'))
     reliability: str = expert(
         'auto', 'auto does as the publishers do: best effort if any of them does',
         choices=('auto', 'best_effort', 'reliable'))

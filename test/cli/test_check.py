@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 
 import cv2
@@ -13,7 +14,7 @@ from made_drives import START, TIMES, drive, images, info_of, write_bag, write_t
 
 from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
-from dashcalib_ros.cli import main
+from dashcalib_ros.cli import command, main
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
@@ -206,3 +207,29 @@ def test_bad_input_is_one_line(files, capfd, arguments, match):
     assert main(arguments) == 2
     errors = capfd.readouterr().err.strip().splitlines()
     assert len(errors) == 1 and match in errors[0]
+
+
+def test_what_nobody_expected_is_no_answer(files, monkeypatch, capfd):
+    def fail(*_):
+        raise ZeroDivisionError('of a defect')
+    monkeypatch.setattr(FakeQuestions, 'check', fail)
+    monkeypatch.setattr(sys, 'argv', ['dashcalib', *files, '--verbose'])
+    # Python's own exit code, 1, would be "wrong"
+    with pytest.raises(SystemExit) as ended:
+        command()
+    assert ended.value.code == 2
+    error = capfd.readouterr().err
+    assert 'Traceback' in error and error.splitlines()[-1].startswith('dashcalib: error: this is')
+
+
+@pytest.mark.parametrize('name', ['track.txt', 'track.csv'])
+def test_a_track_and_poses_are_known_by_their_content(files, tmp_path, capfd, name):
+    rows = '\n'.join(f'{n / 10},49.0,{8 + n * 1e-5}' for n in range(60))
+    (tmp_path / name).write_text(f'stamp_s,latitude,longitude\n{rows}\n')
+    assert main([*files, '--poses', name]) == 0 and 'turn' in capfd.readouterr().out
+    (tmp_path / name).write_text(''.join(
+        f'{(1700000000 + n) * 10**9},{n},0,0,0,0,0,1\n' for n in range(5)))
+    assert main([*files, '--poses', name]) == 0
+    assert 'taken as nanoseconds' in capfd.readouterr().err
+    assert main([*files, '--motion', name]) == 2
+    assert '--poses' in capfd.readouterr().err

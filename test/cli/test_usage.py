@@ -348,3 +348,14 @@ def test_native_libraries_say_nothing_on_stderr(tmp_path):
     done = dashcalib('turns', tmp_path, '--fps', '10')
     assert done.returncode == 0
     assert all(each.startswith('dashcalib: ') for each in done.stderr.splitlines()), done.stderr
+
+
+def test_export_tells_of_a_lens_that_folds_over_inside_the_picture(here, tmp_path):
+    text = ('{"K": [[1870, 0, 647.5], [0, 1880, 485.5], [0, 0, 1]], "image_size": [1296, 972], '
+            '"dist": %s}')
+    path = tmp_path / 'camera.json'
+    path.write_text(text % '[-13.2, -98.0, 0.0014, 0.0028, 1357.8, -13.05, -102.4, 1383.0]')
+    done = here('export', path, '--to', 'ros')
+    assert done.returncode == 0 and 'has no ray for 23 % of the picture' in done.stderr
+    path.write_text(text % '[-0.3, 0.1, 0, 0, 0]')
+    assert here('export', path, '--to', 'ros').stderr == ''

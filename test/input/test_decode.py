@@ -1,5 +1,6 @@
 """Image messages become the right grey pixels, whatever their encoding."""
 import array
+import struct
 
 import cv2
 import numpy as np
@@ -13,7 +14,10 @@ from dashcalib_ros.input.decode import (
     decode,
     decode_file,
     encoded_size,
+    message_size,
+    turned_text,
 )
+from dashcalib_ros.input.inputs import open_frames
 
 WIDTH, HEIGHT = 8, 6
 GREY = (np.arange(WIDTH * HEIGHT, dtype=np.uint8) * 5).reshape(HEIGHT, WIDTH)
@@ -268,3 +272,74 @@ def test_a_message_that_takes_long_is_refused():
     with pytest.raises(InputError, match='jpeg image has more than 100 scans'):
         decode(compressed_message(
             format='jpeg', data=np.frombuffer(empty_scans(4000), np.uint8)))
+
+
+def with_orientation(orientation, image):
+    """Return a JPEG that says (EXIF) how it is to be turned."""
+    jpeg = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    entry = struct.pack('<HHIHH', 274, 3, 1, orientation, 0)
+    exif = b'Exif\0\0II*\0' + struct.pack('<IH', 8, 1) + entry + bytes(4)
+    return jpeg[:2] + b'\xff\xe1' + struct.pack('>H', len(exif) + 2) + exif + jpeg[2:]
+
+
+def ramps():
+    return np.add.outer(np.arange(40) * 4, np.arange(60) * 1).astype(np.uint8)
+
+
+@pytest.mark.parametrize(('orientation', 'text'), [
+    (1, ''), (6, 'turn its pictures by 90 degrees'), (3, 'turn its pictures by 180 degrees'),
+    (8, 'turn its pictures by 270 degrees'), (2, 'mirror its pictures')])
+def test_what_a_jpeg_says_of_its_orientation_is_told(orientation, text):
+    data = with_orientation(orientation, ramps())
+    assert turned_text(data, '') == text
+    assert (decode_file(data).shape == (60, 40)) == (orientation in (6, 8))
+    assert turned_text(data[:300], '') == ''
+
+
+def test_no_message_is_turned_as_no_program_of_ros_does():
+    said = compressed_message(format='jpeg', data=with_orientation(6, ramps()))
+    assert decode(said).shape == (40, 60) and message_size(said) == (60, 40)
+    assert np.abs(decode(said).astype(int) - ramps()).max() < 5
+
+
+def test_a_folder_tells_that_its_pictures_are_turned(tmp_path):
+    for n in range(3):
+        (tmp_path / f'{n}.jpg').write_bytes(with_orientation(6, ramps()))
+    source = open_frames(tmp_path, fps=10)
+    assert next(iter(source)).size == (40, 60)
+    assert source.warnings == (
+        f'{tmp_path} says (EXIF) to turn its pictures by 90 degrees: the calibration is for the '
+        f'pictures as they are shown so',)
+
+
+def thermal(low, high, seed=0, **changes):
+    """Return a 16-bit image whose values are temperatures, with a dead pixel."""
+    noise = np.random.default_rng(seed).integers(0, 3, (40, 60))
+    values = np.linspace(low, high, 60)[None] + noise
+    pixels = values.astype(np.uint16)
+    pixels[3, 5] = 0
+    return message('16UC1', pixels, **changes)
+
+
+@pytest.mark.parametrize('big', [False, True])
+@pytest.mark.parametrize('low, high', [(7400, 7527), (29000, 31000), (7000, 9000)])
+def test_temperatures_are_stretched(low, high, big):
+    image = decode(thermal(low, high, big=big), BitDepth())
+    assert np.ptp(np.percentile(image, (2, 98))) > 90
+    columns = image.mean(axis=0)
+    assert (np.diff(columns[1:-1]) > 0).all()
+
+
+def test_the_range_of_temperatures_grows_rarely_and_never_shrinks():
+    depth, maps = BitDepth(), set()
+    for n in range(200):
+        decode(thermal(7400 - n, 7500 + n, n), depth)
+        maps.add(depth._window)
+    assert len(maps) <= 5
+    again = decode(thermal(7400, 7500), depth)
+    assert np.ptp(again) < 100 and len({depth._window} | maps) == len(maps)
+
+
+def test_cameras_whose_values_begin_at_0_are_as_before():
+    pixels = np.linspace(100, 4000, 2400).reshape(40, 60).astype(np.uint16)
+    np.testing.assert_array_equal(decode(message('mono16', pixels), BitDepth()), pixels >> 4)

@@ -108,6 +108,24 @@ def test_what_is_no_gpx_with_times_is_named(tmp_path, text):
         read_motion(write(tmp_path / 'track.gpx', text))
 
 
+def test_whole_seconds_at_10_hz_give_one_place_a_second(tmp_path):
+    times = [f'<time>2026-09-21T14:13:{n // 10:02}Z</time>' for n in range(600)]
+    found = read_motion(write(tmp_path / 'whole.gpx', gpx(times)))
+    assert found.position is not None and len(found.position.stamps_s) == 60
+    assert found.warnings == (f'of the positions of {tmp_path}/whole.gpx several have one stamp: '
+                              f'the first of each is used',)
+
+
+def test_stamps_of_another_unit_are_said(tmp_path):
+    rows = '\n'.join(f'{1700000000000 + 10 * n},0.1' for n in range(20))
+    found = read_motion(write(tmp_path / 'ms.csv', f'#stamp_s, speed\n{rows}\n'))
+    assert found.absolute and found.warnings == (
+        f'the stamps of {tmp_path}/ms.csv are taken as milliseconds since 1970',)
+    assert abs(found.speed.stamps_s[-1] - 1700000000.19) < 1e-6
+    with pytest.raises(InputError, match='write seconds'):
+        read_motion(write(tmp_path / 'odd.csv', 'stamp_s,speed\n1e40,1\n2e40,1\n'))
+
+
 def test_a_gpx_may_have_any_prefix_fractions_zones_and_damaged_points(tmp_path):
     text = ('<?xml version="1.0" encoding="UTF-8"?><g:gpx xmlns:g="http://example.com/g">'
             '<g:wpt lat="1" lon="1"><g:time>2020-01-01T00:00:00Z</g:time></g:wpt><g:trk>'

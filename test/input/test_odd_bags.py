@@ -7,6 +7,7 @@ import os
 import sqlite3
 
 import lz4.frame
+import made_drives
 import pytest
 import yaml
 import zstandard
@@ -301,3 +302,23 @@ def test_a_raw_message_of_an_absurd_size_is_an_undecodable_one(tmp_path):
         data=drive(1)[0].image.reshape(-1)[:0])
     fails('says it is 2147483648x2147483648', write_bag(
         tmp_path / 'bag', [('/camera', 1, message)]))
+
+
+@pytest.mark.parametrize(('content', 'cure'), [
+    (b'no bag at all', 'is it a recording'), (b'\x89MCAP0\r\n' + b'\xff' * 40, 'mcap recover')])
+def test_a_repair_is_advised_where_it_may_help_only(tmp_path, content, cure):
+    path = tmp_path / 'drive.mcap'
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=cure) as caught:
+        open_frames(path)
+    assert ('mcap recover' in str(caught.value)) == (cure == 'mcap recover')
+
+
+def test_pictures_of_another_kind_are_not_to_be_repaired(tmp_path):
+    frames = drive(3)
+    bag = write_bag(tmp_path / 'bag', [
+        ('/camera', frame.stamp_ns, made_drives.image(frame, encoding='32FC1'))
+        for frame in frames])
+    with pytest.raises(InputError, match='publish mono8') as caught:
+        list(open_frames(bag))
+    assert 'recover' not in str(caught.value)

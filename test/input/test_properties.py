@@ -151,11 +151,13 @@ def test_samples_of_any_sensor(kind: str, rows: list[tuple[float, float]]) -> No
     values = np.array([[value] * 3 for _, value in rows], float).reshape(-1, 3)
     stream = sensor_stream({kind: (stamps, values)}, 'a test')
     samples = stream.kinds.get(kind)
-    assert (samples is None) == (len(stream.warnings) == 1)
+    unused = [line for line in stream.warnings if 'are not used' in line]
+    thinned = [line for line in stream.warnings if 'have one stamp' in line]
+    assert (samples is None) == (len(unused) == 1) and not (unused and thinned)
     if samples is not None:
         assert (np.diff(samples.stamps_s) > 0).all() and np.isfinite(samples.values).all()
         assert set(zip(samples.stamps_s, samples.values[:, 0], strict=True)) <= set(rows)
-        assert len(samples.stamps_s) >= 0.8 * len(rows)
+        assert thinned or len(samples.stamps_s) >= 0.8 * len(rows)
 
 
 @QUICK

@@ -1,6 +1,8 @@
 """The stamp gate, for recordings and for live streams: order, losses, set-backs, thinning."""
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -99,3 +101,71 @@ def test_a_live_stream_begins_anew_and_keeps_its_counts():
     gate.forget()
     assert gate.take(START - 10 * SECOND, 0) == START - 10 * SECOND
     assert (gate.repeated, gate.zero, gate.set_back) == (1, 1, 0)
+
+
+def beside(gate, stamps, received):
+    """Return what a gate makes of stamps, beside the times at which their images came."""
+    return [gate.take(int(stamp), int(time)) for stamp, time in zip(stamps, received, strict=True)]
+
+
+def rounded(times):
+    """Return stamps whose seconds are rounded, and their fraction is not."""
+    return [round(time / 1e9) * 10**9 + time % 10**9 for time in times]
+
+
+def late(times):
+    """Return stamps whose seconds come 0.35 s late."""
+    return [(time - 35 * 10**7) // 10**9 * 10**9 + time % 10**9 for time in times]
+
+
+def standing(times):
+    """Return stamps whose seconds stand still."""
+    return [times[0] // 10**9 * 10**9 + time % 10**9 for time in times]
+
+
+TIMES = [START + n * 10**8 for n in range(300)]
+LATE = [time + (n * 37 % 20) * 10**6 for n, time in enumerate(TIMES)]
+
+
+@pytest.mark.parametrize('rate', [None, 100.0])
+@pytest.mark.parametrize('fault', [rounded, late, standing])
+def test_stamps_that_fall_back_once_a_second_are_named_and_not_used(rate, fault):
+    gate = StampGate(rate)
+    found = beside(gate, fault(TIMES), LATE)
+    kept = [stamp for stamp in found if stamp is not None]
+    assert 'fall back by 0.9 s once a second' in gate.fault
+    assert len(kept) > 270 and all(b > a for a, b in pairwise(kept))
+    # since it is known, each image has the time at which it came
+    assert np.ptp(np.subtract(kept[-200:], LATE[-200:])) == 0
+    if rate is None:
+        [line] = gate.warnings()
+        assert 'the times of reception are used' in line and 'skipped' not in line
+
+
+@pytest.mark.parametrize(('factor', 'words'), [
+    (1e-3, 'microseconds as nanoseconds'), (1e-6, 'milliseconds as nanoseconds'),
+    (1e-9, 'seconds as nanoseconds'), (1e3, 'milliseconds as seconds')])
+def test_stamps_of_another_unit_are_named_and_not_used(factor, words):
+    gate = StampGate()
+    found = beside(gate, [1 + (time - START + 10**12) * factor for time in TIMES], LATE)
+    assert words in gate.fault
+    assert np.ptp(np.subtract(found[-200:], LATE[-200:])) == 0
+
+
+@pytest.mark.parametrize('received', [
+    [0] * 300, TIMES, LATE, [START] * 300, [time + 10**6 * 17 for time in TIMES[::-1]]])
+def test_sound_stamps_are_used_whatever_the_times_of_reception_are(received):
+    gate = StampGate()
+    assert beside(gate, TIMES, received) == TIMES and not gate.warnings()
+
+
+def test_two_publishers_whose_clocks_differ_by_a_second_are_no_sawtooth():
+    gate = StampGate()
+    beside(gate, [time + n % 2 * 10**9 for n, time in enumerate(TIMES)], LATE)
+    assert not gate.fault
+
+
+def test_a_bag_that_loops_is_no_sawtooth():
+    gate = StampGate()
+    beside(gate, [*TIMES[:20], *TIMES[:20], *TIMES[:20]], LATE[:60])
+    assert not gate.fault and gate.set_back == 2

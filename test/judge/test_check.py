@@ -87,6 +87,12 @@ def test_two_mistakes_are_both_named(solution):
     assert found.answer == 'wrong' and 'focal length' in text and 'distortion' in text
 
 
+def test_width_and_height_may_be_exchanged(solution):
+    found = ask(replace(LENS, image_size=SIZE[::-1]), solution)
+    assert found.answer == 'wrong' and 'are width and height exchanged' in found.reasons[0]
+    assert '--crop' not in found.reasons[0]
+
+
 def test_a_resized_calibration_is_recognised(solution):
     found = ask(LENS.resized(2.0, (1600, 900)), solution)
     assert found.answer == 'wrong'

@@ -62,13 +62,63 @@ def test_tums_poses_are_interpolated_at_the_frames_stamps(tmp_path):
     (f'{"1 " * 12}\n' * 2, 'no rotations'), (f'{"a " * 12}\n' * 2, 'not all numbers'),
     (f'{"nan " * 8}\n' * 2, 'not finite'),
     ('2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n', 'do not ascend'),
-    ('1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 0\n', 'no rotations')])
+    ('1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 0\n', 'no rotations'),
+    ('1 0 0 0 9 9 9 9\n2 0 0 0 9 9 9 9\n', 'no rotations'),
+    ('1 1e300 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n', 'write metres'),
+    ('5e10 0 0 0 0 0 0 1\n6e10 0 0 0 0 0 0 1\n', 'write seconds'),
+    ('1e300 0 0 0 0 0 0 1\n2e300 0 0 0 0 0 0 1\n', 'write seconds'),
+    ('0 0 0 0 0 0 0 1\n1e300 0 0 0 0 0 0 1\n', 'write seconds'),
+    ('1 0 0 0 1e200 -1e200 0 1\n2 0 0 0 0 0 0 1\n', 'no rotations'),
+    (f'{"1e300 -1e300 " * 6}\n' * 2, 'no rotations'),
+    ('-1e308 0 0 0 0 0 0 1\n1e308 0 0 0 0 0 0 1\n', 'write seconds'),
+    ('t x y z qx qy qz qw\n' * 2, 'not all numbers')])
+@pytest.mark.filterwarnings('error')
 def test_what_is_no_file_of_poses_is_named(tmp_path, text, match):
     path = tmp_path / 'poses.txt'
     path.write_text(text)
     with pytest.raises(InputError, match=match) as caught:
         read_poses(path)
     assert str(path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(('unit', 'digits', 'word'), [
+    (1, 9, ''), (10**3, 6, 'milliseconds'), (10**6, 3, 'microseconds'), (10**9, 0, 'nanoseconds')])
+def test_stamps_since_1970_may_be_of_any_unit_which_is_said(tmp_path, unit, digits, word):
+    path = tmp_path / 'poses.txt'
+    path.write_text(''.join(f'{(1403636580 + 0.25 * n) * unit:.{digits}f} {n} 0 0 0 0 0 1\n'
+                            for n in range(5)))
+    poses = read_poses(path)
+    stamps = np.array([1403636580 * 10**9 + 375 * 10**6])
+    _, places, known = poses.at(np.arange(1), stamps)
+    assert known.all() and abs(places[0, 0] - 1.5) < 1e-5
+    assert [word in line for line in poses.warnings] == ([True] if word else [])
+
+
+def test_nanoseconds_since_a_computer_was_started_are_no_milliseconds_since_1970(tmp_path):
+    path = tmp_path / 'poses.txt'
+    path.write_text(''.join(f'{5 * 10**12 + n * 10**8} 0 0 0 0 0 0 1\n' for n in range(5)))
+    with pytest.raises(InputError, match='write seconds'):
+        read_poses(path)
+
+
+def test_the_real_part_comes_first_where_the_head_says_so(tmp_path):
+    turn = '0 0.7071067811865476 0 0.7071067811865476'
+    first = '0.7071067811865476 0 0.7071067811865476 0'
+    euroc = ('#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], '
+             'q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1], ...\n')
+    files = {
+        'tum': ''.join(f'{n} 1 2 3 {turn}\n' for n in range(2)),
+        'commas': 't,x,y,z,qx,qy,qz,qw\n' + ''.join(
+            f'{n} 1 2 3 {turn}\n'.replace(' ', ',') for n in range(2)),
+        'w': '# t x y z qw qx qy qz\n' + ''.join(f'{n} 1 2 3 {first}\n' for n in range(2)),
+        'euroc.csv': euroc + ''.join(
+            f'{1403636580 + n}000000000 1 2 3 {first}{" 0" * 9}\n'.replace(' ', ',')
+            for n in range(2))}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+        poses = read_poses(tmp_path / name)
+        np.testing.assert_allclose(poses.rotations[1], rotation(1, np.pi / 2), atol=1e-6)
+        np.testing.assert_allclose(poses.positions[1], [1, 2, 3])
 
 
 def test_a_gps_track_has_headings_and_places():
@@ -84,6 +134,13 @@ def test_a_gps_track_has_headings_and_places():
     np.testing.assert_allclose(turned[0][:, 2], [1.0, 0.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(turned[1][:, 2], [0.0, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(turned[1][:, 1], [0.0, 0.0, -1.0], atol=1e-6)
+
+
+def test_a_gps_that_comes_once_a_second_has_headings_between():
+    when = np.arange(0.0, 20.0, 1.0)
+    poses = track_poses(Samples(when, np.stack([5 * when, 0 * when, 0 * when], axis=1)), 0.0)
+    _, places, known = poses.at(np.arange(1), np.array([9_500_000_000]))
+    assert known.all() and abs(places[0, 0] - 47.5) < 1e-6
 
 
 @pytest.mark.parametrize(('places', 'match'), [

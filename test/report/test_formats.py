@@ -4,6 +4,7 @@ from __future__ import annotations
 import json
 import zipfile
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -14,9 +15,11 @@ from rosbags.rosbag1 import Writer as Writer1
 from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.report import load_camera
+from dashcalib_ros.report.camera_file import load_with_faults
 
 BROWN, FISHEYE = EACH_MODEL['brown'], EACH_MODEL['fisheye']
 SMALL = (640, 480)
+LENS5 = Brown(SMALL, 500.0, 501.5, 320.0, 240.0, -0.1, 1e-5, 0.001, -0.002, 0.3)
 
 # of cv2.FileStorage, versions 2 to 5
 OPENCV = """%YAML:1.0
@@ -180,6 +183,201 @@ def test_a_model_that_colmap_wrote(tmp_path):
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(InputError, match='model_converter'):
         load_camera(path)
+
+
+ECHO = """header:
+  stamp:
+    sec: 1727666393
+    nanosec: 0
+  frame_id: camera
+height: 480
+width: 640
+distortion_model: plumb_bob
+{d}: [-0.1, 1.0e-05, 0.001, -0.002, 0.3]
+{k}: [500.0, 0.0, 320.0, 0.0, 501.5, 240.0, 0.0, 0.0, 1.0]
+{r}: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+{p}: [500.0, 0.0, 320.0, 0.0, 0.0, 501.5, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+binning_y: 0
+roi:
+  x_offset: 0
+  y_offset: 0
+  height: 0
+  width: 0
+  do_rectify: false
+---
+"""
+ECHOES = [ECHO.format(d='d', k='k', r='r', p='p'), ECHO.format(d='D', k='K', r='R', p='P')]
+INI = """# oST version 5.0 parameters
+
+
+[image]
+
+width
+640
+
+height
+480
+
+[narrow_stereo]
+
+camera matrix
+500.000000 0.000000 320.000000
+0.000000 501.500000 240.000000
+0.000000 0.000000 1.000000
+
+distortion
+-0.1 1e-05 0.001 -0.002 0.3
+
+rectification
+1.000000 0.000000 0.000000
+0.000000 1.000000 0.000000
+0.000000 0.000000 1.000000
+
+projection
+500.0 0.0 320.0 0.0
+0.0 501.5 240.0 0.0
+0.0 0.0 1.0 0.0
+
+"""
+
+
+@pytest.mark.parametrize('text', [*ECHOES, 2 * ECHOES[0], '# of a car\n---\n' + ECHOES[1]])
+def test_a_camera_info_that_was_echoed_is_its_first_document(tmp_path, text):
+    path = tmp_path / 'info.yaml'
+    path.write_text(text)
+    assert load_camera(path).camera == LENS5
+
+
+@pytest.mark.parametrize('text', ECHOES)
+@pytest.mark.parametrize(('old', 'new'), [
+    ('binning_x: 0', 'binning_x: 4'), ('binning_y: 0', 'binning_y: 2'),
+    ('  height: 0', '  height: 100'), ('x_offset: 0', 'x_offset: 8')])
+def test_a_file_is_refused_where_the_message_is(tmp_path, text, old, new):
+    path = tmp_path / 'info.yaml'
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match='binning or a region of interest'):
+        load_camera(path)
+
+
+def test_all_of_the_picture_is_no_part(tmp_path):
+    path = tmp_path / 'info.yaml'
+    path.write_text(ECHOES[0].replace('  height: 0', '  height: 480').replace(
+        '  width: 0', '  width: 640').replace('binning_x: 0', 'binning_x: 1'))
+    assert load_camera(path).camera == LENS5
+
+
+@pytest.mark.parametrize('model', ["''", '""', 'none', 'None', 'pinhole', 'null', 'plumb_bob'])
+@pytest.mark.parametrize('d', ['[]', '[0.0, 0.0, 0.0, 0.0, 0.0]', '[0, 0, 0, 0]'])
+@pytest.mark.parametrize('r', ['[0, 0, 0, 0, 0, 0, 0, 0, 0]', '[]'])
+def test_no_distortion_has_many_names(tmp_path, model, d, r):
+    path = tmp_path / 'info.yaml'
+    text = ECHOES[0].replace('plumb_bob', model).replace(
+        '[-0.1, 1.0e-05, 0.001, -0.002, 0.3]', d).replace(
+        '[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]', r)
+    if model == 'null' and d == '[0, 0, 0, 0]':
+        text = text.replace('distortion_model: null\n', '')
+    path.write_text(text)
+    found = load_with_faults(path)
+    assert found.camera == Radial(SMALL, 500.0, 501.5, 320.0, 240.0) and not found.faults
+
+
+def test_a_name_of_no_distortion_is_none_where_there_is_some(tmp_path):
+    path = tmp_path / 'info.yaml'
+    path.write_text(ECHOES[0].replace('plumb_bob', "''"))
+    with pytest.raises(InputError, match='is none of the models here'):
+        load_camera(path)
+
+
+def test_a_file_without_distortion_may_leave_it_out(tmp_path):
+    (tmp_path / 'a.json').write_text(json.dumps(
+        {'fx': 500, 'fy': 501.5, 'cx': 320, 'cy': 240, 'width': 640, 'height': 480,
+         'model': 'pinhole'}))
+    (tmp_path / 'b.json').write_text(json.dumps(
+        {'K': [[500, 0, 320], [0, 501.5, 240], [0, 0, 1]], 'dist': None,
+         'image_shape': [480, 640, 3]}))
+    for name in ('a.json', 'b.json'):
+        assert load_camera(tmp_path / name).camera == Radial(SMALL, 500.0, 501.5, 320.0, 240.0)
+
+
+def test_ros_writes_ini_files_too(tmp_path):
+    path = tmp_path / 'ost.txt'
+    for text in (INI, INI.replace('\n', '\r\n'), INI.replace('width\n640', 'width = 640')):
+        path.write_text(text)
+        found = load_with_faults(path)
+        assert found.camera == LENS5 and not found.faults
+    path.write_text(INI.replace('-0.1 1e-05 0.001 -0.002 0.3', '0.1 0.01 0 0'))
+    with pytest.raises(InputError, match='4 distortion coefficients'):
+        load_camera(path)
+    path.write_text(INI.replace('-0.1 1e-05 0.001 -0.002 0.3', '0.1 0.01 0 0').replace(
+        'distortion\n', 'distortion_model: equidistant\ndistortion\n'))
+    assert load_camera(path).camera == Fisheye(SMALL, 500.0, 501.5, 320.0, 240.0, 0.1, 0.01)
+    second = INI[INI.index('[narrow'):].replace('narrow_stereo', 'right').replace('501.5', '502.5')
+    path.write_text(INI + second)
+    assert load_camera(f'{path}:right').camera.fy == 502.5
+    with pytest.raises(InputError, match='2 cameras'):
+        load_camera(path)
+    path.write_text('[image]\nwidth\n640\n[a]\ncamera matrix\n1 2 x\n')
+    with pytest.raises(InputError, match=r'ost\.txt'):
+        load_camera(path)
+
+
+@pytest.mark.parametrize(('matrix', 'distortion', 'size'), [
+    ('cameraMatrix', 'dist_coeffs', {'cameraResolution': [640, 480]}),
+    ('intrinsic_matrix', 'distortion', {'imageSize': {'data': [640, 480]}}),
+    ('camera_mtx', 'distCoefs', {'image_shape': [480, 640]}),
+    ('K', 'distortion_params', {'shape': [480, 640, 3]}),
+    ('Intrinsics', 'DistortionCoefficient', {'resolution': [640, 480]}),
+    ('mtx', 'dist', {'img_w': 640, 'img_h': 480}), ('k', 'd', {'cols': 640, 'rows': 480})])
+def test_one_thing_has_many_names(tmp_path, matrix, distortion, size):
+    path = tmp_path / 'camera.json'
+    path.write_text(json.dumps({
+        matrix: [[500, 0, 320], [0, 501.5, 240], [0, 0, 1]],
+        distortion: [[-0.1, 1e-05, 0.001, -0.002, 0.3]], **size}))
+    assert load_camera(path).camera == LENS5
+
+
+def test_opencvs_interactive_calibration(tmp_path):
+    file = cv2.FileStorage(str(tmp_path / 'CamParams.xml'), cv2.FILE_STORAGE_WRITE)
+    file.write('calibrationDate', 'Thu Nov 26')
+    file.write('framesCount', 21)
+    file.startWriteStruct('cameraResolution', cv2.FileNode_SEQ + cv2.FileNode_FLOW)
+    file.write('', 640)
+    file.write('', 480)
+    file.endWriteStruct()
+    file.write('cameraMatrix', LENS5.matrix)
+    file.write('cameraMatrix_std_dev', np.ones((4, 1)))
+    file.write('dist_coeffs', np.array([LENS5.ros_distortion()]))
+    file.write('dist_coeffs_std_dev', np.ones((5, 1)))
+    file.write('avg_reprojection_error', 0.3)
+    file.release()
+    assert load_camera(tmp_path / 'CamParams.xml').camera == LENS5
+
+
+def test_euroc_s_sensor_yaml(tmp_path):
+    path = tmp_path / 'sensor.yaml'
+    path.write_text('sensor_type: camera\nresolution: [640, 480]\ncamera_model: pinhole\n'
+                    'intrinsics: [500, 501.5, 320, 240]\n'
+                    'distortion_model: radial-tangential\n'
+                    'distortion_coefficients: [-0.1, 1.0e-05, 0.001, -0.002]\n')
+    assert load_camera(path).camera == Brown(SMALL, 500.0, 501.5, 320.0, 240.0, -0.1, 1e-5, 0.001,
+                                             -0.002)
+
+
+@pytest.mark.parametrize(('given', 'cx', 'cy', 'exchanged'), [
+    ((640, 480), 320, 240, False), ((480, 640), 320, 240, True), ((480, 640), 240, 320, False),
+    ((370, 1226), 604, 186, True), ((1226, 370), 604, 186, False),
+    # a crop whose centre is far off
+    ((640, 480), 600, 60, False)])
+def test_width_and_height_that_are_exchanged_are_told(tmp_path, given, cx, cy, exchanged):
+    path = tmp_path / 'camera.json'
+    path.write_text(json.dumps({'K': [[700, 0, cx], [0, 702, cy], [0, 0, 1]], 'dist': [0] * 5,
+                                'image_size': given}))
+    if exchanged:
+        with pytest.raises(InputError, match='width and height exchanged'):
+            load_camera(path)
+    else:
+        assert load_camera(path).image_size == given
 
 
 def test_a_folder_without_a_calibration_says_what_to_give(tmp_path):

@@ -73,6 +73,17 @@ def test_it_says_which_images_there_are(start_node, make_bench):
     assert 'WARN' not in raw.text + compressed.text
 
 
+def test_what_another_node_draws_is_no_camera(start_node, make_bench):
+    make_bench(topic='front/image_raw', listen=False)
+    # a node of this package that hears a camera, and draws pictures of it for people
+    first = start_node('-r', '__node:=first', '-r', 'image_raw:=/front/image_raw')
+    first.wait_for('subscribing reliable')
+    second = start_node('-r', '__node:=second', camera_name='second')
+    second.wait_for('no images on /image_raw yet; publishers of images: '
+                    '-r image_raw:=/front/image_raw -p image_transport:=raw')
+    assert 'overlay' not in second.text and 'rectified' not in second.text
+
+
 # lifecycle -----------------------------------------------------------------------------------
 
 @pytest.fixture

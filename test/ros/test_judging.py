@@ -266,7 +266,7 @@ def test_a_driver_that_does_not_take_the_calibration_disturbs_nothing(make_desk,
     elif driver == 'refuses':
         desk.bench.node.create_service(SetCameraInfo, 'set_camera_info', refuse)
     desk.give()
-    words = {'missing': 'there is no service /set_camera_info',
+    words = {'missing': 'there is no service /bench/set_camera_info or /set_camera_info',
              'hangs': 'did not answer within 6 s', 'refuses': 'refused: no flash'}[driver]
     said = []
     desk.until(lambda: said.append(capfd.readouterr().err) or words in ''.join(said))
@@ -274,6 +274,28 @@ def test_a_driver_that_does_not_take_the_calibration_disturbs_nothing(make_desk,
     if driver == 'hangs':
         dead.destroy_node()
         rclpy.try_shutdown(context=context)
+
+
+@pytest.mark.parametrize(('remapped', 'service', 'called'), [
+    ('', '/camera/set_camera_info', True), ('', '/bench/set_camera_info', True),
+    ('', '/set_camera_info', True), ('/driver/set', '/driver/set', True),
+    ('/driver/set', '/camera/set_camera_info', False)])
+def test_the_driver_s_service_is_looked_for_beside_the_images(make_desk, capfd, remapped, service,
+                                                              called):
+    desk = make_desk(topic='/camera/image_raw', remapped=remapped, commit='true',
+                     commit_timeout=30.0 if called else 1.0)
+    asked = []
+
+    def take(request, response):
+        asked.append(request)
+        response.success = True
+        return response
+    desk.bench.node.create_service(SetCameraInfo, service, take)
+    desk.give()
+    words = f'{service} took the calibration' if called else 'there is no service /driver/set'
+    said = []
+    desk.until(lambda: said.append(capfd.readouterr().err) or words in ''.join(said))
+    assert len(asked) == called
 
 
 KEPT = """\
