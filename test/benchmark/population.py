@@ -106,7 +106,7 @@ def named(found: Calibration) -> list[str]:
     return [name for name, is_named in (
         ('zoom', 'the zoom changes' in text),
         ('stabilised', found.stabiliser is not None or 'stabil' in text),
-        ('bent', 'bent' in text or (found.field is not None and found.field.used)),
+        ('bent', 'bent' in text),
         ('shutter', found.rolling_shutter is not None)) if is_named]
 
 
