@@ -127,8 +127,10 @@ def test_turns_that_may_be_of_two_kinds_are_tried_with_both():
 def test_a_pinhole_that_all_turns_were_taken_for_a_fisheye_is_one():
     taken = as_model(LENS, Fisheye)
     sure = Profile(np.array([0.5, 0.65, 0.8]), np.array([1.2, 1.0, 1.3]), 100)
-    scenes = [replace(synthetic_turn(LENS, yaw, world=world, tracks=120, keyframes=14).scene(
-        taken, world), rivals=(Start(sure, LENS),)) for world, yaw in enumerate((80, -70, 85))]
+    turns = [synthetic_turn(LENS, yaw, world=world, tracks=120, keyframes=14)
+             for world, yaw in enumerate((80, -70, 85))]
+    scenes = [replace(turn.scene(taken, world), rivals=(Start(sure, LENS),))
+              for world, turn in enumerate(turns)]
     found = solved(scenes)
     assert found.camera.family == 'pinhole' and mapping_error(found.camera, LENS) < 1.0
 
