@@ -63,7 +63,7 @@ def calibrate(path: Paths, fps: float | None = None,
     """
     source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
     sensors = motion if isinstance(motion, SensorStream) else drive_motion(
-        path, motion, start_s=start_s)
+        path, motion, start_s=start_s, topic=topic)
     with _fed(source, config, mask, tell) as calibrator:
         if sensors is not None:
             calibrator.sense(sensors)
@@ -99,12 +99,12 @@ def check(given: Camera, path: Paths, fps: float | None = None,
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
                  chosen: Mapping[str, str | None] = MappingProxyType({}),
-                 start_s: float = 0.0) -> SensorStream | None:
+                 start_s: float = 0.0, topic: str | None = None) -> SensorStream | None:
     """Return what the file motion has, else what the bags of a drive have; None where none is.
 
     start_s: of the part of the drive that is used: a CSV counts from the drive's first image.
-    chosen: the bag's topic by imu, gps and odom. Raises InputError for a file of another kind, and
-    for a topic that there is not.
+    chosen: the bag's topic by imu, gps and odom; topic: its images'. Raises InputError for a file
+    of another kind, and for a topic that there is not.
     """
     wanted = {name: topic for name, topic in chosen.items() if topic is not None}
     if motion is not None:
@@ -116,7 +116,7 @@ def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
     given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
     try:
         bags = [each for each in map(Path, given) if each.exists() and fits_bag(each)]
-        return bag_motion(bags, wanted) if bags else None
+        return bag_motion(bags, wanted, topic) if bags else None
     except (InputError, OSError, ValueError):
         if wanted:
             raise

@@ -113,7 +113,7 @@ def _poses(args: argparse.Namespace) -> tuple[Poses | None, SensorStream | None]
     is_bag = path.exists() and fits_bag(path)
     if not is_bag and not is_motion(path):
         return read_poses(path), None
-    track = bag_motion([path], {'gps': args.gps}) if is_bag else read_motion(path)
+    track = bag_motion([path], {'gps': args.gps}, args.topic) if is_bag else read_motion(path)
     if track is None or track.position is None:
         why = '; '.join(() if track is None else track.warnings)
         raise InputError(f'{path} has no GPS track{why and f" ({why})"}: give one with positions '

@@ -84,7 +84,7 @@ def read_sensors(args: argparse.Namespace) -> SensorStream | None:
     """
     return drive_motion(args.input, args.motion,
                         {name: getattr(args, name) for name in ('imu', 'gps', 'odom')},
-                        args.start)
+                        args.start, args.topic)
 
 
 @contextmanager

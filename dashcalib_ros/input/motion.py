@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.errors import InputError
@@ -28,6 +29,8 @@ LONGEST_STEP_S = 60.0
 DEGREE_M = 111_320.0
 # of the Earth's radius, by which positions of another drive would be off: not this car's
 FARTHEST_M = 1e6
+# degrees of latitude, and of longitude, which some count from 0 on
+FARTHEST_DEG = (90.0, 360.0)
 # values of a stream at the most: ten hours at 200 Hz
 SAMPLES = 7_200_000
 # samples of a stream at the least; fewer say nothing of a turn
@@ -109,13 +112,13 @@ class SensorStream:
     def since(self, start_s: float) -> SensorStream:
         """Return the same, with stamps from a drive's first image on. start_s: its stamp.
 
-        Pictures without a time of day (a video's) begin where an absolute stream begins.
+        Pictures without a time of day (a video's) begin where a stream with one begins.
         """
         if not self.absolute or self.empty:
             return replace(self, absolute=False)
-        if start_s > EPOCH_S:
-            return replace(self.shifted(-start_s), absolute=False)
         first = min(float(samples.stamps_s[0]) for samples in self.kinds.values())
+        if start_s > EPOCH_S or first <= EPOCH_S:
+            return replace(self.shifted(-start_s), absolute=False)
         return replace(self.shifted(start_s - first), absolute=False, warnings=(
             *self.warnings, 'the pictures have no time of day: the first sample of the motion '
                             'sensors is taken to be of the first image'))
@@ -146,12 +149,19 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
     """Return a stream from raw values, with what is damaged left out.
 
     values: by kind, as SensorStream's, the stamps (n,) in s and the values (n, d); positions are
-    in metres. what: where they come from, for warnings.
+    latitude and longitude in degrees, and altitude in m. what: where they come from, for warnings.
+    absolute: as SensorStream's.
     """
     found: dict[str, Samples] = {}
     warnings: list[str] = []
     for kind, (stamps_s, rows) in values.items():
         stamps_s, rows = np.asarray(stamps_s, np.float64), np.asarray(rows, np.float64)
+        if kind == 'position':
+            nowhere = _nowhere(rows)
+            stamps_s, rows = stamps_s[~nowhere], local_metres(*rows[~nowhere].T)
+            if nowhere.any():
+                warnings.append(f'{nowhere.sum()} positions of {what} are left out: they are 0, 0 '
+                                f'or no place on Earth, as a GPS gives them without a fix')
         # whole seconds of a GPS at 10 Hz: the first one is at its time
         with np.errstate(invalid='ignore'):
             again = np.diff(stamps_s, prepend=np.nan) == 0
@@ -169,11 +179,19 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
     return SensorStream(**found, warnings=tuple(warnings), absolute=absolute)
 
 
+def _nowhere(places: Floats) -> npt.NDArray[np.bool_]:
+    """Return which of (n, 3) latitudes, longitudes and altitudes are what no fix gives."""
+    nowhere = (places[:, :2] == 0).all(axis=1) | (np.abs(places[:, :2]) > FARTHEST_DEG).any(axis=1)
+    return np.asarray(nowhere)
+
+
 NAMES = {'rate': 'angular rates', 'speed': 'speeds', 'position': 'positions'}
 
 
 def _cleaned(stamps_s: Floats, values: Floats, kind: str) -> tuple[Samples | None, str]:
     """Return the usable samples, and what is wrong with them, '' where nothing is."""
+    if not len(stamps_s):
+        return None, 'there are none'
     if len(stamps_s) > SAMPLES:
         return None, f'there are more than {SAMPLES} of them'
     good = np.isfinite(stamps_s) & np.isfinite(values).all(axis=1)
@@ -272,7 +290,4 @@ class SensorBuffer:
         if 'odom_rate' in found:
             # a gyro is better than what odometry makes of it
             found.setdefault('rate', found.pop('odom_rate'))
-        if 'position' in found:
-            stamps_s, places = found['position']
-            found['position'] = stamps_s, local_metres(*places.T)
         return sensor_stream(found, what, absolute=True)

@@ -4,11 +4,13 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from statistics import median
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -22,7 +24,6 @@ from dashcalib_ros.input.motion import (
     SensorBuffer,
     SensorStream,
     in_seconds,
-    local_metres,
     sensor_stream,
     values_in,
 )
@@ -40,6 +41,9 @@ from dashcalib_ros.limits import (
     read_text,
 )
 
+if TYPE_CHECKING:
+    from dashcalib_ros.input.bag_storage import Bag
+
 # columns of a CSV by their stream
 STAMP_COLUMN = 'stamp_s'
 COLUMNS = {'rate': ('gyro_x', 'gyro_y', 'gyro_z'), 'speed': ('speed',),
@@ -56,6 +60,10 @@ GOPRO_FIX, GOPRO_BLOCK_S = '0x47505346', 1.0
 # message types by the option that chooses one of their topics
 TYPES = {'imu': ('sensor_msgs/msg/Imu',), 'gps': ('sensor_msgs/msg/NavSatFix',),
          'odom': ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/TwistStamped')}
+# what a damaged message raises
+NO_MESSAGE = (InputError, AttributeError, TypeError, ValueError)
+# s between stamps and reception, beyond what a slow network makes; messages that tell it
+ANOTHER_CLOCK_S, LATE_MESSAGES = 60.0, 9
 
 
 def read_motion(path: Path) -> SensorStream:
@@ -104,8 +112,8 @@ def _csv(lines: Iterator[str], path: Path) -> SensorStream:
     for kind, wanted in COLUMNS.items():
         there = [name for name in wanted if name in column]
         if kind == 'position' and {'latitude', 'longitude'} <= set(there):
-            rows = local_metres(column['latitude'], column['longitude'],
-                                column.get('altitude', np.full(len(stamps), np.nan)))
+            column.setdefault('altitude', np.full(len(stamps), np.nan))
+            rows = np.stack([column[name] for name in wanted], axis=1)
         elif len(there) == len(wanted):
             rows = np.stack([column[name] for name in wanted], axis=1)
         elif there:
@@ -114,7 +122,7 @@ def _csv(lines: Iterator[str], path: Path) -> SensorStream:
         else:
             continue
         # sensors of different rates leave cells empty; a line without a stamp is damaged
-        known = ~np.isnan(rows).all(axis=1) | ~np.isfinite(stamps)
+        known = ~np.isnan(rows[:, :2]).all(axis=1) | ~np.isfinite(stamps)
         values[kind] = stamps[known], rows[known]
     if not values:
         raise InputError(f'{path} has no column of a sensor: its first line must name {HEAD}')
@@ -207,10 +215,10 @@ def _gpx(text: str, path: Path) -> SensorStream:
     except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f'{path} is no valid GPX ({shortened(str(error))}): export the track '
                          f'anew') from error
-    stamps, *places = np.array(points.rows).reshape(-1, 4).T
-    if len(stamps) < 2:
+    rows = np.array(points.rows).reshape(-1, 4)
+    if len(rows) < 2:
         raise InputError(f'{path} has no track with times: export it with them')
-    return sensor_stream({'position': (stamps, local_metres(*places))}, str(path), absolute=True)
+    return sensor_stream({'position': (rows[:, 0], rows[:, 1:])}, str(path), absolute=True)
 
 
 def _inside_video(path: Path) -> SensorStream:
@@ -233,9 +241,9 @@ def _inside_video(path: Path) -> SensorStream:
                               np.radians([sample['gyro'] for sample in seen]))
         fixes = [fix for block in parser.telemetry() for fix in _gopro_fixes(block.get('GPS'))]
         if fixes:
-            stamps, latitude, longitude, altitude, speed = np.array(fixes).T
-            values['position'] = stamps, local_metres(latitude, longitude, altitude)
-            values['speed'] = stamps, speed[:, None]
+            found = np.array(fixes)
+            values['position'] = found[:, 0], found[:, 1:4]
+            values['speed'] = found[:, 0], found[:, 4:]
     except (KeyboardInterrupt, SystemExit, MemoryError):
         raise
     except BaseException as error:  # the library's own panics are no Exception
@@ -291,7 +299,7 @@ def _oxts(folder: Path) -> SensorStream:
     return sensor_stream({
         'rate': (stamps - first, rows[:, OXTS_RATE]),
         'speed': (stamps - first, rows[:, OXTS_SPEED:OXTS_SPEED + 1]),
-        'position': (stamps - first, local_metres(*rows[:, OXTS_POSITION].T))}, str(folder))
+        'position': (stamps - first, rows[:, OXTS_POSITION])}, str(folder))
 
 
 def _kitti_stamps(path: Path) -> Floats:
@@ -302,11 +310,13 @@ def _kitti_stamps(path: Path) -> Floats:
     return np.array(found)
 
 
-def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None]) -> SensorStream | None:
-    """Return what a bag's sensors say; None where it has none.
+def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
+               images: str | None = None) -> SensorStream | None:
+    """Return what a bag's sensors say, on the clock of its images; None where it has none.
 
     chosen: topic by imu, gps and odom; None: the only one of its type. Of several without a choice
-    none is used, and a warning lists them. Raises InputError for a chosen topic that there is not.
+    none is used, and a warning lists them. images: their topic; None: the only one. Raises
+    InputError for a chosen topic that there is not.
     """
     from dashcalib_ros.input.bag_storage import open_bag
     samples = SensorBuffer(SAMPLES + 1)
@@ -333,16 +343,48 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None]) -> Senso
                                 f'messages')
             elif found:
                 topics[found[0].name] = option
+        later = _aligned(bag, tuple(topics), images)
+        warnings += [f'{name} is of another clock than the images, {abs(apart):.0f} s '
+                     f'{"behind" if apart > 0 else "ahead"}: the times of reception align them'
+                     for name, apart in later.items()]
         for record in bag.records(tuple(topics), lambda _: None) if topics else ():
             try:
                 message = record.message()
                 values = list(values_in(message, topics[record.topic]))
-                stamp = message.header.stamp
-                stamp_s = int(stamp.sec) + int(stamp.nanosec) / 1e9 or record.receive_ns / 1e9
-            except (InputError, AttributeError, TypeError, ValueError):
+                stamp_s = _stamp_s(message) or record.receive_ns / 1e9
+            except NO_MESSAGE:
                 continue  # a damaged message is as one that is missing
             for kind, value in values:
-                samples.add(kind, stamp_s, value)
+                samples.add(kind, stamp_s + later.get(record.topic, 0.0), value)
     stream = samples.stream('the bag')
     lines = (*warnings, *stream.warnings)
     return None if stream.empty and not lines else replace(stream, warnings=lines)
+
+
+def _aligned(bag: Bag, topics: Sequence[str], images: str | None) -> dict[str, float]:
+    """Return what is to be added to stamps, s, of those topics that are not of the images' clock.
+
+    images: their topic; None: the only one. Where it is not known nothing is added.
+    """
+    shown = [topic.name for topic in bag.topics if topic.is_image and topic.count
+             and (images is None or topic.name.strip('/') == images.strip('/'))]
+    ours = _late_s(bag, shown[0]) if len(shown) == 1 and topics else None
+    if ours is None:
+        return {}
+    apart = {topic: late - ours for topic in topics if (late := _late_s(bag, topic)) is not None}
+    return {topic: later for topic, later in apart.items() if abs(later) > ANOTHER_CLOCK_S}
+
+
+def _late_s(bag: Bag, topic: str) -> float | None:
+    """Return by how many s a topic's messages come after their stamps, None where none is read."""
+    late = []
+    for record in islice(bag.records((topic,), lambda _: None), LATE_MESSAGES):
+        with suppress(*NO_MESSAGE):
+            came_s = record.receive_ns / 1e9
+            late.append(came_s - (_stamp_s(record.message()) or came_s))
+    return median(late) if late else None
+
+
+def _stamp_s(message: Any) -> float:
+    stamp = message.header.stamp
+    return int(stamp.sec) + int(stamp.nanosec) / 1e9

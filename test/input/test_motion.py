@@ -6,11 +6,13 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from made_drives import ROS2, START, drive, head, images, write_bag
+from made_drives import ROS2, START, drive, head, image, images, write_bag
 from made_gopro import gopro
 
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import (
+    DEGREE_M,
     Samples,
     SensorBuffer,
     SensorStream,
@@ -236,6 +238,30 @@ def test_a_kitti_oxts_folder_counts_from_its_first_image(tmp_path):
         read_motion(data)
 
 
+@pytest.mark.parametrize('lost', ['0,0', '91,8', '49,361'])
+def test_places_of_no_fix_are_left_out_and_said(tmp_path, lost):
+    rows = [f'{n},{lost if n < 30 or n == 45 else f"49,{8 + n * 1e-4}"}' for n in range(60)]
+    path = write(tmp_path / 'gps.csv', '\n'.join(['stamp_s,latitude,longitude', *rows]))
+    found = read_motion(path)
+    assert len(found.position.stamps_s) == 29 and found.position.stamps_s[0] == 30.0
+    assert np.ptp(found.position.values[:, 0]) == pytest.approx(29e-4 * DEGREE_M * np.cos(
+        np.radians(49)))
+    assert found.warnings == (f'31 positions of {path} are left out: they are 0, 0 or no place on '
+                              f'Earth, as a GPS gives them without a fix',)
+
+
+def test_a_gps_that_never_had_a_fix_is_not_used(tmp_path):
+    path = write(tmp_path / 'gps.csv', 'stamp_s,latitude,longitude\n' + '1,0,0\n2,0,0\n' * 9)
+    found = read_motion(path)
+    assert found.empty and 'are not used: there are none' in found.warnings[-1]
+
+
+def test_the_equator_and_the_meridian_of_greenwich_are_places(tmp_path):
+    rows = '\n'.join(f'{n},0,{(n - 5) * 1e-4 + 1e-9}' for n in range(60))
+    found = read_motion(write(tmp_path / 'gps.csv', f'stamp_s,latitude,longitude\n{rows}'))
+    assert len(found.position.stamps_s) == 60 and found.warnings == ()
+
+
 def imu(n, topic='/imu', stamp_ns=None):
     types = ROS2.types
     vector = types['geometry_msgs/msg/Vector3']
@@ -249,13 +275,14 @@ def imu(n, topic='/imu', stamp_ns=None):
     return topic, START + n * 10**7, message
 
 
-def fix(n, status=0):
+def fix(n, status=0, place=None):
     types = ROS2.types
     return '/fix', START + n * 10**8, types['sensor_msgs/msg/NavSatFix'](
         header=head(START + n * 10**8, ROS2),
-        status=types['sensor_msgs/msg/NavSatStatus'](status=status, service=1), latitude=49.0,
-        longitude=8.0 + n * 1e-5, altitude=float('nan'), position_covariance=np.zeros(9),
-        position_covariance_type=0)
+        status=types['sensor_msgs/msg/NavSatStatus'](status=status, service=1),
+        latitude=49.0 if place is None else place,
+        longitude=8.0 + n * 1e-5 if place is None else place, altitude=float('nan'),
+        position_covariance=np.zeros(9), position_covariance_type=0)
 
 
 def twist(n):
@@ -302,6 +329,45 @@ def test_messages_without_a_stamp_have_the_time_they_came(tmp_path):
         0.01, abs=1e-5)
 
 
+def test_a_bag_whose_gps_begins_at_0_0(tmp_path):
+    path = write_bag(tmp_path / 'bag', [*(fix(n, place=0.0) for n in range(10)),
+                                        *(fix(n) for n in range(10, 20))])
+    found = bag_motion([path], NONE)
+    assert len(found.position.values) == 10 and '10 positions of the bag' in found.warnings[0]
+    assert found.since(START / 1e9).position.stamps_s[0] == pytest.approx(1.0, abs=1e-5)
+
+
+UPTIME = 1234 * 10**9
+
+
+@pytest.mark.parametrize(('seen', 'felt'), [
+    (UPTIME, START), (START, UPTIME), (UPTIME, 9 * UPTIME), (0, UPTIME)])
+def test_images_and_sensors_of_different_clocks_are_aligned_by_reception(tmp_path, seen, felt):
+    # the first image comes 0.35 s after the sensor's first message
+    frames = [(topic, at + 350_000_000, image(frame, stamp_ns=seen and seen + n * 10**8))
+              for n, (frame, (topic, at, _)) in enumerate(zip(
+                  drive(12), images(drive(12)), strict=True))]
+    path = write_bag(tmp_path / 'bag', sorted(
+        [*frames, *(imu(n, stamp_ns=felt + n * 10**7) for n in range(100))],
+        key=lambda each: each[1]))
+    source = open_frames(path)
+    start_s = next(iter(source)).stamp_ns / 1e9
+    found = bag_motion([path], NONE, '/camera').since(start_s)
+    np.testing.assert_allclose(found.rate.stamps_s, np.arange(100) / 100 - 0.35, atol=1e-5)
+    [line] = found.warnings
+    assert '/imu is of another clock than the images' in line and 'reception' in line
+
+
+def test_images_and_sensors_of_one_uptime_keep_it(tmp_path):
+    frames = [(topic, at, image(frame, stamp_ns=UPTIME + n * 10**8)) for n, (frame, (
+        topic, at, _)) in enumerate(zip(drive(12), images(drive(12)), strict=True))]
+    # the sensor was ready before the camera
+    path = write_bag(tmp_path / 'bag', [
+        *frames, *(imu(n, stamp_ns=UPTIME - 10**9 + n * 10**7) for n in range(100))])
+    found = bag_motion([path], NONE).since(UPTIME / 1e9)
+    assert found.rate.stamps_s[0] == pytest.approx(-1.0) and found.warnings == ()
+
+
 def test_live_samples_are_bounded_and_in_order():
     buffer = SensorBuffer(length=100)
     assert buffer.stream().empty
@@ -322,7 +388,8 @@ def test_positions_are_metres_from_the_first_fix_also_at_the_date_line():
 
 def test_speed_is_measured_or_comes_from_positions():
     stamps = np.arange(0.0, 20.0, 0.5)
-    places = np.column_stack([9.0 * stamps, 12.0 * stamps, np.zeros(len(stamps))])
+    places = np.column_stack([12.0 * stamps / DEGREE_M, 8 + 9.0 * stamps / DEGREE_M,
+                              np.zeros(len(stamps))])
     by_places = speeds_of(sensor_stream({'position': (stamps, places)}, 'a test'))
     assert np.allclose(by_places.values, 15.0) and by_places.stamps_s[0] == 0.5
     backwards = sensor_stream({'speed': (stamps, np.full((len(stamps), 1), -3.0)),
