@@ -34,7 +34,7 @@ BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera refused; 3 s
 # the names of models and exports are not taken from their tables: that would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
 KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'foxglove',
-         'rays', 'maps')
+         'gyroflow', 'rays', 'maps')
 
 def exit_code(verdict: str) -> int:
     """Return the exit code of a verdict."""

@@ -9,7 +9,7 @@ from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
 from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.report import compare as compare_cameras
 from dashcalib_ros.report import load_camera, write_text
-from dashcalib_ros.report.export import WITH_FIELD, cropped, exported, resized
+from dashcalib_ros.report.export import WITH_FIELD, WITH_READOUT, cropped, exported, resized
 from dashcalib_ros.report.page import difference_html
 from dashcalib_ros.report.tables import comparison
 from dashcalib_ros.standard_streams import write_stdout
@@ -32,15 +32,19 @@ def compare(args: argparse.Namespace) -> int:
 def export(args: argparse.Namespace) -> int:
     """Write the camera to --out, or to standard output."""
     found = load_camera(args.calibration)
-    camera = found.camera
+    camera, readout_ms = found.camera, found.readout_ms
     if args.size is not None:
         camera = resized(camera, args.size)
     if args.crop is not None:
-        camera = cropped(camera, *args.crop)
+        whole, camera = camera, cropped(camera, *args.crop)
+        readout_ms = readout_ms and readout_ms * camera.image_size[1] / whole.image_size[1]
     if found.field is not None and args.to in WITH_FIELD and camera is not found.camera:
         raise UsageError('the field over the picture holds for the whole one; leave --size and '
                          '--crop away')
-    text = exported(camera, args.to, found.field)
+    text = exported(camera, args.to, found.field, readout_ms)
+    if readout_ms is None and args.to in WITH_READOUT:
+        warn([f'{found.name} has no readout time of a rolling shutter: set it in {args.to}, '
+              f'unless the shutter is global'])
     if found.field is not None and args.to not in WITH_FIELD:
         warn([f'{found.name} has a field over the picture, for which {args.to} has no place: it '
               f'is left out; {", ".join(WITH_FIELD)} have it'])

@@ -225,7 +225,8 @@ class NamedCamera:
     covariance: (n, n) of the parameters, as the picture shows them, and sigma_px: over the
     picture; None where the file does not say.
     field: what its lens model leaves over, where a result.json has one that is used. mount: how it
-    sits on the car, where the file says.
+    sits on the car, where the file says. readout_ms: of a rolling shutter, from the first row to
+    the last; None where the file has none.
     faults: in words, of what else stands beside the camera (ROS's K, R and P).
     """
 
@@ -237,6 +238,7 @@ class NamedCamera:
     sigma_px: PictureSigma | None = None
     field: Field | None = default(default=None, compare=False)
     mount: Mount | None = default(default=None, compare=False)
+    readout_ms: float | None = default(default=None, compare=False)
     faults: tuple[str, ...] = ()
 
     def without_faults(self) -> NamedCamera:

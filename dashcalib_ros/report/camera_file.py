@@ -68,8 +68,8 @@ IN_FOLDER = ('result.json', 'calibration.yaml', 'cameras.bin', 'cameras.txt',
              'sparse/0/cameras.bin', 'sparse/0/cameras.txt', 'camera_models.json',
              'transforms.json')
 KNOWN = ('a result.json (or its folder), a camera_info YAML, a file of OpenCV, Kalibr, COLMAP, '
-         'nerfstudio, OpenSfM or mrcal, a JSON of fx, fy, cx, cy, k1, k2, width and height, or a '
-         'bag with camera_info')
+         'nerfstudio, OpenSfM, mrcal or Gyroflow, a JSON of fx, fy, cx, cy, k1, k2, width and '
+         'height, or a bag with camera_info')
 # ROS's distortion models; RATIONAL has all pinholes in it
 PLUMB_BOB, RATIONAL, EQUIDISTANT = 'plumb_bob', 'rational_polynomial', 'equidistant'
 # the coefficients by name, in the order of D
@@ -88,6 +88,12 @@ KALIBR = {'radtan': PLUMB_BOB, 'equidistant': EQUIDISTANT, 'equi': EQUIDISTANT,
 OPENSFM = {'perspective': PLUMB_BOB, 'simple_radial': PLUMB_BOB, 'radial': PLUMB_BOB,
            'brown': PLUMB_BOB, 'fisheye': EQUIDISTANT, 'fisheye_opencv': EQUIDISTANT}
 NERFSTUDIO = {name: kind for name, _, kind, _ in COLMAP[:6]}
+GYROFLOW = {'opencv_fisheye': EQUIDISTANT, 'opencv_standard': RATIONAL}
+# what else a lens profile may do with a picture
+GYROFLOW_MORE = ('digital_lens', 'crop', 'input_horizontal_stretch', 'input_vertical_stretch',
+                 'interpolations')
+# the sign of the readout time of rows; by columns it is not known here
+READOUT = {'TopToBottom': 1, 'BottomToTop': -1}
 MRCAL = {'LENSMODEL_PINHOLE': PLUMB_BOB, 'LENSMODEL_OPENCV4': PLUMB_BOB,
          'LENSMODEL_OPENCV5': PLUMB_BOB, 'LENSMODEL_OPENCV8': RATIONAL,
          'LENSMODEL_OPENCV12': RATIONAL}
@@ -118,8 +124,8 @@ def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedC
     path: a result.json (or its folder) or calibration.yaml of this package; a camera_info YAML; a
     YAML, XML, JSON or .npz with OpenCV's camera matrix and distortion coefficients; Kalibr's
     camchain; COLMAP's cameras.txt or cameras.bin, or the folder of a model; the JSON of nerfstudio
-    or OpenSfM; mrcal's .cameramodel; a JSON of fx, fy, cx, cy, k1, k2 ..., width and height, which
-    may say its "model"; a bag that has camera_info.
+    or OpenSfM; mrcal's .cameramodel; Gyroflow's lens profile; a JSON of fx, fy, cx, cy, k1, k2
+    ..., width and height, which may say its "model"; a bag that has camera_info.
     name: which camera, of a file that has several: as the file names it (cam1, 2), for a bag its
     image topic or its camera_info topic. FILE:NAME as the path means the same.
 
@@ -276,6 +282,10 @@ def _cameras_of(data: Any, path: Path) -> Mapping[str, Reader]:
             return {str(frame.get('file_path', number)): partial(
                 _nerfstudio, {**data, **frame}, path)
                 for number, frame in enumerate(data['frames']) if isinstance(frame, Mapping)}
+        if isinstance(data.get('calibration_data'), Mapping):
+            data = data['calibration_data']  # Gyroflow's project has the profile inside
+        if 'calib_dimension' in data:
+            return {'': partial(_gyroflow, data, path)}
         if 'distortion_coeffs' in data:
             return {'': partial(_kalibr, data, path)}
         for key, read in (('distortion_coeffs', _kalibr), ('projection_type', _opensfm)):
@@ -511,6 +521,36 @@ def _opensfm(data: Data, path: Path) -> Camera:
     return _camera(size, [fx, fy, cx, cy], kind, _coefficients(data, kind, path), path)
 
 
+def _gyroflow(data: Data, path: Path) -> NamedCamera:
+    """Read Gyroflow's lens profile; without coefficients each of its models is a pinhole."""
+    more = [key for key in GYROFLOW_MORE if data.get(key) not in (None, 0, 1, '', [], {})]
+    if more:
+        raise InputError(f'{path} has {more[0]} = {shortened(repr(data[more[0]]))}, which no '
+                         f'model here has; give a profile of pictures as the lens shows them')
+    # the first profiles had no model's name, and a place for each
+    standard = data.get('use_opencv_standard') is True and not data.get('use_opencv_fisheye')
+    named = data.get('distortion_model')
+    kind = _model(GYROFLOW, named or ('opencv_standard' if standard else 'opencv_fisheye'),
+                  'the distortion_model', path)
+    key = 'calib_params' if standard and not named else 'fisheye_params'
+    lens, size = data.get(key), data['calib_dimension']
+    if not isinstance(lens, Mapping) or not isinstance(size, Mapping):
+        raise InputError(f'{path} has no {key} with a camera_matrix, or no calib_dimension with w '
+                         f'and h; give a complete profile')
+    k = _values(lens, 'camera_matrix', 9, path)
+    d = _numbers(lens.get('distortion_coeffs'), 'distortion_coeffs', path)
+    readout_ms = None if data.get('frame_readout_time') is None else read_number(
+        data, 'frame_readout_time', path)
+    if readout_ms is not None and data.get('frame_readout_direction'):
+        sign = READOUT.get(str(data['frame_readout_direction']))
+        readout_ms = None if sign is None else sign * abs(readout_ms)
+    camera = _camera((size.get('w'), size.get('h')), _view(k), kind if any(d) else PLUMB_BOB, d,
+                     path)
+    # 0 is what it has where nobody has measured it
+    return NamedCamera(str(path), camera, readout_ms=readout_ms or None,
+                       faults=ros_faults(camera, k, [], []))
+
+
 def _mrcal(text: str, path: Path) -> Camera:
     try:
         data = ast.literal_eval(text.strip())
@@ -563,7 +603,8 @@ def _result(data: Data, path: Path) -> NamedCamera:
     return NamedCamera(str(path), camera, sigma, str(data['verdict']),
                        read_covariance(data.get('details'), camera, sigma),
                        read_sigma_px(data.get('sigma_px')),
-                       read_field(data.get('field'), size), read_mount(data.get('mount')))
+                       read_field(data.get('field'), size), read_mount(data.get('mount')),
+                       read_readout_ms(data.get('rolling_shutter')))
 
 
 def _no_model(name: Any, path: Path) -> str:
@@ -621,10 +662,12 @@ def calibrated_camera(calibration: Calibration, name: str = 'estimate') -> Named
     if calibration.camera is None:
         raise InputError(no_intrinsics(name, calibration.verdict.level,
                                         calibration.verdict.reasons))
+    shutter = calibration.rolling_shutter
     return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
                        read_covariance(calibration.details, calibration.camera,
                                        calibration.sigma),
-                       calibration.sigma_px, mount=calibration.mount)
+                       calibration.sigma_px, mount=calibration.mount,
+                       readout_ms=None if shutter is None else shutter.readout_ms)
 
 
 def read_size(width: Any, height: Any, *, path: str | Path) -> tuple[int, int]:
@@ -735,6 +778,14 @@ def read_sigma_px(data: Any) -> PictureSigma | None:
     """Return result.json's sigma over the picture; a missing one is no error."""
     try:
         return PictureSigma(*(read_number(data, key, '') for key in ('rms', 'worst')))
+    except (AttributeError, TypeError, InputError):
+        return None
+
+
+def read_readout_ms(data: Any) -> float | None:
+    """Return result.json's readout time; a missing one is no error."""
+    try:
+        return read_number(data, 'readout_ms', '')
     except (AttributeError, TypeError, InputError):
         return None
 

@@ -30,15 +30,19 @@ from dashcalib_ros.report.result import camera_info_yaml
 ROUNDING_PX = 1.0
 
 
-def exported(camera: Camera, kind: str, field: Field | None = None) -> str | bytes:
+def exported(camera: Camera, kind: str, field: Field | None = None,
+             readout_ms: float | None = None) -> str | bytes:
     """Return the content of a camera file of one of EXPORTS: text, or bytes of an .npz.
 
     field: what the camera leaves over; WITH_FIELD has the kinds that can tell it, the others
-    leave it out. Raises ConfigError for a kind that there is not, and for a lens that it cannot
-    describe, and OutputError for one that mrcal's spline cannot.
+    leave it out. readout_ms: of a rolling shutter, from the first row to the last; WITH_READOUT
+    has the kinds that can tell it. Raises ConfigError for a kind that there is not, and for a lens
+    that it cannot describe, and OutputError for one that mrcal's spline cannot.
     """
     if kind not in EXPORTS:
         raise ConfigError(f'there is no export to {kind!r}; choose one of {", ".join(EXPORTS)}')
+    if kind in WITH_READOUT:
+        return WITH_READOUT[kind](camera, readout_ms)
     return WITH_FIELD[kind](camera, field) if kind in WITH_FIELD else EXPORTS[kind](camera)
 
 
@@ -135,6 +139,34 @@ def _foxglove(camera: Camera) -> str:
         'D': ros.d, 'K': ros.k, 'R': ros.r, 'P': ros.p}, indent=2) + '\n'
 
 
+def _gyroflow(camera: Camera, readout_ms: float | None = None) -> str:
+    """Return a lens profile of Gyroflow, which takes all that it lacks for not known.
+
+    readout_ms: of a rolling shutter, from the first row to the last. Raises ConfigError for a
+    fisheye without coefficients.
+    """
+    kind = 'opencv_fisheye' if _is_fisheye(camera) else 'opencv_standard'
+    d = camera.ros_distortion()
+    if _is_fisheye(camera) and not any(d):
+        raise ConfigError('gyroflow takes a fisheye whose coefficients are all 0 for a pinhole; '
+                          'calibrate it with --model fisheye, or export to opencv')
+    width, height = camera.image_size
+    size = {'w': width, 'h': height}
+    return json.dumps({
+        'name': f'dashcam {width}x{height}', 'camera_model': 'dashcam',
+        'calibrated_by': 'dashcalib', 'calibrator_version': 'dashcalib',
+        'calib_dimension': size, 'orig_dimension': size,
+        'frame_readout_time': None if readout_ms is None else abs(readout_ms),
+        'frame_readout_direction': None if readout_ms is None else (
+            'TopToBottom' if readout_ms >= 0 else 'BottomToTop'),
+        'input_horizontal_stretch': 1.0, 'input_vertical_stretch': 1.0,
+        # else the principal point is taken to be in the middle
+        'asymmetrical': True,
+        'distortion_model': kind, 'use_opencv_fisheye': _is_fisheye(camera),
+        'fisheye_params': {'camera_matrix': camera.matrix.tolist(),
+                           'distortion_coeffs': list(d)}}, indent=2) + '\n'
+
+
 def _mrcal(camera: Camera, field: Field | None = None) -> str:
     """Return mrcal's .cameramodel: the splined one for a fisheye, which it has not, and a field.
 
@@ -215,7 +247,9 @@ def _is_fisheye(camera: Camera) -> bool:
 EXPORTS: dict[str, Callable[[Camera], str | bytes]] = {
     'opencv': _opencv, 'colmap': _colmap, 'kalibr': _kalibr, 'opensfm': _opensfm,
     'nerfstudio': _nerfstudio, 'mrcal': _mrcal, 'ros': camera_info_yaml, 'foxglove': _foxglove,
-    'rays': rays_file, 'maps': maps_file}
+    'gyroflow': _gyroflow, 'rays': rays_file, 'maps': maps_file}
 # those that can tell a field
 WITH_FIELD: dict[str, Callable[[Camera, Field | None], str | bytes]] = {
     'mrcal': _mrcal, 'rays': rays_file, 'maps': maps_file}
+# those that can tell a readout time
+WITH_READOUT: dict[str, Callable[[Camera, float | None], str | bytes]] = {'gyroflow': _gyroflow}

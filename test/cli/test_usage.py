@@ -195,6 +195,21 @@ def test_export_tells_where_the_field_over_the_picture_goes(here, results, tmp_p
     assert_one_line_error(here('export', path, '--to', 'mrcal', '--crop', '0,0,640,375'))
 
 
+def test_a_lens_profile_has_the_readout_time_of_its_rows(here, results, tmp_path):
+    data = json.loads((results / 'a/result.json').read_text())
+    data['rolling_shutter'] = {'readout_ms': 20.0, 'sigma_ms': 0.3}
+    path = tmp_path / 'result.json'
+    path.write_text(json.dumps(data))
+    for more, wanted_ms in (((), 20.0), (('--size', '621x188'), 20.0),
+                            (('--crop', '0,0,1242,300'), 16.0)):
+        done = here('export', path, '--to', 'gyroflow', *more)
+        assert (done.returncode, done.stderr) == (0, '')
+        assert json.loads(done.stdout)['frame_readout_time'] == pytest.approx(wanted_ms)
+    without = here('export', results / 'a', '--to', 'gyroflow')
+    assert without.returncode == 0 and json.loads(without.stdout)['frame_readout_time'] is None
+    assert 'has no readout time of a rolling shutter' in without.stderr
+
+
 def test_export_to_what_there_is_not(here, results):
     done = here('export', results / 'a', '--to', 'matlab')
     assert_one_line_error(done)

@@ -5,6 +5,7 @@ import ast
 import json
 import re
 import subprocess
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -94,6 +95,31 @@ def test_each_export_is_read_back(lens, kind, tmp_path):
     assert compare(read, NamedCamera('given', lens)).mapping_px < 1e-6
     if kind != 'opensfm':  # shares of the width are not exact
         assert read.camera == lens
+
+
+@lenses('gyroflow')
+@pytest.mark.parametrize('readout_ms', [None, 21.5, -20.1])
+def test_a_lens_profile_has_what_gyroflow_needs(lens, kind, readout_ms, tmp_path):
+    profile = json.loads(exported(lens, kind, readout_ms=readout_ms))
+    assert profile['calib_dimension'] == {'w': 1242, 'h': 375} == profile['orig_dimension']
+    # it loads none without, and takes the middle for the principal point
+    assert profile['calibrator_version'] and profile['asymmetrical'] is True
+    k = np.array(profile['fisheye_params']['camera_matrix'])
+    d = np.array(profile['fisheye_params']['distortion_coeffs'])
+    seen = {'opencv_fisheye': cv2.fisheye.projectPoints, 'opencv_standard': cv2.projectPoints}[
+        profile['distortion_model']](POINTS[:, None], np.zeros(3), np.zeros(3), k, d)[0]
+    np.testing.assert_allclose(seen.reshape(-1, 2), lens.project(POINTS), atol=1e-6)
+    path = tmp_path / 'profile.json'
+    path.write_text(json.dumps(profile))
+    assert load_camera(path).readout_ms == readout_ms
+    assert (profile['frame_readout_time'], profile['frame_readout_direction']) == {
+        None: (None, None), 21.5: (21.5, 'TopToBottom'), -20.1: (20.1, 'BottomToTop')}[readout_ms]
+
+
+def test_a_fisheye_without_coefficients_is_a_pinhole_to_gyroflow():
+    ideal = replace(EACH_MODEL['fisheye'], k1=0.0, k2=0.0, k3=0.0, k4=0.0)
+    with pytest.raises(ConfigError, match='for a pinhole'):
+        exported(ideal, 'gyroflow')
 
 
 @lenses('rays')

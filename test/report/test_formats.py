@@ -91,7 +91,51 @@ SFM = {'projection_type': 'perspective', 'width': 640, 'height': 480, 'focal': 0
        'k2': 0.01}
 
 
+# a lens profile as it is published, of an action camera
+GYROFLOW = json.loads("""{
+  "name": "AKASO_v50x___2.7k_16by9_2716x1524-30.00fps", "note": "",
+  "camera_brand": "AKASO", "camera_model": "V50x", "lens_model": "", "camera_setting": "",
+  "calib_dimension": {"w": 2716, "h": 1524}, "orig_dimension": {"w": 2716, "h": 1524},
+  "output_dimension": {"w": 2716, "h": 1524}, "frame_readout_time": null, "gyro_lpf": null,
+  "input_horizontal_stretch": 1.0, "num_images": 6, "fps": 29.999979, "official": false,
+  "use_opencv_fisheye": true,
+  "fisheye_params": {
+    "RMS_error": 0.920755232738085,
+    "camera_matrix": [[1521.8556549213351, 0.0, 1398.7223429856729],
+                      [0.0, 1517.3353528760497, 629.1053659679567], [0.0, 0.0, 1.0]],
+    "distortion_coeffs": [0.13409177590858662, -0.33639498801548057, 0.3274956873988361,
+                          -0.1478470585818954],
+    "radial_distortion_limit": null},
+  "use_opencv_standard": false,
+  "calib_params": {"RMS_error": 0.0, "camera_matrix": [], "distortion_coeffs": [],
+                   "radial_distortion_limit": null},
+  "identifier": "", "calibrator_version": "1.0.0-rc4", "date": "2022-02-27",
+  "compatible_settings": []}""")
+ACTION = Fisheye((2716, 1524), 1521.8556549213351, 1517.3353528760497, 1398.7223429856729,
+                 629.1053659679567, 0.13409177590858662, -0.33639498801548057,
+                 0.3274956873988361, -0.1478470585818954)
+LENS = {'camera_matrix': MATRIX['K'], 'distortion_coeffs': [-0.1, 1e-5, 1e-3, -2e-3, 0.3]}
+STANDARD = {'calib_dimension': {'w': 640, 'h': 480}, 'distortion_model': 'opencv_standard',
+            'fisheye_params': LENS}
+
+
+def gyroflow(d, **changes):
+    """Make a lens profile of OpenCV's standard model."""
+    return {**STANDARD, 'fisheye_params': {**LENS, 'distortion_coeffs': d}, **changes}
+
+
 @pytest.mark.parametrize(('content', 'name', 'wanted'), [
+    (GYROFLOW, None, ACTION),
+    ({'title': 'a project', 'calibration_data': GYROFLOW}, None, ACTION),
+    (STANDARD, None, FULL),
+    (gyroflow([*FULL.params[4:], 0.01, 0.02, 0.03, 0, 0, 0, 0]), None,
+     Rational(SMALL, *FULL.params, 0.01, 0.02, 0.03)),
+    (gyroflow([]), None, Radial(SMALL, *FULL.params[:4])),
+    # without coefficients a fisheye is taken for a pinhole there, too
+    (gyroflow([0, 0, 0, 0], distortion_model=None), None, Radial(SMALL, *FULL.params[:4])),
+    # of the first versions
+    ({'calib_dimension': {'w': 640, 'h': 480}, 'use_opencv_fisheye': False, 'fisheye_params': {},
+      'use_opencv_standard': True, 'calib_params': LENS}, None, FULL),
     (OPENCV, None, FULL),
     (OPENCV_XML, None, FULL),
     (KALIBR, 'cam0', NO_K3),
@@ -128,6 +172,17 @@ def test_a_file_of_another_program(tmp_path, content, name, wanted):
         assert load_camera(f'{path}:{name}') == read and read.name == f'{path}:{name}'
 
 
+@pytest.mark.parametrize(('profile', 'readout_ms'), [
+    ({}, None), ({'frame_readout_time': None}, None), ({'frame_readout_time': 0.0}, None),
+    ({'frame_readout_time': 14.2}, 14.2), ({'frame_readout_time': -14.2}, -14.2),
+    ({'frame_readout_time': 14.2, 'frame_readout_direction': 'BottomToTop'}, -14.2),
+    ({'frame_readout_time': 14.2, 'frame_readout_direction': 'LeftToRight'}, None)])
+def test_the_readout_time_of_a_lens_profile(tmp_path, profile, readout_ms):
+    path = tmp_path / 'profile.json'
+    path.write_text(json.dumps({**GYROFLOW, **profile}))
+    assert load_camera(path).readout_ms == readout_ms
+
+
 @pytest.mark.parametrize(('content', 'complaint'), [
     (KALIBR, r'3 cameras; name one, as in .*:cam0; there are cam0, cam1, cam2'),
     (KALIBR.replace('radtan', 'fov', 1).partition('cam1')[0], "'fov', which is none"),
@@ -150,6 +205,17 @@ def test_a_file_of_another_program(tmp_path, content, name, wanted):
     ({'a': {**SFM, 'projection_type': 'spherical'}}, "'spherical', which is none"),
     ({**PLAIN, 'k4': 0.1}, 'may be a fisheye'),
     ({**PLAIN, 'xi': 1.1}, 'no xi'),
+    (gyroflow([0.1], distortion_model='poly5'), "'poly5', which is none"),
+    (gyroflow([0.1], digital_lens='gopro_superview'), "digital_lens = 'gopro_superview'"),
+    (gyroflow([0.1], input_horizontal_stretch=1.33), 'input_horizontal_stretch = 1.33'),
+    (gyroflow([0.1], frame_readout_time='fast'), "frame_readout_time = 'fast'"),
+    (gyroflow([0.1], calib_dimension=[640, 480]), 'no calib_dimension with w and h'),
+    (gyroflow([0.1], calib_dimension={'w': 640}), 'image height'),
+    (gyroflow([0.1], fisheye_params={}), 'no camera_matrix'),
+    (gyroflow([*[0.1] * 8, 0.01, 0, 0, 0]), 'none of the models here'),
+    (gyroflow([0.1] * 5, distortion_model='opencv_fisheye'), 'none of the models here'),
+    (gyroflow([0.1], fisheye_params={**LENS, 'camera_matrix': [[5, 1, 3], [0, 5, 2], [0, 0, 1]]}),
+     r'K\[1\] is 1'),
     ({'images': []}, 'no camera calibration known here'),
     ([], 'no camera calibration known here'),
     ('hello\n', 'no camera calibration known here'),
