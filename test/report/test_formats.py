@@ -127,6 +127,11 @@ def gyroflow(d, **changes):
 @pytest.mark.parametrize(('content', 'name', 'wanted'), [
     (GYROFLOW, None, ACTION),
     ({'title': 'a project', 'calibration_data': GYROFLOW}, None, ACTION),
+    # newer versions name what there is not
+    ({**{key: GYROFLOW[key] for key in ('calib_dimension', 'fisheye_params')},
+      **dict.fromkeys(('distortion_model', 'digital_lens', 'crop', 'interpolations')),
+      'asymmetrical': False, 'input_horizontal_stretch': 1.0, 'input_vertical_stretch': 1.0,
+      'compatible_settings': [{'width': 1920, 'height': 1080, 'crop': 0.928}]}, None, ACTION),
     (STANDARD, None, FULL),
     (gyroflow([*FULL.params[4:], 0.01, 0.02, 0.03, 0, 0, 0, 0]), None,
      Rational(SMALL, *FULL.params, 0.01, 0.02, 0.03)),
