@@ -32,14 +32,6 @@ def resized_pixels(pixels: Pixels, factor: float | np.float32) -> Pixels:
 
 
 @dataclass(frozen=True)
-class Prior:
-    """A normal distribution of the n parameters: mean (n,), covariance (n, n)."""
-
-    mean: Floats
-    covariance: Floats
-
-
-@dataclass(frozen=True)
 class ColmapModel:
     """How COLMAP writes a camera.
 

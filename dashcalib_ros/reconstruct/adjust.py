@@ -12,7 +12,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel, Prior
+from dashcalib_ros.camera.camera import HALF_PIXEL, ColmapModel
 from dashcalib_ros.config import SceneConfig
 from dashcalib_ros.reconstruct.colmap import pyceres, pycolmap
 from dashcalib_ros.reconstruct.scene import Scene, projected_px, retriangulated
@@ -28,7 +28,7 @@ IN_FRONT = 0.035
 # What of the camera is free beside poses and points. COLMAP's models with one focal length have
 # the first coefficients of distortion only: 'first distortion' frees those, 'one focal length' the
 # focal length with them. The others stay as they are, which is right only where they are 0
-Free = Literal['nothing', 'first distortion', 'distortion', 'one focal length', 'everything']
+Free = Literal['nothing', 'first distortion', 'distortion', 'one focal length']
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,11 @@ class Solver:
 
 
 def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
-           focal_range: tuple[float, float] | None = None, prior: Prior | None = None,
-           bounds: tuple[Floats, Floats] | None = None) -> tuple[list[Scene], Camera]:
+           focal_range: tuple[float, float] | None = None) -> tuple[list[Scene], Camera]:
     """Adjust poses, points and what is free of the camera's n parameters; the others are fixed.
 
-    focal_range: px, lowest and highest, for one focal length. prior, and bounds, the lowest and
-    highest values (n,), for everything. Scenes without observations stay as they are.
+    focal_range: px, lowest and highest, for one focal length. Scenes without observations stay as
+    they are.
     """
     # smaller, and enough where it has all coefficients
     single = free in ('first distortion', 'one focal length') or (
@@ -54,17 +53,12 @@ def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
     model = camera.colmap_one_focal if single else camera.colmap
     adjustable = _in_front(scenes)
     reconstruction = _reconstruction(adjustable, camera, model)
-    adjuster = _adjuster(reconstruction, solver,
-                         refine_focal=free in ('one focal length', 'everything'),
-                         refine_centre=free == 'everything')
+    adjuster = _adjuster(reconstruction, solver, refine_focal=free == 'one focal length')
     problem, values = adjuster.problem, reconstruction.cameras[1].params
     if not problem.has_parameter_block(values):
         return list(scenes), camera
     if free == 'nothing':
         problem.set_parameter_block_constant(values)
-    elif free == 'everything':
-        assert prior is not None and bounds is not None
-        _constrain(problem, values, model, prior, bounds)
     else:
         if not single:
             problem.set_manifold(values, pyceres.SubsetManifold(
@@ -80,8 +74,8 @@ def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
     found = camera.params
     found[:len(model.places)] = model.params(reconstruction.cameras[1].params)
     # the conversion from COLMAP's pixels rounds: keep what was fixed exact
-    first, end = {'one focal length': (2, 4), 'everything': (0, 0)}.get(free, (0, 4))
-    found[first:end] = camera.params[first:end]
+    first = 2 if free == 'one focal length' else 0
+    found[first:4] = camera.params[first:4]
     camera = camera.with_params(found)
     return _projected(moved, camera), camera
 
@@ -163,11 +157,11 @@ def _first_ids(scenes: Sequence[Scene]) -> list[int]:
     return [1 + sum(counts[:n]) for n in range(len(counts))]
 
 
-def _adjuster(reconstruction: pycolmap.Reconstruction, solver: Solver, refine_focal: bool,
-              refine_centre: bool) -> pycolmap.CeresBundleAdjuster:
+def _adjuster(reconstruction: pycolmap.Reconstruction, solver: Solver, refine_focal: bool
+              ) -> pycolmap.CeresBundleAdjuster:
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = refine_focal
-    options.refine_principal_point = refine_centre
+    options.refine_principal_point = False
     options.refine_extra_params = True
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -182,20 +176,6 @@ def _adjuster(reconstruction: pycolmap.Reconstruction, solver: Solver, refine_fo
     for image_id in reconstruction.reg_image_ids():
         config.add_image(image_id)
     return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
-
-
-def _constrain(problem: pyceres.Problem, values: Floats, model: ColmapModel, prior: Prior,
-               bounds: tuple[Floats, Floats]) -> None:
-    if model.fixed:
-        problem.set_manifold(values, pyceres.SubsetManifold(model.size, model.fixed))
-    places, (low, high) = list(model.places), map(model.values, bounds)
-    for place in places:
-        _bound(problem, values, place, low[place], high[place])
-    covariance = np.eye(model.size)
-    covariance[np.ix_(places, places)] = prior.covariance
-    problem.add_residual_block(
-        pyceres.factors.NormalPrior(model.values(prior.mean), covariance),
-        pyceres.TrivialLoss(), [values])
 
 
 def _bound(problem: pyceres.Problem, values: Floats, index: int, low: float, high: float) -> None:

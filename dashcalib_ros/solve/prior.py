@@ -2,12 +2,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.camera import Prior
 from dashcalib_ros.config import IntrinsicsConfig
 from dashcalib_ros.reconstruct.scene import Scene, errors_px
 from dashcalib_ros.solve.imaging import Imaging
@@ -29,6 +29,14 @@ FOCAL_BOUND, CENTRE_BOUND, DISTORTION_BOUND = 0.15, (0.2, 0.3), 1.0
 CROP_SIGMA, CROP_TIME_S = 0.03, 1.0
 # prior sigmas of the zoom: of one image, of a stretch, of a turn
 ZOOM_IMAGE, ZOOM_STRETCH, ZOOM_TURN = 0.01, 0.02, 0.03
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A normal distribution of the n parameters: mean (n,), covariance (n, n)."""
+
+    mean: Floats
+    covariance: Floats
 
 
 def prior_of(camera: Camera, aspect_sigma: float) -> Prior:

@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats, Ints, Mask
+from dashcalib_ros.arrays import Floats, Ints
 
 NONE = np.zeros(0)
 
@@ -87,10 +87,6 @@ class Quadratic:
             self.score[rest] - follow.T @ self.score[first],
             combine @ self.by_track @ combine.T)
 
-    def settled(self, places: Mask) -> Quadratic:
-        """Return the cost without a gradient by some parameters, (m,): they are at the optimum."""
-        return Quadratic(self.hessian, np.where(places, 0.0, self.score), self.by_track)
-
     def moved(self, step: Floats) -> Quadratic:
         """Return the same cost about another place, a step (m,) away."""
         return Quadratic(self.hessian, self.score - self.hessian @ step, self.by_track)
@@ -108,12 +104,6 @@ class Quadratic:
     def covariance(self) -> Floats:
         """Return (m, m) the covariance of the optimum, where residuals are independent."""
         return np.asarray(np.linalg.inv(self.hessian))
-
-    @property
-    def covariance_by_track(self) -> Floats:
-        """Return (m, m) the covariance of the optimum with each track as one measurement."""
-        covariance = self.covariance
-        return np.asarray(covariance @ self.by_track @ covariance)
 
     @property
     def chance(self) -> float:

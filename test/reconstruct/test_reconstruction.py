@@ -9,7 +9,6 @@ import pytest
 from synthetic import LENS, SIZE, SyntheticTurn, angle_deg, synthetic_turn
 
 from dashcalib_ros.camera import Camera, Radial
-from dashcalib_ros.camera.camera import Prior
 from dashcalib_ros.config import Config, SceneConfig, TracksConfig
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.points import follow_points
@@ -35,8 +34,6 @@ from dashcalib_ros.reconstruct.tracks import Tracks, longest, spread, thinned, t
 
 CONFIG = SceneConfig()
 NO_PROFILE = Profile(np.ones(1), np.ones(1), 1)
-NO_PRIOR = Prior(LENS.params, np.diag([1e8, 1e8, 1e8, 1e8, 1e4, 1e4]))
-FREE = (LENS.params - [200, 200, 100, 100, 1, 1], LENS.params + [200, 200, 100, 100, 1, 1])
 TRUE_YAW = 80.0
 TURN = TurnId(True, 0)
 
@@ -59,10 +56,6 @@ def chained(turn: SyntheticTurn, camera: Camera) -> Scene:
 def one_focal_length(scenes, camera, solver, reach) -> tuple[list[Scene], Camera]:
     free = 'first distortion' if reach is None else 'one focal length'
     return adjust.adjust(scenes, camera, solver, free, reach)
-
-
-def everything(scenes, camera, solver, prior, bounds) -> tuple[list[Scene], Camera]:
-    return adjust.adjust(scenes, camera, solver, 'everything', prior=prior, bounds=bounds)
 
 
 def refined(scene: Scene, reach: tuple[float, float] | None, rounds: int = 2) -> Scene:
@@ -339,36 +332,6 @@ def test_the_focal_length_is_fixed_or_stays_in_range(turn):
     assert 560.0 <= camera.fx <= 900.0
 
 
-def test_everything_recovers_all_six(turn):
-    other = synthetic_turn(yaw_deg=-75.0, world=1)
-    start = Radial.centred(SIZE, 1.03 * LENS.fx, -0.25)
-    scenes = [turn.scene(start), other.scene(start, 1)]
-    camera = start
-    for _ in range(4):
-        scenes, camera = everything(scenes, camera, Solver(0.5, 30), NO_PRIOR, FREE)
-        scenes = [retriangulated(scene, camera, 2.0, 1.0) for scene in scenes]
-    np.testing.assert_allclose(camera.params[:4], LENS.params[:4], atol=3.0)
-    np.testing.assert_allclose(camera.params[4:], LENS.params[4:], atol=0.006)
-    # each scene keeps its own points, in the order of its own tracks
-    for scene, truth in zip(scenes, (turn, other), strict=True):
-        error = errors_px(scene, camera)[scene.structure.used]
-        assert np.sqrt(np.mean(error**2)) < 0.4
-        assert scene.tracks is truth.tracks
-
-
-def test_everything_stays_within_its_bounds_and_believes_its_prior(turn):
-    scene = turn.scene(LENS)
-    low, high = FREE[0].copy(), FREE[1].copy()
-    low[2], high[4] = 411.0, -0.30
-    _, camera = everything([scene], LENS, Solver(0.5, 30), NO_PRIOR, (low, high))
-    assert camera.cx == pytest.approx(411.0, abs=0.05)
-    assert camera.k1 == pytest.approx(-0.30, abs=1e-3)
-    wish = LENS.params + [30, -20, 5, 5, 0.05, -0.05]
-    strict = Prior(wish, np.diag([1e-6, 1e-6, 1e-6, 1e-6, 1e-12, 1e-12]))
-    _, camera = everything([scene], LENS, Solver(0.5, 30), strict, FREE)
-    np.testing.assert_allclose(camera.params, wish, atol=0.05)
-
-
 def test_scenes_without_any_point_are_no_crash(turn):
     scene = turn.scene(LENS)
     empty = replace(scene, structure=replace(
@@ -376,7 +339,7 @@ def test_scenes_without_any_point_are_no_crash(turn):
     for scenes in ([empty], [empty, empty]):
         again, camera = one_focal_length(scenes, LENS, Solver(), (300.0, 900.0))
         assert camera == LENS and len(again) == len(scenes)
-        again, camera = everything(scenes, LENS, Solver(), NO_PRIOR, FREE)
+        again, camera = adjust.adjust(scenes, LENS, Solver(), 'distortion')
         assert camera == LENS and len(again) == len(scenes)
     assert truncated_cost(empty, LENS, 2.0) == pytest.approx(4.0)
     # beside one that has some, nothing is mixed up
@@ -398,7 +361,7 @@ def test_an_adjustment_uses_no_point_behind_the_camera(turn):
     points, [track] = scene.structure.points.copy(), np.flatnonzero(scene.structure.used[0])[:1]
     points[track] = [0, 0, -1e3]
     scene = replace(scene, structure=replace(scene.structure, points=points))
-    [found], camera = everything([scene], LENS, Solver(0.5, 3), NO_PRIOR, FREE)
+    [found], camera = adjust.adjust([scene], LENS, Solver(0.5, 3), 'distortion')
     assert np.isfinite(residuals_px(found, camera)[found.structure.used]).all()
     others = np.arange(len(points)) != track
     np.testing.assert_array_equal(found.structure.used[:, others],
@@ -456,12 +419,10 @@ def test_colmap_is_given_its_own_pixels(colmap_scene):
     assert reconstruction.compute_mean_reprojection_error() < 1e-6
 
 
-def test_the_principal_point_comes_back_in_our_pixels(colmap_scene):
-    start = replace(colmap_scene.camera, fx=F * 1.01, fy=F * 0.99, cx=CX + 6, cy=CY - 6, k1=-0.1)
-    prior = Prior(start.params, np.diag([1e12, 1e12, 1e12, 1e12, 1e6, 1e6]))
-    bounds = (start.params - 100, start.params + 100)
-    _, camera = everything([colmap_scene], start, Solver(1.0, 100, 1e-14), prior, bounds)
-    np.testing.assert_allclose(camera.params[:4], [F, F, CX - 0.5, CY - 0.5], atol=1e-3)
+def test_the_distortion_comes_back_about_our_pixels(colmap_scene):
+    start = replace(colmap_scene.camera, k1=-0.1)
+    _, camera = adjust.adjust([colmap_scene], start, Solver(1.0, 100, 1e-14), 'distortion')
+    np.testing.assert_array_equal(camera.params[:4], start.params[:4])
     np.testing.assert_allclose(camera.params[4:], [K1, K2], atol=1e-5)
 
 
