@@ -31,7 +31,7 @@ FEW, SMALL_PX = 6, 0.02
 RIDGE = 1e-6
 # chi-squared of each further coefficient; less, and nobody sees it. And px RMS of 1000 px of
 # width, by which they may move the picture all the same
-SEEN, LEAST_APART = 1.5, 0.02
+SEEN, LEAST_APART = 3.0, 0.02
 # px RMS of 1000 px of width; a smaller field is none
 LEAST_FIELD = 0.02
 
