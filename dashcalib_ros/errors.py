@@ -31,7 +31,19 @@ def counted(count: int, what: str) -> str:
 
 
 class DashcalibError(Exception):
-    """Root of all errors that this package raises on purpose."""
+    """Root of all errors that this package raises on purpose.
+
+    code: names what is wrong, 'E-' and words in capitals; it stays when the text is reworded.
+    text: one line that says what is wrong and names the cure.
+    """
+
+    def __init__(self, code: str, text: str = '') -> None:
+        # a text alone is an error whose code is not chosen yet
+        self.code, self.text = (code, text) if text else ('', code)
+        super().__init__(*((code, text) if text else (code,)))
+
+    def __str__(self) -> str:
+        return self.text
 
 
 class InputError(DashcalibError):

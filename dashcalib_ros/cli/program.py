@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as end:  # argparse's way to end after --help and --version
         return end.code if isinstance(end.code, int) else BAD_INPUT
     except DashcalibError as error:
-        return _fail(str(error))
+        return _fail(f'{error} [{error.code}]' if error.code else str(error))
     except KeyboardInterrupt:
         # `python -m` ends with SIGINT instead of our exit code when an interrupt, caught or not,
         # came out of exec('text'), as dataclasses call it on import; the next exec() resets that
