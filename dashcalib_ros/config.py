@@ -268,8 +268,8 @@ class MonitorConfig:
 class Config:
     """All settings; frozen. Config().replace({'turns.wanted': 8}) returns a copy with changes.
 
-    Config.from_mapping() takes what a YAML file has, flat() gives every setting by its full name.
-    Raises ConfigError for a value of the wrong type, NaN or out of range.
+    Config.from_mapping() takes the content of a YAML file, flat() returns all settings by full name.
+    Raises ConfigError for a value that has the wrong type, is NaN or is out of range.
     """
 
     seed: int = expert(
@@ -330,7 +330,7 @@ class Config:
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any]) -> Config:
-        """Make a Config from nested or dotted names, as a YAML file gives them."""
+        """Return a Config from nested or dotted names, as in a YAML file."""
         flat: dict[str, Any] = {}
         for key, value in data.items():
             if isinstance(value, Mapping):

@@ -206,7 +206,7 @@ def _check_values(root: Any, what: str) -> None:
                              f'that it is the right file')
         if (node.id == 'scalar' and len(node.value) > DIGITS
                 and node.tag.endswith((':int', ':float'))):
-            raise InputError('E-YAML-INVALID',
+            raise InputError('E-YAML-NUMBER',
                              f'{what} is not usable YAML: a number has more than '
                              f'{DIGITS} digits; correct it')
 

@@ -108,7 +108,7 @@ def _of_another_picture(camera: Camera, view: Floats) -> list[str]:
         # NaN is a fault, too
         fits = away <= NEAR and ZOOM[0] <= zoom.min() and zoom.max() <= ZOOM[1]
     return [] if fits else [
-        'P does not map the image into the rectified image: it may be for another image size']
+        'P does not map the image into the rectified image: it may be for images of another size']
 
 
 def rectified_matrix(camera: Camera, rectified: str = SAME) -> Floats:

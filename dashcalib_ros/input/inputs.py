@@ -70,20 +70,21 @@ Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
                 start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
-    """Open a drive; its path tells the kind of input.
+    """Open a recorded drive. The kind of input is detected from the content of the files.
 
-    path: a ROS 2 bag (folder, .mcap, .db3, zstd or not), a ROS 1 .bag, a video file, or a folder
-    of images, which are taken in the order of their names (2.png before 10.png). Also several of
-    these, of one camera: a sequence, taken in its order; a folder of videos or bags, or a pattern
-    (drives/*.mp4): in the order that the camera's maker gives their names, else of the times at
-    which they were recorded, else of their names; a warning says which. No turn spans two of them
-    unless they go on; one that cannot be read is skipped, with a warning.
-    topic: the image topic of a bag; needed only when it has several. Of a video with several
-    streams, the number of one: '2'.
-    fps: images per second of a folder (default 10), or instead of what a video says (Hz).
-    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
+    path: a ROS 2 bag (folder, .mcap, .db3, with or without zstd), a ROS 1 .bag, a video file, or a
+    folder of images, ordered by name (2.png before 10.png). Several of these are one drive of one
+    camera: a sequence, in its own order, or a folder of videos or bags, or a pattern
+    (drives/*.mp4). The files of a folder or a pattern are ordered by the naming rule of the
+    camera's maker, otherwise by time of recording, otherwise by name; a warning states which rule
+    was used. A turn spans two files only if the second one continues the first one. A file that
+    cannot be read is skipped, with a warning.
+    topic: the image topic of a bag, needed only if the bag has several; or the number of a stream
+    of a video ('2').
+    fps: image rate in Hz, of a folder (default 10), or to replace the time stamps of a video.
+    start_s, duration_s: part of the drive to use, in seconds; None: up to its end.
 
-    Raises InputError when there is nothing to read, or several topics and no choice among them.
+    Raises InputError if there is nothing to read, or if the topic is ambiguous.
     """
     _check_numbers(fps, start_s, duration_s)
     given = [path] if isinstance(path, (str, os.PathLike)) else list(path)

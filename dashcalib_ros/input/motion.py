@@ -2,7 +2,7 @@
 
 A stream's stamps are seconds since the drive's first image, on the sensor's own clock: how far
 that is off is found later, from the turns (judge/witnesses.py). A stream that cannot be used is
-None, and a warning says why: it never costs the calibration.
+None, and a warning states the reason: the calibration goes on without it.
 """
 from __future__ import annotations
 
@@ -70,12 +70,12 @@ class Samples:
 
 @dataclass(frozen=True)
 class SensorStream:
-    """What sensors say of a drive; each None where there is none of its kind.
+    """Motion sensor data of a drive; each is None if there is no such sensor.
 
     rate: (n, 3) rad/s about the sensor's own three axes, in any mounting. speed: (n, 1) m/s.
     position: (n, 3) m, east, north and up from the first. Stamps: s since the drive's first
     image; absolute: since 1970, as bags and GPX have them.
-    warnings: what was left out, one line each.
+    warnings: what was skipped, one line each.
     """
 
     rate: Samples | None = None

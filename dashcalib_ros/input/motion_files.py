@@ -67,10 +67,9 @@ ANOTHER_CLOCK_S, LATE_MESSAGES = 60.0, 9
 
 
 def read_motion(path: Path) -> SensorStream:
-    """Read what sensors say of a drive from a CSV, a GPX, a KITTI oxts folder, or a video.
+    """Read the motion sensors of a drive from a CSV, a GPX, a KITTI oxts folder or a video.
 
-    Raises InputError for what is none of these. What is damaged inside is left out, with a
-    warning in the stream.
+    Raises InputError for other files. Damaged samples are skipped, with a warning in the stream.
     """
     if path.is_dir():
         return _oxts(path)
@@ -318,7 +317,7 @@ def _kitti_stamps(path: Path) -> Floats:
 
 def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
                images: str | None = None) -> SensorStream | None:
-    """Return what a bag's sensors say, on the clock of its images; None where it has none.
+    """Return the sensor data of a bag, on the clock of its images; None if it has none.
 
     chosen: topic by imu, gps and odom; None: the only one of its type. Of several without a choice
     none is used, and a warning lists them. images: their topic; None: the only one. Raises

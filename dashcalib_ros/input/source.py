@@ -92,14 +92,14 @@ def os_error(path: Path, error: OSError) -> InputError:
 class Frame:
     """One image of the drive.
 
-    index: position among the input's frames, counted from 0.
-    stamp_ns: time of exposure in nanoseconds (the message header's stamp, or index / rate).
-    image: (height, width) uint8, grey. Never written to after the Frame is made.
-    frame_id: the message header's; empty where there is none.
-    after_gap: images are missing before it, or it is of another drive.
-    perhaps_after_gap: the first of another file that may or may not go on where the one before
-    ended, as the next video of a dashcam; how the picture moves tells (detect/continuity.py).
-    Raises InputError for a stamp that is no finite number of 64 bits.
+    index: position among the images of the input, counted from 0.
+    stamp_ns: time of exposure in nanoseconds (the stamp of the message header, or index / rate).
+    image: (height, width) uint8, grey. It is not changed after the Frame is created.
+    frame_id: that of the message header; empty if there is none.
+    after_gap: images are missing before this one, or it belongs to another drive.
+    perhaps_after_gap: first image of a file that may or may not continue the previous one, such as
+    the next video of a dashcam; detect/continuity.py decides from the motion of the image.
+    Raises InputError for a stamp that is not a finite number of 64 bits.
     """
 
     index: int
@@ -164,22 +164,22 @@ class Reading:
 
 
 class FrameSource(ABC):
-    """The images of one drive: iterate over it, as often as you like, to get each Frame in turn.
+    """The images of one drive. Iterating yields each Frame in order; it may be repeated.
 
-    name: of the drive, for messages.
-    count: how many images to expect (for a progress bar), None if unknown.
-    topic: the bag's image topic; None for videos and folders.
-    size: (width, height) where it is known before the first image, else None. stored_size: that
-    of the pictures as they are stored, where their pixels are not square; else None.
-    length_ns: how long the drive is where its stamps are counted from 0, else None.
-    recorded: its stamps are times of recording, as a bag has them. begin_ns: when it began, None
-    where that is not known.
-    warnings: what the user should know about the input; complete after the last frame.
-    contradictions: those of them that may be why a drive teaches too little, with the cure.
+    name: name of the drive, for messages.
+    count: expected number of images (for a progress bar), None if unknown.
+    topic: image topic of a bag; None for videos and folders.
+    size: (width, height) in pixels if known before the first image, otherwise None. stored_size:
+    size of the stored images if their pixels are not square, otherwise None.
+    length_ns: length of the drive if its stamps start at 0, otherwise None.
+    recorded: the stamps are times of recording, as in a bag. begin_ns: start of the recording,
+    None if unknown.
+    warnings: what the user should know about the input, one line each; complete after the last
+    frame. contradictions: those that may explain why a drive is not sufficient, with the cure.
 
-    Frames are read one by one; no memory grows with the drive. Their stamps always increase.
-    Frame.index counts all images of the input, also those that were skipped.
-    Iterating raises InputError when no image can be decoded or when their size changes.
+    Frames are read one by one: memory does not grow with the drive. Their stamps always increase.
+    Frame.index counts all images of the input, including skipped ones.
+    Iterating raises InputError if no image can be decoded or if the image size changes.
     """
 
     size: tuple[int, int] | None = None
