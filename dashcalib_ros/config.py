@@ -268,7 +268,7 @@ class MonitorConfig:
 class Config:
     """All settings; frozen. Config().replace({'turns.wanted': 8}) returns a copy with changes.
 
-    Config.from_mapping() takes the content of a YAML file, flat() returns all settings by full name.
+    Config.from_mapping() takes the content of a YAML file; flat() returns all settings by name.
     Raises ConfigError for a value that has the wrong type, is NaN or is out of range.
     """
 
