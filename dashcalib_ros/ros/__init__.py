@@ -5,7 +5,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.errors import DashcalibError, coded
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, write_stdout
 from dashcalib_ros.workers.worker import one_thread_for_numpy
 
@@ -15,6 +15,8 @@ INSTALL = ("calibrator: error: the Python package {name} is missing: source your
 ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
                 'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
                 'std_srvs')
+# characters of an error on the terminal
+LONGEST = 1000
 # SIGHUP: the terminal was closed, or its connection lost
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -42,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return run([each for each in arguments if each != '--lifecycle'], lifecycle,
                    lambda: bool(signals))
     except DashcalibError as error:
-        write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
+        write_stderr(f'calibrator: error: {coded(error, LONGEST)}')
         return 2
     except ModuleNotFoundError as error:
         missing = (error.name or '').partition('.')[0]
