@@ -558,3 +558,4 @@ def test_without_rclpy_one_line_says_how_to_install_it(tmp_path):
                           timeout=SOON, env={**os.environ, **ros_environment(tmp_path)})
     assert done.returncode == 2
     assert 'pip install' in done.stderr and len(done.stderr.splitlines()) == 1
+    assert done.stderr.endswith('[E-ROS-NOT-INSTALLED]\n')
