@@ -212,7 +212,7 @@ def content_hash(path: Path) -> str:
                     found.update(block)
                     left -= len(block)
     except OSError as error:
-        raise InputError('E-CLIP-NOT-READABLE', f'cannot read {path} ({error.strerror or error}); '
+        raise InputError('E-FILE-UNREADABLE', f'cannot read {path} ({error.strerror or error}); '
                                                 f'check its permissions') from error
     return found.hexdigest()[:32]
 

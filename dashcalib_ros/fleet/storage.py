@@ -186,7 +186,7 @@ def _store_errors(what: str) -> Iterator[None]:
     except Exception as error:
         if getattr(error, 'errno', None) in FULL:
             raise
-        raise InputError('E-ADDRESS-NOT-READABLE', f'cannot {what} ({one_line(error)}); check '
+        raise InputError('E-ADDRESS-UNREADABLE', f'cannot {what} ({one_line(error)}); check '
                                                    f'the address and your access to it') from error
 
 

@@ -21,8 +21,8 @@ from dashcalib_ros.ros.parameters import OVERRIDES, latched
 
 NOT_YET = Check('cannot tell', ('there are not enough turns yet',))
 UNTOUCHED = 'check_only is set: the calibration of the driver is not changed'
-# 'the calibration', then one of these
-SAYS = {'right': 'is right', 'differs': 'differs', 'wrong': 'is wrong'}
+# 'the calibration', one of these, then the reasons, which begin with 'differs' where that is so
+SAYS = {'right': 'is right: ', 'differs': '', 'wrong': 'is wrong: '}
 
 
 class CheckNode(CameraNode):
@@ -88,7 +88,7 @@ class CheckNode(CameraNode):
         what = f'the calibration on {self._given_topic}'
         log_line(self._log, answer.answer == 'wrong', (
             f'{what} {SAYS[answer.answer]}' if answer.answer in SAYS else
-            f'the turns cannot show whether {what} is right') + f': {"; ".join(answer.reasons)}')
+            f'the turns cannot show whether {what} is right: ') + '; '.join(answer.reasons))
         if result.complete and found.answer != 'cannot tell':
             # the next answer must be independent: it uses new turns only
             self._learner.restart()
@@ -125,7 +125,7 @@ class CheckNode(CameraNode):
         if found.answer == 'right':
             message = f'the calibration is right; {turns} for the next check'
         elif found.answer in SAYS:
-            message = f'the calibration {SAYS[found.answer]}: {found.reasons[0]}'
+            message = f'the calibration {SAYS[found.answer]}{found.reasons[0]}'
         else:
             message = f'checking the calibration, {turns}: {found.reasons[0]}'
         level = WARN if found.answer == 'wrong' else OK

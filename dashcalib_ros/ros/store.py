@@ -222,7 +222,7 @@ class Store:
         except InputError as error:
             raise InputError(error.code, f'{self.path} is ignored: {error}') from error
         except (OSError, ValueError, OverflowError) as error:
-            raise InputError('E-KEPT-NOT-READABLE', f'{self.path} is ignored: {error}') from error
+            raise InputError('E-KEPT-UNREADABLE', f'{self.path} is ignored: {error}') from error
         if self.given_up:
             raise InputError('E-KEPT-GIVEN-UP', self.given_up)
         if why := implausible(kept.camera):
@@ -372,7 +372,7 @@ def _in_package(url: str) -> Path:
     try:
         share = get_package_share_directory(parts.netloc)
     except (PackageNotFoundError, ValueError, OSError) as error:
-        raise InputError('E-PACKAGE-MISSING',
+        raise InputError('E-ROS-PACKAGE-MISSING',
                          f'camera_info_url {url}: there is no package {parts.netloc}; source its '
                          f'workspace, or use file://') from error
     return Path(share, rest)

@@ -49,7 +49,7 @@ def test_a_clip_is_copied_to_scratch_and_the_copy_removed(place):
         with (pytest.raises(InputError, match=r'gone\.mp4') as caught,
               storage.local_copy(f'{place}/gone.mp4')):
             pass
-        assert caught.value.code == 'E-ADDRESS-NOT-READABLE'
+        assert caught.value.code == 'E-ADDRESS-UNREADABLE'
 
 
 def test_names_are_relative_to_their_folder():

@@ -131,7 +131,7 @@ def test_a_package_is_looked_up(monkeypatch, tmp_path):
             monkeypatch.delenv('AMENT_PREFIX_PATH')
         with pytest.raises(InputError, match=name) as raised:
             camera_info_path(f'package://{name}/a.yaml', 'front')
-        assert raised.value.code == 'E-PACKAGE-MISSING'
+        assert raised.value.code == 'E-ROS-PACKAGE-MISSING'
 
 
 @pytest.mark.parametrize(('url', 'code', 'cure'), [

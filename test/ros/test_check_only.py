@@ -49,6 +49,7 @@ class Core:
 
     newest: ClassVar[Core]
     dark: ClassVar[bool] = False
+    near: ClassVar[bool] = False
 
     def __init__(self, config=None, mask=None, verbose=False, live=False, use_stored=True,
                  warn=None, inline=False, on_trouble=None, on_wait=None):
@@ -101,6 +102,8 @@ class Asked:
         right = given.fx == calibration.camera.fx
         if self.core.dark:
             return Check('cannot tell', ('too dark',))
+        if self.core.near:
+            return Check('differs', ('differs by 1.0 px, good enough',), 1.0, 2.0)
         return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
 
     def watch(self, camera, sigma=None):
@@ -201,6 +204,17 @@ def test_a_wrong_one_warns_until_the_driver_has_another(desk, capfd):
     assert f'the calibration on {TOPIC} has changed' in capfd.readouterr().err
     Core.newest.ready = turns(30, 40)
     desk.until(lambda: heard[-1]['answer'] == 'right')
+
+
+def test_one_that_differs_and_is_good_enough_is_no_warning(desk, monkeypatch, capfd):
+    desk = desk(check_only='true')
+    monkeypatch.setattr(Core, 'near', True)
+    Core.newest.ready = turns(10, 20)
+    drive(desk, other(404.0), lambda: desk.bench.values['check'] == 'differs')
+    desk.until(lambda: desk.bench.status.level == b'\x00')
+    assert desk.bench.status.message.startswith('the calibration differs by 1.0 px')
+    line, = [line for line in capfd.readouterr().err.splitlines() if 'differs' in line]
+    assert line.startswith('[INFO]') and f'{TOPIC} differs by 1.0 px' in line
 
 
 def test_it_answers_as_soon_as_the_turns_can_tell(desk, monkeypatch):
