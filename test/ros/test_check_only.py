@@ -354,5 +354,7 @@ def test_it_is_fixed_at_the_start_and_no_calibration_is_committed(desk):
     desk = desk(check_only='true')
     refused = desk.node.set_parameters_atomically([Parameter('commit', value=True)])
     assert not refused.successful and '[E-COMMIT-WITH-CHECK-ONLY]' in refused.reason
-    refused = desk.node.set_parameters_atomically([Parameter('check_only', value=False)])
-    assert not refused.successful and '[E-PARAMETER-READ-ONLY]' in refused.reason
+    # one for experts is not declared, but known
+    for name, value in (('check_only', False), ('scene.tracks', 500)):
+        refused = desk.node.set_parameters_atomically([Parameter(name, value=value)])
+        assert not refused.successful and '[E-PARAMETER-READ-ONLY]' in refused.reason

@@ -129,9 +129,6 @@ def test_parameters_that_may_not_change_say_so(node_and_bench):
     refused = set_to('turns.at_most', type=whole, integer_value=3)
     assert not refused.successful and '-p turns.at_most:=VALUE' in refused.reason
     assert refused.reason.endswith('[E-PARAMETER-READ-ONLY]')
-    # for experts: not declared, but known
-    refused = set_to('scene.tracks', type=whole, integer_value=500)
-    assert not refused.successful and refused.reason.endswith('[E-PARAMETER-READ-ONLY]')
     # the same as at the start
     for name, near in (('turns.wnted', 'turns.wanted'), ('of_another_node', '/**')):
         refused = set_to(name, type=whole, integer_value=3)
