@@ -136,7 +136,7 @@ class CalibratorNode(CameraNode):
                 self._adopt(calibration)
                 self._learner.restart()
             case 'give_up':
-                self._log.error(f'the published calibration is given up: {judged.why}')
+                self._log.error(f'the published calibration is withdrawn: {judged.why}')
                 self._give_up()
                 # the turns that contradict it stay, and are used for the next one
                 self._learner.forget_stored(calibration.used_turns)

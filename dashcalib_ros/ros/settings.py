@@ -129,7 +129,7 @@ class NodeConfig:
         0.7, 'ratio; a new calibration replaces the old one when its standard deviation (sigma) '
              'of fx is at most this times that of the old one', 0.1, 1.0)
     contradictions: int = expert(
-        3, 'contradictions in a row before the old calibration is given up; one or two may be '
+        3, 'contradictions in a row before the old calibration is withdrawn; one or two may be '
            'chance', 1, 20)
 
     def __post_init__(self) -> None:

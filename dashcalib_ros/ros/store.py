@@ -202,7 +202,7 @@ class Store:
         """Return the line where the file still has a calibration that was given up, else ''."""
         if self._given_up is None or self._read() != self._given_up:
             return ''
-        return (f'{self.path} was given up, but could not be moved aside: remove it, or the next '
+        return (f'{self.path} was withdrawn, but could not be moved aside: remove it, or the next '
                 f'start of the node publishes it again')
 
     def load(self) -> Kept | None:
@@ -224,7 +224,7 @@ class Store:
         except (OSError, ValueError, OverflowError) as error:
             raise InputError('E-KEPT-UNREADABLE', f'{self.path} is ignored: {error}') from error
         if self.given_up:
-            raise InputError('E-KEPT-GIVEN-UP', self.given_up)
+            raise InputError('E-KEPT-WITHDRAWN', self.given_up)
         if why := implausible(kept.camera):
             try:
                 end = f'it is now {set_aside(self.path)}'
