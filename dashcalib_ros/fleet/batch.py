@@ -17,6 +17,7 @@ from dashcalib_ros.errors import ConfigError, InputError, coded
 from dashcalib_ros.fleet import lens_prior, overview, solved, tables
 from dashcalib_ros.fleet.clips import (
     GONE,
+    LONGEST,
     ClipResult,
     gather_clip,
     gathered,
@@ -131,7 +132,7 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
         if isinstance(outcome, DiedError):
             outcome = set_aside(row, out, config)
         elif isinstance(outcome, Exception):
-            outcome = ClipResult(coded(outcome))
+            outcome = ClipResult(coded(outcome, LONGEST))
         camera.results[row.number] = outcome
         tell(camera, outcome)
         if len(camera.results) == len(camera.rows):
@@ -149,7 +150,7 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
 
 def _failed(camera: Camera, error: Exception) -> None:
     camera.own, camera.verdict = None, 'refused'
-    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, coded(error))
+    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, coded(error, LONGEST))
 
 
 def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.OfMake], out: str,

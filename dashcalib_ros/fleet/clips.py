@@ -42,6 +42,8 @@ from dashcalib_ros.reconstruct.scene_file import (
 LATER = ('intrinsics.', 'verdict.', 'fleet.')
 LATER_NAMES = ('threads', 'rectified', 'turns.store')
 GONE = coded(InputError('E-CLIP-MISSING', 'there is no such file; check the path'))
+# characters of an error in a table, without its code
+LONGEST = 300
 # bytes of a file that are hashed at a time
 BLOCK = 2**20
 
@@ -90,9 +92,9 @@ def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
         now = stamp(row.place) or ''
         return _earlier(name, out, now) or _noted(name, _gathered(row, out, config, now))
     except InputError as error:
-        return _noted(name, ClipResult(coded(error), now))
+        return _noted(name, ClipResult(coded(error, LONGEST), now))
     except DashcalibError as error:  # not the clip's own fault
-        return ClipResult(coded(error))
+        return ClipResult(coded(error, LONGEST))
     except OSError as error:
         return ClipResult(f'this machine cannot read it: {one_line(error)}')
 
@@ -136,7 +138,7 @@ def _noted(name: str, result: ClipResult) -> ClipResult:
         try:
             write(name, json.dumps(asdict(result), sort_keys=True).encode())
         except DashcalibError as error:
-            return ClipResult(coded(error))
+            return ClipResult(coded(error, LONGEST))
     return result
 
 

@@ -15,8 +15,6 @@ INSTALL = ("the Python package {name} is missing: source your ROS 2 installation
 ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
                 'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
                 'std_srvs')
-# characters of an error on the terminal
-LONGEST = 1000
 # SIGHUP: the terminal was closed, or its connection lost
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -57,5 +55,5 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fail(error: DashcalibError) -> int:
-    write_stderr(f'calibrator: error: {coded(error, LONGEST)}')
+    write_stderr(f'calibrator: error: {coded(error)}')
     return 2
