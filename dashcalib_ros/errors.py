@@ -20,6 +20,12 @@ def one_line(error: BaseException, limit: int = 160) -> str:
     return shortened(' '.join(str(error).split()) or type(error).__name__, limit)
 
 
+def coded(error: Exception, limit: int = 1000) -> str:
+    """Return an error's message on one line, with its code at the end if it has one."""
+    code = error.code if isinstance(error, DashcalibError) else ''
+    return one_line(error, limit) + (f' [{code}]' if code else '')
+
+
 def shortened(text: str, limit: int = 160) -> str:
     """Return the text, or its beginning where it is too long for a message."""
     return text if len(text) <= limit else text[:limit - 1] + '…'

@@ -19,6 +19,7 @@ from dashcalib_ros.fleet.batch import batch as calibrate_fleet
 from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.engine import Engine, LocalEngine, RayEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
+from dashcalib_ros.fleet.overview import duration
 from dashcalib_ros.fleet.storage import joined, remove, write
 from dashcalib_ros.report.tables import line
 from dashcalib_ros.standard_streams import write_stderr
@@ -120,7 +121,7 @@ class _Progress:
         left = (self.clips - self.done) / rate if rate else 0.0
         note = (f'{self.done} of {self.clips} clips, {60 * rate:.0f} a minute, '
                 f'{self.video_s / max(passed, 1e-9):.1f} s of video a second, '
-                f'{_duration(left)} left')
+                f'{duration(left)} left')
         self.stages.show('clips', self.done / max(self.clips, 1), note)
 
     def effort_json(self, engine: Engine) -> bytes:
@@ -131,9 +132,3 @@ class _Progress:
             'video_s': self.video_s, 'gather_cpu_s': gather_s,
             'solve_cpu_s': sum(engine.cpu_s.values()) - gather_s,
             'peak_mb_of_a_worker': engine.peak_mb}, indent=2) + '\n').encode()
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f'{seconds:.0f} s'
-    return f'{seconds / 60:.0f} min' if seconds < 7200 else f'{seconds / 3600:.1f} h'

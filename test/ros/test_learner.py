@@ -84,7 +84,7 @@ class Core:
         while not self.hold.wait(0.01):
             self.on_wait()
             if self.closed.is_set():
-                raise WorkerError('the calibrator was closed while it calibrated')
+                raise WorkerError('E-CALIBRATOR-CLOSED', 'closed while it calibrated')
         if Core.failures:
             raise Core.failures.pop()
         turns = tuple(TurnSummary(turn.number, turn.number, turn.number, 0.0, 0.1, 1, 1,
@@ -277,18 +277,18 @@ def test_a_request_needs_turns_and_only_one_runs(desk):
     core.hold.clear()
     until(lambda: desk.learner.request() == '')
     until(lambda: desk.learner.activity.calibrating)
-    assert 'running already' in desk.learner.request()
+    assert 'already running' in desk.learner.request()
     core.hold.set()
     until(lambda: desk.results)
     assert not desk.learner.activity.calibrating
 
 
 def test_a_failed_calibration_is_told_and_tried_again(desk):
-    Core.failures = [RuntimeError('odd'), WorkerError('the process died')]
+    Core.failures = [RuntimeError('odd'), WorkerError('E-WORKER-DIED', 'exit code 7')]
     Core.made[0].ready = at(10, 20)
     until(lambda: len(desk.results) == 1)
     assert [kind for kind, _ in desk.troubles] == ['failed_calibrations'] * 2
-    assert 'the process died' in desk.troubles[0][1] and 'in 2 s' in desk.troubles[0][1]
+    assert 'exit code 7 [E-WORKER-DIED]' in desk.troubles[0][1] and 'in 2 s' in desk.troubles[0][1]
     assert 'RuntimeError: odd' in desk.troubles[1][1] and 'in 4 s' in desk.troubles[1][1]
     assert len(Core.made) == 1  # the turns are kept
 
@@ -452,13 +452,13 @@ def test_a_camera_that_is_moved_on_a_straight_road_is_told_once(desk):
 def test_turns_that_could_not_be_compared_are_told_and_tried_with_the_next(desk):
     desk.learner.goal = None
     desk.learner.watched = CAMERA
-    Core.failures = [WorkerError('the process died')]
+    Core.failures = [WorkerError('E-WORKER-DIED', 'exit code 7')]
     core = Core.made[0]
     core.ready = at(10)
     until(lambda: desk.troubles)
     time.sleep(2 * room.LOOK_S)
     (kind, text), = desk.troubles
-    assert kind == 'failed_watches' and 'the process died' in text and len(core.watched) == 1
+    assert kind == 'failed_watches' and '[E-WORKER-DIED]' in text and len(core.watched) == 1
     core.ready = at(10, 20)
     until(lambda: desk.watched)
     assert core.watched[-1][1] == at(10, 20) and len(desk.troubles) == 1
