@@ -109,9 +109,8 @@ class Questions:
         size, scale = self._asked.detection.size, self._asked.detection.scale
         if camera.image_size != size:
             raise InputError('E-CALIBRATION-SIZE',
-                             f'the camera in use is for pictures of {by(camera.image_size)}, '
-                             f'which is not the size of the drive; resize it with dashcalib '
-                             f'export --size')
+                             f'the camera in use is for pictures of another size: '
+                             f'{by(camera.image_size)}; resize it with dashcalib export --size')
         return camera.resized(1 / scale.px, scale.size(size))
 
     def _run(self, stage: str, progress: Progress | None, function: Callable[..., Any],

@@ -319,7 +319,7 @@ def _answer_text(found: Difference) -> str:
     if found.answer == 'differs':
         return f'differs by {far}: {enough}'
     parts = ' and '.join(_blamed(found))
-    return f'wrong by {far}{parts and f", because of the {parts}"}'
+    return f'off by {far}{parts and f", because of the {parts}"}'
 
 
 def _distance_text(found: Difference, whose: str) -> str:

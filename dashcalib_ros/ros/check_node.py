@@ -83,11 +83,10 @@ class CheckNode(CameraNode):
         if not result.complete and found.answer == before:
             return
         answer = self._answer()
-        said = f'the calibration on {self._given_topic}'
+        said = f'the calibration on {self._given_topic} is'
         log_line(self._log, answer.answer == 'wrong', (
-            f'the turns cannot tell whether {said} is right' if answer.answer == 'cannot tell' else
-            f'{said} differs, but is good enough' if answer.answer == 'differs' else
-            f'{said} is {answer.answer}') + f': {"; ".join(answer.reasons)}')
+            f'the turns cannot tell whether {said} right' if answer.answer == 'cannot tell' else
+            f'{said} {answer.answer}') + f': {"; ".join(answer.reasons)}')
         if result.complete and found.answer != 'cannot tell':
             # the next answer must be independent: it uses new turns only
             self._learner.restart()
@@ -123,8 +122,6 @@ class CheckNode(CameraNode):
         found = self._answer()
         if found.answer == 'wrong':
             level, message = WARN, f'the calibration is wrong: {found.reasons[0]}'
-        elif found.answer == 'differs':
-            level, message = OK, f'the calibration {found.reasons[0]}'
         elif found.answer == 'right':
             level, message = OK, f'the calibration is right; {turns} for the next check'
         else:
