@@ -88,9 +88,9 @@ def check(given: Camera, path: Paths, fps: float | None = None,
     False there.
     progress: called with the stage's name and the share done, 0 to 1.
 
-    Returns a Check: its answer is 'right', 'wrong' or 'cannot tell', with reasons. Raises
-    InputError for what cannot be read, ConfigError for a bad setting, WorkerError where a child
-    process cannot run.
+    Returns a Check: its answer is 'right', 'differs' (good enough for the uses in its good_for),
+    'wrong' or 'cannot tell', with reasons. Raises InputError for what cannot be read, ConfigError
+    for a bad setting, WorkerError where a child process cannot run.
     """
     source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
     with _fed(source, config, mask, tell) as calibrator:

@@ -28,7 +28,8 @@ CALIBRATION_HELP = ('result.json (or its folder), calibration.yaml, a file of RO
                     'k2 ..., width and height, or a bag with camera_info; FILE:NAME for one of '
                     'several cameras')
 SHORT_EXIT_HELP = 'exit codes: 0 done; 2 bad input or usage'
-CHECK_EXIT_HELP = 'exit codes: 0 right; 1 wrong; 3 the drive cannot tell; 2 bad input or usage'
+CHECK_EXIT_HELP = ('exit codes: 0 right, or differs but is good enough; 1 wrong; 3 the drive '
+                   'cannot tell; 2 bad input or usage')
 BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera refused; 3 some were not; '
                    '2 bad manifest or usage')
 # the names of models and exports are not taken from their tables: that would load OpenCV
@@ -271,7 +272,8 @@ COMMANDS = {
                        'help': 'default: standard output'}))),
     'check': Command(
         'dashcalib_ros.cli.check', 'tell whether a calibration explains a drive',
-        'Says whether CALIBRATION is right (to so many pixels), wrong (in which way and by how '
+        'Says whether CALIBRATION is right, differs from what the drive determines but is good '
+        'enough (by how many pixels, and for which uses), is wrong (in which way and by how '
         'much), or whether the drive cannot tell.',
         'dashcalib check calibration drive.mcap', (
             CALIBRATION,

@@ -149,7 +149,8 @@ def test_compare_shows_the_difference(results):
     done = dashcalib('compare', results / 'a', results / 'truth.json')
     assert (done.returncode, done.stderr) == (0, '')
     assert re.search(r'fx +721.54 px +714.54 px +\+7.0000 +\+0.980 % +2.0\n', done.stdout)
-    assert 'matters: yes' in done.stdout
+    # without a covariance, pixels decide
+    assert 'answer: differs' in done.stdout and 'good enough for detection' in done.stdout
     assert '\x1b' not in done.stdout
 
 
@@ -176,14 +177,22 @@ def test_export_prints_or_writes_a_camera_file(here, results):
     # an .npz is not for a terminal
     rays = here('export', results / 'a', '--to', 'rays', '--size', '414x125')
     assert_one_line_error(rays)
-    assert '--out rays.npz' in rays.stderr
+    assert '--out rays.npz' in rays.stderr and '[E-OUT-NEEDED]' in rays.stderr
+    picture = results / 'm.png'
+    maps = here('export', results / 'a', '--to', 'maps', '--out', picture)
+    assert_one_line_error(maps)
+    assert '[E-EXPORT-SUFFIX]' in maps.stderr and 'm.npz' in maps.stderr
+    assert not picture.exists()
     here('export', results / 'a', '--to', 'rays', '--out', results / 'rays.npz')
     assert here('compare', results / 'a', results / 'rays.npz').returncode == 0
 
 
 def test_export_tells_where_the_field_over_the_picture_goes(here, results, tmp_path):
     data = json.loads((results / 'a/result.json').read_text())
-    data['field'] = {'used': True, 'coefficients': np.zeros((2, len(FIELD_TERMS))).tolist()}
+    coefficients = np.zeros((2, len(FIELD_TERMS)))
+    # 0.3 px everywhere to the right, and 0.4 px down
+    coefficients[:, 0] = 0.3, 0.4
+    data['field'] = {'used': True, 'coefficients': coefficients.tolist()}
     path = tmp_path / 'result.json'
     path.write_text(json.dumps(data))
     splined = here('export', path, '--to', 'mrcal')
@@ -191,8 +200,10 @@ def test_export_tells_where_the_field_over_the_picture_goes(here, results, tmp_p
     assert 'LENSMODEL_SPLINED_STEREOGRAPHIC_order=3' in splined.stdout
     without = here('export', path, '--to', 'ros')
     assert without.returncode == 0
-    assert 'has a field over the picture, for which ros has no place' in without.stderr
-    assert_one_line_error(here('export', path, '--to', 'mrcal', '--crop', '0,0,640,375'))
+    assert '0.50 px RMS and 0.50 px at the worst' in without.stderr
+    part = here('export', path, '--to', 'mrcal', '--crop', '0,0,640,375')
+    assert_one_line_error(part)
+    assert '[E-FIELD-OF-PART]' in part.stderr
 
 
 def test_a_lens_profile_has_the_readout_time_of_its_rows(here, results, tmp_path):
