@@ -47,7 +47,7 @@ class DashcalibError(Exception):
 
 
 class InputError(DashcalibError):
-    """The images cannot be read: missing, empty, corrupt, ambiguous, or of changing size."""
+    """Input cannot be used: files or images that are missing, damaged, ambiguous, of two sizes."""
 
 
 class ConfigError(DashcalibError):
@@ -55,7 +55,11 @@ class ConfigError(DashcalibError):
 
 
 class OutputError(DashcalibError):
-    """A result cannot be written."""
+    """A result cannot be written: the disk is full, or the place is not writable."""
+
+
+class NotAcceptedError(DashcalibError):
+    """An accepted calibration is required, and this one is weak or refused."""
 
 
 class WorkerError(DashcalibError):

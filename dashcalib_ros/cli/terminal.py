@@ -25,7 +25,7 @@ from dashcalib_ros.errors import OutputError, visible
 from dashcalib_ros.standard_streams import write_stderr, write_stdout
 
 PIPE_WIDTH = 80  # columns where there is no terminal
-EVERY_S = 10.0  # where there is no terminal, progress is told so often
+EVERY_S = 10.0  # between two lines of progress, where there is no terminal
 STEPS = 1000  # a stage's fraction is shown in thousandths
 
 
