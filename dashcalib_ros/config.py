@@ -21,8 +21,6 @@ from typing import Any, TypeVar
 from dashcalib_ros.errors import ConfigError
 
 T = TypeVar('T')
-# settings that are shown for an unknown name
-NEAREST = 3
 
 
 def setting(default: T, reason: str, minimum: float | None = None, maximum: float | None = None,
@@ -283,9 +281,9 @@ class Config:
         nested: dict[str, dict[str, Any]] = {}
         for name, value in changes.items():
             if name not in known:
-                near = sorted(known, key=lambda each: -_likeness(name, each))[:NEAREST]
-                raise ConfigError('E-SETTING-UNKNOWN', f'unknown setting {name!r}; the nearest '
-                                                       f'are {", ".join(near)}')
+                near = difflib.get_close_matches(name, known, 1)
+                hint = f': did you mean {near[0]}?' if near else f'; there are {", ".join(known)}'
+                raise ConfigError(f'unknown setting {name!r}{hint}')
             section, _, key = name.rpartition('.')
             # an integer is a fine float, and a fine text: YAML reads 13 as one, and 1e-3 as a text
             kind = type(known[name].default)
@@ -331,13 +329,6 @@ def _settings(config: Config) -> Iterator[tuple[str, dataclasses.Field[Any], Any
                 yield f'{outer.name}.{inner.name}', inner, getattr(value, inner.name)
         else:
             yield outer.name, outer, value
-
-
-def _likeness(name: str, known: str) -> float:
-    """Return how alike two names are, with or without the section; more if one has the other."""
-    return (name.lower() in known) + max(
-        difflib.SequenceMatcher(None, name.lower(), each).ratio()
-        for each in (known, known.rpartition('.')[2]))
 
 
 def _is_exact(value: Any) -> bool:

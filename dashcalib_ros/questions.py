@@ -55,9 +55,8 @@ class Questions:
             return None
         if given.image_size != size:
             raise InputError(
-                'E-IMAGE-SIZE', f'the calibration is for {by(given.image_size)} pictures, and '
-                                f'those of the drive have {by(size)}: compare poses with a '
-                                f'calibration of this size (dashcalib export --size)')
+                f'the calibration is for {by(given.image_size)} pictures, and those of the drive '
+                f'have {by(size)}: poses tell nothing of it')
         own, config = solution.camera, self._asked.scenes.config
         cameras = {'given': given.resized(1 / Scale.of(size, config).px, own.image_size),
                    'ours': own, 'guess': judge.trivial_guess(own.image_size)}
@@ -105,8 +104,8 @@ class Questions:
         """Return a camera of the resized pictures."""
         size, scale = self._asked.detection.size, self._asked.detection.scale
         if camera.image_size != size:
-            raise InputError('E-IMAGE-SIZE', f'the camera in use is for pictures of another size: '
-                                             f'{by(camera.image_size)}')
+            raise InputError(f'the camera in use is for pictures of another size: '
+                             f'{by(camera.image_size)}')
         return camera.resized(1 / scale.px, scale.size(size))
 
     def _run(self, stage: str, progress: Progress | None, function: Callable[..., Any],

@@ -31,7 +31,7 @@ CALIBRATION_HELP = ('result.json (or its folder), calibration.yaml, a file of RO
                     'k2 ..., width and height, or a bag with camera_info; FILE:NAME for one of '
                     'several cameras')
 SHORT_EXIT_HELP = 'exit codes: 0 done; 2 bad input or usage'
-CHECK_EXIT_HELP = ('exit codes: 0 right, or different but good enough; 1 wrong; 3 the drive '
+CHECK_EXIT_HELP = ('exit codes: 0 right, or differs but is good enough; 1 wrong; 3 the drive '
                    'cannot tell; 2 bad input or usage')
 BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera was refused; 3 a clip could '
                    'not be read or a camera was refused; 2 bad manifest or usage')
@@ -308,9 +308,10 @@ COMMANDS = {
             ('--out', {'type': path_or('omit --out for standard output'), 'metavar': 'FILE',
                        'help': 'default: standard output'}))),
     'check': Command(
-        'dashcalib_ros.cli.check', 'check whether a calibration fits a drive',
-        'Answers whether CALIBRATION is right (within how many pixels), different but good '
-        'enough, or wrong (in which way and by how much), or that the drive cannot tell.',
+        'dashcalib_ros.cli.check', 'tell whether a calibration explains a drive',
+        'Says whether CALIBRATION is right, differs from what the drive determines but is good '
+        'enough (by how many pixels, and for which uses), is wrong (in which way and by how '
+        'much), or whether the drive cannot tell.',
         'dashcalib check calibration drive.mcap', (
             CALIBRATION,
             ('input', {'metavar': 'INPUT', 'nargs': '*',

@@ -128,6 +128,11 @@ def _compared(calibration: Calibration, drive: Drive, lens: NamedCamera, found: 
         estimate = ('not found' if shutter is None else
                     f'{shutter.readout_ms:.1f} ± {shutter.sigma_ms:.1f} ms')
         yield line(f'readout time of the rows: {estimate}; truth: {true_ms:.1f} ms')
+    if calibration.stabiliser is not None or drive.spec.stabilised:
+        estimate = ('not found' if calibration.stabiliser is None else
+                    f'by up to {calibration.stabiliser.largest_px:.0f} px')
+        yield line(f'movement of the picture: {estimate}; truth: by up to '
+                   f'{np.abs(drive.crop_px).max():.0f} px')
 
 
 def _true_rays(drive: Drive) -> bytes:
