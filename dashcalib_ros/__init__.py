@@ -19,9 +19,14 @@ if TYPE_CHECKING:
     )
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
-    from dashcalib_ros.judge.calibration import AcceptedCalibration, Verdict
     from dashcalib_ros.recorded import calibrate, check
-    from dashcalib_ros.report import Calibration, compare, load_camera
+    from dashcalib_ros.report import (
+        AcceptedCalibration,
+        Calibration,
+        Verdict,
+        compare,
+        load_camera,
+    )
     from dashcalib_ros.report.export import export
 
     __version__: str
@@ -36,10 +41,11 @@ __all__ = ['AcceptedCalibration', 'Brown', 'Calibration', 'Calibrator', 'Camera'
            'OutputError', 'Radial', 'Rational', 'Verdict', 'WorkerError', '__version__',
            'calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames']
 
-_HOMES = {'Calibration': 'report', 'Calibrator': 'calibrator', 'Config': 'config',
-          'Frame': 'input', 'calibrate': 'recorded', 'check': 'recorded', 'compare': 'report',
-          'export': 'report.export', 'load_camera': 'report', 'open_frames': 'input.inputs',
-          **dict.fromkeys(('AcceptedCalibration', 'Verdict'), 'judge.calibration'),
+_HOMES = {'Calibrator': 'calibrator', 'Config': 'config', 'Frame': 'input',
+          'calibrate': 'recorded', 'check': 'recorded', 'export': 'report.export',
+          'open_frames': 'input.inputs',
+          **dict.fromkeys(('AcceptedCalibration', 'Calibration', 'Verdict', 'compare',
+                           'load_camera'), 'report'),
           **dict.fromkeys(('Brown', 'Camera', 'Fisheye', 'Radial', 'Rational'), 'camera'),
           **dict.fromkeys(('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError',
                            'OutputError', 'WorkerError'), 'errors')}

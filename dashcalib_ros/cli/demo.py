@@ -116,8 +116,10 @@ def _compared(calibration: Calibration, drive: Drive, lens: NamedCamera, found: 
         return
     yield line('')
     yield line('against the truth')
-    yield against_truth(compare(calibrated_camera(calibration), lens),
-                        None if found is None else found.rms)
+    both = compare(calibrated_camera(calibration), lens)
+    # the lens has no glass, and the estimate no field: the rays have both
+    yield against_truth(dataclasses.replace(
+        both, whole=dataclasses.replace(both.whole, apart=found)))
     if drive.lens.glass is not None:
         without = mapping_error(calibration, drive, with_field=False)
         yield line(f'the windscreen bends the picture by {drive.lens.glass.rms_px:.2f} px RMS; '

@@ -1,6 +1,6 @@
 """stdout for results, stderr for progress, warnings and errors; plain text in a pipe.
 
-Colours are left out where NO_COLOR is set.
+No colours are used if NO_COLOR is set.
 """
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def warn(lines: Iterable[str]) -> None:
 class Stages:
     """The progress of one command, a stage at a time.
 
-    It is drawn on a terminal; elsewhere there is a line from time to time, in long runs only.
+    It is drawn on a terminal; elsewhere a line is printed from time to time, in long runs only.
     """
 
     def __init__(self, quiet: bool = False) -> None:

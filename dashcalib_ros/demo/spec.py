@@ -37,7 +37,7 @@ class DriveSpec:
     right alternate, 60 to 100 degrees, radius 8 to 14 m); 0 is a straight drive.
     straight_m: between turns. lead_m: before the first and after the last turn.
     speed_mps on straights, turn_speed_mps in turns, accel_mps2 between them.
-    height_m: of the camera; mount_deg: yaw, pitch and roll of its mounting at the most.
+    height_m: of the camera; mount_deg: largest yaw, pitch and roll of its mounting.
     vibration_deg: RMS of pitch from the road; roll is 0.7 of it, and
     the body also dives when it brakes and leans in turns. 0 switches all of these off.
     noise: sigma in grey levels. blur: sigma in pixels. exposure_ms: how long each row is exposed;

@@ -84,14 +84,14 @@ def comparison(found: Comparison) -> RenderableType:
     return Group(*map(line, sides), *map(line, answers(found)), TextTable(*comparison_rows(found)))
 
 
-def against_truth(found: Comparison, mapping_px: float | None) -> RenderableType:
-    """Return an estimate with its sigma beside the truth, and the mapping error, RMS."""
+def against_truth(found: Comparison) -> RenderableType:
+    """Return an estimate with its sigma beside the truth, and the mapping error."""
     rows = [(d.name, number(d.name, d.a),
              '-' if d.sigma is None else '± ' + number(d.name, d.sigma), number(d.name, d.b),
              *difference_row(d)[-2:]) for d in found.differences]
     head = ('', 'estimate', 'sigma', 'truth', 'error', 'in sigmas')
-    known = mapping_px is not None and math.isfinite(mapping_px)
-    mapping = (f'{mapping_px:.2f} px{unseen_text(found)}' if known else
+    known = found.mapping_px is not None and math.isfinite(found.mapping_px)
+    mapping = (f'{found.mapping_px:.2f} px{unseen_text(found)}' if known else
                'unknown, a lens model folds over inside the image')
     return Group(TextTable(head, rows), line(f'mapping error: {mapping}'))
 
