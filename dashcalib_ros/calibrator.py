@@ -144,7 +144,7 @@ class Calibrator:
         config, asked = self.scenes.config, Asked()
         if scenes:
             if self._motion is not None:
-                tell('asking the motion sensors', 0.0)
+                tell('evaluating the motion sensors', 0.0)
                 asked = self.scenes.run(ask_sensors, solution, self._motion,
                                         self.detection.start_s, config)
                 solution = asked.solution

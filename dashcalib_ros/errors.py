@@ -61,7 +61,11 @@ class ConfigError(DashcalibError):
 
 
 class OutputError(DashcalibError):
-    """A result cannot be written."""
+    """A result cannot be written: the disk is full, or the place is not writable."""
+
+
+class NotAcceptedError(DashcalibError):
+    """An accepted calibration is required, and this one is weak or refused."""
 
 
 class WorkerError(DashcalibError):

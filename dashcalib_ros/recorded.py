@@ -16,22 +16,23 @@ import numpy.typing as npt
 
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.calibrator import Calibrator
-from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, read_mask
-from dashcalib_ros.input.inputs import Paths, fits_bag, open_frames
+from dashcalib_ros.input.inputs import Paths, as_list, fits_bag, open_frames
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
 from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Check
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import Calibration
+from dashcalib_ros.report.camera_file import Given, given_camera
 from dashcalib_ros.selection import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
+MotionOrPath = str | os.PathLike[str] | SensorStream | None
 # what frames are pushed into
 Taker = Calibrator | Detection
 # s between two looks whether an image has been read
@@ -41,94 +42,103 @@ READING_S = 0.01
 def calibrate(path: Paths, fps: float | None = None,
               config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
               duration_s: float | None = None, mask: MaskOrPath = None,
-              progress: Progress | None = None,
-              motion: str | os.PathLike[str] | SensorStream | None = None) -> Calibration:
+              progress: Progress | None = None, motion: MotionOrPath = None) -> Calibration:
     """Calibrate a recorded drive.
 
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
     of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
-    fps: images per second of a folder (default 10), or instead of what a video says.
+    fps: images per second of a folder (default 10), or to override the rate of a video.
     config: the settings; None: Config().
     topic: the image topic of a bag; needed only when it has several.
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
-    mask: what is not to be used (bonnet, burnt-in text): a picture's path, black there, or an
-    array (height, width), 0 or False there; in addition to what is found by itself.
-    progress: called with the stage's name and the share done, 0 to 1.
-    motion: the car's own sensors: a CSV, a GPX or a KITTI oxts folder, or a stream. None: of a
-    bag, its own topics.
+    mask: the part of the pictures that is not used (bonnet, burnt-in text): the path of a picture
+    that is black there, or an array (height, width) that is 0 or False there; it is added to the
+    automatic mask.
+    progress: called with the name of the stage and the fraction done, 0 to 1.
+    motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
+    a stream. None: the topics of the bag, if path is one.
 
-    Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and where it is
-    refused its camera is None. Raises InputError for what cannot be read, ConfigError for a bad
-    setting, WorkerError where a child process cannot run.
+    Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and its camera is
+    None if it is refused; accepted() returns it, or raises. Raises InputError for input that
+    cannot be read, ConfigError for a bad setting, WorkerError if a child process cannot run.
     """
-    source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
-    sensors = motion if isinstance(motion, SensorStream) else drive_motion(
-        path, motion, start_s=start_s, topic=topic)
-    with _fed(source, config, mask, tell) as calibrator:
-        if sensors is not None:
-            calibrator.sense(sensors)
+    paths, tell = as_list(path), progress or _silent
+    source = open_frames(paths, topic, fps, start_s, duration_s)
+    sensors = _sensors(paths, motion, start_s, topic)
+    with _fed(source, config, mask, tell, sensors) as calibrator:
         return with_source(calibrator.calibrate(tell), source)
 
 
-def check(given: Camera, path: Paths, fps: float | None = None,
+def check(given: Given, path: Paths, fps: float | None = None,
           config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
           duration_s: float | None = None, mask: MaskOrPath = None,
-          progress: Progress | None = None) -> Check:
-    """Say whether a camera explains a recorded drive.
+          progress: Progress | None = None, motion: MotionOrPath = None) -> Check:
+    """Check whether a calibration fits a recorded drive.
 
-    given: a Radial, Brown, Rational or Fisheye of the drive's pictures, such as
-    load_camera('camera.yaml').camera.
+    given: the calibration: a Calibration, what load_camera() returns, the path of a file that it
+    reads, or a Radial, Brown, Rational or Fisheye of the drive's pictures.
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
     of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
-    fps: images per second of a folder (default 10), or instead of what a video says.
+    fps: images per second of a folder (default 10), or to override the rate of a video.
     config: the settings; None: Config().
     topic: the image topic of a bag; needed only when it has several.
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
-    mask: what is not to be used: a picture's path, black there, or an array (height, width), 0 or
-    False there.
-    progress: called with the stage's name and the share done, 0 to 1.
+    mask: the part of the pictures that is not used: the path of a picture that is black there, or
+    an array (height, width) that is 0 or False there.
+    progress: called with the name of the stage and the fraction done, 0 to 1.
+    motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
+    a stream. None: the topics of the bag, if path is one.
 
     Returns a Check: its answer is 'right', 'differs' (good enough for the uses in its good_for),
     'wrong' or 'cannot tell', with reasons. Raises InputError for what cannot be read, ConfigError
     for a bad setting, WorkerError where a child process cannot run.
     """
-    source, tell = open_frames(path, topic, fps, start_s, duration_s), progress or _silent
-    with _fed(source, config, mask, tell) as calibrator:
-        return Questions(calibrator).check(source.shown(given), calibrator.calibrate(tell), tell)
+    paths, tell, camera = as_list(path), progress or _silent, given_camera(given).camera
+    source = open_frames(paths, topic, fps, start_s, duration_s)
+    sensors = _sensors(paths, motion, start_s, topic)
+    with _fed(source, config, mask, tell, sensors) as calibrator:
+        return Questions(calibrator).check(source.shown(camera), calibrator.calibrate(tell), tell)
+
+
+def _sensors(paths: Paths, motion: MotionOrPath, start_s: float, topic: str | None
+             ) -> SensorStream | None:
+    return motion if isinstance(motion, SensorStream) else drive_motion(
+        paths, motion, start_s=start_s, topic=topic)
 
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
                  chosen: Mapping[str, str | None] = MappingProxyType({}),
                  start_s: float = 0.0, topic: str | None = None) -> SensorStream | None:
-    """Return what the file motion has, else what the bags of a drive have; None where none is.
+    """Return the sensors' data of the file motion, else of the bags; None if there is none.
 
-    start_s: of the part of the drive that is used: a CSV counts from the drive's first image.
-    chosen: the bag's topic by imu, gps and odom; topic: its images'. Raises InputError for a file
-    of another kind, and for a topic that there is not.
+    start_s: where the used part of the drive starts; a CSV counts from the drive's first image.
+    chosen: the bag's topics by imu, gps and odom; topic: its image topic. Raises InputError for a
+    file of another kind, and for a topic that does not exist.
     """
     wanted = {name: topic for name, topic in chosen.items() if topic is not None}
     if motion is not None:
         if wanted:
-            raise InputError('--imu, --gps and --odom choose topics of a bag: leave them or '
-                             '--motion away')
+            raise InputError('E-MOTION-TWICE', '--imu, --gps and --odom choose topics of a bag: '
+                                               'omit them or --motion')
         found = read_motion(Path(motion))
         return found if found.absolute else found.shifted(-start_s)
-    given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
     try:
-        bags = [each for each in map(Path, given) if each.exists() and fits_bag(each)]
+        bags = [each for each in map(Path, as_list(path)) if each.exists() and fits_bag(each)]
         return bag_motion(bags, wanted, topic) if bags else None
     except (InputError, OSError, ValueError):
         if wanted:
             raise
-        return None  # what is wrong with the bag, its pictures will tell
+        return None  # reading the pictures will report what is wrong with the bag
 
 
 @contextmanager
-def _fed(source: FrameSource, config: Config | None, mask: MaskOrPath, tell: Progress
-         ) -> Iterator[Calibrator]:
-    """Give a calibrator that has taken every frame of the drive."""
+def _fed(source: FrameSource, config: Config | None, mask: MaskOrPath, tell: Progress,
+         sensors: SensorStream | None) -> Iterator[Calibrator]:
+    """Yield a calibrator that has taken every frame of the drive, and the sensors' data."""
     valid = _valid(mask)
     with Calibrator(config, valid) as calibrator:
+        if sensors is not None:
+            calibrator.sense(sensors)
         for frames in pushed(calibrator, source, valid):
             tell('reading', min(frames / source.count, 1.0) if source.count else 0.0)
         yield calibrator
@@ -177,7 +187,8 @@ def _valid(mask: MaskOrPath) -> Mask | None:
     if mask is None or isinstance(mask, (str, os.PathLike)):
         return None if mask is None else read_mask(Path(mask))
     if mask.ndim != 2:
-        raise InputError(f'the mask has the shape {mask.shape}: give (height, width)')
+        raise InputError('E-MASK-SHAPE', f'the mask has the shape {mask.shape}: pass an array of '
+                                         f'shape (height, width)')
     return np.asarray(mask) > 0
 
 

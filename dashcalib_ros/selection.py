@@ -233,7 +233,8 @@ class SceneSelection:
 
             self._pool.wait(ready)
             if self._closed:
-                raise WorkerError('the calibrator was closed while it calibrated')
+                raise WorkerError('E-CALIBRATOR-CLOSED',
+                                  'the calibrator was closed while it calibrated')
             # only when all are done: what is submitted must not depend on the workers' speed
             own = [scene for scene in self._pool.scenes().values() if scene is not None]
             self._kept.drop_repeated((), own)

@@ -2,6 +2,11 @@
 from __future__ import annotations
 
 import inspect
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,16 +15,31 @@ from fakes import stands_in_for
 from made_calibration import TRUTH, make_calibration
 
 import dashcalib_ros
-from dashcalib_ros import Calibrator, calibrate, check, recorded
-from dashcalib_ros.errors import InputError
+from dashcalib_ros import Calibrator, calibrate, check, compare, export, open_frames, recorded
+from dashcalib_ros.errors import DashcalibError, InputError, NotAcceptedError
+from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.questions import Questions
 
-NAMES = ('calibrate', 'check', 'load_camera', 'open_frames', 'Calibration', 'Calibrator', 'Config',
-         'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye', 'Rational')
+FUNCTIONS = ('calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames')
+ERRORS = ('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError', 'OutputError',
+          'WorkerError')
+NAMES = (*FUNCTIONS, *ERRORS, 'AcceptedCalibration', 'Calibration', 'Calibrator', 'Config',
+         'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye', 'Rational', 'Verdict')
+# what mypy --strict accepts of a user
+SCRIPT = """
+from dashcalib_ros import calibrate
+found = calibrate('drive.mp4').accepted()
+print(found.camera.fx, found.sigma['fx'], found.K @ found.rays([[0.0, 0.0]])[0], found.D.tolist())
+"""
 
 
 def test_all_names_are_there_to_see():
-    assert set(NAMES) == set(dashcalib_ros.__all__) <= set(dir(dashcalib_ros))
+    assert {*NAMES, '__version__'} == set(dashcalib_ros.__all__) <= set(dir(dashcalib_ros))
+    assert dashcalib_ros.__version__[0].isdigit() or 'sources' in dashcalib_ros.__version__
+
+
+def test_every_error_is_a_child_of_one():
+    assert all(issubclass(getattr(dashcalib_ros, name), DashcalibError) for name in ERRORS)
 
 
 @pytest.mark.parametrize('name', NAMES)
@@ -37,7 +57,10 @@ class FakeCalibrator:
     """Takes note of what it is given."""
 
     def __init__(self, config=None, mask=None):
-        type(self).mask = mask
+        type(self).mask, type(self).motion = mask, None
+
+    def sense(self, motion):
+        type(self).motion = motion
 
     def expect(self, frames):
         type(self).frames = frames
@@ -64,6 +87,7 @@ class FakeQuestions:
         pass
 
     def check(self, given, calibration, progress=None):
+        type(self).given = given
         progress('checking', 1.0)
 
 
@@ -93,3 +117,75 @@ def test_a_mask_and_the_progress(drive, tmp_path, run):
         run(drive, mask=mask[1:])
     with pytest.raises(InputError, match='height, width'):
         run(drive, mask=np.zeros((48, 64, 3)))
+
+
+@pytest.mark.parametrize('run', [calibrate, lambda path, **more: check(TRUTH, path, **more)])
+def test_the_sensors_of_a_drive_are_heard(drive, tmp_path, run):
+    (tmp_path / 'gyro.csv').write_text('stamp_s,gyro_x,gyro_y,gyro_z\n0,0,0.1,0\n1,0,0.2,0\n')
+    run(drive, motion=tmp_path / 'gyro.csv')
+    assert FakeCalibrator.motion is not None
+    given = SensorStream()
+    run(drive, motion=given)
+    assert FakeCalibrator.motion is given
+    run(drive)
+    assert FakeCalibrator.motion is None
+
+
+@pytest.mark.parametrize('run', [calibrate, open_frames,
+                                 lambda path: check(TRUTH, path)], ids=['run', 'open', 'check'])
+@pytest.mark.parametrize('path', [None, 3, b'drive.mp4', [None], ['a.mp4', 3]])
+def test_what_is_no_path_is_an_input_error(run, path):
+    with pytest.raises(InputError) as error:
+        run(path)
+    assert error.value.code == 'E-PATH-TYPE'
+
+
+def test_paths_that_come_one_by_one_are_a_drive(drive):
+    calibrate(each for each in (drive, drive))
+    assert FakeCalibrator.frames == 8
+
+
+def test_a_calibration_is_given_in_any_form(drive, tmp_path):
+    result = make_calibration()
+    result.save(tmp_path / 'a')
+    named = dashcalib_ros.load_camera(tmp_path / 'a')
+    for given in (result, TRUTH, named, tmp_path / 'a', str(tmp_path / 'a/calibration.yaml')):
+        check(given, drive)
+        assert FakeQuestions.given == TRUTH
+        assert compare(given, result).mapping_px == pytest.approx(0.0, abs=1e-6)
+        assert json.loads(export(given, 'nerfstudio'))['fl_x'] == TRUTH.fx
+    for use in (lambda given: check(given, drive), lambda given: compare(given, TRUTH),
+                lambda given: export(given, 'ros')):
+        with pytest.raises(InputError) as error:
+            use(None)
+        assert error.value.code == 'E-CALIBRATION-TYPE'
+
+
+def test_accepted_returns_the_same_result_or_raises_with_the_reasons():
+    result = make_calibration()
+    found = result.accepted()
+    assert found.camera == result.camera and found.sigma == result.sigma
+    assert found.material is result.material and repr(found) == repr(result)
+    assert found.intrinsics == result.intrinsics and found.accepted() == found
+    for level in ('weak', 'refused'):
+        other = make_calibration(level)
+        with pytest.raises(NotAcceptedError) as error:
+            other.accepted()
+        assert error.value.code == 'E-NOT-ACCEPTED' and level in str(error.value)
+        assert all(reason in str(error.value) for reason in other.verdict.reasons)
+
+
+def test_a_script_of_three_lines_is_clean_for_mypy(tmp_path):
+    pytest.importorskip('mypy')
+    root = Path(__file__).parents[1]
+
+    def checked(script):
+        (tmp_path / 'script.py').write_text(script)
+        return subprocess.run(
+            [sys.executable, '-m', 'mypy', '--strict', str(tmp_path / 'script.py')], cwd=root,
+            env={**os.environ, 'MYPYPATH': str(root)}, capture_output=True, text=True, timeout=300)
+    done = checked(SCRIPT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    # accepted() is what does it
+    done = checked(SCRIPT.replace('.accepted()', ''))
+    assert done.returncode == 1 and 'None' in done.stdout

@@ -93,6 +93,7 @@ def may_import(room: str) -> set[str]:
     above = set(ROOMS[:ROOMS.index(room)]) if room in ROOMS else set()
     above -= {border for border, users in BORDERS.items() if room not in users}
     shared = EVERYWHERE if room not in EVERYWHERE else set()
+    shared = shared | ({'__init__'} if room == 'cli' else set())  # __version__
     return ALLOWED.get(room, above) | shared | {room}
 
 

@@ -38,7 +38,7 @@ def read_config(args: argparse.Namespace) -> Config:
     changes.update({name: getattr(args, flag) for flag, names in FLAGS.items() for name in names
                     if getattr(args, flag, None) is not None})
     config = config.replace(changes)
-    searched(config.model)  # raises for a model that there is not, before anything is begun
+    searched(config.model)  # raises for an unknown model before any work begins
     return config
 
 
@@ -48,12 +48,14 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
     for pair in pairs:
         key, equals, text = pair.partition('=')
         if not equals or not key.strip():
-            raise ConfigError(f'--set needs KEY=VALUE (turns.wanted=4), not {shortened(pair)!r}')
+            raise ConfigError('E-SETTING-FORM', f'--set needs KEY=VALUE, such as '
+                                                f'turns.wanted=4, not {shortened(pair)!r}')
         what = f'--set {shortened(pair)}: the value'
         try:
             changes[key.strip()] = parse_yaml(text, what)
         except InputError as error:
-            raise ConfigError(f'{error}; write a plain number, true or false') from error
+            raise ConfigError('E-SETTING-VALUE',
+                              f'{error}; use a plain number, true or false') from error
     return changes
 
 
@@ -62,12 +64,13 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
         what = f'the configuration {path}'
         data = parse_yaml(read_text(path, YAML_BYTES, what), what)
     except InputError as error:
-        raise ConfigError(f'{error}; write lines like turns.wanted: 4') from error
+        raise ConfigError('E-CONFIG-UNREADABLE',
+                          f'{error}; write lines like turns.wanted: 4') from error
     if data is None:
         return {}
     if not isinstance(data, Mapping):
-        raise ConfigError(f'the configuration {path} has no settings; '
-                          'write lines like turns.wanted: 4')
+        raise ConfigError('E-CONFIG-EMPTY', f'the configuration {path} has no settings; write '
+                                            f'lines like turns.wanted: 4')
     return data
 
 
@@ -78,9 +81,9 @@ def open_drive(args: argparse.Namespace) -> tuple[FrameSource, Mask | None]:
 
 
 def read_sensors(args: argparse.Namespace) -> SensorStream | None:
-    """Return what --motion has, else what the bags of the drive have; None where there is none.
+    """Return the sensors' data of --motion, else of the drive's bags; None where there is none.
 
-    Raises InputError for a file of another kind, and for a topic that there is not.
+    Raises InputError for a file of another kind, and for a topic that does not exist.
     """
     return drive_motion(args.input, args.motion,
                         {name: getattr(args, name) for name in ('imu', 'gps', 'odom')},

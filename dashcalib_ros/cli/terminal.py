@@ -1,6 +1,6 @@
 """stdout for results, stderr for progress, warnings and errors; plain text in a pipe.
 
-Colours are left out where NO_COLOR is set.
+No colours are used if NO_COLOR is set.
 """
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dashcalib_ros.errors import OutputError, visible
 from dashcalib_ros.standard_streams import write_stderr, write_stdout
 
 PIPE_WIDTH = 80  # columns where there is no terminal
-EVERY_S = 10.0  # where there is no terminal, progress is told so often
+EVERY_S = 10.0  # between two lines of progress, where there is no terminal
 STEPS = 1000  # a stage's fraction is shown in thousandths
 
 
@@ -71,7 +71,7 @@ def warn(lines: Iterable[str]) -> None:
 class Stages:
     """The progress of one command, a stage at a time.
 
-    It is drawn on a terminal; elsewhere there is a line from time to time, in long runs only.
+    It is drawn on a terminal; elsewhere a line is printed from time to time, in long runs only.
     """
 
     def __init__(self, quiet: bool = False) -> None:

@@ -700,12 +700,34 @@ def calibrated_camera(calibration: Calibration, name: str = 'estimate') -> Named
     if calibration.camera is None:
         raise InputError('E-NO-INTRINSICS', no_intrinsics(
             name, calibration.verdict.level, calibration.verdict.reasons))
-    shutter = calibration.rolling_shutter
+    shutter, field = calibration.rolling_shutter, calibration.field
     return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
                        read_covariance(calibration.details, calibration.camera,
                                        calibration.sigma),
-                       calibration.sigma_px, mount=calibration.mount,
+                       calibration.sigma_px,
+                       field.field if field is not None and field.used else None,
+                       mount=calibration.mount,
                        readout_ms=None if shutter is None else shutter.readout_ms)
+
+
+Given = Calibration | NamedCamera | Camera | str | os.PathLike[str]
+
+
+def given_camera(given: Given) -> NamedCamera:
+    """Return the camera of a calibration: a result, a file as for load_camera(), or a camera.
+
+    Raises InputError for a refused result, a file that cannot be read, and any other object.
+    """
+    if isinstance(given, NamedCamera):
+        return given
+    if isinstance(given, Calibration):
+        return calibrated_camera(given)
+    if isinstance(given, Camera):
+        return NamedCamera(f'the {given.model} camera', given)
+    if isinstance(given, (str, os.PathLike)):
+        return load_camera(given)
+    raise InputError('E-CALIBRATION-TYPE', f'a calibration cannot be {shortened(repr(given))}: '
+                                           f'pass a Calibration, a camera, or the path of a file')
 
 
 def read_size(width: Any, height: Any, *, path: str | Path) -> tuple[int, int]:

@@ -14,6 +14,7 @@ from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.check import export_command, same_shape
 from dashcalib_ros.judge.difference import Difference as WholeDifference
 from dashcalib_ros.judge.difference import NamedCamera, answers_of, difference_between
+from dashcalib_ros.report.camera_file import Given, given_camera
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.wording import digits_of, mounts_text, number, optional
 
@@ -81,8 +82,14 @@ def mount_dict(mount: Mount | None, other: Mount | None) -> dict[str, Any] | Non
         for name, (degrees, sigma) in mount.apart(other).items()}}
 
 
-def compare(a: NamedCamera, b: NamedCamera) -> Comparison:
-    """Compare camera a with the reference b. Raises InputError when the image sizes differ."""
+def compare(a: Given, b: Given) -> Comparison:
+    """Compare calibration a with the reference b.
+
+    a, b: a Calibration, what load_camera() returns, a camera, or the path of a file that
+    load_camera() reads. Returns a Comparison: mapping_px is how far apart both see the same rays,
+    px RMS over the picture. Raises InputError if the image sizes differ or a file cannot be read.
+    """
+    a, b = given_camera(a), given_camera(b)
     if a.image_size != b.image_size:
         raise InputError('E-COMPARE-SIZE', _sizes_text(a, b))
     names = _common_names(a.camera, b.camera)

@@ -26,8 +26,22 @@ from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.input.source import by
 from dashcalib_ros.judge.check import same_shape
 from dashcalib_ros.limits import check_pixels
-from dashcalib_ros.report.camera_file import EQUIDISTANT, RATIONAL, TERMS
+from dashcalib_ros.report.camera_file import EQUIDISTANT, RATIONAL, TERMS, Given, given_camera
 from dashcalib_ros.report.result import camera_info_yaml
+
+
+def export(calibration: Given, kind: str) -> str | bytes:
+    """Return a calibration as another program's camera file.
+
+    calibration: a Calibration, what load_camera() returns, a camera, or the path of a file that
+    load_camera() reads. kind: opencv, colmap, kalibr, opensfm, nerfstudio, mrcal, ros, foxglove,
+    gyroflow, rays or maps.
+
+    Returns the file's text; the bytes of an .npz for rays and maps. Raises InputError for a file
+    that cannot be read, and ConfigError for an unknown kind or a lens that it cannot describe.
+    """
+    found = given_camera(calibration)
+    return exported(found.camera, kind, found.field, found.readout_ms)
 
 
 def exported(camera: Camera, kind: str, field: Field | None = None,

@@ -30,6 +30,11 @@ def test_a_fleet_is_calibrated_here_and_nothing_is_done_twice(tmp_path, capsys):
     assert json.loads((out / 'effort.json').read_text())['clips_read'] == 2
     assert (out / 'overview.html').exists() and not list(out.rglob('.writable'))
     before = (out / 'overview.html').read_bytes()
+    code, text, err = run(capsys, manifest, '--out', out, '--workers', '1', '--json')
+    found = json.loads(text)
+    assert code == 3 and found['cameras'] == {'one': 'refused', 'two': 'refused'}
+    assert {each['row'] for each in found['not_read']} == {2, 3} and found['files']
+    assert '2 cameras: ' in err
     _, text, _ = run(capsys, manifest, '--out', out, '--shard', '1/1')
     assert 'one: refused' not in text
     run(capsys, manifest, '--out', out, '--workers', '1')
