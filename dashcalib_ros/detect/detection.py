@@ -86,11 +86,11 @@ class Detection:
         self.standing = motion.standing
         if not motion.standing:
             self._lines.push(frame.image, frame.stamp_ns)
-        return self._fixed(self._turns.push(frame, motion))
+        return self._turns.push(frame, motion)
 
     def finish(self) -> list[Turn]:
         """End the drive; return the turns that this completes or changes."""
-        return self._fixed(self._turns.finish())
+        return self._turns.finish()
 
     def close(self) -> None:
         """End the thread that looks for lines; what it found stays."""
@@ -102,7 +102,7 @@ class Detection:
 
     def release(self, center: int) -> None:
         """Drop a turn's frames, once they are handed over."""
-        self._turns.bank.release(center)
+        self._turns.bank.exchange(center, ())
 
     def exchange(self, center: int, frames: tuple[Frame, ...]) -> None:
         """Take the same frames, stored in another way, for those of a turn."""
@@ -148,17 +148,6 @@ class Detection:
     def mixed(self) -> bool:
         """Return whether the newest images are of two cameras."""
         return self._motion.one_camera.mixed
-
-    def _fixed(self, new: list[Turn]) -> list[Turn]:
-        """Fix the frames of all turns: a later turn that overlaps one of them is trimmed.
-
-        This is done when a turn is confirmed, not when it is reconstructed: the result must not
-        depend on the speed of the workers.
-        """
-        if new:
-            for turn in self.turns():
-                self._turns.bank.fix(turn.center)
-        return new
 
     def _check_size(self, frame: Frame) -> None:
         if self.size is None:
