@@ -18,8 +18,8 @@ from dashcalib_ros.detect.one_camera import OneCamera
 from dashcalib_ros.detect.points import Tracking, find_clear_corners, follow_points
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
 from dashcalib_ros.detect.straights import PAIRS, STRAIGHT, StraightCollector, Straights
-from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.decode import check_mask
 from dashcalib_ros.input.scale import shrink_image
 from dashcalib_ros.input.stamps import EARLY, Looks, least_step_ns
 
@@ -42,11 +42,11 @@ class Motion:
     """Motion at one image, measured over the triplet of images that ends with it.
 
     index, stamp_ns: of the image. center, center_ns: index and stamp of the triplet's middle
-    image, which the magnitude belongs to; None before there is a triplet.
-    magnitude: turning magnitude, of the image width (see epipoles.py); 0 when standing, NaN when
-    no epipole is found. standing: the picture does not move. moved_px: how far the median point
-    moved since the last processed image, at full resolution. points: how many were tracked.
-    after_gap: the tracking began anew: nothing from here on belongs to what was before.
+    image, which the magnitude belongs to; None before there is a triplet. magnitude: turning
+    magnitude, as a share of the image width (see epipoles.py); 0 where the car stands, NaN where
+    no epipole is found. standing: the car stands. moved_px: motion of the median point since the
+    last processed image, in px at full resolution. points: number of tracked points. after_gap:
+    the tracking started again, and this image does not follow the last one.
     """
 
     index: int
@@ -97,7 +97,7 @@ class _Triplet:
 class MotionEstimator:
     """Tracks points through the drive and measures how much the car turns.
 
-    one_camera: whether the images that are left out are of the same camera as the others.
+    one_camera: whether the skipped images are of the same camera as the others.
     """
 
     _last: GreyImage | None = None
@@ -159,10 +159,10 @@ class MotionEstimator:
             after_gap or lost)
 
     def valid(self) -> Mask | None:
-        """Return (height, width) of the full image: False on the ego vehicle and the user's mask.
+        """Return (height, width) of the full image, False where it is masked; None: no mask.
 
-        The vehicle is found by both the automatic mask and the segmentation model. None while
-        nothing is masked.
+        Masked is what the user masks, and the ego vehicle as the automatic mask and the
+        segmentation model find it.
         """
         valid = self._user
         if self._shape is None:
@@ -188,7 +188,7 @@ class MotionEstimator:
 
     @property
     def straight_pairs(self) -> int:
-        """Return how many pairs of images of straight driving there are."""
+        """Return the number of pairs of images of straight driving."""
         return len(self._straights)
 
     def straights(self, newest: int = PAIRS) -> Straights:
@@ -216,10 +216,7 @@ class MotionEstimator:
 
     def _start(self, shape: tuple[int, ...]) -> None:
         """Begin with images of this shape."""
-        if self._user is not None and self._user.shape != shape[:2]:
-            raise InputError(
-                f'the mask is {self._user.shape[1]}x{self._user.shape[0]}, the images are '
-                f'{shape[1]}x{shape[0]}: give a mask of the images\' size')
+        check_mask(self._user, (shape[1], shape[0]))
         self._reset()
         self._shape = (shape[0], shape[1])
         self._factor = -(-shape[1] // self.config.width)
@@ -327,9 +324,9 @@ class MotionEstimator:
         return float(np.mean(trusted))
 
     def _goes_on(self, followed: float) -> bool:
-        """Return whether the points tell that the image they are in now follows the last one.
+        """Return whether the image with the points of now follows the last one without a gap.
 
-        followed: the share of the last image's points that is left.
+        followed: the share of the last image's points that were found.
         """
         usual = [seen.followed for seen in self._seen if not math.isnan(seen.followed)]
         if not usual:
