@@ -6,11 +6,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dashcalib_ros.calibrator import Calibrator
     from dashcalib_ros.camera import Brown, Camera, Fisheye, Radial, Rational
     from dashcalib_ros.config import Config
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
+    from dashcalib_ros.pipeline import Calibrator
     from dashcalib_ros.recorded import calibrate, check
     from dashcalib_ros.report import Calibration, load_camera
 
@@ -22,7 +22,7 @@ os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(PIXELS))
 __all__ = ['Brown', 'Calibration', 'Calibrator', 'Camera', 'Config', 'Fisheye', 'Frame', 'Radial',
            'Rational', 'calibrate', 'check', 'load_camera', 'open_frames']
 
-_HOMES = {'Calibration': 'report', 'Calibrator': 'calibrator', 'Config': 'config',
+_HOMES = {'Calibration': 'report', 'Calibrator': 'pipeline', 'Config': 'config',
           'Frame': 'input', 'calibrate': 'recorded', 'check': 'recorded',
           'load_camera': 'report', 'open_frames': 'input.inputs',
           **dict.fromkeys(('Brown', 'Camera', 'Fisheye', 'Radial', 'Rational'), 'camera')}

@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Mask
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import Detection
@@ -27,9 +26,10 @@ from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
 from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Check
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import Calibration
-from dashcalib_ros.selection import Progress
+from dashcalib_ros.workers.worker import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
 # what frames are pushed into
@@ -139,8 +139,6 @@ def pushed(taker: Taker, source: FrameSource, mask: Mask | None) -> Iterator[int
 
     Raises InputError for a mask of another size.
     """
-    if isinstance(taker, Calibrator):
-        taker.expect(source.count)
     for number, frame in enumerate(_read_ahead(source), 1):
         if number == 1:
             check_mask(mask, frame.size)

@@ -39,9 +39,6 @@ class FakeCalibrator:
     def __init__(self, config=None, mask=None):
         type(self).mask = mask
 
-    def expect(self, frames):
-        type(self).frames = frames
-
     def push(self, frame):
         pass
 
@@ -86,7 +83,6 @@ def test_a_mask_and_the_progress(drive, tmp_path, run):
         told = []
         run(drive, mask=given, progress=lambda stage, done, told=told: told.append((stage, done)))
         np.testing.assert_array_equal(FakeCalibrator.mask, mask > 0)
-        assert FakeCalibrator.frames == 4
         assert told[:4] == [('reading', share) for share in (0.25, 0.5, 0.75, 1.0)]
         assert told[4] == ('solving', 1.0)
     with pytest.raises(InputError, match='64x47'):

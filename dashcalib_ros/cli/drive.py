@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from dashcalib_ros.arrays import Mask
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import searched
 from dashcalib_ros.cli.program import handling
 from dashcalib_ros.cli.terminal import Stages
@@ -21,6 +20,7 @@ from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.recorded import Taker, drive_motion, pushed, with_source
 
 # --turns sets both, so that exactly this number of turns is used

@@ -22,7 +22,6 @@ from made_calibration import TRUTH, make_calibration
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import AUTO, calibrated_models, ros_camera
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.terminal import Stages
@@ -32,6 +31,7 @@ from dashcalib_ros.demo.drive import Drive
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import ConfigError, OutputError, WorkerError
+from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.report import write_results
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
