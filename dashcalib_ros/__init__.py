@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
     from dashcalib_ros.pipeline import Calibrator
-    from dashcalib_ros.recorded import calibrate, check
     from dashcalib_ros.report import Calibration, load_camera
+    from dashcalib_ros.session import calibrate, check
 
 from dashcalib_ros.limits import PIXELS
 
@@ -23,7 +23,7 @@ __all__ = ['Brown', 'Calibration', 'Calibrator', 'Camera', 'Config', 'Fisheye', 
            'Rational', 'calibrate', 'check', 'load_camera', 'open_frames']
 
 _HOMES = {'Calibration': 'report', 'Calibrator': 'pipeline', 'Config': 'config',
-          'Frame': 'input', 'calibrate': 'recorded', 'check': 'recorded',
+          'Frame': 'input', 'calibrate': 'session', 'check': 'session',
           'load_camera': 'report', 'open_frames': 'input.inputs',
           **dict.fromkeys(('Brown', 'Camera', 'Fisheye', 'Radial', 'Rational'), 'camera')}
 

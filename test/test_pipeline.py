@@ -35,8 +35,8 @@ from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.recorded import calibrate
 from dashcalib_ros.selection import SceneSelection
+from dashcalib_ros.session import calibrate
 from dashcalib_ros.solve import solve
 from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
@@ -227,7 +227,7 @@ def test_a_live_calibrator_gives_the_same_even_if_asked_on_the_way_with_a_turn_l
 INLINE = """
 import pickle, sys
 from dashcalib_ros.pipeline import Calibrator
-from dashcalib_ros.recorded import calibrate
+from dashcalib_ros.session import calibrate
 frames, config = pickle.load(sys.stdin.buffer)
 with Calibrator(config, inline=True) as calibrator:
     for frame in frames:
@@ -480,7 +480,7 @@ def test_turns_that_are_rejected_leave_the_store(tmp_path):
         calibrator.scenes.exclude({first: 'moved'})
         assert calibrator.status().reconstructed == (second,) and calibrator.status().turns == 1
         assert len(list(tmp_path.iterdir())) == 1
-        calibrator.scenes.exclude(dict.fromkeys((first, TurnId.at(77)), 'moved'))  # gone; never there
+        calibrator.scenes.exclude(dict.fromkeys((first, TurnId.at(77)), 'moved'))  # none there
         assert calibrator.status().reconstructed == (second,)
 
 

@@ -10,8 +10,9 @@ from fakes import stands_in_for
 from made_calibration import TRUTH, make_calibration
 
 import dashcalib_ros
-from dashcalib_ros import Calibrator, calibrate, check, recorded
+from dashcalib_ros import Calibrator, calibrate, check, session
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.judge import Check
 from dashcalib_ros.questions import Questions
 
 NAMES = ('calibrate', 'check', 'load_camera', 'open_frames', 'Calibration', 'Calibrator', 'Config',
@@ -36,7 +37,7 @@ def test_help_stands_alone(name):
 class FakeCalibrator:
     """Takes note of what it is given."""
 
-    def __init__(self, config=None, mask=None):
+    def __init__(self, config=None, mask=None, verbose=False):
         type(self).mask = mask
 
     def push(self, frame):
@@ -46,10 +47,10 @@ class FakeCalibrator:
         progress('solving', 1.0)
         return make_calibration()
 
-    def __enter__(self):
-        return self
+    def turns(self):
+        return ()
 
-    def __exit__(self, kind, error, trace):
+    def close(self):
         pass
 
 
@@ -62,12 +63,13 @@ class FakeQuestions:
 
     def check(self, given, calibration, progress=None):
         progress('checking', 1.0)
+        return Check('right', (), 0.0, 1.0)
 
 
 @pytest.fixture
 def drive(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorded, 'Calibrator', FakeCalibrator)
-    monkeypatch.setattr(recorded, 'Questions', FakeQuestions)
+    monkeypatch.setattr(session, 'Calibrator', FakeCalibrator)
+    monkeypatch.setattr(session, 'Questions', FakeQuestions)
     (tmp_path / 'drive').mkdir()
     for n in range(4):
         cv2.imwrite(str(tmp_path / 'drive' / f'{n}.png'), np.full((48, 64), 60 + n, np.uint8))
@@ -83,8 +85,8 @@ def test_a_mask_and_the_progress(drive, tmp_path, run):
         told = []
         run(drive, mask=given, progress=lambda stage, done, told=told: told.append((stage, done)))
         np.testing.assert_array_equal(FakeCalibrator.mask, mask > 0)
-        assert told[:4] == [('reading', share) for share in (0.25, 0.5, 0.75, 1.0)]
-        assert told[4] == ('solving', 1.0)
+        assert told[:5] == [('reading', share) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+        assert told[5] == ('solving', 1.0)
     with pytest.raises(InputError, match='64x47'):
         run(drive, mask=mask[1:])
     with pytest.raises(InputError, match='height, width'):

@@ -79,8 +79,8 @@ class FakeQuestions:
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     """Make a drive, a calibration and a file of poses; return the command's first arguments."""
-    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', FakeCalibrator)
-    monkeypatch.setattr('dashcalib_ros.cli.check.Questions', FakeQuestions)
+    monkeypatch.setattr('dashcalib_ros.session.Calibrator', FakeCalibrator)
+    monkeypatch.setattr('dashcalib_ros.session.Questions', FakeQuestions)
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'drive').mkdir()
     for n in range(3):

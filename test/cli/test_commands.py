@@ -73,7 +73,7 @@ class FakeCalibrator:
 @pytest.fixture
 def fake(monkeypatch):
     """Put the fake in the calibrator's place."""
-    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', FakeCalibrator)
+    monkeypatch.setattr('dashcalib_ros.session.Calibrator', FakeCalibrator)
     monkeypatch.setattr(FakeCalibrator, 'made', [])
     return FakeCalibrator
 
@@ -107,7 +107,7 @@ class FakeDetection:
 def fake_detection(monkeypatch):
     """Put the fake in the place of the first stage; nobody may calibrate."""
     monkeypatch.setattr('dashcalib_ros.cli.run.Detection', FakeDetection)
-    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', None)
+    monkeypatch.setattr('dashcalib_ros.session.Calibrator', None)
     return FakeDetection
 
 
