@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import inspect
+import types
 
 import cv2
 import numpy as np
@@ -64,6 +65,9 @@ class FakeQuestions:
     def check(self, given, calibration, progress=None):
         progress('checking', 1.0)
         return Check('right', (), 0.0, 1.0)
+
+    def watch(self, camera, sigma=None, progress=None):
+        return types.SimpleNamespace(changes=())
 
 
 @pytest.fixture
