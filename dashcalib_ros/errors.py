@@ -1,6 +1,6 @@
-"""Every error a user can cause. The core raises them; only the borders (cli, ros) catch them.
+"""All errors that a user can cause. The core raises them; only the borders (cli, ros) catch them.
 
-Each message is one line that says what is wrong and names the cure.
+Each has a code and one line of text with the problem and its cure. docs/messages.md lists them.
 """
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def counted(count: int, what: str) -> str:
 class DashcalibError(Exception):
     """Root of all errors that this package raises on purpose.
 
-    code: names what is wrong, 'E-' and words in capitals; it stays when the text is reworded.
-    text: one line that says what is wrong and names the cure.
+    code: identifies the problem, such as E-FILE-EMPTY. It does not change when the text does: use
+    it in scripts. text: one line with the problem and its cure; str(error) is the text alone.
     """
 
     def __init__(self, code: str, text: str = '') -> None:
@@ -47,7 +47,7 @@ class DashcalibError(Exception):
 
 
 class InputError(DashcalibError):
-    """The images cannot be read: missing, empty, corrupt, ambiguous, or of changing size."""
+    """An input cannot be used: it is missing, empty, damaged, ambiguous or not supported."""
 
 
 class ConfigError(DashcalibError):
@@ -59,4 +59,4 @@ class OutputError(DashcalibError):
 
 
 class WorkerError(DashcalibError):
-    """The child process that reconstructs died, or could not be started."""
+    """The child process for the reconstruction died or could not be started."""

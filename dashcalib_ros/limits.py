@@ -80,16 +80,16 @@ FREE_BYTES = 2**30
 # bytes in which a zip file's end is, of its end without a comment, and of an entry of its list
 ZIP_TAIL, ZIP_END, ZIP_ENTRY = 2**16 + 22, 22, 200
 
-TOO_LARGE = f'more than {PIXELS // 10**6} million pixels are not taken'
-
 
 def check_pixels(width: int, height: int, what: str = 'an image') -> None:
     """Raise InputError unless a picture of this size is within limits."""
     if width <= 0 or height <= 0:
-        raise InputError(f'{what} says it is {width}x{height}: the camera driver or the recording '
-                         f'is broken')
+        raise InputError('E-IMAGE-SIZE', f'{what} has the impossible size {width}x{height}: check '
+                         f'the camera driver or the recording')
     if width * height > PIXELS or max(width, height) > SIDE:
-        raise InputError(f'{what} says it is {width}x{height}, {TOO_LARGE}: make it smaller')
+        raise InputError('E-IMAGE-TOO-LARGE',
+                         f'{what} has {width}x{height} pixels; the limits are '
+                         f'{PIXELS // 10**6} million pixels and {SIDE} per side: reduce its size')
 
 
 def check_file(path: Path, what: str = '', limit: int | None = None) -> None:
@@ -102,8 +102,8 @@ def check_file(path: Path, what: str = '', limit: int | None = None) -> None:
     except ValueError as error:  # a name with a zero byte in it
         raise FileNotFoundError(2, 'No such file or directory', str(path)) from error
     if not stat.S_ISREG(about.st_mode):
-        raise InputError(f'cannot read {what or path}: it is no regular file, but a folder, a '
-                         f'pipe or a device; check the path')
+        raise InputError('E-FILE-NOT-REGULAR', f'cannot read {what or path}: it is a folder, a '
+                         f'pipe or a device, not a regular file; check the path')
     if limit is not None and about.st_size > limit:
         raise _too_large(what or str(path), limit)
 
@@ -125,14 +125,16 @@ def _opened(path: Path, limit: int, what: str) -> Iterator[BinaryIO]:
         with path.open('rb') as file:
             yield file
     except FileNotFoundError as error:
-        raise InputError(f'cannot read {what}: it does not exist; check the path') from error
+        raise InputError('E-FILE-MISSING',
+                         f'cannot read {what}: it does not exist; check the path') from error
     except OSError as error:
-        raise InputError(f'cannot read {what} ({error.strerror}); check the path') from error
+        raise InputError('E-FILE-UNREADABLE', f'cannot read {what} ({error.strerror}); check the '
+                         f'path and its permissions') from error
 
 
 def _too_large(what: str, limit: int) -> InputError:
-    return InputError(f'cannot read {what}: it is too large, more than {limit / 2**20:.0f} MB; is '
-                      f'it the right file?')
+    return InputError('E-FILE-TOO-LARGE', f'cannot read {what}: it is larger than '
+                      f'{limit / 2**20:.0f} MB; check that it is the right file')
 
 
 def read_text(path: Path, limit: int, what: str = '') -> str:
@@ -163,7 +165,8 @@ def read_lines(path: Path, limit: int, what: str = '') -> Iterator[str]:
 
 
 def _no_text(what: str) -> InputError:
-    return InputError(f'cannot read {what}: it is not a text file (UTF-8); check the path')
+    return InputError('E-FILE-NOT-TEXT',
+                      f'cannot read {what}: it is not a text file (UTF-8); check the path')
 
 
 def parse_yaml(text: str, what: str) -> Any:
@@ -174,7 +177,9 @@ def parse_yaml(text: str, what: str) -> Any:
     import yaml
 
     if len(text) > YAML_BYTES:
-        raise InputError(f'{what} has more than {YAML_BYTES / 2**20:.0f} MB of YAML')
+        raise InputError('E-YAML-TOO-LARGE',
+                         f'{what} has more than {YAML_BYTES / 2**20:.0f} MB of '
+                         f'YAML; check that it is the right file')
     try:
         # 20 times as fast where libyaml is
         loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)(text)
@@ -189,17 +194,21 @@ def parse_yaml(text: str, what: str) -> Any:
         mark = getattr(error, 'problem_mark', None)
         # libyaml calls the end the line after the last
         where = f' at line {min(mark.line, text.count(chr(10))) + 1}' if mark else ''
-        raise InputError(f'{what} is not valid YAML{where}') from error
+        raise InputError('E-YAML-INVALID',
+                         f'{what} is not valid YAML{where}; correct it') from error
 
 
 def _check_values(root: Any, what: str) -> None:
     for count, (node, level) in enumerate(_nodes(root), 1):
         if count > YAML_VALUES or level > YAML_DEPTH:
-            raise InputError(f'{what} is no usable YAML: more than {YAML_VALUES} values or '
-                             f'{YAML_DEPTH} levels, aliases followed')
+            raise InputError('E-YAML-TOO-LARGE', f'{what} is not usable YAML: with its aliases it '
+                             f'has more than {YAML_VALUES} values or {YAML_DEPTH} levels; check '
+                             f'that it is the right file')
         if (node.id == 'scalar' and len(node.value) > DIGITS
                 and node.tag.endswith((':int', ':float'))):
-            raise InputError(f'{what} is no usable YAML: a number has more than {DIGITS} digits')
+            raise InputError('E-YAML-NUMBER',
+                             f'{what} is not usable YAML: a number has more than '
+                             f'{DIGITS} digits; correct it')
 
 
 def _nodes(root: Any, level: int = 1) -> Iterator[tuple[Any, int]]:
@@ -220,7 +229,7 @@ def check_npz(file: BinaryIO, parts: int) -> None:
     tail = file.read()
     end = tail.rfind(b'PK\5\6')
     if end < 0 or len(tail) - end < ZIP_END or b'PK\6\7' in tail[max(0, end - 20):end]:
-        raise ValueError('it is no .npz, or is cut off')
+        raise ValueError('it is not an .npz file, or it is truncated')
     if int.from_bytes(tail[end + 12:end + 16], 'little') > parts * ZIP_ENTRY:
         raise ValueError('it has too many parts')
     file.seek(0)
@@ -229,7 +238,7 @@ def check_npz(file: BinaryIO, parts: int) -> None:
             raise ValueError('it has too many parts')
         if any(each.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
                for each in packed.infolist()):
-            raise ValueError('it is compressed in an unknown way')
+            raise ValueError('its compression method is not supported')
     file.seek(0)
 
 
@@ -238,4 +247,5 @@ def parse_json(text: str, what: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f'{what} is not valid JSON ({error}); write it anew') from error
+        raise InputError('E-JSON-INVALID',
+                         f'{what} is not valid JSON ({error}); write it again') from error

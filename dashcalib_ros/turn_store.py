@@ -55,7 +55,7 @@ class TurnStore:
             self._folder = self._folder.expanduser()
         except RuntimeError:  # ~user of an unknown user: do not make a folder of that name
             self._off = True
-            warn(f'turns cannot be stored in {folder} (there is no such home folder); set '
+            warn(f'turns cannot be stored in {folder} (that home folder does not exist); set '
                  f'turns.store to a path without ~')
         self._capacity = capacity
         self._half_width_s = half_width_s
@@ -167,12 +167,12 @@ class TurnStore:
     def _report(self, bad: list[str], others: list[Origin], origin: Origin) -> None:
         if bad:
             more = f' and {len(bad) - 3} more' if len(bad) > 3 else ''
-            self._warn(f'{counted(len(bad), "file")} in {self._folder} left out: '
-                       f'{", ".join(bad[:3])}{more}; delete what is no stored turn')
+            self._warn(f'{counted(len(bad), "file")} in {self._folder} skipped: '
+                       f'{", ".join(bad[:3])}{more}; delete files that are not stored turns')
         if others:
-            self._warn(f'{counted(len(others), "file")} in {self._folder} left out: of images '
-                       f'{others[0]}, these are {origin}; give each camera a folder of its own in '
-                       f'turns.store')
+            self._warn(f'{counted(len(others), "file")} in {self._folder} skipped: the images '
+                       f'were {others[0]}, but these are {origin}; use a separate folder for each '
+                       f'camera in turns.store')
 
     def _read(self, name: str) -> tuple[Origin, StoredTurn]:
         """Return a file's origin and turn; raises InputError if it is no stored turn."""
@@ -181,7 +181,8 @@ class TurnStore:
             file = decoded(data)
             [turn] = file.turns
         except ValueError as error:
-            raise InputError(f'{name} cannot be used ({one_line(error)})') from error
+            raise InputError('E-TURN-FILE',
+                             f'{name} cannot be used ({one_line(error)})') from error
         return file.origin, turn
 
     def _about(self, name: str) -> tuple[Origin, float] | None:
@@ -232,5 +233,5 @@ class TurnStore:
         self._warned = True
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         self._warn(f'turns cannot be stored in {self._folder} ({error.strerror or error}); '
-                   + ('free some space' if full else 'set turns.store to a folder you may write '
-                                                     'to'))
+                   + ('free some disk space' if full else
+                      'set turns.store to a folder with write permission'))

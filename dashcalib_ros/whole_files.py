@@ -39,7 +39,7 @@ def prepared(folder: Path, contents: Mapping[str, bytes]) -> Iterator[dict[str, 
     with ExitStack() as stack:
         for name, content in contents.items():
             if (folder / name).is_dir():
-                raise IsADirectoryError(errno.EISDIR, f'{name} is a folder there')
+                raise IsADirectoryError(errno.EISDIR, f'{name} is a folder')
             temporary[name], stream = stack.enter_context(_temporary_file(folder, name))
             stream.write(content)
             stream.flush()
@@ -108,7 +108,7 @@ def remove_leftovers(folder: Path | None = None,
     """Remove what killed processes of this user left in a folder under temporary names.
 
     folder: None: the scratch disk (TMPDIR). names: of the files; of temporary folders where they
-    are left away. A running process has its own locked: they stay.
+    are omitted. A running process has its own locked: they stay.
     """
     name = names.pattern if isinstance(names, re.Pattern) else '|'.join(map(re.escape, names))
     ours = re.compile(rf'\.({name})\.[0-9a-f]{{8}}\.tmp')

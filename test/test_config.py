@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from refused import refused
 
 from dashcalib_ros.config import (
     Config,
@@ -65,9 +66,8 @@ def test_what_was_measured_is_told_of_settings_that_exist_with_their_defaults():
 @pytest.mark.parametrize('name', [n for n, s in SPECS.items() if isinstance(s.default, float)])
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
 def test_not_a_finite_number(name, value):
-    with pytest.raises(ConfigError, match='finite') as caught:
+    with refused(ConfigError, 'E-CONFIG-FINITE', name):
         Config().replace({name: value})
-    assert name in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -76,9 +76,8 @@ def test_out_of_range_names_the_range(name):
     meta = SPECS[name].metadata
     kind = type(SPECS[name].default)
     for value in (meta['minimum'] - 1, meta['maximum'] + 1):
-        with pytest.raises(ConfigError, match='between') as caught:
+        with refused(ConfigError, 'E-CONFIG-RANGE', name, f'{meta["minimum"]:g} and'):
             Config().replace({name: kind(value)})
-        assert name in str(caught.value)
     for value in (meta['minimum'], meta['maximum']):
         assert Config().replace({name: kind(value)}).flat()[name] == value
 
@@ -91,31 +90,29 @@ def test_out_of_range_names_the_range(name):
     ('mask.segmentation_classes', [63, 64]),
 ])
 def test_wrong_type_names_the_right_one(name, value):
-    with pytest.raises(ConfigError) as caught:
+    with refused(ConfigError, 'E-CONFIG-TYPE', name, type(SPECS[name].default).__name__):
         Config().replace({name: value})
-    message = str(caught.value)
-    assert name in message and type(SPECS[name].default).__name__ in message
-    assert '\n' not in message
 
 
 @pytest.mark.parametrize(('name', 'hint'), [
     ('turns.half_with', 'turns.half_width'), ('turn.wanted', 'turns.wanted'), ('sed', 'seed'),
     ('motion.Rate', 'motion.rate')])
 def test_a_typo_gets_the_nearest_name(name, hint):
-    with pytest.raises(ConfigError, match=f'did you mean {hint}'):
+    with refused(ConfigError, 'E-CONFIG-UNKNOWN', f'did you mean {hint}, '):
         Config().replace({name: 1})
 
 
-def test_a_name_like_no_other_gets_the_list():
-    with pytest.raises(ConfigError, match='unknown setting') as caught:
+def test_a_name_like_no_other_gets_the_three_nearest():
+    with refused(ConfigError, 'E-CONFIG-UNKNOWN') as caught:
         Config().replace({'qqqqqqqqqqqqqq': 1})
-    assert 'turns.wanted' in str(caught.value) and 'seed' in str(caught.value)
+    named = re.findall(r'[a-z_.]+', str(caught.value).partition('did you mean ')[2])
+    assert len(set(named) & set(SPECS)) == 3 and len(named) == 4
 
 
 @pytest.mark.parametrize(
     'name', ['__class__', 'turns', 'flat', 'turns.', '.', '', 'turns.wanted.x'])
 def test_names_that_are_attributes_but_no_settings(name):
-    with pytest.raises(ConfigError, match='unknown setting'):
+    with refused(ConfigError, 'E-CONFIG-UNKNOWN'):
         Config().replace({name: 1})
 
 
@@ -137,18 +134,18 @@ def test_an_integer_is_a_fine_float_in_yaml_and_in_python():
 
 @pytest.mark.parametrize('value', [10**30, -10**400])
 def test_an_integer_that_no_float_can_hold(value):
-    with pytest.raises(ConfigError, match=r'motion\.rate'):
+    with refused(ConfigError, 'E-CONFIG-TYPE', 'motion.rate'):
         Config().replace({'motion.rate': value})
-    with pytest.raises(ConfigError, match=r'motion\.rate'):
+    with refused(ConfigError, 'E-CONFIG-TYPE', 'motion.rate'):
         Config(motion=MotionConfig(rate=value))
 
 
 def test_a_config_made_directly_is_checked_too():
-    with pytest.raises(ConfigError, match=r'turns\.wanted'):
+    with refused(ConfigError, 'E-CONFIG-RANGE', 'turns.wanted'):
         Config(turns=TurnsConfig(wanted=0))
-    with pytest.raises(ConfigError, match='threads'):
+    with refused(ConfigError, 'E-CONFIG-RANGE', 'threads'):
         Config(threads=0)
-    with pytest.raises(ConfigError, match=r'motion\.rate'):
+    with refused(ConfigError, 'E-CONFIG-FINITE', 'motion.rate'):
         Config(motion=MotionConfig(rate=math.nan))
 
 

@@ -385,7 +385,7 @@ def test_a_full_disk_leaves_nothing_half_written(make, monkeypatch):
         patch.setattr(room.os, 'fsync', full)
         hold(store, stored(0), stored(1))
         hold(store, stored(0), stored(1))
-    assert len(store.said) == 1 and 'free some space' in store.said[0]
+    assert len(store.said) == 1 and 'disk space' in store.said[0]
     assert len(names(store)) == 1
     # there is space again
     hold(store, stored(0), stored(1))

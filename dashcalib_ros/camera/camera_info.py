@@ -75,11 +75,11 @@ def ros_faults(camera: Camera, k: Sequence[float] | None = None, r: Sequence[flo
     if r and (distorted or any(r)):
         rotation = np.reshape(r, (3, 3))
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > EXACT or np.linalg.det(rotation) < 0:
-            faults.append('R is no rotation: of one camera, it is the identity')
+            faults.append('R is not a rotation: for a single camera, it must be the identity')
         elif np.abs(rotation - np.eye(3)).max() > EXACT:
             angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
-            faults.append(f'R turns the rectified picture by {angle:.1f} degrees: of one camera, '
-                          f'it is the identity')
+            faults.append(f'R rotates the rectified image by {angle:.1f} degrees: for a single '
+                          f'camera, it must be the identity')
     if p and (distorted or any(p)):
         view = np.reshape(p, (3, 4))
         wanted = np.diag([view[0, 0], view[1, 1], 1.0, 0.0])[:3]
@@ -108,7 +108,7 @@ def _of_another_picture(camera: Camera, view: Floats) -> list[str]:
         # NaN is a fault, too
         fits = away <= NEAR and ZOOM[0] <= zoom.min() and zoom.max() <= ZOOM[1]
     return [] if fits else [
-        'P does not show the picture: is it for pictures of another size?']
+        'P does not map the image into the rectified image: it may be for images of another size']
 
 
 def rectified_matrix(camera: Camera, rectified: str = SAME) -> Floats:
@@ -118,7 +118,8 @@ def rectified_matrix(camera: Camera, rectified: str = SAME) -> Floats:
     most. ALL: everything that the lens sees is in the picture, and the rest is black.
     """
     if rectified not in RECTIFIED:
-        raise ConfigError(f'rectified must be one of {", ".join(RECTIFIED)}, not {rectified!r}')
+        raise ConfigError('E-CONFIG-CHOICE',
+                          f'rectified must be one of {", ".join(RECTIFIED)}, not {rectified!r}')
     if rectified == SAME:
         return camera.matrix
     with np.errstate(all='ignore'):

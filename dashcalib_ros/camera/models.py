@@ -26,10 +26,12 @@ def model_named(name: str) -> type[Camera]:
     """Return the model of this name that is to be calibrated. Raises ConfigError."""
     if name in MODELS and not MODELS[name].given_only:
         return MODELS[name]
-    what = (f'the coefficients of {name} can be given, but not found from turns' if name in MODELS
-            else f'there is no camera model {shortened(repr(name))}')
-    raise ConfigError(f'{what}; there are '
-                      f'{", ".join([AUTO, *(model.model for model in calibrated_models())])}')
+    known = ', '.join([AUTO, *(model.model for model in calibrated_models())])
+    if name in MODELS:
+        raise ConfigError('E-MODEL-NOT-CALIBRATED', f'turns cannot determine the coefficients of '
+                          f'the camera model {name}; use one of {known}')
+    raise ConfigError('E-MODEL-UNKNOWN',
+                      f'unknown camera model {shortened(repr(name))}; use one of {known}')
 
 
 def searched(name: str) -> tuple[type[Camera], ...]:
@@ -53,8 +55,8 @@ def larger_models(camera: Camera) -> list[type[Camera]]:
 def camera_of(model: str, image_size: tuple[int, int], params: npt.ArrayLike) -> Camera:
     """Return the camera of a model's name; raises InputError for a model that is not known."""
     if model not in MODELS:
-        raise InputError(f'the camera model {model!r} is not known here; there are '
-                         f'{", ".join(MODELS)}')
+        raise InputError('E-MODEL-UNKNOWN',
+                         f'unknown camera model {model!r}; use one of {", ".join(MODELS)}')
     return MODELS[model].of(image_size, params)
 
 
@@ -68,8 +70,9 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
     matrix = np.asarray(k, np.float64)
     fx, _, cx, _, fy, cy = matrix[:6]
     if not np.array_equal(matrix, [fx, 0, cx, 0, fy, cy, 0, 0, 1]):
-        raise InputError('the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1], and no model here '
-                         'has skew: calibrate without it')
+        raise InputError('E-CAMERA-SKEW',
+                         'the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1], and '
+                         'no supported model has skew: calibrate without it')
     wanted = np.trim_zeros(np.asarray(d, np.float64), 'b')
     name = re.sub('[ -]', '_', distortion_model.strip().lower())
     if name in NO_DISTORTION and not len(wanted):
@@ -83,9 +86,9 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
                                        *np.zeros(max(0, size - len(wanted)))])
         if np.array_equal(np.trim_zeros(np.array(camera.ros_distortion()), 'b'), wanted):
             return camera
-    raise InputError(f'a camera of {shortened(repr(distortion_model))} with {len(wanted)} '
-                     f'coefficients is none of the models here; calibrate it as one of '
-                     f'{", ".join(ROS_MODELS)}')
+    raise InputError('E-MODEL-DISTORTION', f'the distortion model '
+                     f'{shortened(repr(distortion_model))} with {len(wanted)} coefficients is not '
+                     f'supported; calibrate the camera with one of {", ".join(ROS_MODELS)}')
 
 
 ROS_MODELS = tuple(dict.fromkeys(model.ros_model for model in MODELS.values()))

@@ -78,9 +78,10 @@ def unpack(kind: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
     unpacker = UNPACKERS[kind]() if kind not in ('', 'none') else None
     plain: bytes = data if unpacker is None else unpacker.decompress(data, limit + 1)
     if len(plain) > limit:
-        raise InputError(f'a part of the bag unpacks to more than {limit / 2**20:.0f} MB')
+        raise InputError('E-BAG-TOO-LARGE', f'a part of the bag decompresses to more than '
+                         f'{limit / 2**20:.0f} MB')
     if unpacker is not None and not unpacker.eof:
-        raise EOFError('a packed part is cut off')
+        raise EOFError('a compressed part is truncated')
     return plain
 
 
@@ -93,8 +94,8 @@ class _Unpacking:
     def check(self, size: int) -> None:
         """Raise InputError where so many bytes are too many."""
         if size > self._left:
-            raise InputError(f'its chunks unpack to more than {self._limit / 2**20:.0f} MB, which '
-                             f'is no recording')
+            raise InputError('E-BAG-TOO-LARGE', f'its chunks decompress to more than '
+                             f'{self._limit / 2**20:.0f} MB, too large for a recording')
 
     def through(self, unpacker: Callable[[bytes, int], bytes], data: bytes) -> bytes:
         """Return unpacked data, as unpack() does; raises InputError beyond the limit."""
@@ -167,7 +168,7 @@ def _limited(database: apsw.Connection) -> None:
     database.limit(apsw.SQLITE_LIMIT_LENGTH, MESSAGE_BYTES)
     database.set_progress_handler(endless, PIECE)
     if list(database.execute(_MADE)):
-        raise apsw.SQLError('it has more than tables')
+        raise apsw.SQLError('it contains more than tables')
 
 
 def _whole(database: apsw.Connection) -> None:
@@ -176,7 +177,7 @@ def _whole(database: apsw.Connection) -> None:
     size = Path(database.filename).stat().st_size
     [(contents, topics, names)] = database.execute(_SIZES)
     if max(contents, names) > size or topics > TOPICS:
-        raise apsw.SQLError('its rows have more than the file')
+        raise apsw.SQLError('its rows contain more than the file')
 
 
 class _McapReader(storage_mcap.McapReader):
@@ -185,7 +186,7 @@ class _McapReader(storage_mcap.McapReader):
     def read_index(self) -> None:
         """Read the index, and check it before anything is unpacked; raises InputError."""
         if Path(str(self.path)).stat().st_size - self.data_end > INDEX_BYTES:
-            raise InputError('the index is too large')
+            raise InputError('E-BAG-INDEX', 'the index is too large')
         super().read_index()
         sizes = [chunk.uncompressed_size for chunk in self.chunks]
         _Unpacking(Path(str(self.path))).check(sum(sizes))
@@ -195,7 +196,7 @@ class _McapReader(storage_mcap.McapReader):
             (chunk.message_end_time + 1, -chunk.uncompressed_size)))
         if max(accumulate(size for _, size in ends), default=0) > max(
                 OVERLAPPING_BYTES, max(sizes, default=0)):
-            raise InputError('too many chunks overlap')
+            raise InputError('E-BAG-INDEX', 'too many chunks overlap')
 
     def messages_scan(self, *which: Any) -> Generator[tuple[Connection, int, bytes], None, None]:
         """Read a file without an index of its chunks, once it is known what they unpack to."""
@@ -210,7 +211,7 @@ class _McapReader(storage_mcap.McapReader):
             head = self.bio.read(33)
             size = int.from_bytes(head[1:9], 'little')
             if size > RECORD_BYTES and head[0] in (Opcode.CHUNK, Opcode.MESSAGE):
-                raise InputError('a record is too large')
+                raise InputError('E-BAG-INDEX', 'a record is too large')
             if head[0] == Opcode.CHUNK:
                 # behind the times of its first and last message
                 yield int.from_bytes(head[25:33], 'little')
@@ -218,7 +219,7 @@ class _McapReader(storage_mcap.McapReader):
 
     def meta_scan(self) -> None:
         """Leave a file without an index to scan_mcap()."""
-        raise InputError('there is no index')
+        raise InputError('E-BAG-INDEX', 'the file has no index')
 
 
 class _Ros1Reader(rosbag1.Reader):
@@ -233,7 +234,7 @@ class _Ros1Reader(rosbag1.Reader):
         """Read a topic; raises InputError beyond limits."""
         assert self.bio is not None
         if Path(str(self.path)).stat().st_size - self.bio.tell() > INDEX_BYTES:
-            raise InputError('the index is too large')
+            raise InputError('E-BAG-INDEX', 'the index is too large')
         return super().read_connection()
 
     def read_chunk_info(self) -> rosbag1.ChunkInfo:
@@ -247,7 +248,7 @@ class _Ros1Reader(rosbag1.Reader):
         """Read a chunk's head; raises InputError where it is a part of the one before."""
         assert self.bio is not None
         if self.bio.tell() < self._end:
-            raise InputError('chunks overlap')
+            raise InputError('E-BAG-INDEX', 'chunks overlap')
         return super().read_chunk()
 
     def read_index_data(self, pos: int, indexes: dict[int, list[rosbag1.IndexData]]) -> None:
@@ -256,7 +257,7 @@ class _Ros1Reader(rosbag1.Reader):
         head = self.bio.read(INDEX_HEAD)
         self._entries += int.from_bytes(head[-4:], 'little')
         if self._entries > INDEX_BYTES:
-            raise InputError('the index is too large')
+            raise InputError('E-BAG-INDEX', 'the index is too large')
         self.bio.seek(-len(head), os.SEEK_CUR)
         super().read_index_data(pos, indexes)
         self._end = self.bio.tell()
@@ -266,7 +267,7 @@ class _Ros1Reader(rosbag1.Reader):
         super().open()
         if self._index_end != Path(str(self.path)).stat().st_size:
             self.close()
-            raise InputError('there is more than the head says')
+            raise InputError('E-BAG-INDEX', 'the file is longer than its header indicates')
         unpacking = _Unpacking(Path(str(self.path)))
         for pos, chunk in self.chunks.items():
             # the one of the table, which takes a limit
@@ -307,22 +308,24 @@ def unpacked(file: Path, damage: Damage) -> Iterator[Path]:
                 _unpack_file(file, plain)
             else:
                 _complete(file, journals, plain)
-                damage(f'{file.name} was not closed, and its end is taken from '
+                damage(f'{file.name} was not closed; its last messages are read from '
                        f'{first_of([each.name for each in journals])}')
         except (zstd.ZstdError, EOFError):
             damage(f'{file.name} is damaged')
         except apsw.Error as error:
-            damage(f'{file.name} was not closed, and {journals[0].name}, which has its end, '
+            damage(f'{file.name} was not closed, and {journals[0].name} with its last messages '
                    f'cannot be used ({one_line(error)})')
             plain = file
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
             raise InputError(
-                f'no room to unpack {file} in {folder}: set TMPDIR to a bigger disk, or unpack it '
-                f'first (zstd -d)' if packed else
-                f'no room to copy {file}, which was not closed, to {folder}: set TMPDIR to a '
-                f'bigger disk, or close it first (sqlite3 {file.name} .schema)') from error
+                'E-DISK-FULL',
+                f'not enough disk space to decompress {file} in {folder}: set TMPDIR to a larger '
+                f'disk, or decompress the file first (zstd -d)' if packed else
+                f'{file} was not closed, and there is not enough disk space to copy it to '
+                f'{folder}: set TMPDIR to a larger disk, or close the file first '
+                f'(sqlite3 {file.name} .schema)') from error
         yield plain
 
 
@@ -332,8 +335,9 @@ def _unpack_file(packed: Path, plain: Path) -> None:
         for size in _copied(source.read1, plain):
             if size > limit:
                 raise InputError(
-                    f'{packed} unpacks to more than {limit / 2**20:.0f} MB, which is no '
-                    f'recording; if it is one, unpack it first (zstd -d)')
+                    'E-BAG-TOO-LARGE', f'{packed} decompresses to more than '
+                    f'{limit / 2**20:.0f} MB, too large for a recording; if it is one, '
+                    f'decompress it first (zstd -d)')
 
 
 def _copied(read: Callable[[int], bytes], plain: Path) -> Iterator[int]:
@@ -369,7 +373,7 @@ def _complete(file: Path, journals: Sequence[Path], plain: Path) -> None:
         database.execute('PRAGMA schema_version').fetchone()  # takes a rollback journal
         _, frames, _ = database.execute('PRAGMA wal_checkpoint').fetchone() or (0, 0, 0)
         if not frames:
-            raise apsw.Error('nothing in it is whole')
+            raise apsw.Error('it has no complete message')
         database.execute('PRAGMA journal_mode = DELETE')
 
 
@@ -398,9 +402,10 @@ class Record:
                 raw = unpack('zstd', raw, MESSAGE_BYTES)
             return message_of(self.msgtype, self.encoding, raw, self.schema)
         except InputError as error:
-            raise InputError(f'a message on {self.topic}: {error}') from error
+            raise InputError(error.code, f'a message on {self.topic}: {error}') from error
         except Exception as error:  # struct.error, AssertionError, DecodeError ...
-            raise InputError(f'a damaged message on {self.topic}: record it again') from error
+            raise InputError('E-MESSAGE-DAMAGED',
+                             f'a message on {self.topic} is damaged: record it again') from error
 
 
 def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]], bool]:
@@ -447,7 +452,7 @@ def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
             missing -= 1
             yield Record(connection.topic, connection.msgtype, receive_ns, bytes(raw), encoding)
         if missing > 0:
-            raise ValueError('the index does not lead to all messages')
+            raise ValueError('the index does not list all messages')
 
 
 def _reader(path: Path) -> rosbag1.Reader | rosbag2.Reader:
@@ -466,7 +471,7 @@ def scan(path: Path, damage: Damage) -> Iterator[Record]:
     elif magic.startswith(b'#ROSBAG V2.0\n'):
         yield from scan_bag(path, damage)
     else:
-        damage(f'{path.name} does not start like a bag')
+        damage(f'{path.name} does not have the header of a bag')
 
 
 def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
@@ -480,7 +485,7 @@ def record_of(schema: Schema | None, channel: Channel, message: Message) -> Reco
     encoding = channel.message_encoding
     name = schema.name if schema else ''
     name = normalize_msgtype(name) if '/' in name else name
-    # one that is not read here is told with the type
+    # an unsupported one is shown with the type
     kind = name if encoding in ENCODINGS else f'{name} in {encoding or "no encoding"}'
     return Record(channel.topic, kind, message.log_time, message.data, encoding,
                   schema.data if schema and encoding == PROTOBUF else b'')
@@ -538,7 +543,7 @@ def _mcap_records(reader: StreamReader, unpacking: _Unpacking, name: str, damage
         try:
             record = next(records, None)
         except (McapError, struct.error, ValueError, MemoryError, OverflowError):
-            damage(f'{name} is cut off')
+            damage(f'{name} is truncated')
             return
         if record is None:
             return
@@ -549,7 +554,7 @@ def _mcap_records(reader: StreamReader, unpacking: _Unpacking, name: str, damage
             plain = unpacking.through(partial(unpack, record.compression), record.data)
             inner = breakup_chunk(replace(record, compression='', data=plain), validate_crc=True)
         except Exception as error:  # also the unpackers' own errors
-            damage(f'{name} has a broken chunk ({one_line(error)})')
+            damage(f'{name} has a damaged chunk ({one_line(error)})')
             continue
         yield from inner
 
@@ -573,7 +578,7 @@ def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
         for topic, receive_ns, data in database.execute(_ROWS, (left,)):
             left -= len(data)
             if left < 0:
-                raise apsw.SQLError('its rows have more than the file')
+                raise apsw.SQLError('its rows contain more than the file')
             if topic in topics:
                 yield Record(*topics[topic], receive_ns, data)
     except apsw.Error as error:
@@ -589,7 +594,7 @@ def scan_bag(path: Path, damage: Damage) -> Iterator[Record]:
         try:
             yield from _bag_messages(file, {}, _Unpacking(path))
         except Exception as error:  # rosbags' errors, and those of what unpacks
-            damage(f'{path.name} is cut off ({one_line(error)})')
+            damage(f'{path.name} is truncated ({one_line(error)})')
 
 
 def _bag_messages(file: BufferedReader, connections: dict[int, tuple[str, str]],

@@ -17,7 +17,7 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, counted
 from dashcalib_ros.input.bag_read import Damage, Record, message_counts, records
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.encodings import ENCODINGS, PICTURES
@@ -37,12 +37,12 @@ from dashcalib_ros.input.video import FramePicture
 from dashcalib_ros.limits import YAML_BYTES, check_file, parse_yaml, read_text
 
 CURE = ("repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'rosbag reindex'), "
-        'copy it again or record it again')
+        'copy it again, or record it again')
 
 
-# reasons that no repair mends
-NO_CURE = 'is it a recording? copy it again or record it again'
-NO_RECORDING = re.compile('does not start like a bag|more than|too large|too many')
+# reasons that no repair fixes
+NO_CURE = 'check that it is a recording, then copy it again or record it again'
+NO_RECORDING = re.compile('header of a bag|more than|too large|too many')
 
 
 @dataclass(frozen=True)
@@ -92,24 +92,27 @@ def open_bag(path: Path) -> Bag:
     present = tuple(path / name for name in names if name not in skipped)
     warnings = []
     if skipped:
-        warnings = [f'{len(skipped)} entries of {path} were skipped, which are no regular files: '
+        warnings = [f'{counted(len(skipped), "file")} in {path} skipped, not regular files: '
                     f'{first_of(skipped)}']
     listed, promised = _metadata(path / METADATA)
     files = tuple(file for file in listed if file in present)
     if files:
-        warnings += [f'{file.name} is listed in metadata.yaml but missing: its images are lost'
+        warnings += [f'{file.name} is listed in metadata.yaml but does not exist: its '
+                     f'images are lost'
                      for file in listed if file not in present and file.name not in skipped]
     elif present:
         files = present
         if (cameras := cameras_named([file.name for file in files])) > 1:
-            raise InputError(f'{path} has recordings of {cameras} cameras '
-                             f'({first_of([file.name for file in files])}): give the files of one')
-        warnings += [f'{path} has no usable metadata.yaml: reading '
-                     f'{first_of([file.name for file in files])} in this order']
+            raise InputError('E-INPUT-SEVERAL-CAMERAS', f'{path} has recordings of {cameras} '
+                             f'cameras ({first_of([file.name for file in files])}): pass the '
+                             f'files of one camera')
+        warnings += [f'{path} has no usable metadata.yaml: its files are read in the order '
+                     f'{first_of([file.name for file in files])}']
     if not files:
         why = f' ({"; ".join(warnings)})' if warnings else ''
-        raise InputError(f'{path} has no .mcap, .db3 or .bag file{why}: '
-                         f'copy the whole folder')
+        raise InputError('E-BAG-NO-FILES',
+                         f'{path} has no .mcap, .db3 or .bag file{why}: copy the '
+                         f'whole folder')
     if any(topic.is_image and topic.count for topic in promised):
         return Bag(files, promised, True, tuple(warnings))
     topics, indexed = _topics_of(files, path)
@@ -144,8 +147,10 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
         counts.update(found)
         indexed &= by_index
     if problems and not counts:
-        cure = NO_CURE if NO_RECORDING.search(problems[0]) else CURE
-        raise InputError(f'{bag} cannot be read ({problems[0]}): {cure}')
+        if NO_RECORDING.search(problems[0]):
+            raise InputError('E-BAG-NOT-A-RECORDING',
+                             f'{bag} cannot be read ({problems[0]}): {NO_CURE}')
+        raise InputError('E-BAG-DAMAGED', f'{bag} cannot be read ({problems[0]}): {CURE}')
     return _sorted(counts), indexed
 
 
@@ -178,7 +183,7 @@ class BagSource(FrameSource):
         chosen = _choose(path, self._bag, topic)
         warnings = list(self._bag.warnings)
         if fps is not None:
-            warnings.append(f'{path} is a bag, its images have stamps: fps is ignored')
+            warnings.append(f'{path} is a bag, and its images have time stamps: fps is ignored')
         super().__init__(str(path), chosen.count, chosen.name, tuple(warnings))
 
     @property
@@ -224,20 +229,20 @@ class BagSource(FrameSource):
             yield from [shot] if shown is None else starmap(_of_video, shown)
         yield from starmap(_of_video, packets.rest())
         if packets.waited:
-            reading.warnings.append(f'the first {packets.waited} images of the video are left '
-                                    f'out: they need a picture before the recording began')
+            reading.warnings.append(f'the first {packets.waited} images of the video are skipped: '
+                                    f'they depend on images from before the recording')
 
     def _losses(self, read: int, damage: list[str]) -> list[str]:
         lost = (self._promised or 0) - read if self._bag.indexed else 0
         if not damage and lost <= 0:
             return []
         why = f' ({"; ".join(damage[:2])}{" ..." if len(damage) > 2 else ""})' if damage else ''
-        start = f'the bag is damaged{why}: read {read}'
+        start = f'the bag is damaged{why}: {read}'
         if lost > 0:
-            return [f'{start} of {self._promised} images; {lost} are lost']
+            return [f'{start} of {self._promised} images were read, {lost} are lost']
         if self._bag.indexed:
-            return [f'{start} of {self._promised} images; none is lost']
-        return [f'{start} images; how many are lost is not known']
+            return [f'{start} of {self._promised} images were read, none is lost']
+        return [f'{start} images were read, the number of lost images is unknown']
 
 
 def _of_video(shot: _Shot, frame: Any) -> _Shot:
@@ -255,21 +260,22 @@ def _choose(path: Path, bag: Bag, name: str | None) -> Topic:
     if not images:
         there = ', '.join(f'{topic.name} ({topic.msgtype})' for topic in bag.topics[:8])
         there = ' '.join(there.split())  # a damaged bag's names may hold anything
-        raise InputError(f'{path} has no image topic: it has {there or "no messages at all"}; '
-                         f'record the camera (Image, CompressedImage or a video) too, as '
-                         f'{", ".join(ENCODINGS)}')
+        raise InputError('E-BAG-NO-IMAGES', f'{path} has no image topic: it has '
+                         f'{there or "no messages"}; record the camera (Image, CompressedImage or '
+                         f'a video), encoded as {", ".join(ENCODINGS)}')
     if name is not None:
         found = [topic for topic in images if topic.name.strip('/') == name.strip('/')]
         if not found:
-            raise InputError(f'{path} has no image topic {name!r}: choose {_listing(images)}')
+            raise InputError('E-BAG-TOPIC-UNKNOWN', f'{path} has no image topic {name!r}: choose '
+                             f'one of {_listing(images)}')
         images = found
     filled = [topic for topic in images if topic.count]
     if not filled:
-        raise InputError(f'{path} has no images on {images[0].name}: was the camera running? '
-                         f'Record again')
+        raise InputError('E-BAG-TOPIC-EMPTY', f'{path} has no images on {images[0].name}: check '
+                         f'that the camera runs, and record again')
     if len(filled) > 1:
-        raise InputError(f'{path} has {len(filled)} image topics: choose one with --topic: '
-                         f'{_listing(filled)}')
+        raise InputError('E-BAG-TOPIC-AMBIGUOUS', f'{path} has {len(filled)} image topics: choose '
+                         f'one with --topic: {_listing(filled)}')
     return filled[0]
 
 

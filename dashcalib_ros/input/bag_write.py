@@ -33,7 +33,7 @@ from dashcalib_ros.whole_files import temporary_folder
 CAMERA_INFO = CAMERA_INFOS[0]
 # what image_transport adds to the name of a topic
 TRANSPORTS = ('compressed', 'ffmpeg', 'foxglove')
-REPAIR = "repair it first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
+REPAIR = "repair the bag first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
 
 
 def camera_info_topic(image_topic: str) -> str:
@@ -59,13 +59,14 @@ def first_camera_info(path: Path, topic: str | None = None) -> tuple[str, Any]:
         wanted = {f'/{topic.strip("/")}', camera_info_topic(f'/{topic.strip("/")}')}
         found = [name for name in infos if f'/{name.strip("/")}' in wanted]
     if len(found) != 1:
-        there = f'it has {", ".join(infos)}' if infos else 'there is none'
-        raise InputError(f'{path}: no one camera_info belongs to '
-                         f'{topic or "its images"}: {there}; name its topic, as in '
-                         f'{path}:{(infos or ["/camera/camera_info"])[0]}, or give a file')
+        there = ', '.join(infos) if infos else 'none'
+        raise InputError('E-BAG-CAMERA-INFO', f'{path} has no single camera_info topic for '
+                         f'{topic or "its images"} (camera_info topics: {there}): specify one, as '
+                         f'in {path}:{(infos or ["/camera/camera_info"])[0]}, or use a file')
     record = next(bag.records(found, lambda _: None), None)
     if record is None:
-        raise InputError(f'{path} is damaged: there is no message on {found[0]}; {REPAIR}')
+        raise InputError('E-BAG-DAMAGED',
+                         f'{path} is damaged, no message on {found[0]} can be read: {REPAIR}')
     return found[0], record.message()
 
 
@@ -123,7 +124,7 @@ def _is_mixed(source: Path) -> bool:
         return all(file.suffix == '.mcap' for file in files) and any(
             map(has_other_encodings, files))
     except (InputError, OSError):
-        return False  # told where it is opened
+        return False  # raised again where it is opened
 
 
 def _write_mixed(source: Path, image_topic: str, ros: RosCamera, out: Path) -> int:
@@ -193,12 +194,13 @@ def _new_folder(path: Path, made: bool = True) -> Iterator[Path]:
 
 def _check_free(path: Path) -> None:
     if os.path.lexists(path):
-        raise OutputError(f'{path} exists: choose another place for the bag or remove it')
+        raise OutputError('E-OUTPUT-EXISTS',
+                          f'{path} already exists: choose another path for the bag, or remove it')
 
 
 def _unwritable(path: Path, error: Exception) -> OutputError:
-    return OutputError(f'{path} cannot be written ({error}): check the path, its permissions and '
-                       f'the room on that disk')
+    return OutputError('E-OUTPUT-NOT-WRITABLE', f'{path} cannot be written ({error}): check the '
+                       f'path, its permissions and the free disk space')
 
 
 def _messages(reader: Reader2, connections: list[Connection], source: str | os.PathLike[str]
@@ -206,7 +208,8 @@ def _messages(reader: Reader2, connections: list[Connection], source: str | os.P
     try:
         yield from reader.messages(connections)
     except Exception as error:  # a damaged file makes rosbags raise nearly anything
-        raise InputError(f'{source} is damaged, no bag is made of it: {REPAIR}') from error
+        raise InputError('E-BAG-DAMAGED',
+                         f'{source} is damaged and cannot be copied: {REPAIR}') from error
 
 
 def _declared(writer: Writer, connection: Connection) -> Connection:
@@ -220,27 +223,31 @@ def _declared(writer: Writer, connection: Connection) -> Connection:
                                      **common)
     types = types_of(Stores.ROS2_JAZZY)
     if connection.msgtype not in types.types:
-        raise InputError(f'the bag does not say what a {connection.msgtype} is (topic '
-                         f"{connection.topic}): convert it on a machine that has that type with "
-                         f"'ros2 bag convert'")
+        raise InputError('E-BAG-TYPE-UNKNOWN', f'the bag does not define the message type '
+                         f'{connection.msgtype} (topic {connection.topic}): convert the bag with '
+                         f"'ros2 bag convert' on a machine where that type is installed")
     return writer.add_connection(connection.topic, connection.msgtype, typestore=types, **common)
 
 
 @contextmanager
 def _opened(source: str | os.PathLike[str], image_topic: str | None) -> Iterator[Reader2]:
     if image_topic is None:
-        raise InputError(f'{source} is no bag: only of a bag a bag can be made')
+        raise InputError('E-BAG-REQUIRED',
+                         f'{source} is not a bag, and a bag with camera_info can '
+                         f'only be made from a bag: use a bag as input')
     path = Path(source)
     if path.suffix == '.bag' or (path.is_dir() and not any(path.glob('*.yaml'))
                                  and any(path.glob('*.bag'))):
-        raise InputError(f'{source} is a ROS 1 bag: convert it first (rosbags-convert)')
+        raise InputError('E-BAG-ROS1',
+                         f'{source} is a ROS 1 bag: convert it first (rosbags-convert)')
     with ExitStack() as opened:
         try:
             _check_limits(path)
             opened.enter_context(WITHIN_LIMIT)
             reader = opened.enter_context(Reader2(path))
         except Exception as error:  # a damaged file makes rosbags raise nearly anything
-            raise InputError(f'{source} cannot be copied ({error}): {REPAIR}') from error
+            raise InputError('E-BAG-DAMAGED',
+                             f'{source} cannot be copied ({error}): {REPAIR}') from error
         _checked_topic(source, image_topic)
         yield reader
 
@@ -251,8 +258,8 @@ def _checked_topic(source: str | os.PathLike[str], image_topic: str) -> str:
     wrong = [each.msgtype for each in open_bag(Path(source)).topics
              if each.name == topic and each.msgtype not in CAMERA_INFOS]
     if wrong:
-        raise InputError(f'{source} has {wrong[0]} on {topic}, where camera_info belongs: '
-                         f'rename that topic')
+        raise InputError('E-BAG-TOPIC-TAKEN', f'{source} has {wrong[0]} messages on {topic}, the '
+                         f'topic of camera_info: rename that topic')
     return topic
 
 
@@ -266,7 +273,7 @@ def _check_limits(path: Path) -> None:
 
 
 def _refuse(damage: str) -> None:
-    raise InputError(damage)
+    raise InputError('E-BAG-DAMAGED', damage)
 
 
 def _camera_info(c: RosCamera, header: Any) -> bytes:

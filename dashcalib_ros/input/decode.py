@@ -162,8 +162,9 @@ def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) ->
         return _to_8_bits(pixels, depth)
     layout = _LAYOUTS.get(str(message.encoding).lower())
     if layout is None:
-        raise InputError(f'encoding {message.encoding!r} is not supported: '
-                         f'publish mono8, bgr8, rgb8, yuv422 or a bayer encoding')
+        raise InputError('E-IMAGE-ENCODING',
+                         f'the encoding {message.encoding!r} is not supported: '
+                         f'publish mono8, bgr8, rgb8, yuv422 or a Bayer encoding')
     colour = colour and bool(layout.conversion)
     pixels = _pixels(message, layout, colour)
     if layout.conversion and (colour or not layout.planar):
@@ -189,11 +190,12 @@ def _name(message: Any) -> str:
     """Return a name for messages about a CompressedImage; raises InputError for other formats."""
     name = ' '.join(str(message.format).split())
     if 'compresseddepth' in name.lower():
-        raise InputError(f'format {name!r} is a depth image: choose the topic of a camera image')
+        raise InputError('E-IMAGE-DEPTH',
+                         f'{name!r} is a depth image: choose the topic of a camera image')
     if any(video in name.lower() for video in _VIDEO_FORMATS):
-        raise InputError(f'format {name!r} is a video, of which no picture stands alone: set '
-                         f'image_transport:=video, or republish it as jpeg (image_transport '
-                         f'republish)')
+        raise InputError('E-IMAGE-VIDEO', f'{name!r} is a video, and one packet of it is not a '
+                         f'complete image: set image_transport:=video, or republish it as JPEG '
+                         f'(image_transport republish)')
     return f'{name or "compressed"} image'
 
 
@@ -207,7 +209,7 @@ def decode_file(data: bytes | memoryview, depth: BitDepth | None = None,
 
 
 def turned_text(data: bytes, what: str) -> str:
-    """Return what a file says to do with its picture, and decode_file() does; '' for nothing."""
+    """Return how decode_file() turns the picture by its EXIF orientation; '' for not at all."""
     if not any(mark in data for mark in _EXIF):
         return ''
     try:
@@ -216,8 +218,8 @@ def turned_text(data: bytes, what: str) -> str:
         return ''
     turns = [90 * n for n in range(4) if np.array_equal(np.rot90(stored, -n), shown)]
     if not turns:
-        return 'mirror its pictures'
-    return f'turn its pictures by {turns[0]} degrees' if turns[0] else ''
+        return 'mirrored'
+    return f'rotated by {turns[0]} degrees' if turns[0] else ''
 
 
 def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = False,
@@ -236,7 +238,7 @@ def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = 
     head, tail = buffer[:2].tobytes(), buffer[-4096:].tobytes()
     if head == _JPEG_START and _JPEG_END not in tail:
         # OpenCV would fill the rest with grey
-        raise InputError(f'{what} is cut off: record or copy it again')
+        raise InputError('E-IMAGE-TRUNCATED', f'{what} is truncated: record or copy it again')
     try:
         image = cv2.imdecode(
             buffer, cv2.IMREAD_ANYDEPTH
@@ -247,7 +249,8 @@ def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = 
     if image is None:
         raise _damaged(what, buffer.size)
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f'{what} has {image.dtype} pixels: save it with 8 or 16 bits')
+        raise InputError('E-IMAGE-PIXELS',
+                         f'{what} has {image.dtype} pixels: save it with 8 or 16 bits per channel')
     return np.asarray(image)
 
 
@@ -279,19 +282,20 @@ def _check_parts(data: bytes, what: str) -> None:
         entries = _tiff_entries(data)
         # each is read for itself, also where many name the same bytes
         if sum(count * TIFF_BYTES.get(kind, 1) for _, kind, count, _ in entries) > 2 * len(data):
-            raise InputError(f'{what} is damaged: its directory names more than it has; save it '
-                             f'anew')
+            raise InputError('E-IMAGE-DAMAGED',
+                             f'{what} is damaged: its directory lists more data '
+                             f'than the file has; save it again')
 
 
 def _check_count(count: int, limit: int, parts: str, what: str) -> None:
     if count > limit:
-        raise InputError(f'{what} has more than {limit} {parts}, which takes too long to decode: '
-                         f'save it anew')
+        raise InputError('E-IMAGE-COMPLEX', f'{what} has more than {limit} {parts} and takes too '
+                         f'long to decode: save it again')
 
 
 def _damaged(what: str, size: int) -> InputError:
-    return InputError(f'{what} is damaged or of an unknown kind ({size} bytes): record it again, '
-                      f'as jpeg or png')
+    return InputError('E-IMAGE-DAMAGED', f'{what} is damaged or has an unknown format ({size} '
+                      f'bytes): record it again as JPEG or PNG')
 
 
 def _pixels(message: Any, layout: _Layout, colour: bool) -> Pixels:
@@ -306,8 +310,8 @@ def _pixels(message: Any, layout: _Layout, colour: bool) -> Pixels:
     fits = data.size >= step * height if layout.planar else data.size == step * height
     if step < row or not fits:
         raise InputError(
-            f'an image says {width}x{height} {message.encoding} with step {step} but has '
-            f'{data.size} bytes: the camera driver or the recording is broken')
+            'E-IMAGE-LAYOUT', f'an image of {width}x{height} pixels, {message.encoding}, step '
+            f'{step} cannot have {data.size} bytes: check the camera driver or the recording')
     height = min(height * 3 // 2, data.size // step) if layout.planar and colour else height
     rows = data[:step * height].reshape(height, step)[:, :row]
     if layout.bits == 16:
@@ -323,8 +327,9 @@ def _convert(pixels: Pixels, conversion: str) -> Pixels:
     try:
         return np.asarray(cv2.cvtColor(plain, getattr(cv2, f'COLOR_{conversion}')))
     except cv2.error as error:
-        raise InputError(f'an image of {plain.shape[1]}x{plain.shape[0]} cannot be converted: '
-                         f'publish mono8 or bgr8 ({error.err})') from error
+        raise InputError('E-IMAGE-CONVERSION', f'an image of {plain.shape[1]}x{plain.shape[0]} '
+                         f'pixels cannot be converted ({error.err}): publish mono8 or bgr8'
+                         ) from error
 
 
 def _to_8_bits(image: Pixels, depth: BitDepth | None) -> Pixels:
@@ -345,19 +350,20 @@ def read_mask(path: Path) -> Mask:
     try:
         mask: Mask = decode_pixels(data) > 0
     except InputError as error:
-        raise InputError(f'{what} is no picture that can be used ({error}); give a PNG, black '
-                         'where the image is not to be used') from error
+        raise InputError(error.code, f'{what} cannot be used ({error}); use a PNG that is black '
+                         'where the images must be ignored') from error
     if not mask.any():
-        raise InputError(f'the mask {path} is all black, nothing is left of the image; '
-                         'make the part to use white')
+        raise InputError('E-MASK-BLACK',
+                         f'{what} is entirely black, so that nothing of the images '
+                         f'is left; make the part to use white')
     return mask
 
 
 def check_mask(mask: Mask | None, size: tuple[int, int]) -> None:
     """Raise InputError unless the mask is as large as images of this (width, height)."""
     if mask is not None and (own := mask.shape[::-1]) != size:
-        raise InputError(f'the mask is {own[0]}x{own[1]} and the images are '
-                         f'{size[0]}x{size[1]}; make the mask as large as the images')
+        raise InputError('E-MASK-SIZE', f'the mask has {own[0]}x{own[1]} pixels and the images '
+                         f'have {size[0]}x{size[1]}; make the mask as large as the images')
 
 
 Size = tuple[int, int]

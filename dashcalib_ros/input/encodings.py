@@ -73,14 +73,16 @@ def message_of(kind: str, encoding: str, raw: bytes, schema: bytes = b'') -> Any
         return _of_foxglove(kind, partial(getattr, message))
     if encoding == JSON:
         if len(raw) > JSON_MESSAGE_BYTES:
-            raise InputError(f'more than {JSON_MESSAGE_BYTES / 2**20:.0f} MB of JSON: record it '
-                             f'in another encoding')
+            raise InputError('E-MESSAGE-TOO-LARGE', f'it has more than '
+                             f'{JSON_MESSAGE_BYTES / 2**20:.0f} MB of JSON: record it in another '
+                             f'encoding')
         return _of_foxglove(kind, json.loads(raw).__getitem__)
     if encoding == ROS1:
         return _as_ros(types(Stores.ROS1_NOETIC).deserialize_ros1(raw, kind))
     if encoding == CDR:
         return _as_ros(types(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind))
-    raise InputError(f'the encoding {encoding} is not read here')
+    raise InputError('E-MESSAGE-ENCODING', f'the encoding {encoding} is not supported: record it '
+                     f'as {", ".join(ENCODINGS)}')
 
 
 def _of_foxglove(kind: str, value_of: Callable[[str], Any]) -> Any:
@@ -112,7 +114,8 @@ def types(store: Stores) -> Typestore:
 def _protobuf_class(name: str, schema: bytes) -> Any:
     """Return the class of a bag's protobuf messages. schema: a FileDescriptorSet, or nothing."""
     if len(schema) > YAML_BYTES:
-        raise InputError('its schema is too large')
+        raise InputError('E-MESSAGE-TOO-LARGE', 'its schema is too large: record it in another '
+                         'encoding')
     pool = descriptor_pool.DescriptorPool()
     files = {file.name: file for file in
              (*descriptor_pb2.FileDescriptorSet.FromString(schema).file, *([] if schema else [

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, counted
 from dashcalib_ros.input.source import (
     IMAGE_SUFFIXES,
     METADATA,
@@ -70,26 +70,28 @@ Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
                 start_s: float = 0.0, duration_s: float | None = None) -> FrameSource:
-    """Open a drive; its path tells the kind of input.
+    """Open a recorded drive. The kind of input is detected from the content of the files.
 
-    path: a ROS 2 bag (folder, .mcap, .db3, zstd or not), a ROS 1 .bag, a video file, or a folder
-    of images, which are taken in the order of their names (2.png before 10.png). Also several of
-    these, of one camera: a sequence, taken in its order; a folder of videos or bags, or a pattern
-    (drives/*.mp4): in the order that the camera's maker gives their names, else of the times at
-    which they were recorded, else of their names; a warning says which. No turn spans two of them
-    unless they go on; one that cannot be read is left out, with a warning.
-    topic: the image topic of a bag; needed only when it has several. Of a video with several
-    streams, the number of one: '2'.
-    fps: images per second of a folder (default 10), or instead of what a video says (Hz).
-    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
+    path: a ROS 2 bag (folder, .mcap, .db3, with or without zstd), a ROS 1 .bag, a video file, or a
+    folder of images, ordered by name (2.png before 10.png). Several of these are one drive of one
+    camera: a sequence, in its own order, or a folder of videos or bags, or a pattern
+    (drives/*.mp4). The files of a folder or a pattern are ordered by the naming rule of the
+    camera's maker, otherwise by time of recording, otherwise by name; a warning states which rule
+    was used. A turn spans two files only if the second one continues the first one. A file that
+    cannot be read is skipped, with a warning.
+    topic: the image topic of a bag, needed only if the bag has several; or the number of a stream
+    of a video ('2').
+    fps: image rate in Hz, of a folder (default 10), or to replace the time stamps of a video.
+    start_s, duration_s: part of the drive to use, in seconds; None: up to its end.
 
-    Raises InputError when there is nothing to read, or several topics and no choice among them.
+    Raises InputError if there is nothing to read, or if the topic is ambiguous.
     """
     _check_numbers(fps, start_s, duration_s)
     given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
     groups = [_expanded(os.fspath(each)) for each in given]
     if not groups:
-        raise InputError('no input was given: name a bag, a video or a folder of images')
+        raise InputError('E-INPUT-MISSING',
+                         'no input was given: pass a bag, a video or a folder of images')
     if len(groups) == 1 and len(groups[0].paths) == 1:
         source = _open_one(groups[0].paths[0], topic, fps)
     else:
@@ -99,11 +101,13 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
 
 def _check_numbers(fps: float | None, start_s: float, duration_s: float | None) -> None:
     if fps is not None and not (math.isfinite(fps) and 0 < fps <= 1000):
-        raise InputError(f'fps must be above 0 and at most 1000, not {fps!r}')
+        raise InputError('E-INPUT-FPS',
+                         f'fps must be greater than 0 and at most 1000 Hz, not {fps!r}')
     if not (math.isfinite(start_s) and start_s >= 0):
-        raise InputError(f'the start must be 0 s or later, not {start_s!r}')
+        raise InputError('E-INPUT-START', f'the start must be 0 s or later, not {start_s!r}')
     if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
-        raise InputError(f'the duration must be above 0 s, not {duration_s!r}')
+        raise InputError('E-INPUT-DURATION',
+                         f'the duration must be greater than 0 s, not {duration_s!r}')
 
 
 @dataclass(frozen=True)
@@ -123,14 +127,14 @@ def _expanded(text: str) -> _Group:
         if path.is_dir():
             return _in_folder(path)
     except OSError as error:
-        raise InputError(os_error(path, error)) from error
+        raise os_error(path, error) from error
     if path.exists() or not glob.has_magic(text):
         return _Group(text, [path])
     found = sorted(named_like(text), key=lambda each: by_name(str(each)))
     known = _without_previews([each for each in found if _opener_of(each) is not None])
     if not known:
-        raise InputError(_unknown(found[0]) if found else
-                         f'no file is named like {text}: check the pattern')
+        raise (_unknown(found[0]) if found else
+               InputError('E-INPUT-NO-MATCH', f'no file matches {text}: check the pattern'))
     return _Group(text, known, len(found) - len(known))
 
 
@@ -146,7 +150,9 @@ def named_like(pattern: str) -> Iterator[Path]:
             if not any(map(_is_hidden, found.parts)) or any(map(_is_hidden, path.parts)):
                 yield found
     except ValueError as error:
-        raise InputError(f'{pattern} is no pattern ({error})') from error
+        raise InputError('E-INPUT-PATTERN',
+                         f'{pattern} is not a valid pattern ({error}): correct it'
+                         ) from error
 
 
 def _is_hidden(part: str) -> bool:
@@ -171,32 +177,34 @@ def _in_folder(folder: Path) -> _Group:
 def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> FrameSource:
     """Open all recordings of all groups as one drive; those that cannot be read are left out."""
     parts: list[FrameSource] = []
-    warnings = [f'{group.where}: left out {group.others} other file{"s" * (group.others > 1)}'
+    warnings = [f'{group.where}: {counted(group.others, "other file")} skipped'
                 for group in groups if group.others]
-    failures: list[str] = []
+    failures: list[InputError] = []
     for group in groups:
         opened = []
         for path in group.paths:
             try:
                 opened.append(_open_one(path, topic, fps))
             except InputError as error:
-                failures.append(str(error))
+                failures.append(error)
         if len(opened) > 1:
             opened, by = _ordered(opened)
             if (cameras := _cameras(opened)) > 1:
-                raise InputError(f'{group.where} has recordings of {cameras} cameras '
-                                 f'({_listed(opened)}): give a pattern that names one')
-            warnings.append(f'{group.where}: {len(opened)} files by {by}: {_listed(opened)}')
+                raise InputError('E-INPUT-SEVERAL-CAMERAS', f'{group.where} has recordings of '
+                                 f'{cameras} cameras ({_listed(opened)}): use a pattern that '
+                                 f'matches the files of one camera')
+            warnings.append(f'{group.where}: {len(opened)} files, ordered by {by}: '
+                            f'{_listed(opened)}')
         parts += opened
     if len(parts) == len(groups):
         ordered, by = _ordered(parts)
         if by in MAKERS and ordered != parts:
-            warnings.append(f'the files are taken in the order in which they were given; by {by} '
-                            f'it is {_listed(ordered)}: give their folder for that')
+            warnings.append(f'the files are used in the order of the arguments; ordered by {by} '
+                            f'they are {_listed(ordered)}: pass their folder for that order')
     if not parts:
         more = f' (and {len(failures) - 1} more like it)' if len(failures) > 1 else ''
-        raise InputError(f'none of the files can be read: {failures[0]}{more}')
-    return JoinedSource(parts, (*warnings, *(f'one of the files is left out: {each}'
+        raise InputError(failures[0].code, f'none of the files can be read: {failures[0]}{more}')
+    return JoinedSource(parts, (*warnings, *(f'one of the files is skipped: {each}'
                                              for each in failures)))
 
 
@@ -235,16 +243,16 @@ def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
         if not place.is_dir():
             check_file(place)
             if place.stat().st_size == 0:
-                raise InputError(f'{place} is empty: the recording or the copy failed; make it '
-                                 f'again')
+                raise InputError('E-FILE-EMPTY', f'{place} is empty, because the recording or the '
+                                 f'copy failed: record or copy it again')
             with place.open('rb'):
-                pass  # what may not be read is told in our own words
+                pass  # a missing permission is reported in our own words
         opener = _opener_of(place)
         if opener is None:
-            raise InputError(_unknown(place))
+            raise _unknown(place)
         return opener(place, topic, fps)
     except OSError as error:
-        raise InputError(os_error(place, error)) from error
+        raise os_error(place, error) from error
 
 
 def _opener_of(path: Path) -> Callable[[Path, str | None, float | None], FrameSource] | None:
@@ -307,28 +315,28 @@ class FolderSource(FrameSource):
         self._path = path
         self._names = sorted(filter(_is_image, names), key=by_name)
         if not self._names:
-            raise InputError(_no_images(path, names))
+            raise _no_images(path, names)
         if (cameras := cameras_named(self._names)) > 1:
-            raise InputError(f'{path} has pictures of {cameras} cameras '
-                             f'({first_of(self._names)}): put those of one into a folder of '
-                             f'their own')
+            raise InputError('E-INPUT-SEVERAL-CAMERAS', f'{path} has images of {cameras} cameras '
+                             f'({first_of(self._names)}): put the images of one camera into a '
+                             f'separate folder')
         self._fps = fps or DEFAULT_FPS
         warnings = []
         if fps is None:
-            warnings.append(f'{path} is taken as {DEFAULT_FPS:g} images per second: '
-                            f'give --fps if it is not')
+            warnings.append(f'{path} has no image rate, and {DEFAULT_FPS:g} images per second are '
+                            f'assumed: specify another rate with --fps')
         if topic is not None:
-            warnings.append(f'{path} is a folder of images: topic {topic} is ignored')
+            warnings.append(f'{path} is a folder of images: the topic {topic} is ignored')
         if turned := self._turned():
-            warnings.append(f'{path} says (EXIF) to {turned}: the calibration is for the pictures '
-                            f'as they are shown so')
+            warnings.append(f'{path} has images that are {turned} by their EXIF orientation: the '
+                            f'calibration is valid for the images as they are shown')
         super().__init__(str(path), len(self._names), warnings=tuple(warnings))
         self.length_ns = round(len(self._names) * 1e9 / self._fps)
 
     def _turned(self) -> str:
-        """Return what the first picture says to do with it, in words; '' for nothing."""
+        """Return how the first picture is turned when it is shown; '' for not at all."""
         from dashcalib_ros.input.decode import turned_text
-        with suppress(InputError):  # told when it is read
+        with suppress(InputError):  # raised again when it is read
             return turned_text(read_file(self._path / self._names[0], PICTURE_BYTES), '')
         return ''
 
@@ -350,32 +358,35 @@ def _is_image(name: str) -> bool:
     return Path(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith('.')
 
 
-def _no_images(path: Path, names: list[str]) -> str:
+def _no_images(path: Path, names: list[str]) -> InputError:
     if not names:
-        return f'{path} is empty: give a folder of images, a bag or a video'
-    return (f'{path} has no images (png, jpg, bmp, tif, pgm, ppm, webp) and is no bag: '
-            f'it has {first_of(sorted(names))}; give the folder or the file that has them')
+        return InputError('E-FOLDER-EMPTY',
+                          f'{path} is empty: pass a folder of images, a bag or a video')
+    return InputError('E-FOLDER-NO-IMAGES', f'{path} has no images (png, jpg, bmp, tif, pgm, ppm, '
+                      f'webp) and is not a bag: it has {first_of(sorted(names))}; pass the folder '
+                      f'or the file with the images')
 
 
 def _check_recorded(text: str) -> None:
     """Raise InputError for a live stream: a drive is read from its beginning to its end."""
     if re.match(r'[a-z][a-z0-9+.-]+://', text, re.IGNORECASE):
         raise InputError(
-            f'{text} is a stream: record it first (ffmpeg -i {text} -c copy -t 900 drive.mp4) and '
-            f'give that file, or publish it in ROS and run the node (ros2 run dashcalib_ros '
-            f'calibrator)')
+            'E-INPUT-STREAM', f'{text} is a stream: record it first (ffmpeg -i {text} -c copy -t '
+            f'900 drive.mp4) and pass that file, or publish it in ROS and run the node (ros2 run '
+            f'dashcalib_ros calibrator)')
     if re.match(r'/dev/video\d', text):
         raise InputError(
-            f'{text} is a live camera: record it first (ffmpeg -f v4l2 -i {text} -t 900 '
-            f'drive.mp4) and give that file, or run v4l2_camera and the node (ros2 run '
-            f'dashcalib_ros calibrator)')
+            'E-INPUT-LIVE-CAMERA', f'{text} is a live camera: record it first (ffmpeg -f v4l2 -i '
+            f'{text} -t 900 drive.mp4) and pass that file, or run v4l2_camera and the node (ros2 '
+            f'run dashcalib_ros calibrator)')
 
 
-def _unknown(path: Path) -> str:
+def _unknown(path: Path) -> InputError:
     if _has_image_name(path):
-        return f'{path} is a single image: give the folder of all images of the drive'
-    return (f'{path} is no kind of drive known here: give a bag (.mcap, .db3, .bag), '
-            f'a video (.mp4, .avi, .mkv ...) or a folder of images')
+        return InputError('E-INPUT-SINGLE-IMAGE', f'{path} is a single image: pass the folder of '
+                          f'all images of the drive')
+    return InputError('E-INPUT-UNKNOWN', f'{path} is not a recorded drive: pass a bag (.mcap, '
+                      f'.db3, .bag), a video (.mp4, .avi, .mkv ...) or a folder of images')
 
 
 # a later recording that begins within this goes on with the one before; split bags do
@@ -402,8 +413,9 @@ class JoinedSource(FrameSource):
         for name, size in sized:
             if size != sized[0][1]:
                 raise InputError(
-                    f'{name} is {by(size)} and {sized[0][0]} is {by(sized[0][1])}: a calibration '
-                    f'holds for one size; calibrate each size on its own')
+                    'E-IMAGE-SIZE-CHANGES', f'{name} has {by(size)} pixels and {sized[0][0]} has '
+                    f'{by(sized[0][1])}: a calibration is valid for one image size; calibrate '
+                    f'each size separately')
         if sized and len(stored := {part.stored_size for part in self._parts}) == 1:
             self.size, [self.stored_size] = sized[0][1], stored
         counts = [part.count for part in self._parts]
@@ -425,7 +437,7 @@ class JoinedSource(FrameSource):
                 with closing(place.pictures(part, inner)) as pictures:
                     yield from pictures
             except (InputError, OSError) as error:
-                reading.warnings.append(f'{part.name} is left out from image {inner.images} on: '
+                reading.warnings.append(f'{part.name} is skipped from image {inner.images} on: '
                                         f'{error}')
             told.append((part.name, inner.summary()))
             place.index += inner.images

@@ -2,7 +2,7 @@
 
 A stream's stamps are seconds since the drive's first image, on the sensor's own clock: how far
 that is off is found later, from the turns (judge/witnesses.py). A stream that cannot be used is
-None, and a warning says why: it never costs the calibration.
+None, and a warning states the reason: the calibration goes on without it.
 """
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, counted
 
 # s; stamps beyond it are times of day, since 1970
 EPOCH_S = 1e8
@@ -70,12 +70,12 @@ class Samples:
 
 @dataclass(frozen=True)
 class SensorStream:
-    """What sensors say of a drive; each None where there is none of its kind.
+    """Motion sensor data of a drive; each is None if there is no such sensor.
 
     rate: (n, 3) rad/s about the sensor's own three axes, in any mounting. speed: (n, 1) m/s.
     position: (n, 3) m, east, north and up from the first. Stamps: s since the drive's first
     image; absolute: since 1970, as bags and GPX have them.
-    warnings: what was left out, one line each.
+    warnings: what was skipped, one line each.
     """
 
     rate: Samples | None = None
@@ -120,8 +120,8 @@ class SensorStream:
         if start_s > EPOCH_S or first <= EPOCH_S:
             return replace(self.shifted(-start_s), absolute=False)
         return replace(self.shifted(start_s - first), absolute=False, warnings=(
-            *self.warnings, 'the pictures have no time of day: the first sample of the motion '
-                            'sensors is taken to be of the first image'))
+            *self.warnings, 'the images have no time of day: the first sample of the motion '
+                            'sensors is assigned to the first image'))
 
 
 def in_seconds(stamps: Floats, what: str) -> tuple[Floats, tuple[str, ...]]:
@@ -137,10 +137,12 @@ def in_seconds(stamps: Floats, what: str) -> tuple[Floats, tuple[str, ...]]:
         step = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
     for name, unit in UNITS.items():
         if EPOCH_S < size * unit <= LATEST_S and step * unit <= LONGEST_STEP_S:
-            return stamps * unit, (f'the stamps of {what} are taken as {name} since 1970',)
+            return stamps * unit, (
+                f'the time stamps of {what} are interpreted as {name} since 1970',)
     if size > LATEST_S:
-        raise InputError(f'{what} has stamps such as {known[0]:.10g}, which are no seconds, '
-                         f'milliseconds, microseconds or nanoseconds since 1970; write seconds')
+        raise InputError('E-STAMP-UNIT', f'{what} has time stamps such as {known[0]:.10g}, which '
+                         f'are not seconds, milliseconds, microseconds or nanoseconds since 1970; '
+                         f'write seconds')
     return stamps, ()
 
 
@@ -160,8 +162,8 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
             nowhere = _nowhere(rows)
             stamps_s, rows = stamps_s[~nowhere], local_metres(*rows[~nowhere].T)
             if nowhere.any():
-                warnings.append(f'{nowhere.sum()} positions of {what} are left out: they are 0, 0 '
-                                f'or no place on Earth, as a GPS gives them without a fix')
+                warnings.append(f'{counted(int(nowhere.sum()), "position")} of {what} skipped: '
+                                f'0, 0 or not on Earth, as a GPS sends them without a fix')
         # whole seconds of a GPS at 10 Hz: the first one is at its time
         with np.errstate(invalid='ignore'):
             again = np.diff(stamps_s, prepend=np.nan) == 0
@@ -170,8 +172,8 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
             stamps_s, rows = stamps_s[~again], rows[~again]
         samples, trouble = _cleaned(stamps_s, rows, kind)
         if thinned and samples is not None:
-            warnings.append(f'of the {NAMES[kind]} of {what} several have one stamp: the first of '
-                            f'each is used')
+            warnings.append(f'several {NAMES[kind]} of {what} have the same time stamp: the first '
+                            f'one of each is used')
         if trouble:
             warnings.append(f'the {NAMES[kind]} of {what} are not used: {trouble}')
         if samples is not None:
@@ -201,13 +203,13 @@ def _cleaned(stamps_s: Floats, values: Floats, kind: str) -> tuple[Samples | Non
     good &= ahead > latest
     count = int(good.sum())
     if count < max(LEAST_SAMPLES if kind == 'rate' else 2, (1 - DAMAGED) * len(good)):
-        return None, f'{len(good) - count} of {len(good)} are damaged, doubled or out of order'
+        return None, f'{len(good) - count} of {len(good)} are damaged, repeated or out of order'
     samples = Samples(stamps_s[good], values[good])
     if kind == 'rate' and np.percentile(np.abs(samples.values), QUANTILE) > FASTEST_TURN:
-        return None, (f'no car turns at {np.percentile(np.abs(samples.values), QUANTILE):.0f} '
-                      f'rad/s; write rad/s, not degrees a second')
+        return None, (f'{np.percentile(np.abs(samples.values), QUANTILE):.0f} rad/s is too fast '
+                      f'for a car; write rad/s, not degrees per second')
     if kind == 'position' and not np.ptp(samples.values, axis=0).max() < FARTHEST_M:
-        return None, 'they are not of one drive'
+        return None, 'they are too far apart for one drive'
     return samples, ''
 
 

@@ -67,10 +67,9 @@ ANOTHER_CLOCK_S, LATE_MESSAGES = 60.0, 9
 
 
 def read_motion(path: Path) -> SensorStream:
-    """Read what sensors say of a drive from a CSV, a GPX, a KITTI oxts folder, or a video.
+    """Read the motion sensors of a drive from a CSV, a GPX, a KITTI oxts folder or a video.
 
-    Raises InputError for what is none of these. What is damaged inside is left out, with a
-    warning in the stream.
+    Raises InputError for other files. Damaged samples are skipped, with a warning in the stream.
     """
     if path.is_dir():
         return _oxts(path)
@@ -101,8 +100,8 @@ def _names(line: str) -> list[str]:
 def _csv(lines: Iterator[str], path: Path) -> SensorStream:
     names = _names(next(lines, ''))
     if STAMP_COLUMN not in names or len(set(names)) < len(names):
-        raise InputError(f'{path} is no CSV of motion sensors: its first line must name its '
-                         f'columns: {HEAD}; poses are given with --poses')
+        raise InputError('E-MOTION-HEADER', f'{path} is not a CSV of motion sensors: its first '
+                         f'line must contain the column names {HEAD}; for poses, use --poses')
     # only what is used: a file may have any number of columns
     used = [name for name in names if name in (STAMP_COLUMN, *chain(*COLUMNS.values()))]
     table = _table(lines, len(names), [names.index(name) for name in used])
@@ -117,15 +116,16 @@ def _csv(lines: Iterator[str], path: Path) -> SensorStream:
         elif len(there) == len(wanted):
             rows = np.stack([column[name] for name in wanted], axis=1)
         elif there:
-            raise InputError(f'{path} has only {", ".join(there)} of {", ".join(wanted)}: write '
-                             f'all of them')
+            raise InputError('E-MOTION-COLUMNS', f'{path} has only {", ".join(there)} of '
+                             f'{", ".join(wanted)}: write all of them')
         else:
             continue
         # sensors of different rates leave cells empty; a line without a stamp is damaged
         known = ~np.isnan(rows[:, :2]).all(axis=1) | ~np.isfinite(stamps)
         values[kind] = stamps[known], rows[known]
     if not values:
-        raise InputError(f'{path} has no column of a sensor: its first line must name {HEAD}')
+        raise InputError('E-MOTION-HEADER', f'{path} has no sensor column: its first line must '
+                         f'contain the column names {HEAD}')
     late = stamps[np.isfinite(stamps)]
     found = sensor_stream(values, str(path), bool(len(late) and late[0] > EPOCH_S))
     return replace(found, warnings=(*warnings, *found.warnings))
@@ -213,11 +213,12 @@ def _gpx(text: str, path: Path) -> SensorStream:
             parser.feed(text[start:start + GPX_PIECE])
         parser.close()
     except (ElementTree.ParseError, ValueError) as error:
-        raise InputError(f'{path} is no valid GPX ({shortened(str(error))}): export the track '
-                         f'anew') from error
+        raise InputError('E-MOTION-GPX', f'{path} is not valid GPX ({shortened(str(error))}): '
+                         f'export the track again') from error
     rows = np.array(points.rows).reshape(-1, 4)
     if len(rows) < 2:
-        raise InputError(f'{path} has no track with times: export it with them')
+        raise InputError('E-MOTION-NO-TIMES',
+                         f'{path} has no track with time stamps: export it with time stamps')
     return sensor_stream({'position': (rows[:, 0], rows[:, 1:])}, str(path), absolute=True)
 
 
@@ -226,12 +227,13 @@ def _inside_video(path: Path) -> SensorStream:
     try:
         check_file(path, f'the video {path}')
     except OSError as error:
-        raise InputError(os_error(path, error)) from error
+        raise os_error(path, error) from error
     try:
         import telemetry_parser
     except ImportError as error:
-        raise InputError(f"{path} is a video, whose gyro and GPS telemetry-parser reads: pip "
-                         f"install 'dashcalib_ros[motion]'") from error
+        raise InputError('E-MOTION-PARSER',
+                         f'{path} is a video, and telemetry-parser is needed to '
+                         f"read its gyro and GPS: pip install 'dashcalib_ros[motion]'") from error
     values: dict[str, tuple[Floats, Floats]] = {}
     try:
         parser = telemetry_parser.Parser(str(path))
@@ -247,8 +249,8 @@ def _inside_video(path: Path) -> SensorStream:
     except (KeyboardInterrupt, SystemExit, MemoryError):
         raise
     except BaseException as error:  # the library's own panics are no Exception
-        raise InputError(f'{path} has no motion data that can be read '
-                         f'({shortened(one_line(error))}): give a CSV or a GPX') from error
+        raise InputError('E-MOTION-VIDEO', f'{path} has no readable motion data '
+                         f'({shortened(one_line(error))}): use a CSV or a GPX') from error
     return sensor_stream(values, str(path))
 
 
@@ -279,12 +281,14 @@ def _oxts(folder: Path) -> SensorStream:
     """Read oxts/ of a KITTI raw drive: timestamps.txt, and data/ with a file for each record."""
     inner = folder / 'oxts' if (folder / 'oxts').is_dir() else folder
     if not (inner / 'data').is_dir() or not (inner / 'timestamps.txt').exists():
-        raise InputError(f'{folder} is no folder of motion data known here: give a KITTI oxts '
-                         f'folder (timestamps.txt and data/), a CSV or a GPX')
+        raise InputError('E-MOTION-FOLDER',
+                         f'{folder} is not a folder of motion data: use a KITTI '
+                         f'oxts folder (timestamps.txt and data/), a CSV or a GPX')
     stamps = _kitti_stamps(inner / 'timestamps.txt')
     files = sorted(file for file in (inner / 'data').iterdir() if file.suffix == '.txt')
     if len(files) > OXTS_FILES or len(files) < 2:
-        raise InputError(f'{inner / "data"} has {len(files)} records: give a whole KITTI drive')
+        raise InputError('E-MOTION-KITTI', f'{inner / "data"} has {len(files)} records: use a '
+                         f'complete KITTI drive')
     rows = np.full((len(files), OXTS_VALUES), np.nan)
     for row, file in zip(rows, files, strict=True):
         if not file.is_file():
@@ -306,17 +310,18 @@ def _kitti_stamps(path: Path) -> Floats:
     """Return seconds from lines like 2011-09-26 13:02:25.964389445; NaN for other lines."""
     found = [_epoch_s(line) for line in islice(read_lines(path, MOTION_BYTES), OXTS_FILES)]
     if not found:
-        raise InputError(f'{path} has no stamps: give a whole KITTI drive')
+        raise InputError('E-MOTION-KITTI',
+                         f'{path} has no time stamps: use a complete KITTI drive')
     return np.array(found)
 
 
 def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
                images: str | None = None) -> SensorStream | None:
-    """Return what a bag's sensors say, on the clock of its images; None where it has none.
+    """Return the sensor data of a bag, on the clock of its images; None if it has none.
 
     chosen: topic by imu, gps and odom; None: the only one of its type. Of several without a choice
     none is used, and a warning lists them. images: their topic; None: the only one. Raises
-    InputError for a chosen topic that there is not.
+    InputError for a chosen topic that does not exist.
     """
     from dashcalib_ros.input.bag_storage import open_bag
     samples = SensorBuffer(SAMPLES + 1)
@@ -332,8 +337,10 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
                 if not found:
                     there = ', '.join(topic.name for topic in bag.topics
                                       if topic.msgtype in types) or 'none'
-                    raise InputError(f'{path} has no {option} topic {name!r} with messages of the '
-                                     f'type {" or ".join(types)}: there is {there}')
+                    raise InputError('E-BAG-TOPIC-UNKNOWN',
+                                     f'{path} has no {option} topic {name!r} '
+                                     f'with messages of the type {" or ".join(types)}: choose one '
+                                     f'of those that it has ({there})')
             if len(found) > 1:
                 names = ', '.join(topic.name for topic in found)
                 warnings.append(f'none of the {len(found)} {option} topics is used ({names}): '
@@ -344,9 +351,9 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
             elif found:
                 topics[found[0].name] = option
         later = _aligned(bag, tuple(topics), images)
-        warnings += [f'{name} is of another clock than the images, {abs(apart):.0f} s '
-                     f'{"behind" if apart > 0 else "ahead"}: the times of reception align them'
-                     for name, apart in later.items()]
+        warnings += [f'the clock of {name} is {abs(apart):.0f} s '
+                     f'{"behind" if apart > 0 else "ahead of"} the clock of the images: the times '
+                     f'of reception are used to align them' for name, apart in later.items()]
         for record in bag.records(tuple(topics), lambda _: None) if topics else ():
             try:
                 message = record.message()

@@ -23,15 +23,15 @@ THREADS = 2
 def codec_of(message: Any) -> str | None:
     """Return FFmpeg's name of the codec of a video's packet; None for a picture of its own.
 
-    Raises InputError for a packet whose codec is not read here.
+    Raises InputError for a packet whose codec is not supported.
     """
     packet = hasattr(message, 'pts')
     name = str(message.encoding if packet else getattr(message, 'format', ''))
     kind = name.lower().partition(';')[0]
     found = next((codec for part, codec in CODECS.items() if part in kind), None)
     if found is None and packet:
-        raise InputError(f'packets of {shortened(repr(name))} are not read here: publish h264 or '
-                         f'hevc')
+        raise InputError('E-VIDEO-CODEC', f'video packets of {shortened(repr(name))} are not '
+                         f'supported: publish h264 or hevc')
     return found
 
 
@@ -82,7 +82,8 @@ class PacketDecoder:
             frames: Sequence[av.VideoFrame] = self._context.decode(packet)
         except (av.FFmpegError, ValueError) as error:
             if self._begun:
-                raise InputError('a packet of the video is damaged: record it again') from error
+                raise InputError('E-VIDEO-PACKET',
+                                 'a packet of the video is damaged: record it again') from error
             frames = []
         found = []
         for frame in frames:

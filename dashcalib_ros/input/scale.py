@@ -38,7 +38,9 @@ class Scale:
         while size[0] / shrink > config.max_width:
             shrink *= 2
         if size[1] < shrink and shrink > 1:
-            raise InputError(f'the images are {size[0]}x{size[1]}: a camera has more rows')
+            raise InputError('E-IMAGE-SHAPE',
+                             f'the images have {size[0]}x{size[1]} pixels, too few '
+                             f'rows for a camera: check the input')
         wanted = -(-config.min_width // size[0])
         return cls(shrink, max(1, min(wanted, MOST, config.max_width // max(size))))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dashcalib_ros.arrays import GreyImage, Pixels
-from dashcalib_ros.errors import InputError, shortened
+from dashcalib_ros.errors import InputError, counted, shortened
 
 if TYPE_CHECKING:
     from dashcalib_ros.camera import Camera
@@ -77,28 +77,29 @@ def is_bag_file(name: str) -> bool:
     return name.lower().removesuffix('.zstd').removesuffix('.active').endswith(BAG_SUFFIXES)
 
 
-def os_error(path: Path, error: OSError) -> str:
-    """Return a message for an input that cannot be read, with the cure."""
+def os_error(path: Path, error: OSError) -> InputError:
+    """Return the error for an input that cannot be read."""
     if isinstance(error, FileNotFoundError):
-        return f'{path} does not exist: check the path'
+        return InputError('E-FILE-MISSING', f'{path} does not exist: check the path')
     if isinstance(error, PermissionError):
-        where = error.filename or path
-        return f'{where} may not be read: change its permissions (chmod a+rX) or its owner'
-    return f'{path} cannot be read ({error.strerror}): check the disk or copy it again'
+        return InputError('E-FILE-PERMISSION', f'no permission to read {error.filename or path}: '
+                          f'change its permissions (chmod a+rX) or its owner')
+    return InputError('E-FILE-UNREADABLE', f'{path} cannot be read ({error.strerror}): check the '
+                      f'disk, or copy it again')
 
 
 @dataclass(frozen=True)
 class Frame:
     """One image of the drive.
 
-    index: position among the input's frames, counted from 0.
-    stamp_ns: time of exposure in nanoseconds (the message header's stamp, or index / rate).
-    image: (height, width) uint8, grey. Never written to after the Frame is made.
-    frame_id: the message header's; empty where there is none.
-    after_gap: images are missing before it, or it is of another drive.
-    perhaps_after_gap: the first of another file that may or may not go on where the one before
-    ended, as the next video of a dashcam; how the picture moves tells (detect/continuity.py).
-    Raises InputError for a stamp that is no finite number of 64 bits.
+    index: position among the images of the input, counted from 0.
+    stamp_ns: time of exposure in nanoseconds (the stamp of the message header, or index / rate).
+    image: (height, width) uint8, grey. It is not changed after the Frame is created.
+    frame_id: that of the message header; empty if there is none.
+    after_gap: images are missing before this one, or it belongs to another drive.
+    perhaps_after_gap: first image of a file that may or may not continue the previous one, such as
+    the next video of a dashcam; detect/continuity.py decides from the motion of the image.
+    Raises InputError for a stamp that is not a finite number of 64 bits.
     """
 
     index: int
@@ -111,8 +112,8 @@ class Frame:
     def __post_init__(self) -> None:
         # NaN is in no range
         if not (isinstance(self.stamp_ns, Real) and -LAST_NS <= self.stamp_ns <= LAST_NS):
-            raise InputError(f'Frame.stamp_ns must be a number of nanoseconds, not '
-                             f'{shortened(repr(self.stamp_ns))}')
+            raise InputError('E-STAMP-INVALID', f'Frame.stamp_ns must be a number of nanoseconds '
+                             f'that fits into 64 bits, not {shortened(repr(self.stamp_ns))}')
 
     @property
     def size(self) -> tuple[int, int]:
@@ -147,38 +148,38 @@ class Reading:
     warnings: list[str] = field(default_factory=list)
     images: int = 0
     undecodable: int = 0
-    first_failure: str = ''
+    first_failure: InputError | None = None
 
     def failed(self, index: int, error: InputError, file: str = '') -> None:
         """Count an image that cannot be decoded."""
         self.undecodable += 1
         where = f'{file}: image {index}' if file else f'image {index}'
-        self.first_failure = self.first_failure or f'{where}: {error}'
+        self.first_failure = self.first_failure or InputError(error.code, f'{where}: {error}')
 
     def summary(self) -> tuple[str, ...]:
         """Return all warnings, one line each."""
-        skipped = ([f'{self.undecodable} undecodable images were skipped ({self.first_failure})']
-                   if self.undecodable else [])
+        skipped = ([f'{counted(self.undecodable, "undecodable image")} skipped '
+                    f'({self.first_failure})'] if self.undecodable else [])
         return (*self.warnings, *skipped)
 
 
 class FrameSource(ABC):
-    """The images of one drive: iterate over it, as often as you like, to get each Frame in turn.
+    """The images of one drive. Iterating yields each Frame in order; it may be repeated.
 
-    name: of the drive, for messages.
-    count: how many images to expect (for a progress bar), None if unknown.
-    topic: the bag's image topic; None for videos and folders.
-    size: (width, height) where it is known before the first image, else None. stored_size: that
-    of the pictures as they are stored, where their pixels are not square; else None.
-    length_ns: how long the drive is where its stamps are counted from 0, else None.
-    recorded: its stamps are times of recording, as a bag has them. begin_ns: when it began, None
-    where that is not known.
-    warnings: what the user should know about the input; complete after the last frame.
-    contradictions: those of them that may be why a drive teaches too little, with the cure.
+    name: name of the drive, for messages.
+    count: expected number of images (for a progress bar), None if unknown.
+    topic: image topic of a bag; None for videos and folders.
+    size: (width, height) in pixels if known before the first image, otherwise None. stored_size:
+    size of the stored images if their pixels are not square, otherwise None.
+    length_ns: length of the drive if its stamps start at 0, otherwise None.
+    recorded: the stamps are times of recording, as in a bag. begin_ns: start of the recording,
+    None if unknown.
+    warnings: what the user should know about the input, one line each; complete after the last
+    frame. contradictions: those that may explain why a drive is not sufficient, with the cure.
 
-    Frames are read one by one; no memory grows with the drive. Their stamps always increase.
-    Frame.index counts all images of the input, also those that were skipped.
-    Iterating raises InputError when no image can be decoded or when their size changes.
+    Frames are read one by one: memory does not grow with the drive. Their stamps always increase.
+    Frame.index counts all images of the input, including skipped ones.
+    Iterating raises InputError if no image can be decoded or if the image size changes.
     """
 
     size: tuple[int, int] | None = None
@@ -186,7 +187,7 @@ class FrameSource(ABC):
     length_ns: int | None = None
     recorded = False
     contradictions: tuple[str, ...] = ()
-    _cure = 'check that it plays in another program, or record it again'
+    _cure = 'check that another program can play it, or record it again'
     _start_ns = 0
     _duration_ns: int | None = None
 
@@ -244,7 +245,7 @@ class FrameSource(ABC):
         try:
             yield from self._frames(reading)
         except OSError as error:
-            raise InputError(os_error(Path(self.name), error)) from error
+            raise os_error(Path(self.name), error) from error
         finally:
             self._reading_warnings = reading.summary()
 
@@ -285,13 +286,14 @@ class FrameSource(ABC):
                 size = size or frame.size
                 if frame.size != size:
                     raise InputError(
-                        f'{picture.file or self.name}: image {frame.index} is {by(frame.size)}, '
-                        f'those before are {by(size)}: a calibration holds for one size; '
-                        f'split the drive there')
+                        'E-IMAGE-SIZE-CHANGES', f'{picture.file or self.name}: image '
+                        f'{frame.index} has {by(frame.size)} pixels and the images before it have '
+                        f'{by(size)}: a calibration is valid for one image size; split the drive '
+                        f'there')
                 after_gap = perhaps = False
                 yield frame
         if size is None:
-            raise InputError(self._no_image(reading))
+            raise self._no_image(reading)
 
     def _excerpted(self, reading: Reading) -> Generator[Picture, None, None]:
         """Yield the pictures from the excerpt's start to its end."""
@@ -304,15 +306,16 @@ class FrameSource(ABC):
                     return
                 yield picture
 
-    def _no_image(self, reading: Reading) -> str:
+    def _no_image(self, reading: Reading) -> InputError:
         if self._start_ns and not reading.undecodable and not reading.warnings:
-            return (f'{self.name} has no image from {self._start_ns / 1e9:g} s on: '
-                    f'give a smaller --start')
-        reasons = [reading.first_failure] if reading.first_failure else reading.warnings
-        why = '; '.join(reasons) or 'it has none'
-        # what is wrong with a picture has a cure of its own
-        cure = '' if reading.first_failure else f': {self._cure}'
-        return f'{self.name} gave no image ({why}){cure}'
+            return InputError('E-INPUT-START-LATE', f'{self.name} has no image from '
+                              f'{self._start_ns / 1e9:g} s on: use a smaller --start')
+        # what is wrong with an image has a cure of its own
+        if failure := reading.first_failure:
+            return InputError(failure.code, f'{self.name} has no readable image ({failure})')
+        why = '; '.join(reading.warnings)
+        return InputError('E-INPUT-NO-IMAGES', f'{self.name} has no readable image'
+                          f'{f" ({why})" if why else ""}: {self._cure}')
 
     @abstractmethod
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:

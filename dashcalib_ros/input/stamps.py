@@ -5,6 +5,8 @@ import statistics
 from collections import deque
 from itertools import pairwise
 
+from dashcalib_ros.errors import counted
+
 SECOND_NS = 1_000_000_000
 # a stamp further back means a clock that was set back (a bag that loops), not a late image
 SET_BACK_NS = SECOND_NS
@@ -70,8 +72,8 @@ class Comparison:
         for factor, units in WRONG_UNITS.items():
             if min(steps) >= 0 and abs(ratio / factor - 1) < ALIKE:
                 how = 'fast' if factor > 1 else 'slow'
-                return (f'the stamps run {max(factor, 1 / factor):.0f} times too {how}: the '
-                        f'driver writes {units}')
+                return (f'the time stamps run {max(factor, 1 / factor):.0f} times too {how}: '
+                        f'the driver writes {units}')
         # seconds that are rounded up while their fraction is not: 1 s too late, for a part of
         # each; or that stand still
         apart = [stamp - time - stamps[0] + came[0] for stamp, time in self._pairs]
@@ -80,8 +82,8 @@ class Comparison:
         if (falls >= FALLS and abs(falls - (came[-1] - came[0]) / SECOND_NS) <= 1
                 and all(abs(each - n * SECOND_NS) < LATE_NS
                         for each, n in zip(apart, seconds, strict=True))):
-            return (f'the stamps fall back by {-min(steps) / SECOND_NS:.1f} s once a second: the '
-                    f'driver gives them wrong seconds')
+            return (f'the time stamps jump back by {-min(steps) / SECOND_NS:.1f} s once per '
+                    f'second: the driver writes wrong seconds')
         return ''
 
 
@@ -140,16 +142,16 @@ class StampGate:
         """Return warnings about a recording's stamps for the user, one line each."""
         lines = []
         if self.unstamped:
-            lines.append('the image headers have no stamps: the times of reception were used')
+            lines.append('the image headers have no time stamps: the times of reception are used')
         if self.fault:
-            lines.append(f'{self.fault}; from there on the times of reception are used: repair '
-                         f'the driver')
+            lines.append(f'{self.fault}; from there on the times of reception are used: fix the '
+                         f'driver')
         elif self.repeated:
-            lines.append(f'{self.repeated} images were skipped: their stamps are not later than '
-                         f'those before')
+            lines.append(f'{counted(self.repeated, "image")} skipped: the time stamps are not '
+                         f'later than the previous ones')
         if self.set_back:
-            lines.append(f'the clock was set back {self.set_back} times, by up to '
-                         f'{self.furthest_back_ns / 1e9:.1f} s: later stamps were shifted')
+            lines.append(f'the clock was set back {counted(self.set_back, "time")}, by up to '
+                         f'{self.furthest_back_ns / 1e9:.1f} s: later time stamps are shifted')
         return lines
 
     def _time(self, header_ns: int, received_ns: int) -> int | None:

@@ -56,7 +56,7 @@ class VideoSource(FrameSource):
 
     topic: the number of the stream, where it has several; None: the one that players take. Stamps
     are the pictures' own times, counted from the first one; with fps they are index / fps.
-    Raises InputError for a file that is no video, and without fps for one that knows no times.
+    Raises InputError for a file that is not a video, and for one without time stamps or fps.
     """
 
     def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:
@@ -65,8 +65,9 @@ class VideoSource(FrameSource):
         with _opened(path, self._stream) as (container, stream):
             timed = not container.format.flags & NO_TIMES
             if not (fps or timed):
-                raise InputError(f'{path} does not say when its pictures were taken: give their '
-                                 f'rate with --fps')
+                raise InputError('E-VIDEO-NO-TIMES',
+                                 f'{path} has no time stamps: specify its rate '
+                                 f'with --fps')
             first, times = None, []
             for packet in islice(_packets(container, stream), LOOKED_AT):
                 times.append(_time_ns(packet))
@@ -85,16 +86,16 @@ class VideoSource(FrameSource):
             self._created = container.metadata.get('creation_time', '')
         if self.size != stored:
             self.stored_size = stored
-            warnings.append(f'{path} says that its pixels are not square: its {by(stored)} '
-                            f'pictures are taken as {by(self.size)}, as players show them')
+            warnings.append(f'{path} has pixels that are not square: its images of {by(stored)} '
+                            f'pixels are scaled to {by(self.size)}, as players show them')
         if turn:
-            warnings.append(f'{path} says to turn its pictures by {turn} degrees: '
-                            f'the calibration is for the turned pictures')
+            warnings.append(f'{path} has a rotation flag of {turn} degrees: the calibration is '
+                            f'valid for the rotated images')
         super().__init__(str(path), count, warnings=tuple(warnings))
         if fps and rate and abs(fps / rate - 1) > ALIKE:
             self.contradictions = (
-                f'{path} says {rate:.4g} images per second, and --fps {fps:g} replaces its times: '
-                f'leave --fps away unless you know that they are wrong',)
+                f'{path} has {rate:.4g} images per second, but --fps {fps:g} replaces its time '
+                f'stamps: omit --fps unless the time stamps are wrong',)
         self.length_ns = round(((count or 0) / fps if fps else length_s) * 1e9) or None
 
     @property
@@ -128,8 +129,8 @@ class VideoSource(FrameSource):
         reading.warnings += gate.warnings()
         promised = self._promised or 0
         if read < self._complete * promised - 1:
-            reading.warnings.append(f'the video is cut off or damaged: read {read} of {promised} '
-                                    f'images; {promised - read} are lost')
+            reading.warnings.append(f'the video is truncated or damaged: {read} of {promised} '
+                                    f'images were read, {promised - read} are lost')
 
     def _stamp_ns(self, time_ns: int | None, index: int) -> int | None:
         if self._fps:
@@ -159,7 +160,7 @@ class VideoSource(FrameSource):
 
 
 class FramePicture:
-    """Frame -> picture, as a player shows it; BGR where colour is asked for. Raises InputError.
+    """Frame -> picture, as a player shows it; BGR with colour=True. Raises InputError.
 
     stretch: by how much its columns and rows are stretched.
     """
@@ -169,7 +170,7 @@ class FramePicture:
         self._stretch = stretch
 
     def __call__(self, frame: av.VideoFrame, colour: bool = False) -> Pixels:
-        """Return (h, w) grey, or (h, w, 3) BGR where colour is asked for and there is some."""
+        """Return (h, w) grey, or (h, w, 3) BGR with colour=True where there is colour."""
         check_pixels(*_stretched(frame, self._stretch))
         kind = frame.format
         image: Pixels
@@ -203,8 +204,8 @@ def _stretch(stream: av.VideoStream, path: Path, warnings: list[str]) -> tuple[f
     aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
     ratio = float(aspect) if aspect else 1.0
     if aspect and not 1 / MOST_STRETCH <= ratio <= MOST_STRETCH:
-        warnings.append(f'{path} says that its pixels are {aspect.numerator}:{aspect.denominator}'
-                        f', which no camera has: they are taken as square')
+        warnings.append(f'{path} has a pixel aspect ratio of {aspect.numerator}:'
+                        f'{aspect.denominator}, which no camera has: square pixels are assumed')
         return SQUARE
     if abs(ratio - 1) <= ALMOST_SQUARE:
         return SQUARE
@@ -256,19 +257,19 @@ def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[str]]:
     """
     with _opened(path) as (container, best):
         streams = _streams(container)
-        there = ', '.join(f'{n} has {by((each.width, each.height))}'
+        there = ', '.join(f'{n}: {by((each.width, each.height))}'
                           for n, each in enumerate(streams, 1))
         if topic is None:
             taken = next((n for n, each in enumerate(streams, 1) if each.index == best.index), 1)
-            several = [f'{path} has {len(streams)} video streams ({there}): {taken} is taken; '
-                       f'choose with --stream'] if len(streams) > 1 else []
+            several = [f'{path} has {len(streams)} video streams ({there}): stream {taken} is '
+                       f'used; choose another one with --stream'] if len(streams) > 1 else []
             return None, several
         if topic.isdecimal() and 1 <= int(topic[:9]) <= len(streams):
             return int(topic), []
         if len(streams) > 1 or topic.isdecimal():
-            raise InputError(f'{path} has no video stream {shortened(topic)!r} ({there}): choose '
-                             f'one with --stream')
-    return None, [f'{path} is a video: topic {topic} is ignored']
+            raise InputError('E-VIDEO-STREAM', f'{path} has no video stream {shortened(topic)!r} '
+                             f'({there}): choose one with --stream')
+    return None, [f'{path} is a video: the topic {topic} is ignored']
 
 
 def _streams(container: InputContainer) -> list[av.VideoStream]:
@@ -299,12 +300,14 @@ def _opened(path: Path, number: int | None = None
 
 def _unplayable(path: Path) -> InputError:
     if _lacks_index(path):
-        return InputError(f'{path} was not closed: the camera lost its power, or the copy ended, '
-                          f'before it had its index (moov); copy it again, or make the index '
-                          f'anew from a whole video of the same camera (untrunc WHOLE.mp4 '
+        return InputError('E-VIDEO-NO-INDEX',
+                          f'{path} has no index (moov): the camera lost power, '
+                          f'or the copy was interrupted; copy it again, or rebuild the index from '
+                          f'a complete video of the same camera (untrunc COMPLETE.mp4 '
                           f'{path.name})')
-    return InputError(f'{path} is no video that can be played, or it is cut off: copy it again, '
-                      f'or convert it (ffmpeg -i IN -c:v libx264 OUT.mp4)')
+    return InputError('E-VIDEO-UNREADABLE', f'{path} is not a video that can be played, or it is '
+                      f'truncated: copy it again, or convert it (ffmpeg -i IN -c:v libx264 '
+                      f'OUT.mp4)')
 
 
 def _lacks_index(path: Path) -> bool:
@@ -327,5 +330,5 @@ def _lacks_index(path: Path) -> bool:
 
 
 def _undecodable() -> InputError:
-    return InputError('the picture cannot be decoded: convert the video '
+    return InputError('E-VIDEO-UNDECODABLE', 'the image cannot be decoded: convert the video '
                       '(ffmpeg -i IN -c:v libx264 OUT.mp4)')

@@ -51,4 +51,4 @@ def _numerical_failures(turn: Turn) -> Iterator[None]:
         yield
     except (np.linalg.LinAlgError, cv2.error) as error:
         # shown with --verbose only; the result lists the turns that were not reconstructed
-        print(f'the turn at frame {turn.center} gives no scene: {error}', file=sys.stderr)
+        print(f'the turn at frame {turn.center} was not reconstructed: {error}', file=sys.stderr)

@@ -50,7 +50,7 @@ ORTHOGONAL = 1e-6
 FARTHEST, FARTHEST_POINT = 1e6, 1e15
 
 Arrays = Mapping[str, npt.NDArray[Any]]
-INVALID = 'its numbers are no valid scene'
+INVALID = 'its numbers are not a valid scene'
 
 
 @dataclass(frozen=True)
@@ -176,16 +176,16 @@ def _check_sizes(members: zipfile.ZipFile) -> None:
             shape, _, dtype = read(stream)
             # numpy allocates the size in the header before it reads
             if math.prod(shape) * dtype.itemsize > member.file_size:
-                raise ValueError(f'{member.filename} is smaller than its header says')
+                raise ValueError(f'{member.filename} is smaller than its header indicates')
 
 
 def _file(arrays: Arrays) -> SceneFile:
     if 'about' not in arrays:
-        raise ValueError('it is no file of turns, or one of an older version')
+        raise ValueError('it is not a file of turns, or it has an older format')
     about = json.loads(str(_array(arrays, 'about', str, ())))
     if about['format'] != FORMAT:
         number = shortened(str(about['format']), 20)
-        raise ValueError(f'it has format {number}, this version has {FORMAT}')
+        raise ValueError(f'it has format {number}, but this version reads {FORMAT}')
     origin = _origin(about)
     listed = about['turns']
     _check(isinstance(listed, list) and len(listed) <= MOST_TURNS)
@@ -274,9 +274,9 @@ def _array(data: Arrays, name: str, kind: Any, shape: tuple[int, ...], most: flo
     """
     array, same = data[name], np.dtype(kind).kind
     if array.dtype.kind != same or array.shape != shape:
-        raise ValueError(f'{name} is {array.dtype} of {array.shape}')
+        raise ValueError(f'{name} has type {array.dtype} and shape {array.shape}')
     if same == 'f' and not ((np.abs(array) <= most) | (np.isnan(array) & nan)).all():
-        raise ValueError(f'{name} is not finite, or too large')
+        raise ValueError(f'{name} is not finite or is too large')
     return array if same == 'U' else array.astype(kind)
 
 

@@ -164,7 +164,7 @@ def _loaded(path: str | os.PathLike[str], name: str | None) -> NamedCamera:
             return _chosen(_colmap_binary(place), name, place)
         return parse_camera(read_text(place, JSON_BYTES), place, name)
     except OSError as error:
-        raise InputError(os_error(place, error)) from error
+        raise os_error(place, error) from error
 
 
 def parse_camera(text: str, path: str | Path, name: str | None = None) -> NamedCamera:

@@ -20,8 +20,10 @@ from made_drives import (
     write_timed,
     write_video,
 )
+from refused import refused
 from rosbags.rosbag2 import StoragePlugin
 
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.inputs import fits_bag, is_video, open_frames
 from dashcalib_ros.report import load_camera
 
@@ -75,17 +77,17 @@ def test_what_only_begins_like_a_video_is_none(tmp_path, head):
     path = tmp_path / 'file.xyz'
     path.write_bytes(head + bytes(1000))
     assert not is_video(path) and not fits_bag(path)
-    fails('no kind of drive known here', path)
+    fails('E-INPUT-UNKNOWN', path)
     # its name says otherwise
     path = path.rename(tmp_path / 'file.mp4')
-    fails('no video that can be played', path)
+    fails('E-VIDEO-UNREADABLE', path)
 
 
 def test_a_pipe_is_not_read(tmp_path):
     for name in ('pipe', 'pipe.insv'):
         os.mkfifo(tmp_path / name)
         assert not fits_bag(tmp_path / name)
-        fails('no regular file', tmp_path / name)
+        fails('E-FILE-NOT-REGULAR', tmp_path / name)
 
 
 def test_pictures_are_not_looked_into(tmp_path, monkeypatch):
@@ -103,5 +105,5 @@ def test_pictures_are_not_looked_into(tmp_path, monkeypatch):
 def test_a_calibration_that_is_a_bag_is_known_by_its_content(tmp_path):
     whole = storage(write_bag(tmp_path / 'bag', images(drive(3))))
     path = whole.rename(tmp_path / 'camera.yaml')
-    with pytest.raises(Exception, match='no one camera_info'):
+    with refused(InputError, 'E-BAG-CAMERA-INFO', path):
         load_camera(path)

@@ -15,6 +15,7 @@ from made_drives import COMPRESSED, ROS1, ROS2, START, STEP, head, info_of
 from made_packets import SIZE, encoded, levels
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from refused import refused
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -114,7 +115,7 @@ def test_a_recording_that_begins_late_waits_for_a_key_picture(tmp_path, codec):
     frames = list(source)
     assert brightness(frames) == list(range(8, 20))
     assert [frame.index for frame in frames] == list(range(5, 17))
-    assert 'the first 5 images of the video are left out' in ' '.join(source.warnings)
+    assert 'the first 5 images' in ' '.join(source.warnings)
 
 
 def test_damaged_packets_are_counted_and_the_rest_is_shown(tmp_path):
@@ -124,9 +125,9 @@ def test_damaged_packets_are_counted_and_the_rest_is_shown(tmp_path):
     shown = brightness(source)
     assert set(range(20)) - set(shown) <= {4} and len(shown) >= 19
     junk = [(n, bytes([n]) * 40) for n in range(9)]
-    with pytest.raises(InputError, match='gave no image'):
+    with refused(InputError, 'E-INPUT-NO-IMAGES', tmp_path / 'junk'):
         list(open_frames(write_packets(tmp_path / 'junk', junk, PACKET, 'libx264')))
-    with pytest.raises(InputError, match="'mpeg4' are not read here"):
+    with refused(InputError, 'E-VIDEO-CODEC', "'mpeg4'"):
         list(open_frames(write_packets(tmp_path / 'other', junk, PACKET, 'mpeg4')))
 
 
@@ -290,7 +291,7 @@ def test_a_calibration_for_foxglove(tmp_path, camera):
 
 def test_what_is_not_read_is_named_by_its_encoding(tmp_path, capsys):
     path = write_foxglove(tmp_path / 'drive.mcap', 'RawImage', 'flatbuffer')
-    with pytest.raises(InputError, match=r'/cam/image \(foxglove.RawImage in flatbuffer\)'):
+    with refused(InputError, 'E-BAG-NO-IMAGES', '/cam/image (foxglove.RawImage in flatbuffer)'):
         open_frames(path)
     assert main(['turns', str(path)]) == 2 and 'protobuf, json' in capsys.readouterr().err
 
@@ -313,13 +314,12 @@ def test_damaged_messages_and_schemas_are_one_line(tmp_path, encoding, schema):
                 raw.replace(f'{{"sec": {START // 10**9}', '{"sec": "x"').encode())):
             writer.add_message(channel, START + n, data, START + n)
         writer.finish()
-    with pytest.raises(InputError, match='gave no image') as caught:
+    with refused(InputError, 'E-MESSAGE-DAMAGED', path, 'image 0', '/a'):
         list(open_frames(path))
-    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_a_message_in_json_is_limited():
-    with pytest.raises(InputError, match='of JSON'):
+    with refused(InputError, 'E-MESSAGE-TOO-LARGE', '32 MB'):
         message_of('foxglove.RawImage', 'json', b'[' + b'[],' * 12_000_000)
 
 

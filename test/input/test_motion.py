@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from made_drives import ROS2, START, drive, head, image, images, write_bag
 from made_gopro import gopro
+from refused import refused
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.inputs import open_frames
@@ -56,13 +57,13 @@ def test_sensors_of_different_rates_leave_cells_empty(tmp_path):
     assert len(found.rate.values) == 45 and len(found.position.values) == 5
 
 
-@pytest.mark.parametrize(('text', 'line'), [
-    ('', 'its first line must name its columns'),
-    ('time,gyro_x\n1,2\n', 'its first line must name its columns'),
-    ('stamp_s,temperature\n1,2\n', 'no column of a sensor'),
-    ('stamp_s,gyro_x,gyro_y\n1,2,3\n', 'has only gyro_x, gyro_y')])
-def test_what_is_no_csv_of_sensors_is_named(tmp_path, text, line):
-    with pytest.raises(InputError, match=line):
+@pytest.mark.parametrize(('text', 'code', 'values'), [
+    ('', 'E-MOTION-HEADER', ['stamp_s', 'gyro_x', '--poses']),
+    ('time,gyro_x\n1,2\n', 'E-MOTION-HEADER', ['stamp_s', 'gyro_x', '--poses']),
+    ('stamp_s,temperature\n1,2\n', 'E-MOTION-HEADER', ['stamp_s', 'gyro_x', 'sensor']),
+    ('stamp_s,gyro_x,gyro_y\n1,2,3\n', 'E-MOTION-COLUMNS', ['gyro_x, gyro_y of gyro_x'])])
+def test_what_is_no_csv_of_sensors_is_named(tmp_path, text, code, values):
+    with refused(InputError, code, 'bad.csv', *values):
         read_motion(write(tmp_path / 'bad.csv', text))
 
 
@@ -104,9 +105,11 @@ def test_a_gpx_has_times_of_day(tmp_path):
     assert guessed.since(0.0) == guessed
 
 
-@pytest.mark.parametrize('text', ['<gpx', gpx(['']), '<!DOCTYPE x [<!ENTITY a "b">]><gpx/>'])
-def test_what_is_no_gpx_with_times_is_named(tmp_path, text):
-    with pytest.raises(InputError, match=r'track\.gpx'):
+@pytest.mark.parametrize(('text', 'code'), [
+    ('<gpx', 'E-MOTION-GPX'), (gpx(['']), 'E-MOTION-NO-TIMES'),
+    ('<!DOCTYPE x [<!ENTITY a "b">]><gpx/>', 'E-MOTION-GPX')])
+def test_what_is_no_gpx_with_times_is_named(tmp_path, text, code):
+    with refused(InputError, code, 'track.gpx'):
         read_motion(write(tmp_path / 'track.gpx', text))
 
 
@@ -114,17 +117,17 @@ def test_whole_seconds_at_10_hz_give_one_place_a_second(tmp_path):
     times = [f'<time>2026-09-21T14:13:{n // 10:02}Z</time>' for n in range(600)]
     found = read_motion(write(tmp_path / 'whole.gpx', gpx(times)))
     assert found.position is not None and len(found.position.stamps_s) == 60
-    assert found.warnings == (f'of the positions of {tmp_path}/whole.gpx several have one stamp: '
-                              f'the first of each is used',)
+    [warning] = found.warnings
+    assert f'positions of {tmp_path}/whole.gpx have the same time stamp' in warning
 
 
 def test_stamps_of_another_unit_are_said(tmp_path):
     rows = '\n'.join(f'{1700000000000 + 10 * n},0.1' for n in range(20))
     found = read_motion(write(tmp_path / 'ms.csv', f'#stamp_s, speed\n{rows}\n'))
     assert found.absolute and found.warnings == (
-        f'the stamps of {tmp_path}/ms.csv are taken as milliseconds since 1970',)
+        f'the time stamps of {tmp_path}/ms.csv are interpreted as milliseconds since 1970',)
     assert abs(found.speed.stamps_s[-1] - 1700000000.19) < 1e-6
-    with pytest.raises(InputError, match='write seconds'):
+    with refused(InputError, 'E-STAMP-UNIT', 'odd.csv', '1e+40'):
         read_motion(write(tmp_path / 'odd.csv', 'stamp_s,speed\n1e40,1\n2e40,1\n'))
 
 
@@ -153,7 +156,7 @@ def test_more_columns_than_are_used_take_no_memory(tmp_path):
     tracemalloc.stop()
     assert len(found.speed.values) == 20
     names += ',c' * 2**17
-    with pytest.raises(InputError, match='its first line must name its columns'):
+    with refused(InputError, 'E-MOTION-HEADER', 'wide.csv'):
         read_motion(write(tmp_path / 'wide.csv', names[::-1]))
 
 
@@ -165,9 +168,9 @@ def test_a_line_without_an_end_comes_in_parts(tmp_path):
     for limit, content in ((100, None), (2**20, b'\xff\xfe')):
         if content:
             path.write_bytes(content)
-        with pytest.raises(InputError, match='too large' if content is None else 'no.* text file'):
+        with refused(InputError, 'E-FILE-NOT-TEXT' if content else 'E-FILE-TOO-LARGE', path):
             list(read_lines(path, limit))
-    with pytest.raises(InputError, match='does not exist'):
+    with refused(InputError, 'E-FILE-MISSING', 'gone.csv'):
         list(read_lines(tmp_path / 'gone.csv', 10))
 
 
@@ -178,9 +181,11 @@ def test_a_line_without_an_end_comes_in_parts(tmp_path):
     '<gpx>' + ''.join(f'<a{n}/>' for n in range(2000)) + '</gpx>',
     '<gpx ' + ' '.join(f'a{n}=""' for n in range(2000)) + '/>'])
 def test_a_hostile_gpx_is_one_line(tmp_path, text):
-    with pytest.raises(InputError, match=r'track\.gpx') as caught:
+    code = 'E-MOTION-HEADER' if text == '\0' else 'E-MOTION-GPX'
+    if '<trkpt/>' in text:
+        code = 'E-MOTION-NO-TIMES'
+    with refused(InputError, code, 'track.gpx'):
         read_motion(write(tmp_path / 'track.gpx', text))
-    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_a_gopro_has_gyro_and_gps_inside(tmp_path):
@@ -214,7 +219,7 @@ def test_a_video_without_motion_data_is_named(tmp_path, content):
 
 def test_without_its_reader_the_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'telemetry_parser', None)
-    with pytest.raises(InputError, match=r'dashcalib_ros\[motion\]'):
+    with refused(InputError, 'E-MOTION-PARSER', 'drive.mp4', 'dashcalib_ros[motion]'):
         read_motion(write(tmp_path / 'drive.mp4', 'x'))
 
 
@@ -234,7 +239,7 @@ def test_a_kitti_oxts_folder_counts_from_its_first_image(tmp_path):
         assert found.rate.stamps_s[0] == pytest.approx(-0.05, abs=1e-6)
         assert len(found.rate.values) == 11 and found.rate.values[-1].tolist() == [0.1, 0.2, 1.1]
         assert found.speed.values[0, 0] == 7.0
-    with pytest.raises(InputError, match='no folder of motion data'):
+    with refused(InputError, 'E-MOTION-FOLDER', data):
         read_motion(data)
 
 
@@ -246,8 +251,8 @@ def test_places_of_no_fix_are_left_out_and_said(tmp_path, lost):
     assert len(found.position.stamps_s) == 29 and found.position.stamps_s[0] == 30.0
     assert np.ptp(found.position.values[:, 0]) == pytest.approx(29e-4 * DEGREE_M * np.cos(
         np.radians(49)))
-    assert found.warnings == (f'31 positions of {path} are left out: they are 0, 0 or no place on '
-                              f'Earth, as a GPS gives them without a fix',)
+    [warning] = found.warnings
+    assert f'31 positions of {path}' in warning
 
 
 def test_a_gps_that_never_had_a_fix_is_not_used(tmp_path):
@@ -319,7 +324,7 @@ def test_of_several_topics_none_is_used_until_one_is_chosen(tmp_path):
     [line] = found.warnings
     assert found.empty and '/imu, /other' in line and '--imu' in line
     assert bag_motion([path], {'imu': 'other'}).rate is not None
-    with pytest.raises(InputError, match=r"no imu topic '/none'.*/imu, /other"):
+    with refused(InputError, 'E-BAG-TOPIC-UNKNOWN', "imu topic '/none'", '/imu, /other'):
         bag_motion([path], {'imu': '/none'})
 
 
@@ -355,7 +360,7 @@ def test_images_and_sensors_of_different_clocks_are_aligned_by_reception(tmp_pat
     found = bag_motion([path], NONE, '/camera').since(start_s)
     np.testing.assert_allclose(found.rate.stamps_s, np.arange(100) / 100 - 0.35, atol=1e-5)
     [line] = found.warnings
-    assert '/imu is of another clock than the images' in line and 'reception' in line
+    assert 'clock of /imu' in line and 'reception' in line
 
 
 def test_images_and_sensors_of_one_uptime_keep_it(tmp_path):

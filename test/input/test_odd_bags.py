@@ -24,6 +24,7 @@ from made_drives import (
     write_ros1,
 )
 from mcap.writer import CompressionType, IndexType
+from refused import refused
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag1.reader import Header
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
@@ -46,9 +47,9 @@ def test_what_is_packed_is_unpacked_within_the_limit(kind, pack):
     bomb = pack(bytes(2**24))
     assert len(bomb) < 2**18
     assert len(unpack(kind, bomb, 2**24)) == 2**24
-    with pytest.raises(InputError, match='unpacks to more than 8 MB'):
+    with refused(InputError, 'E-BAG-TOO-LARGE', '8 MB'):
         unpack(kind, bomb, 2**23)
-    with pytest.raises(EOFError, match='cut off'):
+    with pytest.raises(EOFError):
         unpack(kind, bomb[:len(bomb) // 2])
 
 
@@ -68,13 +69,14 @@ def test_a_chunk_that_is_a_bomb_is_left_out(tmp_path, compression, options, smal
     frames = drive(5)
     file = write_mcap(tmp_path / 'drive.mcap', frames, compression=compression, chunk_size=4000,
                       **options)
-    line = fails('broken chunk', file)
-    assert 'unpacks to more than 0 MB' in line
+    fails('E-BAG-NOT-A-RECORDING' if 'use_statistics' in options else 'E-INPUT-NO-IMAGES', file,
+          'damaged chunk', 'more than 0 MB')
 
 
 @pytest.mark.parametrize('compression', Writer1.CompressionFormat)
 def test_a_chunk_of_a_ros1_bag_that_is_a_bomb_is_left_out(tmp_path, compression, small_chunks):
-    fails('unpacks to more than 0 MB', write_ros1(tmp_path / 'drive.bag', drive(5), compression))
+    file = write_ros1(tmp_path / 'drive.bag', drive(5), compression)
+    fails('E-INPUT-NO-IMAGES', file, 'more than 0 MB')
 
 
 @pytest.mark.parametrize('options', [{}, NO_INDEX, {'index_types': IndexType.NONE}])
@@ -89,14 +91,14 @@ def test_chunks_are_unpacked_while_all_of_them_are_a_recording(tmp_path, options
     read = list(source)
     assert 0 < len(read) < 5
     same(read, frames[:len(read)])
-    assert 'damaged' in source.warnings[-1] and 'unpacks to more than' in source.warnings[-1]
+    assert 'damaged' in source.warnings[-1] and 'more than 0 MB' in source.warnings[-1]
 
 
 def test_a_ros1_bag_s_chunks_are_unpacked_while_all_of_them_are_a_recording(tmp_path, monkeypatch):
     monkeypatch.setattr(bag_read, 'UNPACKED_RATIO', 0)
     monkeypatch.setattr(bag_read, 'UNPACKED_LEAST', 15_000)
     file = write_ros1(tmp_path / 'drive.bag', drive(10), Writer1.CompressionFormat.BZ2)
-    fails('unpacks to more than', file)
+    fails('E-INPUT-NO-IMAGES', file, 'more than 0 MB')
 
 
 def test_only_so_many_overlapping_chunks_are_in_memory(tmp_path, monkeypatch):
@@ -106,7 +108,7 @@ def test_only_so_many_overlapping_chunks_are_in_memory(tmp_path, monkeypatch):
     with bag_read.WITHIN_LIMIT, bag_read._reader(file):
         pass
     monkeypatch.setattr(bag_read, 'OVERLAPPING_BYTES', 1)
-    with bag_read.WITHIN_LIMIT, pytest.raises(InputError, match='overlap'):
+    with bag_read.WITHIN_LIMIT, refused(InputError, 'E-BAG-INDEX', 'overlap'):
         bag_read._reader(file).open()
     # in the order of the file, where what comes late is left out
     read = [frame.stamp_ns for frame in open_frames(file)]
@@ -130,7 +132,7 @@ BLOB = "x'" + 10_000 * '00' + "'"
 def test_only_what_is_stored_in_tables_is_read(tmp_path, made):
     with sqlite3.connect(tmp_path / 'odd.db3') as database:
         database.executescript(f'{TOPICS} {made};')
-    fails('it has more than tables', tmp_path / 'odd.db3')
+    fails('E-BAG-NOT-A-RECORDING', tmp_path / 'odd.db3', 'tables')
 
 
 def test_a_query_of_a_database_ends(tmp_path, monkeypatch):
@@ -142,7 +144,7 @@ def test_a_query_of_a_database_ends(tmp_path, monkeypatch):
             f'{COUNTED.format(" LIMIT 5000")} SELECT n, 1, n, x\'00\' FROM c;')
     with bag_read.WITHIN_LIMIT, pytest.raises(Exception, match='interrupted'):
         bag_read._reader(tmp_path / 'odd.db3').open()
-    fails('has no image topic', tmp_path / 'odd.db3')
+    fails('E-BAG-NO-IMAGES', tmp_path / 'odd.db3')
 
 
 def test_a_ros1_bag_s_index_names_each_chunk_once(tmp_path):
@@ -153,7 +155,7 @@ def test_a_ros1_bag_s_index_names_each_chunk_once(tmp_path):
     place = data.index(b'chunk_count=') + 12
     count = int.from_bytes(data[place:place + 4], 'little') + 50
     file.write_bytes(data[:place] + count.to_bytes(4, 'little') + data[place + 4:] + 50 * record)
-    with bag_read.WITHIN_LIMIT, pytest.raises(InputError, match='chunks overlap'):
+    with bag_read.WITHIN_LIMIT, refused(InputError, 'E-BAG-INDEX', 'chunks overlap'):
         bag_read._reader(file).open()
     same(list(open_frames(file)), drive(400))
 
@@ -191,7 +193,7 @@ def test_a_message_that_is_a_bomb_is_an_undecodable_one(tmp_path, monkeypatch):
     bag = write_bag(tmp_path / 'bag', images(drive(3)), mode=CompressionMode.MESSAGE)
     same(list(open_frames(bag)), drive(3))
     monkeypatch.setattr(bag_read, 'MESSAGE_BYTES', 1000)
-    fails('a message on /camera: a part of the bag unpacks to more than', bag)
+    fails('E-BAG-TOO-LARGE', bag, 'a message on /camera')
 
 
 @pytest.mark.parametrize('plugin', StoragePlugin)
@@ -205,8 +207,8 @@ def test_a_file_that_is_a_bomb_ends_in_time(tmp_path, plugin, monkeypatch):
     monkeypatch.setattr(bag_read, 'UNPACKED_LEAST', 2**20)
     monkeypatch.setattr(bag_read, 'UNPACKED_RATIO', 2)
     for path in (bag, packed):
-        fails(r'unpacks to more than 1 MB, which is no recording; .* \(zstd -d\)', path)
-    with pytest.raises(InputError, match='which is no recording'):
+        fails('E-BAG-TOO-LARGE', path, '1 MB', 'zstd -d')
+    with refused(InputError, 'E-BAG-DAMAGED', packed, '1 MB'):
         check_bag(packed, '/camera', tmp_path / 'out')
 
 
@@ -215,7 +217,7 @@ def test_unpacking_leaves_the_disk_room(tmp_path, monkeypatch):
     packed.write_bytes(zstandard.compress(write_mcap(tmp_path / 'drive.mcap', drive(3)
                                                      ).read_bytes()))
     monkeypatch.setattr(bag_read, 'FREE_BYTES', 2**60)
-    fails('no room to unpack .* set TMPDIR', packed)
+    fails('E-DISK-FULL', packed, packed, 'TMPDIR', 'zstd -d')
     monkeypatch.undo()
     same(list(open_frames(packed)), drive(3))
 
@@ -228,7 +230,7 @@ def test_a_hostile_metadata_file_is_no_obstacle(tmp_path, metadata):
     source = open_frames(bag)
     same(list(source), drive(3))
     assert 'no usable metadata.yaml' in source.warnings[0]
-    with pytest.raises(InputError, match='cannot be copied'):
+    with refused(InputError, 'E-BAG-DAMAGED', bag):
         check_bag(bag, '/camera', tmp_path / 'out')
 
 
@@ -283,8 +285,8 @@ def test_odd_entries_of_a_bag_are_skipped_and_named(tmp_path):
     (bag / 'c.bag').symlink_to('nowhere')
     source = open_frames(bag)
     same(list(source), drive(3))
-    assert source.warnings == (
-        f'3 entries of {bag} were skipped, which are no regular files: a.mcap, b.db3, c.bag',)
+    [warning] = source.warnings
+    assert f'3 files in {bag} skipped' in warning and 'a.mcap, b.db3, c.bag' in warning
     (bag / 'metadata.yaml').unlink()
     same(list(open_frames(bag)), drive(3))
 
@@ -293,25 +295,26 @@ def test_a_bag_of_odd_entries_alone_says_so(tmp_path):
     bag = write_bag(tmp_path / 'bag', images(drive(3)))
     storage(bag).unlink()
     os.mkfifo(bag / 'a.mcap')
-    fails('has no .mcap, .db3 or .bag file .1 entries of .*: a.mcap', bag)
+    fails('E-BAG-NO-FILES', bag, '1 file in', 'a.mcap')
 
 
 def test_a_raw_message_of_an_absurd_size_is_an_undecodable_one(tmp_path):
     message = ROS2.types['sensor_msgs/msg/Image'](
         header=head(1), height=2**31, width=2**31, encoding='mono8', is_bigendian=0, step=0,
         data=drive(1)[0].image.reshape(-1)[:0])
-    fails('says it is 2147483648x2147483648', write_bag(
-        tmp_path / 'bag', [('/camera', 1, message)]))
+    fails('E-IMAGE-TOO-LARGE', write_bag(tmp_path / 'bag', [('/camera', 1, message)]),
+          '2147483648x2147483648')
 
 
-@pytest.mark.parametrize(('content', 'cure'), [
-    (b'no bag at all', 'is it a recording'), (b'\x89MCAP0\r\n' + b'\xff' * 40, 'mcap recover')])
-def test_a_repair_is_advised_where_it_may_help_only(tmp_path, content, cure):
+@pytest.mark.parametrize(('content', 'code'), [
+    (b'no bag at all', 'E-BAG-NOT-A-RECORDING'),
+    (b'\x89MCAP0\r\n' + b'\xff' * 40, 'E-BAG-DAMAGED')])
+def test_a_repair_is_advised_where_it_may_help_only(tmp_path, content, code):
     path = tmp_path / 'drive.mcap'
     path.write_bytes(content)
-    with pytest.raises(InputError, match=cure) as caught:
+    with refused(InputError, code, path) as caught:
         open_frames(path)
-    assert ('mcap recover' in str(caught.value)) == (cure == 'mcap recover')
+    assert ('mcap recover' in str(caught.value)) == (code == 'E-BAG-DAMAGED')
 
 
 def test_pictures_of_another_kind_are_not_to_be_repaired(tmp_path):
@@ -319,6 +322,6 @@ def test_pictures_of_another_kind_are_not_to_be_repaired(tmp_path):
     bag = write_bag(tmp_path / 'bag', [
         ('/camera', frame.stamp_ns, made_drives.image(frame, encoding='32FC1'))
         for frame in frames])
-    with pytest.raises(InputError, match='publish mono8') as caught:
+    with refused(InputError, 'E-IMAGE-ENCODING', '32FC1') as caught:
         list(open_frames(bag))
     assert 'recover' not in str(caught.value)

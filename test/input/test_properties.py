@@ -152,7 +152,7 @@ def test_samples_of_any_sensor(kind: str, rows: list[tuple[float, float]]) -> No
     stream = sensor_stream({kind: (stamps, values)}, 'a test')
     samples = stream.kinds.get(kind)
     unused = [line for line in stream.warnings if 'are not used' in line]
-    thinned = [line for line in stream.warnings if 'have one stamp' in line]
+    thinned = [line for line in stream.warnings if 'have the same time stamp' in line]
     assert (samples is None) == (len(unused) == 1) and not (unused and thinned)
     if samples is not None:
         assert (np.diff(samples.stamps_s) > 0).all() and np.isfinite(samples.values).all()
@@ -203,6 +203,6 @@ def test_yaml_is_what_it_was_or_an_error(content: object, damage: list[tuple[int
     try:
         found = parse_yaml(text, 'it')
     except InputError as error:
-        assert damage and 'no usable YAML' in str(error)
+        assert damage and error.code in ('E-YAML-TOO-LARGE', 'E-YAML-NUMBER')
         return
     assert found == expected

@@ -109,8 +109,8 @@ def test_a_lost_or_broken_metadata_file_is_no_obstacle(tmp_path, plugin, metadat
         (bag / 'metadata.yaml').write_text(metadata)
     source = open_frames(bag)
     same(list(source), frames)
-    assert source.warnings == (
-        f'{bag} has no usable metadata.yaml: reading bag.{suffix(plugin)} in this order',)
+    [warning] = source.warnings
+    assert f'{bag} has no usable metadata.yaml' in warning and f'bag.{suffix(plugin)}' in warning
 
 
 @pytest.mark.parametrize('plugin', StoragePlugin)
@@ -159,9 +159,8 @@ def two_cameras(tmp_path):
 
 
 def test_several_image_topics_are_listed(tmp_path):
-    line = fails('2 image topics: choose one with --topic', two_cameras(tmp_path))
-    assert '/left (Image, 4 images)' in line
-    assert '/right/compressed (CompressedImage, 3 images)' in line
+    line = fails('E-BAG-TOPIC-AMBIGUOUS', two_cameras(tmp_path), '2 image topics', '--topic',
+                 '/left (Image, 4 images)', '/right/compressed (CompressedImage, 3 images)')
     assert '/words' not in line
 
 
@@ -174,8 +173,8 @@ def test_a_chosen_topic_is_read_alone(tmp_path, topic):
 
 @pytest.mark.parametrize('topic', ['/middle', '/words'])
 def test_a_wrong_topic_lists_what_there_is(tmp_path, topic):
-    line = fails(f"no image topic '{topic}'", two_cameras(tmp_path), topic=topic)
-    assert '/left (Image' in line and '/right/compressed (' in line
+    fails('E-BAG-TOPIC-UNKNOWN', two_cameras(tmp_path), repr(topic), '/left (Image',
+          '/right/compressed (', topic=topic)
 
 
 def test_topics_that_do_not_count(tmp_path):
@@ -190,12 +189,12 @@ def test_topics_that_do_not_count(tmp_path):
 
 def test_no_image_topic(tmp_path):
     words = write_bag(tmp_path / 'words', [('/words', START, text('hello'))])
-    fails(r'no image topic: it has /words \(std_msgs/msg/String\); record the camera', words)
+    fails('E-BAG-NO-IMAGES', words, '/words (std_msgs/msg/String)')
     nothing = write_bag(tmp_path / 'nothing', [])
-    fails('no messages at all', nothing)
+    fails('E-BAG-NO-IMAGES', nothing, 'no messages')
     unused = write_bag(tmp_path / 'unused', [('/words', START, text('hello'))],
                        empty=[('/camera', IMAGE)])
-    fails('no images on /camera', unused)
+    fails('E-BAG-TOPIC-EMPTY', unused, '/camera')
 
 
 def test_without_header_stamps_the_times_of_reception_count(tmp_path):
@@ -204,7 +203,7 @@ def test_without_header_stamps_the_times_of_reception_count(tmp_path):
         ('/camera', frame.stamp_ns, image(frame, stamp_ns=0)) for frame in frames]))
     same(list(source), frames)
     assert source.warnings == (
-        'the image headers have no stamps: the times of reception were used',)
+        'the image headers have no time stamps: the times of reception are used',)
 
 
 def test_images_that_come_twice_or_late_are_skipped(tmp_path):
@@ -216,7 +215,7 @@ def test_images_that_come_twice_or_late_are_skipped(tmp_path):
     found = list(source)
     assert [frame.index for frame in found] == [0, 1, 3, 5]
     assert [(frame.stamp_ns - START) // STEP for frame in found] == [0, 1, 3, 5]
-    assert '2 images were skipped' in source.warnings[0]
+    assert '2 images skipped' in source.warnings[0]
 
 
 @pytest.mark.parametrize('plugin', StoragePlugin)
@@ -231,12 +230,12 @@ def test_a_cut_ros2_bag_gives_what_precedes_the_cut(tmp_path, plugin, share):
     assert 60 * share - 18 <= len(found) <= 60  # a chunk has 14 images
     same(found, frames[:len(found)])
     warning, = source.warnings
-    assert f'read {len(found)} of 60 images; ' in warning
+    assert f'{len(found)} of 60 images were read, ' in warning
     assert ('none is lost' if len(found) == 60 else f'{60 - len(found)} are lost') in warning
 
     alone = open_frames(file)
     same(list(alone), found)
-    assert f'read {len(found)} images; how many are lost is not known' in alone.warnings[0]
+    assert f'{len(found)} images were read, the number of lost images' in alone.warnings[0]
 
 
 @pytest.mark.parametrize('compression', [None, *Writer1.CompressionFormat])
@@ -248,7 +247,7 @@ def test_a_cut_ros1_bag_gives_what_precedes_the_cut(tmp_path, compression, share
     found = list(source)
     assert 60 * share - 18 <= len(found) <= 60
     same(found, frames[:len(found)])
-    assert f'read {len(found)} images; how many are lost is not known' in source.warnings[0]
+    assert f'{len(found)} images were read, the number of lost images' in source.warnings[0]
 
 
 @pytest.mark.parametrize('plugin', StoragePlugin)
@@ -261,7 +260,7 @@ def test_a_cut_zstd_file(tmp_path, plugin, alone):
     found = list(source)
     assert 60 * 0.6 - 18 <= len(found) < 60
     same(found, frames[:len(found)])
-    assert f'read {len(found)} ' in source.warnings[0]
+    assert f': {len(found)} ' in source.warnings[0]
 
 
 def test_a_broken_chunk_costs_only_itself(tmp_path):
@@ -278,8 +277,8 @@ def test_a_broken_chunk_costs_only_itself(tmp_path):
     for frame in found:
         np.testing.assert_array_equal(frame.image, expected[frame.stamp_ns].image)
     assert found[-1].stamp_ns == frames[-1].stamp_ns
-    assert f'read {len(found)} of 60 images; {60 - len(found)} are lost' in source.warnings[0]
-    assert 'broken chunk' in source.warnings[0]
+    assert f'{len(found)} of 60 images were read, {60 - len(found)} are lost' in source.warnings[0]
+    assert 'damaged chunk' in source.warnings[0]
 
 
 def test_a_broken_first_chunk_costs_only_itself(tmp_path):
@@ -294,7 +293,7 @@ def test_a_broken_first_chunk_costs_only_itself(tmp_path):
     assert [frame.stamp_ns for frame in found] == [
         frame.stamp_ns for frame in frames[60 - len(found):]]
     assert 50 <= len(found) <= 55
-    assert f'read {len(found)} of 60 images; {60 - len(found)} are lost' in source.warnings[0]
+    assert f'{len(found)} of 60 images were read, {60 - len(found)} are lost' in source.warnings[0]
 
 
 def test_a_split_bag_with_a_missing_and_a_broken_file(tmp_path):
@@ -303,21 +302,20 @@ def test_a_split_bag_with_a_missing_and_a_broken_file(tmp_path):
     (bag / '2.mcap').write_bytes(os.urandom(1000))
     source = open_frames(bag)
     assert len(list(source)) == 20
-    assert 'read 20 of 30 images; 10 are lost' in source.warnings[0]
+    assert '20 of 30 images were read, 10 are lost' in source.warnings[0]
     (bag / '2.mcap').unlink()
     source = open_frames(bag)
     assert [frame.stamp_ns for frame in source] == [
         frame.stamp_ns for frame in frames[:10] + frames[20:]]
-    assert '2.mcap is listed in metadata.yaml but missing' in source.warnings[0]
-    assert 'read 20 of 30 images; 10 are lost' in source.warnings[1]
+    assert '2.mcap is listed in metadata.yaml but does not exist' in source.warnings[0]
+    assert '20 of 30 images were read, 10 are lost' in source.warnings[1]
 
 
 @pytest.mark.parametrize('plugin', StoragePlugin)
 def test_a_bag_folder_of_junk(tmp_path, plugin):
     bag = write_bag(tmp_path / 'bag', images(drive(5)), plugin)
     storage(bag).write_bytes(b'junk' * 100)
-    line = fails('gave no image .*read 0 of 5 images; 5 are lost', bag)
-    assert 'ros2 bag reindex' in line
+    fails('E-INPUT-NO-IMAGES', bag, bag, '0 of 5 images were read, 5 are lost', 'ros2 bag reindex')
 
 
 def test_a_single_zstd_file_of_the_zstd_tool(tmp_path):

@@ -316,8 +316,8 @@ def test_broken_files_are_refused_with_what_is_wrong(tmp_path, old, new, complai
 
 
 @pytest.mark.parametrize(('key', 'place', 'words'), [
-    ('camera_matrix', 1, 'K[1] is 50'), ('rectification_matrix', 1, 'R is no rotation'),
-    ('projection_matrix', 2, 'P does not show the picture')])
+    ('camera_matrix', 1, 'K[1] is 50'), ('rectification_matrix', 1, 'R is not a rotation'),
+    ('projection_matrix', 2, 'P does not map the image')])
 def test_faults_beside_the_camera_are_read(tmp_path, key, place, words):
     path = tmp_path / 'calibration.yaml'
     data = yaml.safe_load(camera_info_yaml(Radial((100, 60), 80.0, 80.0, 49.5, 29.5)))

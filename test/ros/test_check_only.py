@@ -229,8 +229,8 @@ SAME_K, SAME_P = list(info_of().k), list(info_of().p)
 FAULTS = [
     ({'k': [*SAME_K[:1], 50.0, *SAME_K[2:]]}, r'K\[1\] is 50, not 0'),
     ({'k': [*SAME_K[:8], 0.0]}, r'K\[8\] is 0, not 1'),
-    ({'r': [0.985, 0.0, 0.174, 0.0, 1.0, 0.0, -0.174, 0.0, 0.985]}, 'R turns .* 9.9 degrees'),
-    ({'r': [0.0] * 9}, 'R is no rotation'),
+    ({'r': [0.985, 0.0, 0.174, 0.0, 1.0, 0.0, -0.174, 0.0, 0.985]}, 'R rotates .* 9.9 degrees'),
+    ({'r': [0.0] * 9}, 'R is not a rotation'),
     ({'p': [0.0] * 12}, r'P\[10\] is 0'),
     ({'p': [*SAME_P[:3], -40.0, *SAME_P[4:]]}, r'P\[3\] is -40'),
     *(({'p': [scale * value for value in SAME_P[:8]] + SAME_P[8:]}, 'P .* another size')
@@ -247,11 +247,11 @@ def test_a_fault_beside_a_right_camera_is_wrong_before_and_after_the_turns(desk,
     desk = desk(check_only='true')
     heard = answers(desk)
     drive(desk, info_of(r=FAULTS[2][0]['r']), lambda: heard)
-    assert heard[-1]['answer'] == 'wrong' and 'R turns' in heard[-1]['reasons'][0]
+    assert heard[-1]['answer'] == 'wrong' and 'R rotates' in heard[-1]['reasons'][0]
     assert 'is wrong: R turns' in capfd.readouterr().err
     Core.newest.ready = turns(10, 20)
     desk.until(lambda: 'fx 400' in heard[-1]['reasons'])
-    assert heard[-1]['answer'] == 'wrong' and 'R turns' in heard[-1]['reasons'][0]
+    assert heard[-1]['answer'] == 'wrong' and 'R rotates' in heard[-1]['reasons'][0]
     # each field counts as a change
     drive(desk, info_of(), lambda: heard[-1]['answer'] == 'cannot tell')
 
