@@ -67,7 +67,7 @@ SAMPLE = """\
 /**:
   ros__parameters:
 {users}
-    # For experts: few users need these. What was measured for them: docs/notebook/lessons.md
+    # For experts: few users need these. What was measured for them: benchmark/settings.md
 {experts}"""
 # settings of the core that are most often set
 CORE = ('model', 'rectified', 'turns.wanted', 'turns.store', 'motion.rate', 'verdict.max_sigma')
