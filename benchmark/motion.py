@@ -22,7 +22,6 @@ from made_motion import town
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.demo.drive import MARGIN_S
@@ -32,6 +31,7 @@ from dashcalib_ros.input.motion import Samples, SensorStream, local_metres
 from dashcalib_ros.judge.gyro_scale import scale_by_gps
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.judge.witnesses import Asked, ask_sensors
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.start import scene_with
 

@@ -41,8 +41,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from dashcalib_ros import Calibration
-from dashcalib_ros.judge.agreement import evidence_of
-from dashcalib_ros.judge.conclude import CONTRADICTS, conclude
+from dashcalib_ros.judge.agreement import contradicting_turns
+from dashcalib_ros.judge.conclude import conclude
 from dashcalib_ros.solve import solve
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
@@ -60,10 +60,9 @@ def calibrated(case: Case) -> Calibration:
     while True:
         solution = solve(scenes, case.config) if scenes else None
         if scenes:
-            against = ({scene.turn for scene in scenes}
-                       - evidence_of(solution, case.config.verdict))
             evidence = replace(evidence, left_out={
-                **evidence.left_out, **dict.fromkeys(against, CONTRADICTS)})
+                **evidence.left_out,
+                **contradicting_turns(scenes, solution, case.config.verdict)})
         found = conclude(solution, evidence, case.config)
         if found.verdict.level != 'weak' or scenes is case.more or not case.more:
             return found

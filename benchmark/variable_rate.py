@@ -22,7 +22,7 @@ from drives import BY_NAME, drive_of
 
 from dashcalib_ros import Config
 from dashcalib_ros.demo import Drive
-from dashcalib_ros.recorded import calibrate
+from dashcalib_ros.session import calibrate
 
 PERIODS_S, STRETCH_S, JITTER = (0.050, 0.067, 0.120), 4.0, 0.2
 TICK = Fraction(1, 90000)

@@ -6,7 +6,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dashcalib_ros.calibrator import Calibrator
     from dashcalib_ros.camera import Brown, Camera, Fisheye, Radial, Rational
     from dashcalib_ros.config import Config
     from dashcalib_ros.errors import (
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     )
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
-    from dashcalib_ros.recorded import calibrate, check
+    from dashcalib_ros.pipeline import Calibrator
     from dashcalib_ros.report import (
         AcceptedCalibration,
         Calibration,
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
         load_camera,
     )
     from dashcalib_ros.report.export import export
+    from dashcalib_ros.session import calibrate, check
 
     __version__: str
 
@@ -41,8 +41,8 @@ __all__ = ['AcceptedCalibration', 'Brown', 'Calibration', 'Calibrator', 'Camera'
            'OutputError', 'Radial', 'Rational', 'Verdict', 'WorkerError', '__version__',
            'calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames']
 
-_HOMES = {'Calibrator': 'calibrator', 'Config': 'config', 'Frame': 'input',
-          'calibrate': 'recorded', 'check': 'recorded', 'export': 'report.export',
+_HOMES = {'Calibrator': 'pipeline', 'Config': 'config', 'Frame': 'input',
+          'calibrate': 'session', 'check': 'session', 'export': 'report.export',
           'open_frames': 'input.inputs',
           **dict.fromkeys(('AcceptedCalibration', 'Calibration', 'Verdict', 'compare',
                            'load_camera'), 'report'),

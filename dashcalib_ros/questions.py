@@ -6,7 +6,6 @@ from typing import Any
 
 from dashcalib_ros import judge
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
@@ -15,7 +14,8 @@ from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Calibration, Check, Monitor, Odometry, Poses, Reading
 from dashcalib_ros.judge.check import CALIBRATION
 from dashcalib_ros.judge.monitor import readings_of
-from dashcalib_ros.selection import Progress
+from dashcalib_ros.pipeline import Calibrator
+from dashcalib_ros.workers.worker import Progress
 
 
 class Questions:
@@ -117,4 +117,4 @@ class Questions:
              *arguments: Any) -> Any:
         if progress is not None:
             progress(stage, 0.0)
-        return self._asked.scenes.run(function, *arguments)
+        return self._asked.workers.run(function, *arguments)

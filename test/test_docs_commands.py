@@ -26,10 +26,10 @@ from made_drives import (
     write_video,
 )
 
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.arguments import make_parser
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import write_results
 
 ROOT = Path(__file__).parents[1]

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import cv2
@@ -15,9 +16,10 @@ from fakes import stands_in_for
 from made_calibration import TRUTH, make_calibration
 
 import dashcalib_ros
-from dashcalib_ros import Calibrator, calibrate, check, compare, export, open_frames, recorded
+from dashcalib_ros import Calibrator, calibrate, check, compare, export, open_frames, session
 from dashcalib_ros.errors import DashcalibError, InputError, NotAcceptedError
 from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.judge import Check
 from dashcalib_ros.questions import Questions
 
 FUNCTIONS = ('calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames')
@@ -56,26 +58,23 @@ def test_help_stands_alone(name):
 class FakeCalibrator:
     """Takes note of what it is given."""
 
-    def __init__(self, config=None, mask=None):
-        type(self).mask, type(self).motion = mask, None
+    def __init__(self, config=None, mask=None, verbose=False):
+        type(self).mask, type(self).motion, type(self).frames = mask, None, 0
 
     def sense(self, motion):
         type(self).motion = motion
 
-    def expect(self, frames):
-        type(self).frames = frames
-
     def push(self, frame):
-        pass
+        type(self).frames += 1
 
     def calibrate(self, progress=None):
         progress('solving', 1.0)
         return make_calibration()
 
-    def __enter__(self):
-        return self
+    def turns(self):
+        return ()
 
-    def __exit__(self, kind, error, trace):
+    def close(self):
         pass
 
 
@@ -86,15 +85,19 @@ class FakeQuestions:
     def __init__(self, calibrator):
         pass
 
-    def check(self, given, calibration, progress=None):
+    def check(self, given, calibration, progress=None, name=''):
         type(self).given = given
         progress('checking', 1.0)
+        return Check('right', (), 0.0, 1.0)
+
+    def watch(self, camera, sigma=None, progress=None):
+        return types.SimpleNamespace(changes=())
 
 
 @pytest.fixture
 def drive(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorded, 'Calibrator', FakeCalibrator)
-    monkeypatch.setattr(recorded, 'Questions', FakeQuestions)
+    monkeypatch.setattr(session, 'Calibrator', FakeCalibrator)
+    monkeypatch.setattr(session, 'Questions', FakeQuestions)
     (tmp_path / 'drive').mkdir()
     for n in range(4):
         cv2.imwrite(str(tmp_path / 'drive' / f'{n}.png'), np.full((48, 64), 60 + n, np.uint8))
@@ -110,9 +113,8 @@ def test_a_mask_and_the_progress(drive, tmp_path, run):
         told = []
         run(drive, mask=given, progress=lambda stage, done, told=told: told.append((stage, done)))
         np.testing.assert_array_equal(FakeCalibrator.mask, mask > 0)
-        assert FakeCalibrator.frames == 4
-        assert told[:4] == [('reading', share) for share in (0.25, 0.5, 0.75, 1.0)]
-        assert told[4] == ('solving', 1.0)
+        assert told[:5] == [('reading', share) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+        assert told[5] == ('solving', 1.0)
     with pytest.raises(InputError, match='64x47'):
         run(drive, mask=mask[1:])
     with pytest.raises(InputError, match='height, width'):

@@ -5,36 +5,27 @@ import argparse
 import json
 from collections.abc import Sequence
 
-from dashcalib_ros.camera import Camera
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
-from dashcalib_ros.cli.drive import (
-    feed,
-    open_calibrator,
-    open_drive,
-    read_config,
-    read_sensors,
-)
+from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Stages, show, warn
 from dashcalib_ros.errors import InputError, counted
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, is_motion, read_motion
 from dashcalib_ros.judge import (
-    Calibration,
     Check,
     Odometry,
     Poses,
     path_files,
     read_poses,
-    track_poses,
     with_faults,
 )
-from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.camera_file import load_with_faults
 from dashcalib_ros.report.compare import mount_dict
 from dashcalib_ros.report.tables import TextTable, labelled, line
 from dashcalib_ros.report.wording import mounts_text
+from dashcalib_ros.session import check_drive
 from dashcalib_ros.standard_streams import write_stdout
 
 COLOURS = {'right': 'bold green', 'differs': 'bold cyan', 'wrong': 'bold red',
@@ -70,25 +61,12 @@ def check(args: argparse.Namespace) -> int:
             raise UsageError('E-OUT-WITHOUT-POSES',
                              '--out is for the paths that --poses compares; add --poses FILE')
         check_writable(args.out)
-    source, mask = open_drive(args)
-    given = source.shown(named.camera)
-    sensors, motion = read_sensors(args), None
-    with open_calibrator(config, mask, args.verbose) as calibrator, Stages(args.quiet) as stages:
-        if sensors is not None:
-            calibrator.sense(sensors)
-        feed(calibrator, source, mask, stages)
-        calibration, questions = calibrator.calibrate(stages.show), Questions(calibrator)
-        found = with_faults(questions.check(given, calibration, stages.show, named.name),
-                            named.faults)
-        # one for pictures of another size is wrong, and explains no motion
-        changes = _changes(questions, given, calibration)
-        if track is not None:
-            track = track.since(calibration.start_s)
-            assert track.position is not None
-            poses = track_poses(track.position, calibration.start_s)
-        if poses is not None and given.image_size == calibration.image_size:
-            motion = questions.odometry(given, calibration, poses, stages.show)
-    warn((*source.warnings, *calibration.warnings, *(track.warnings if track else ())))
+    drive = open_drive(args)
+    with Stages(args.quiet) as stages:
+        checked = check_drive(drive, named, config, stages, poses, track, args.verbose)
+    found, motion = with_faults(checked.check, named.faults), checked.odometry
+    calibration, changes = checked.calibration, checked.changes
+    warn((*drive.source.warnings, *calibration.warnings, *(track.warnings if track else ())))
     now, before = calibration.mount, named.mount
     if args.json:
         write_stdout(json.dumps(answer_dict(found, changes, motion, mount_dict(now, before)),
@@ -126,13 +104,6 @@ def _poses(args: argparse.Namespace) -> tuple[Poses | None, SensorStream | None]
                          f'{path} has no GPS track{why and f" ({why})"}: use one with positions '
                          f'(NavSatFix, GPX), or poses in the format of KITTI, TUM or EuRoC')
     return None, track
-
-
-def _changes(questions: Questions, given: Camera, calibration: Calibration) -> list[str]:
-    """Return in words what changed during the drive: a long drive may have two cameras."""
-    if given.image_size != calibration.image_size:
-        return []
-    return [str(change) for change in questions.watch(given).changes]
 
 
 def _show(found: Check, motion: Odometry | None, changes: Sequence[str]) -> None:

@@ -17,7 +17,7 @@ from rich.console import RenderableType
 from dashcalib_ros.camera import camera_of
 from dashcalib_ros.camera.mapping import Apart, apart_at, grid_of
 from dashcalib_ros.cli.arguments import exit_code
-from dashcalib_ros.cli.drive import calibrate, read_config
+from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.run import files_line, now, warn_of
 from dashcalib_ros.cli.terminal import Screen, Stages
 from dashcalib_ros.demo import DEMOS, Drive, demo_drive, render_to_bag
@@ -37,6 +37,7 @@ from dashcalib_ros.report.files import TRUTH
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.tables import against_truth, conclusion, line, next_step, summary
 from dashcalib_ros.report.wording import optional
+from dashcalib_ros.session import Recording, calibrate_drive
 from dashcalib_ros.standard_streams import write_stdout
 from dashcalib_ros.whole_files import temporary_folder
 
@@ -55,7 +56,8 @@ def demo(args: argparse.Namespace) -> int:
         with Stages(args.quiet) as stages, _bag_path(out, args.keep_bag) as bag:
             stages.show('rendering the drive')
             render_to_bag(drive, bag, lambda done: stages.show('rendering the drive', done))
-            calibration = calibrate(open_frames(bag), config, None, args.verbose, stages)
+            calibration = calibrate_drive(Recording(open_frames(bag)), config, stages,
+                                          args.verbose)
         calibration = dataclasses.replace(
             calibration, input_name=f'demo drive {config.seed}, {args.lens}')
         lens = NamedCamera('truth', camera_of(drive.lens.model, drive.lens.size,

@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.text import Text
 
 from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
-from dashcalib_ros.cli.drive import calibrate, feed, open_drive, read_config, read_sensors
+from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, OutputError, counted
@@ -32,20 +32,20 @@ from dashcalib_ros.report.tables import (
     next_step,
     summary,
 )
+from dashcalib_ros.session import calibrate_drive, feed
 from dashcalib_ros.standard_streams import write_stdout
 
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate, write the results, show them; return the verdict's exit code."""
     config = read_config(args)
-    source, mask = open_drive(args)
-    motion = read_sensors(args)
+    drive = open_drive(args)
     screen = Screen(args.quiet, to_stderr=args.json)
     with output_folder(args.out):
         if args.write_bag is not None:
-            _check_bag(args, source)
+            _check_bag(args, drive.source)
         with Stages(args.quiet) as stages:
-            calibration = calibrate(source, config, mask, args.verbose, stages, motion)
+            calibration = calibrate_drive(drive, config, stages, args.verbose)
         try:
             written = write_results(calibration, args.out, created=now())
         except OutputError:
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             raise
     _show(args, calibration, screen, written)
     if args.write_bag is not None:
-        _write_bag(args, str(source.topic), calibration, screen)
+        _write_bag(args, str(drive.source.topic), calibration, screen)
     screen.show(next_step(calibration.verdict))
     return exit_code(calibration.verdict.level)
 
@@ -115,10 +115,10 @@ PROMINENCE = ('prominence: how far a turn stands out from the driving before and
 def turns(args: argparse.Namespace) -> int:
     """List the turns found, best first. The exit code is 0, also if there are none."""
     config = read_config(args)
-    source, mask = open_drive(args)
-    detection = Detection(config, mask)
+    drive = open_drive(args)
+    source, detection = drive.source, Detection(config, drive.mask)
     with Stages(args.quiet) as stages:
-        frames = feed(detection, source, mask, stages)
+        frames = feed(detection, drive, stages)
     detection.finish()
     found = detection.turns()
     warn((*source.warnings, *detection.warnings()))

@@ -10,7 +10,6 @@ from functools import reduce
 from typing import Any
 
 from dashcalib_ros.arrays import GreyImage, Mask
-from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
@@ -19,8 +18,8 @@ from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge import Calibration, Check, Monitor, moved_text
-from dashcalib_ros.judge.agreement import outdated, turns_of_another_camera
-from dashcalib_ros.judge.conclude import CONTRADICTS
+from dashcalib_ros.judge.agreement import CONTRADICTS, outdated, turns_of_another_camera
+from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.workers.memory import mapped_copy
@@ -378,7 +377,7 @@ class Learner:
             check = None if given is None else bank.questions.check(
                 given.camera, calibration, self._progress)
             of_another = turns_of_another_camera(calibration.misfits, self.config.verdict)
-            bank.calibrator.scenes.reject(dict.fromkeys(
+            bank.calibrator.scenes.exclude(dict.fromkeys(
                 outdated(of_another | calibration.used_turns, of_another), CONTRADICTS))
         except Exception as error:
             self._failed(bank, error)

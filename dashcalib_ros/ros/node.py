@@ -20,10 +20,10 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 
-from dashcalib_ros.calibrator import Status
 from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, coded
 from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.judge import Monitor, Verdict
+from dashcalib_ros.pipeline import Status
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.result import check_camera_name
 from dashcalib_ros.report.wording import witness_texts

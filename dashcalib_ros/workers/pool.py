@@ -209,6 +209,11 @@ class ScenePool:
         with self._changed:
             return dict(self._pictures)
 
+    @property
+    def closed(self) -> bool:
+        """Return whether close() was called."""
+        return self._closed.is_set()
+
     def pids(self) -> list[int]:
         """Return the process ids of the workers that have one."""
         return [pid for worker in self._workers if (pid := worker.pid) is not None]

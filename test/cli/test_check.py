@@ -12,13 +12,13 @@ from fakes import stands_in_for
 from made_calibration import MOUNT, TRUTH, make_calibration
 from made_drives import START, TIMES, drive, images, info_of, write_bag, write_timed
 
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import command, main
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import result_json
 from dashcalib_ros.solve.quadratic import Quadratic
@@ -79,8 +79,8 @@ class FakeQuestions:
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     """Make a drive, a calibration and a file of poses; return the command's first arguments."""
-    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', FakeCalibrator)
-    monkeypatch.setattr('dashcalib_ros.cli.check.Questions', FakeQuestions)
+    monkeypatch.setattr('dashcalib_ros.session.Calibrator', FakeCalibrator)
+    monkeypatch.setattr('dashcalib_ros.session.Questions', FakeQuestions)
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'drive').mkdir()
     for n in range(3):

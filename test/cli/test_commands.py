@@ -23,7 +23,6 @@ from made_calibration import TRUTH, make_calibration
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import AUTO, calibrated_models, ros_camera
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.terminal import Stages
@@ -32,6 +31,7 @@ from dashcalib_ros.demo import Drive, Lens, demo_drive, render_to_bag
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import ConfigError, OutputError, WorkerError
+from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.report import write_results
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
@@ -73,7 +73,7 @@ class FakeCalibrator:
 @pytest.fixture
 def fake(monkeypatch):
     """Put the fake in the calibrator's place."""
-    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', FakeCalibrator)
+    monkeypatch.setattr('dashcalib_ros.session.Calibrator', FakeCalibrator)
     monkeypatch.setattr(FakeCalibrator, 'made', [])
     return FakeCalibrator
 
@@ -107,7 +107,7 @@ class FakeDetection:
 def fake_detection(monkeypatch):
     """Put the fake in the place of the first stage; nobody may calibrate."""
     monkeypatch.setattr('dashcalib_ros.cli.run.Detection', FakeDetection)
-    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', None)
+    monkeypatch.setattr('dashcalib_ros.session.Calibrator', None)
     return FakeDetection
 
 

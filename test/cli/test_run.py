@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zstandard
 
-pytest.importorskip('dashcalib_ros.calibrator')
+pytest.importorskip('dashcalib_ros.pipeline')
 
 from processes import processes_of
 from waiting import wait_for

@@ -21,11 +21,11 @@ from ros_desk import FIRST, SIGMA
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from std_msgs.msg import Header, String
 
-from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
+from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros import background, node
@@ -84,7 +84,7 @@ class Scenes:
     def want(self, turns, more=0):
         pass
 
-    def reject(self, reasons):
+    def exclude(self, reasons, keep_files=False):
         pass
 
     def clear_store(self):

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from fakes import image_message, stands_in_for
 
-from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.judge.calibration import StoredTurnSummary
+from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros import background as room
@@ -108,7 +108,7 @@ class Scenes:
     def want(self, turns, more=0):
         self.core.wanted = turns + more
 
-    def reject(self, reasons):
+    def exclude(self, reasons, keep_files=False):
         self.core.ready = tuple(turn for turn in self.core.ready if turn not in reasons)
 
     def clear_store(self):
@@ -374,7 +374,7 @@ def test_sensors_that_cannot_be_used_are_told_at_the_next_calibration(desk):
 
 def test_a_failing_core_ends_no_thread(desk, monkeypatch):
     core = Core.made[0]
-    failures = ['status', 'reject']
+    failures = ['status', 'exclude']
 
     def status():
         if 'status' in failures:
@@ -382,12 +382,12 @@ def test_a_failing_core_ends_no_thread(desk, monkeypatch):
             raise RuntimeError('status')
         return Core.status(core)
 
-    def reject(reasons):
-        if 'reject' in failures:
-            failures.remove('reject')
-            raise RuntimeError('reject')
+    def exclude(reasons):
+        if 'exclude' in failures:
+            failures.remove('exclude')
+            raise RuntimeError('exclude')
     core.ready = at(10, 20)
-    core.status, core.scenes.reject = status, reject
+    core.status, core.scenes.exclude = status, exclude
     until(lambda: desk.results)
     assert failures == []
     # the first look at the turns may come before status is replaced, never after two results
