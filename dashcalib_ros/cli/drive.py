@@ -44,8 +44,8 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, Any]:
         try:
             changes[key.strip()] = parse_yaml(text, what)
         except InputError as error:
-            raise ConfigError('E-SETTING-VALUE',
-                              f'{error}; use a plain number, true or false') from error
+            raise ConfigError(error.code, f'{error}: use a plain number, a word, true or '
+                                          f'false') from error
     return changes
 
 
@@ -54,8 +54,7 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
         what = f'the configuration {path}'
         data = parse_yaml(read_text(path, YAML_BYTES, what), what)
     except InputError as error:
-        raise ConfigError('E-CONFIG-UNREADABLE',
-                          f'{error}; write lines like turns.wanted: 4') from error
+        raise ConfigError(error.code, str(error)) from error
     if data is None:
         return {}
     if not isinstance(data, Mapping):

@@ -72,12 +72,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         # `python -m` ends with SIGINT instead of our exit code when an interrupt, caught or not,
         # came out of exec('text'), as dataclasses call it on import; the next exec() resets that
         exec('pass')
-        return _fail(DashcalibError('interrupted'), INTERRUPTED)
+        return _interrupted()
     except RuntimeError as error:
         # what Condition.wait() makes of Ctrl-C in the middle of its own code: its lock is free
         if not isinstance(error.__context__, KeyboardInterrupt):
             raise
-        return _fail(DashcalibError('interrupted'), INTERRUPTED)
+        return _interrupted()
     except ModuleNotFoundError as error:
         if not error.name or error.name.startswith('dashcalib_ros'):
             raise
@@ -115,10 +115,15 @@ def handling(handler: Any, *signals: signal.Signals) -> Iterator[None]:
             signal.signal(each, earlier)
 
 
-def _fail(error: DashcalibError, exit_code: int = BAD_INPUT) -> int:
+def _fail(error: DashcalibError) -> int:
     code = f' [{error.code}]' if error.code else ''
     write_stderr(f'{PROGRAM}: error: {" ".join(str(error).split())}{code}')
-    return exit_code
+    return BAD_INPUT
+
+
+def _interrupted() -> int:
+    write_stderr(f'{PROGRAM}: error: interrupted')
+    return INTERRUPTED
 
 
 def _os_error(error: OSError) -> DashcalibError:
