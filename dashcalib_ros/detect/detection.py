@@ -161,8 +161,8 @@ class Detection:
         elif frame.size != self.size:
             raise InputError(
                 'E-IMAGE-SIZE-CHANGES', f'the image size changes from {self.size[0]}x'
-                f'{self.size[1]} to {frame.size[0]}x{frame.size[1]} pixels at frame '
-                f'{frame.index}: calibrate each size separately')
+                f'{self.size[1]} to {frame.size[0]}x{frame.size[1]} at frame {frame.index}: '
+                f'calibrate each size separately')
 
     def _check_stamps(self, frame: Frame) -> None:
         """Check once that time passes between the first images, in the right unit."""

@@ -69,8 +69,8 @@ class _Candidate:
 class TurnDetector:
     """Median filter, peaks by prominence, and the bank of the best turns, as a stream.
 
-    A turn is a peak of enough prominence that has no higher turn within half a width. This is
-    known when the filtered signal is half a width past the peak, and is final.
+    A turn is a peak of enough prominence that has no higher turn within half a width. It is
+    reported with its last image; a higher one that follows soon takes its place.
     """
 
     def __init__(self, config: TurnsConfig) -> None:
@@ -98,8 +98,7 @@ class TurnDetector:
             for stamp_ns, median in self._median.push(motion.center_ns, value):
                 self._filtered(stamp_ns, median)
         self._collect(frame.stamp_ns)
-        if self._is_decided():
-            self._enter()
+        self._judge(self._is_decided())
         return self.bank.new_turns()
 
     def finish(self) -> list[Turn]:
@@ -128,7 +127,7 @@ class TurnDetector:
             self._find(self._filtered_ns, self._beyond(self.magnitude))
         self._peaks.finish()
         self._collect(None)
-        self._enter()
+        self._judge(True)
         self._begin()
 
     def _filtered(self, stamp_ns: int, value: float) -> None:
@@ -183,21 +182,23 @@ class TurnDetector:
             self._recent.popleft()
 
     def _is_decided(self) -> bool:
-        """Return whether it is known which of the candidates are turns."""
+        """Return whether no peak can come that hides a candidate."""
         return (bool(self._candidates)
                 and self._peaks.earliest_ns - self._candidates[-1].peak.stamp_ns > self._reach_ns
                 and all(each.peak.prominence >= self.config.min_prominence
                         for each in self._candidates))
 
-    def _enter(self) -> None:
+    def _judge(self, final: bool) -> None:
         """Put the candidates that are turns into the bank.
 
-        Of candidates near each other the last one is the highest.
+        Of candidates near each other the last one is the highest. final: there will be no other
+        turns near them.
         """
         turns: list[_Candidate] = []
         for each in reversed(self._candidates):
-            if not turns or not self._near(each.peak, turns[-1].peak):
+            ready = each.frames and each.peak.prominence >= self.config.min_prominence
+            if ready and not (turns and self._near(each.peak, turns[-1].peak)):
                 turns.append(each)
-        self._candidates = []
-        for each in reversed(turns):
-            self.bank.add(each.peak, each.frames)
+        self.bank.set_newest([(each.peak, each.frames) for each in reversed(turns)], final)
+        if final:
+            self._candidates = []
