@@ -108,7 +108,7 @@ def test_a_bag_s_own_calibration_is_checked(files, tmp_path, capfd):
     assert main(['check', 'bag', '--topic', '/camera']) == 0
     write_bag(tmp_path / 'without', images(drive(3)))
     assert main(['check', 'without']) == 2
-    assert 'there is none' in capfd.readouterr().err
+    assert '[E-BAG-CAMERA-INFO]' in capfd.readouterr().err
 
 
 def test_a_calibration_of_the_stored_pictures_is_checked_as_it_is_shown(files, tmp_path, capfd):
@@ -168,7 +168,7 @@ def test_a_gps_track_may_be_the_poses(files, tmp_path, capfd):
 
 
 @pytest.mark.parametrize(('more', 'line'), [
-    (['--motion', 'none.csv'], 'none.csv'), (['--motion', 'camera.json'], 'no CSV of motion'),
+    (['--motion', 'none.csv'], 'none.csv'), (['--motion', 'camera.json'], 'E-MOTION-HEADER'),
     (['--motion', 'gyro.csv', '--imu', '/imu'], '--imu'),
     (['--gyro-scale-sigma', '-1'], 'must be 0 or more')])
 def test_wrong_motion_arguments_are_one_line(files, tmp_path, capfd, more, line):
@@ -231,6 +231,6 @@ def test_a_track_and_poses_are_known_by_their_content(files, tmp_path, capfd, na
     (tmp_path / name).write_text(''.join(
         f'{(1700000000 + n) * 10**9},{n},0,0,0,0,0,1\n' for n in range(5)))
     assert main([*files, '--poses', name]) == 0
-    assert 'taken as nanoseconds' in capfd.readouterr().err
+    assert 'nanoseconds' in capfd.readouterr().err
     assert main([*files, '--motion', name]) == 2
     assert '--poses' in capfd.readouterr().err
