@@ -25,8 +25,6 @@ from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.solve.solution import LeftOut, Solution
 from dashcalib_ros.solve.spread import PictureSigma, sigma_over
 
-UNKNOWN_COVARIANCE = ('this calibration does not know how its parameters are correlated: '
-                      'calibrate the drive again')
 # after the point, in one line of text
 MOST_DIGITS = 9
 # an optical frame that looks ahead (z ahead, x to the right, y downwards) to the car's (REP-103)
@@ -38,12 +36,14 @@ Level = Literal['accepted', 'weak', 'refused']
 class Verdict:
     """accepted: use it. weak: look at the sigmas before using it. refused: there is no result.
 
-    reasons: one line each, what is wrong: what to do. cures: what to do, the gravest first.
+    reasons: one line each, what is wrong: what to do. cures: what to do, the likeliest to help
+    first. codes: of the reasons, in their order; a code stays when its text is reworded.
     """
 
     level: Level
     reasons: tuple[str, ...] = ()
     cures: tuple[str, ...] = ()
+    codes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -152,6 +152,14 @@ class LensField:
     worst_px: float
     sigma_px: float
 
+    @property
+    def text(self) -> str:
+        """Return the clause that stands beside the camera's parameters, without a verb."""
+        side = 'below' if self.rms_px < self.sigma_px else 'above'
+        digits = 1 if self.rms_px >= 0.1 else 2
+        return (f'a smooth field of {self.rms_px:.{digits}f} px, {side} its sigma of '
+                f'{self.sigma_px:.{digits}f} px')
+
 
 # of a mounting, and what its sigmas are named by
 ANGLES = ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg')
@@ -231,6 +239,11 @@ class Material:
     pictures: Mapping[TurnId, TurnPicture] = default(default_factory=dict)
 
 
+def _unknown_covariance() -> InputError:
+    return InputError('E-UNKNOWN-COVARIANCE', 'this calibration does not contain the correlations '
+                      'of its parameters: calibrate the drive again')
+
+
 def _with_sigma(value: float, sigma: float) -> str:
     """Return a value and its sigma, both to the second digit of the sigma."""
     if not (math.isfinite(sigma) and sigma > 0):
@@ -302,7 +315,9 @@ class Calibration:
         sigma = self.sigma or {}
         found = [f'{name} {_with_sigma(value, sigma.get(name, math.nan))}'
                  for name, value in self.camera.named.items()]
-        text = f'{self.verdict.level}, {self.camera.model}, {", ".join(found)}'
+        field = self._used_field and self.field
+        text = (f'{self.verdict.level}, {self.camera.model}, {", ".join(found)}'
+                + (f', and {field.text}' if field else ''))
         return f'Calibration({"; ".join(part for part in (text, self.caveat) if part)})'
 
     def accepted(self) -> AcceptedCalibration:
@@ -346,7 +361,7 @@ class Calibration:
         names = self._camera.names()
         correlation = np.array(self.details.get('correlation', ()), np.float64)
         if self.sigma is None or correlation.shape != (len(names), len(names)):
-            raise InputError(UNKNOWN_COVARIANCE)
+            raise _unknown_covariance()
         sigma = np.array([self.sigma[name] for name in names])
         return np.asarray(correlation * np.outer(sigma, sigma))
 
@@ -381,7 +396,7 @@ class Calibration:
         camera = self._camera.widened()
         covariance = np.array(self.details.get('picture_covariance', ()), np.float64)
         if covariance.shape != (len(camera.params),) * 2:
-            raise InputError(UNKNOWN_COVARIANCE)
+            raise _unknown_covariance()
         return camera, covariance
 
     def rays(self, pixels: npt.ArrayLike) -> Floats:
@@ -416,8 +431,10 @@ class Calibration:
         import cv2
         camera = self._camera
         if image.shape[1::-1] != camera.image_size:
-            raise InputError(f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
-                             f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}')
+            raise InputError('E-IMAGE-SIZE',
+                             f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
+                             f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}: '
+                             f'resize the image, or use `dashcalib export --size`')
         if self._used_field is not None:
             y, x = np.indices(image.shape[:2])
             ahead = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy,
@@ -431,7 +448,8 @@ class Calibration:
     @property
     def _camera(self) -> Camera:
         if self.camera is None:
-            raise InputError(f'the calibration was refused: {"; ".join(self.verdict.reasons)}')
+            raise InputError('E-CALIBRATION-REFUSED', 'the calibration was refused: '
+                             f'{"; ".join(self.verdict.reasons)}')
         return self.camera
 
     @property

@@ -38,6 +38,7 @@ from dashcalib_ros.report.wording import (
     optional,
     parameter_rows,
     run_facts,
+    verdict_text,
 )
 from dashcalib_ros.solve.spread import SigmaMap
 
@@ -73,6 +74,7 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
                                                             c.start_s or None),
         turns=turn_sections(c, mask_id), rows=turn_rows(c),
         evidence=[*evidence_of(c, mask_id), *field_of(c)], mounting=mounting_of(c),
+        mount_verdict='' if c.mount is None else verdict_text(c.mount),
         facts=run_facts(c),
         mask='' if mask is None else mask_data_uri(mask), mask_id=MASK_ID,
         changed={key: value for key, value in settings.items() if value != defaults[key]},
