@@ -39,8 +39,8 @@ FEWEST = 4  # observations of a cell whose mean residual is drawn
 GRID_LINES = 12  # over the picture's width
 # from little to much, BGR
 RAMP = np.array([(250, 243, 236), (238, 205, 160), (206, 148, 78), (142, 86, 34), (72, 38, 16)])
-BY_TURN = ('fx by each turn alone, with one sigma. Last, and as a band: all turns together, with '
-           'how much they differ.')
+BY_TURN = ('fx by each turn alone, with one sigma. Last, and as a band: all turns together, '
+           'including how much they differ.')
 # times the sigma of the best turn; where all together know less, that needs no explanation
 MUCH_BETTER = 0.5
 WHY_TOGETHER = (' One turn alone cannot separate fx from the other parameters of the lens; turns '

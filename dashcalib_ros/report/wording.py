@@ -255,18 +255,15 @@ class Condition(NamedTuple):
 
 
 def checks(c: Calibration) -> list[Condition]:
-    """Return the conditions of the verdict, those that are not met first.
+    """Return the conditions of the verdict: its reasons in their order, then what is met.
 
-    Each reason of the verdict is one of them; those that can be put in a number are there also
-    where they are met.
+    What can be put in a number is there also where it is met.
     """
     rows = {row.code: row for row in _measured(c)}
-    reasons = list(objections(c.verdict))
-    failed = {code for code, _, _ in reasons}
-    measured = [row._replace(met=row.met and row.code not in failed) for row in rows.values()]
-    others = [Condition(code, what, '', '', False) for code, what, _ in reasons
-              if code not in rows]
-    return sorted([*measured, *others], key=lambda row: row.met)
+    failed = [rows.pop(code)._replace(met=False) if code in rows
+              else Condition(code, what, '', '', False)
+              for code, what, _ in objections(c.verdict)]
+    return [*failed, *sorted(rows.values(), key=lambda row: row.met)]
 
 
 def _measured(c: Calibration) -> list[Condition]:

@@ -100,12 +100,13 @@ def test_a_turn_that_contradicts_the_others_says_so():
 
 def test_every_objection_is_a_row_that_failed_and_they_come_first(drawn):
     # the second reason has no number, the third no code
-    verdict = Verdict('weak', ('sigma is large: drive', 'the picture is `bent`: clean', 'old'),
-                      ('drive', 'clean'), ('E-LARGE-SIGMA', 'E-PICTURE-BENT'))
+    verdict = Verdict('weak', ('the picture is bent: clean', 'sigma is large: drive', 'old'),
+                      ('clean', 'drive'), ('E-PICTURE-BENT', 'E-LARGE-SIGMA'))
     rows = checks(dataclasses.replace(drawn, verdict=verdict))
-    assert [row.code for row in rows if not row.met] == ['E-LARGE-SIGMA', 'E-PICTURE-BENT', '']
+    assert [row.code for row in rows if not row.met] == ['E-PICTURE-BENT', 'E-LARGE-SIGMA', '']
     assert [row.met for row in rows] == [False] * 3 + [True] * 6
-    assert [row.name for row in rows[1:3]] == ['the picture is `bent`', 'old']
+    assert (rows[0].name, rows[2].name) == ('the picture is bent', 'old')
+    assert rows[1].found == '0.39 %'
     assert all(row.met for row in checks(drawn))
     text = report_html(dataclasses.replace(drawn, verdict=verdict))
     assert text.count('<tr class="objection">') == 3 and '<code>E-PICTURE-BENT</code>' in text
