@@ -1,4 +1,4 @@
-"""Whether the turns agree on one camera, and what each of them, and one more, tells of fx."""
+"""Whether the turns agree on one camera, and what each of them, and one more, knows of fx."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set

@@ -105,9 +105,9 @@ class Stabiliser:
 
 @dataclass(frozen=True)
 class Witness:
-    """What a sensor says of the focal length, from the angles of the turns.
+    """The focal length by a sensor, from the angles of the turns.
 
-    time_offset_s: what must be taken off the sensor's stamps; positive: its messages are late.
+    time_offset_s: to subtract from the sensor's stamps; positive: its messages are late.
     None where it is not known. scale: the sensor's angles over the camera's. fx_percent: by how
     much fx would have to change to agree with the sensor, of fx; fx_sigma_percent: with what the
     sensor's own scale may be off. agrees: no contradiction beyond 3 sigmas of both.
@@ -131,7 +131,7 @@ class Witness:
 
 @dataclass(frozen=True)
 class Witnesses:
-    """The sensors that were asked; each None where it has nothing to say."""
+    """The sensors that were compared; each None where it is not used."""
 
     gyro: Witness | None = None
     gps: Witness | None = None
@@ -172,7 +172,7 @@ class Mount:
     """How the camera sits on the car, relative to the direction of travel and to the road.
 
     yaw_left_deg, pitch_up_deg: where the optical axis points; roll_right_deg: by how much the
-    camera is turned clockwise, as seen from behind; None where nothing tells it. height_m: above
+    camera is turned clockwise, as seen from behind; None where it is not known. height_m: above
     the road; None where the speed is not known. sigma: by these four names. travel_px: the pixel
     (u, v) in which the car travels, with its sigma: less than that of the angles, which have the
     centre's, too. straight_m: of straight driving. moved_s: stamp after which the camera was
@@ -263,12 +263,12 @@ class Calibration:
     mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
     rolling_shutter: the one that was found, and whose effect was removed; None for a global one.
     stabiliser: the one that was found, and whose effect was removed; None for a fixed picture.
-    mount: how the camera sits on the car; None where nothing tells it.
-    field: what the camera leaves over; None: nothing speaks for one. camera is the best without.
-    sigma_px: how far the whole camera may be off over the picture. held_out: what each turn says
-    of the calibration without it, in the full-size images' pixels; () for fewer than three turns.
-    straight_lines: what upright lines of the world say of the distortion; None: too few of them.
-    witnesses: what the car's own sensors say of the focal length.
+    mount: how the camera sits on the car; None where it is not known.
+    field: what the camera's model leaves over; None: no evidence for one. camera is without it.
+    sigma_px: how far the whole camera may be off over the picture. held_out: how each turn
+    fits the calibration without it, full-size images' px; () for fewer than three turns.
+    straight_lines: the distortion by upright lines of the world; None: too few of them.
+    witnesses: the focal length by the car's own sensors.
     start_s: stamp of the first image. material: what the report draws, None in a live drive.
     """
 

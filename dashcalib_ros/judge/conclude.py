@@ -262,8 +262,8 @@ def _verdict_without_solution(evidence: Evidence) -> Verdict:
                         'show too little', 'record a drive with turns at crossings, in daylight')
     elif evidence.left_out and set(evidence.left_out.values()) == {STOOD}:
         found = Finding('E-CAR-STOOD', 'refused',
-                        f'{counted(turns, "turn")} {"was" if turns == 1 else "were"} found, but '
-                        f'according to its speed the car stood',
+                        f'the car stood during all turns that were found ({turns}), according to '
+                        f'its speed',
                         'drive through turns, or omit the speed if it is wrong')
     else:
         found = Finding('E-NO-SCENE', 'refused',

@@ -77,7 +77,7 @@ class _Pairs:
 
 def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str,
              speed: Speed | None) -> Mount | None:
-    """Return how the camera sits on the car; None where nothing tells.
+    """Return how the camera sits on the car; None where that is not known.
 
     straights, lines: in the scenes' pixels. level: the lens's verdict; the mount's is never
     better. speed: m/s (n,) at stamps (n,), s.

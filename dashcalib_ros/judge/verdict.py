@@ -19,7 +19,6 @@ from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.one_camera import APART, OtherCamera
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import counted
 from dashcalib_ros.judge.agreement import (
     focal_disagreement,
     leverages,
@@ -129,8 +128,8 @@ def _too_few_turns(solution: Solution, config: VerdictConfig) -> Finding | None:
         return None
     lone = ', and nothing confirms its numbers and their sigma' if count == 1 else ''
     return Finding('E-FEW-TURNS', 'weak',
-                   f'only {counted(count, "turn")} could be used, at least {config.min_turns} are '
-                   f'needed{lone}', MORE_TURNS)
+                   f'only {count} of at least {config.min_turns} turns could be used{lone}',
+                   MORE_TURNS)
 
 
 def gyro_confirms(solution: Solution) -> bool:

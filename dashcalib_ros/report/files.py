@@ -106,7 +106,7 @@ def set_aside(path: Path) -> Path | None:
         return None
     except OSError as error:
         raise OutputError('E-FILE-NOT-MOVED',
-                          f'{path} could not be renamed: {error.strerror or error}; rename it '
+                          f'{path} could not be moved aside: {error.strerror or error}; move it '
                           f'yourself, or allow writing to {path.parent}') from error
     sync(path.parent)
     return target

@@ -200,7 +200,7 @@ def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
 
 def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None,
                 mount: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return what a drive says of a given calibration as types of strict JSON.
+    """Return the answer of a drive about a given calibration as types of strict JSON.
 
     changes: of the camera during the drive, in words. motion: the comparison with true poses.
     mount: how far the mounting is from the calibration's.

@@ -77,8 +77,8 @@ def angle_text(name: str, degrees: float | None, sigma: float | None) -> str:
 def mounts_text(mount: Mount, other: Mount) -> str:
     """Return how far a mounting is from another one, and whether the camera was moved."""
     parts = [angle_text(name, *apart) for name, apart in mount.apart(other).items()]
-    moved = 'the camera was moved' if mount.moved_from(other) else 'it is mounted as before'
-    return f'mounting changed by {", ".join(parts)}: {moved}'
+    moved = 'the camera was moved' if mount.moved_from(other) else 'it sits as before'
+    return f'mounting: differs by {", ".join(parts)}: {moved}'
 
 
 def verdict_text(mount: Mount) -> str:
