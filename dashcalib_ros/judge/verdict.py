@@ -406,11 +406,10 @@ def two_cameras(found: OtherCamera) -> Finding:
 def _sensors_disagree(witnesses: Witnesses, solution: Solution, config: VerdictConfig
                       ) -> Finding | None:
     """A gyro and GPS know the angles of the turns, and so the focal length, without pictures."""
-    for code, name, said in (('E-GYRO-CONTRADICTS', 'the gyro', witnesses.gyro),
-                             ('E-GPS-CONTRADICTS', 'GPS', witnesses.gps)):
+    for name, said in (('the gyro', witnesses.gyro), ('GPS', witnesses.gps)):
         if said is not None and not said.agrees:
             own = 100 * float(solution.sigma[0]) / solution.camera.fx
-            return Finding(code, 'weak',
+            return Finding('E-SENSOR-CONTRADICTS', 'weak',
                            f'the pictures and {name} contradict each other: according to {name} '
                            f'the focal length is off by {said.fx_percent:+.1f} ± '
                            f'{said.fx_sigma_percent:.1f} %, and the pictures know it to '

@@ -274,10 +274,12 @@ def _measured(c: Calibration) -> list[Condition]:
     needed, count, yaw = c.config.verdict, c.turns_used, c.yaw_deg
     solution = None if c.material is None else c.material.solution
     alone = solution is not None and gyro_confirms(solution)
-    found = [Condition('E-FEW-TURNS', 'turns used', f'{count}', 'the gyro confirms them' if alone
-                       else f'at least {needed.min_turns}', alone or count >= needed.min_turns),
-             Condition('E-LITTLE-YAW', 'yaw of these turns together', f'{yaw:.0f}°',
-                       f'at least {needed.min_yaw_deg:.0f}°', yaw >= needed.min_yaw_deg)]
+    found = [Condition(*row) for row in (
+        ('E-FEW-TURNS', 'turns used', f'{count}',
+         'the gyro confirms them' if alone else f'at least {needed.min_turns}',
+         alone or count >= needed.min_turns),
+        ('E-LITTLE-YAW', 'yaw of these turns together', f'{yaw:.0f}°',
+         f'at least {needed.min_yaw_deg:.0f}°', yaw >= needed.min_yaw_deg))]
     if solution is None:
         return found
     share = max(leverages(solution).values(), default=1.0)

@@ -101,7 +101,8 @@ def test_a_contradiction_makes_the_result_weak_with_both_named(drive):
     found = ask_sensors(solution, gyro(drive, 1.05), START_S, CALIBRATED).witnesses
     verdict = judge(solution, config, witnesses=found)
     assert verdict.level == 'weak'
-    assert set(verdict.codes) - set(before.codes) == {'E-GYRO-CONTRADICTS'}
+    assert set(verdict.codes) - set(before.codes) == {'E-SENSOR-CONTRADICTS'}
+    assert 'the gyro' in verdict.reasons[verdict.codes.index('E-SENSOR-CONTRADICTS')]
     assert judge(solution, config, witnesses=ask_sensors(
         solution, gyro(drive), START_S, CALIBRATED).witnesses) == before
 

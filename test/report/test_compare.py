@@ -305,8 +305,9 @@ def test_a_drive_given_by_mistake_is_not_read_whole(tmp_path):
     path = tmp_path / 'drive.mp4'
     with path.open('wb') as stream:
         stream.truncate(2**40)  # sparse; reading it all would be noticed
-    with pytest.raises(InputError, match='too large'):
+    with pytest.raises(InputError) as caught:
         load_camera(path)
+    assert caught.value.code == 'E-FILE-TOO-LARGE'
 
 
 def test_the_comparison_is_strict_json():
