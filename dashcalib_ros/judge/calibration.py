@@ -431,7 +431,7 @@ class Calibration:
         import cv2
         camera = self._camera
         if image.shape[1::-1] != camera.image_size:
-            raise InputError('E-IMAGE-SIZE',
+            raise InputError('E-OTHER-IMAGE-SIZE',
                              f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
                              f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}: '
                              f'resize the image, or use `dashcalib export --size`')

@@ -74,7 +74,7 @@ def test_undistorted_points_lie_where_a_pinhole_sees_them(calibration):
 def test_what_cannot_be_is_said(calibration):
     with pytest.raises(InputError, match='32x24') as caught:
         calibration.undistort(np.zeros((24, 32), np.uint8))
-    assert caught.value.code == 'E-IMAGE-SIZE'
+    assert caught.value.code == 'E-OTHER-IMAGE-SIZE'
     refused = make_calibration('refused')
     for ask in (lambda: refused.K, lambda: refused.D,
                 lambda: refused.covariance,
