@@ -257,7 +257,7 @@ def test_turns_outlive_the_node_and_add_up(start_node, make_bench, rendered, tmp
     node = start_node(**options)
     camera.connect(node)
     camera.publish(image_message(frames[0].image, frames[0].stamp_ns, 'rear'))
-    node.wait_for('left out')
+    node.wait_for('skipped')
     camera.counted('store', 1, node)
     assert camera.count('turns found') == 0
     assert node.stop() == 0 and len(list(folder.glob('*.npz'))) == 1

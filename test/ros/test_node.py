@@ -394,9 +394,9 @@ def test_services_say_why_not(plain):
 # codes are of this room; those of the core are tested there
 @pytest.mark.parametrize(('parameters', 'words', 'code'), [
     ({'turns__half_width': 99.0}, 'Max: 10.0', 'E-PARAMETER-VALUE-INVALID'),
-    ({'turns__wanted': 2.5}, 'must be int', ''),
+    ({'turns__wanted': 2.5}, 'E-CONFIG-TYPE', ''),
     ({'model': 'mirror'}, 'auto, radial, brown, fisheye', ''),
-    ({'model': 3.5}, 'model must be str', ''),
+    ({'model': 3.5}, 'E-CONFIG-TYPE', ''),
     ({'rectified': 'whole'}, 'same, crop, all', ''),
     ({'reliability': 'perfect'}, 'auto, best_effort, reliable', ''),
     ({'camera_name': 'narrow_stereo'}, 'image_pipeline', ''),
