@@ -166,7 +166,7 @@ class Calibrator:
                 continue
             # the search for repeated pictures takes a second and hardly ever finds some
             search = self.workers.begin(without_repeated, scenes, config.scene.min_images)
-            solving = self.workers.begin(solve, scenes, config, tells=True)
+            solving = self.workers.begin(solve, scenes, config, reports=True)
             kept, repeated = self.workers.result(search)
             if repeated:
                 self.workers.drop(solving)
@@ -175,7 +175,7 @@ class Calibrator:
             if any(len(one.tracks.frames) < len(other.tracks.frames)
                    for one, other in zip(kept, scenes, strict=True)):
                 self.workers.drop(solving)
-                solving = self.workers.begin(solve, kept, config, tells=True)
+                solving = self.workers.begin(solve, kept, config, reports=True)
             return kept, self.workers.result(solving, progress)
         return [], None
 
