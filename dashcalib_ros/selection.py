@@ -10,8 +10,8 @@ from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.reconstruct.scene_file import Origin, StoredTurn
-from dashcalib_ros.turn_store import TurnStore
+from dashcalib_ros.store.scene_file import Origin, StoredTurn
+from dashcalib_ros.store.turn_store import TurnStore
 from dashcalib_ros.workers.memory import in_a_file
 from dashcalib_ros.workers.pool import ScenePool
 from dashcalib_ros.workers.worker import Progress

@@ -38,7 +38,7 @@ from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.session import calibrate
 from dashcalib_ros.solve import solve
-from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
+from dashcalib_ros.store.turn_store import Origin, StoredTurn, TurnStore
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 TRUE = Radial((640, 360), *LENS.truth.values())

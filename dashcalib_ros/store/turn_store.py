@@ -1,4 +1,4 @@
-"""Reconstructed turns on disk, so that short trips add up (config: turns.store).
+"""A folder of reconstructed turns, so that short trips add up (config: turns.store).
 
 There is one file for each turn. It is written completely under a unique name, and never changed:
 any number of processes may share the folder. Files that are no turns of this camera are not used
@@ -18,7 +18,7 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError, counted, one_line
 from dashcalib_ros.limits import read_file
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.reconstruct.scene_file import (
+from dashcalib_ros.store.scene_file import (
     LARGEST,
     SUFFIX,
     Origin,
