@@ -13,7 +13,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / 'dashcalib_ros'
 # in the order in which data flows: a room imports from those above it
 ROOMS = ('arrays', 'camera', 'input', 'detect', 'reconstruct', 'solve', 'store', 'judge',
-         'report', 'workers', 'selection', 'pipeline', 'questions',
+         'report', 'workers', 'selection', 'pipeline',
          'session', 'standard_streams', 'fleet', 'ros', 'demo', 'cli')
 EVERYWHERE = {'config', 'errors', 'arrays', 'limits', 'whole_files'}
 # what is not simply "all rooms above"

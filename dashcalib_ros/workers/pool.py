@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Set
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -73,14 +74,15 @@ class ScenePool:
     """
 
     def __init__(self, config: Config, make_worker: Callable[[], Worker],
-                 queue: int | None = None,
+                 load: Callable[[], object] = reconstruct.load, queue: int | None = None,
                  on_lost: Callable[[str], None] = lambda text: None,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  keep_pictures: bool = False,
                  on_wait: Callable[[], bool] | None = None) -> None:
-        """queue: how many turns may wait for a worker, with their images; None: any number.
+        """load: imports what the calls need; each worker begins with it.
 
-        If there are more, as in a live drive, the least prominent counts as one without a scene.
+        queue: how many turns may wait for a worker, with their images; None: any number. If there
+        are more, as in a live drive, the least prominent counts as one without a scene.
         on_lost: called with a line when a turn is given up. on_trouble: called with a line when a
         worker failed and its work is tried again.
         keep_pictures: pictures() has one of each turn that is done. on_wait: called again and
@@ -88,6 +90,7 @@ class ScenePool:
         did something, and is called again at once then.
         """
         self._config = config
+        self._load = load
         self._queue = queue
         self._keep_pictures = keep_pictures
         self._on_lost, self._on_trouble, self._on_wait = on_lost, on_trouble, on_wait
@@ -198,6 +201,15 @@ class ScenePool:
 
     # the workers ------------------------------------------------------------------------------
 
+    def start(self) -> None:
+        """Have the workers import what they need, before there is work for them."""
+        with self._changed:
+            if not self._threads and not self._closed.is_set():
+                self._threads = [threading.Thread(target=self._work, args=(worker,), daemon=True)
+                                 for worker in self._workers]
+                for thread in self._threads:
+                    thread.start()
+
     @property
     def closed(self) -> bool:
         """Return whether close() was called."""
@@ -232,6 +244,8 @@ class ScenePool:
                     self._changed.wait(LOOK_S if self._on_wait is None else CALL_S)
 
     def _work(self, worker: Worker) -> None:
+        with suppress(Exception):  # the first call will say what is wrong
+            worker.call(self._load)
         # a function of its own: its variables must not keep a turn's images while it waits
         while self._work_once(worker):
             return_free_memory()
@@ -285,7 +299,7 @@ class ScenePool:
                 self._try_again(call, error)
                 return
             try:
-                worker.call(reconstruct.load)
+                worker.call(self._load)
             except Exception as reason:
                 # the call is not the cause: workers die without it, too
                 error = WorkerError('E-WORKER-CANNOT-LOAD', f'no reconstruction process can '
@@ -330,11 +344,7 @@ class ScenePool:
     def _put(self, call: Call) -> None:
         if self._closed.is_set():
             return
-        if not self._threads:
-            self._threads = [threading.Thread(target=self._work, args=(worker,), daemon=True)
-                             for worker in self._workers]
-            for thread in self._threads:
-                thread.start()
+        self.start()
         self._calls.append(call)
         waiting = [each for each in self._calls if each.turn is not None and not each.running]
         if self._queue is not None and len(waiting) > self._queue:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import signal
 import threading
@@ -9,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import child_tasks
 import cv2
@@ -26,7 +28,7 @@ from dashcalib_ros.workers import child as child_module
 from dashcalib_ros.workers import pool as pool_module
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ATTEMPTS, ScenePool
-from dashcalib_ros.workers.worker import THREAD_VARIABLES, InlineWorker, WorkerDiedError
+from dashcalib_ros.workers.worker import THREAD_VARIABLES, InlineWorker, Worker, WorkerDiedError
 
 at = TurnId.at
 
@@ -41,9 +43,15 @@ def trouble() -> list[str]:
     return []
 
 
+def make_pool(threads: int = 2, make_worker: Callable[[], Worker] = ChildWorker,
+              load: Callable[[], object] = child_tasks.pid, **options: Any) -> ScenePool:
+    """Make a pool whose workers load nothing large."""
+    return ScenePool(Config().replace({'threads': threads}), make_worker, load, **options)
+
+
 @pytest.fixture
 def pool(trouble) -> Iterator[ScenePool]:
-    pool = ScenePool(Config().replace({'threads': 2}), ChildWorker, on_trouble=trouble.append)
+    pool = make_pool(2, on_trouble=trouble.append)
     yield pool
     pool.close()
 
@@ -92,7 +100,7 @@ def test_a_hopeless_turn_has_no_scene_and_verbose_tells_why(monkeypatch, capsys,
 
 def test_without_a_queue_the_longest_is_built_first(monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build_slowly)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker)
+    pool = make_pool(1)
     try:
         pool.submit(turn(10, tmp_path / 'flag'), None)
         wait_for((tmp_path / 'flag.10').exists)
@@ -130,7 +138,7 @@ def test_a_turn_whose_child_is_killed_from_outside_is_built_again(
 def test_a_turn_that_kills_every_child_is_given_up_and_told(monkeypatch, tmp_path):
     log, told = tmp_path / 'log', []
     use(monkeypatch, child_tasks.build_dies)
-    pool = ScenePool(Config(), ChildWorker, on_lost=told.append)
+    pool = make_pool(on_lost=told.append)
     pool.submit(turn(10, log), None)
     wait_until_built(pool)
     assert pool.scenes() == {at(10): None}
@@ -191,7 +199,7 @@ def test_scenes_of_turns_that_left_are_dropped(pool, monkeypatch, tmp_path):
 
 def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build_slowly)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=2)
+    pool = make_pool(1, queue=2)
     try:
         pool.submit(turn(10, tmp_path / 'flag'), None)
         wait_for((tmp_path / 'flag.10').exists)
@@ -230,7 +238,7 @@ def test_a_turn_is_built_in_two_halves(monkeypatch, tmp_path, live, done):
     log, hold = tmp_path / 'log', tmp_path / 'hold'
     use(monkeypatch, child_tasks.build_slowly)
     monkeypatch.setattr(reconstruct, 'finish', child_tasks.finish)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=9 if live else None)
+    pool = make_pool(1, queue=9 if live else None)
     try:
         pool.submit(turn(5, hold), None)
         wait_for(lambda: (tmp_path / 'hold.5').exists() and (tmp_path / 'hold.5').read_text())
@@ -272,7 +280,7 @@ def test_what_failed_is_not_kept_for_a_turn_that_left(pool, monkeypatch, tmp_pat
 def test_a_lost_turn_is_tried_again_by_itself(pool, trouble, monkeypatch, tmp_path):
     """Killed at each start for a while and then left alone; nobody waits for it."""
     use(monkeypatch, child_tasks.build_dies)
-    monkeypatch.setattr(reconstruct, 'load', child_tasks.die)
+    pool._load = child_tasks.die
     pool.submit(turn(10, tmp_path / 'log'), None)
     wait_for(lambda: len(trouble) > ATTEMPTS)
     (tmp_path / 'log.ended').touch()
@@ -309,7 +317,7 @@ def test_a_turn_that_failed_waits_while_others_do_not(monkeypatch, tmp_path):
     monkeypatch.setattr(pool_module, 'BACK_OFF_S', 1000.0)
     monkeypatch.setattr(pool_module, 'LONGEST_BACK_OFF_S', 1000.0)
     use(monkeypatch, child_tasks.build_fails_at_first)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker)
+    pool = make_pool(1)
     with contextlib.closing(pool):
         pool.submit(turn(10, tmp_path / 'flag'), None)
         wait_for(lambda: waiting(pool) == [at(10)] and pool._calls[0].failures)
@@ -321,7 +329,7 @@ def test_a_turn_that_failed_waits_while_others_do_not(monkeypatch, tmp_path):
 
 def test_who_runs_something_comes_before_the_turns(monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build_slowly)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker)
+    pool = make_pool(1)
     try:
         pool.submit(turn(10, tmp_path / 'flag'), None)
         wait_for(lambda: (tmp_path / 'flag.10').exists())
@@ -340,7 +348,7 @@ def test_inline_it_is_all_the_same(monkeypatch):
     for name in THREAD_VARIABLES:
         monkeypatch.setenv(name, '1')
     use(monkeypatch, child_tasks.build)
-    pool = ScenePool(Config().replace({'threads': 2}), InlineWorker)
+    pool = make_pool(2, InlineWorker)
     for center in (10, 50, 90):
         pool.submit(turn(center), None)
     wait_until_built(pool)
@@ -357,7 +365,7 @@ def test_pictures_are_kept_where_they_are_wanted_and_leave_with_their_turns(monk
     for name in THREAD_VARIABLES:
         monkeypatch.setenv(name, '1')
     use(monkeypatch, lambda turn, config, valid: None)
-    pool = ScenePool(Config(), InlineWorker, keep_pictures=kept)
+    pool = make_pool(2, InlineWorker, keep_pictures=kept)
     with contextlib.closing(pool):
         for center in (10, 50):
             pool.submit(replace(turn(center), frames=(
@@ -402,7 +410,7 @@ def test_who_waits_may_do_other_things_meanwhile(monkeypatch, tmp_path):
         pool.submit(turn(10), None)
         return True
 
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, on_wait=meanwhile)
+    pool = make_pool(1, on_wait=meanwhile)
     with contextlib.closing(pool):
         assert pool.run(child_tasks.add, 1, 2) == 3
         wait_until_built(pool)
@@ -432,6 +440,25 @@ def test_what_was_begun_runs_side_by_side_and_what_waits_can_be_dropped(pool, tm
                        lambda stage, done: told.append(stage)) == 2
     assert told == ['step 0', 'step 1'] and not dropped.done
     assert not (tmp_path / 'dropped').exists()
+
+
+def test_a_child_that_dies_before_its_first_call_is_not_missed(trouble, tmp_path):
+    pool = make_pool(1, load=child_tasks.die, on_trouble=trouble.append)
+    with contextlib.closing(pool):
+        pool.start()
+        assert pool.run(child_tasks.add, 1, 2) == 3 and not trouble
+
+
+def test_each_worker_begins_with_what_it_needs(tmp_path):
+    pool = make_pool(2, load=functools.partial(child_tasks.sleep, 0, tmp_path / 'loaded'))
+    with contextlib.closing(pool):
+        assert not pool.pids()
+        pool.start()
+        wait_for((tmp_path / 'loaded').exists)
+        wait_for(lambda: len(pool.pids()) == 2)
+        threads = list(pool._threads)
+        pool.start()
+        assert pool.run(child_tasks.add, 1, 2) == 3 and pool._threads == threads
 
 
 def test_what_was_dropped_is_not_tried_again(pool, trouble, tmp_path):
