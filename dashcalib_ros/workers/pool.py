@@ -22,7 +22,7 @@ from dashcalib_ros.workers.worker import Progress, Worker, WorkerDiedError
 # if a worker dies in the same call this often, seconds apart, the call may be the cause
 ATTEMPTS = 5
 # s between two looks at what is waited for, and between two calls of on_wait
-LOOK_S, CALL_S = 0.2, 0.02
+LOOK_S, ON_WAIT_S = 0.2, 0.02
 # s; before the second attempt, doubled before each further one
 BACK_OFF_S = 1.0
 LONGEST_BACK_OFF_S = 60.0
@@ -241,7 +241,7 @@ class ScenePool:
                 continue
             with self._changed:
                 if self._changes == seen:
-                    self._changed.wait(LOOK_S if self._on_wait is None else CALL_S)
+                    self._changed.wait(LOOK_S if self._on_wait is None else ON_WAIT_S)
 
     def _work(self, worker: Worker) -> None:
         with suppress(Exception):  # the first call will say what is wrong
