@@ -795,7 +795,7 @@ def old_stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
 
     from fleet_made import YAWS, clip_of
 
-    from dashcalib_ros.reconstruct.scene_file import SceneFile, encoded
+    from dashcalib_ros.store.scene_file import SceneFile, encoded
     pictures = two_turns(folder / 'pictures')
     true = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
     lens = Radial((640, 360), *(getattr(true, name) for name in (

@@ -34,11 +34,11 @@ COMMAND = [sys.executable, '-m', 'dashcalib_ros.ros']
 # of them need
 QUICK_COMMAND = [sys.executable, '-c', """
 import sys
-from dashcalib_ros import selection
+from dashcalib_ros import pipeline
 from dashcalib_ros.ros import images, node, main
 images.DEPTH = 50
 node.PERIOD_S = 0.1
-selection._load_judging = lambda: None
+pipeline._load_judging = lambda: None
 sys.exit(main())
 """]
 

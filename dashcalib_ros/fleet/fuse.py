@@ -23,9 +23,9 @@ from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import lacks_knowledge_only
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.reconstruct.scene_file import Origin, SceneFile, StoredTurn
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.store.scene_file import Origin, SceneFile, StoredTurn
 
 # solutions at the most; each leaves out the clips that contradict the one before
 ROUNDS = 3

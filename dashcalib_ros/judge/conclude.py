@@ -45,9 +45,9 @@ from dashcalib_ros.judge.verdict import (
 )
 from dashcalib_ros.judge.witnesses import Asked
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, picture_of, rms_px
-from dashcalib_ros.reconstruct.scene_file import StoredTurn
 from dashcalib_ros.solve.evidence import largest_crop
 from dashcalib_ros.solve.solution import Solution, cross_validation
+from dashcalib_ros.store.scene_file import StoredTurn
 
 # why turns are not used
 NOT_NEEDED = 'more prominent turns were enough'

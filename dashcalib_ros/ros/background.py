@@ -20,7 +20,6 @@ from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge import Calibration, Check, Monitor, moved_text
 from dashcalib_ros.judge.agreement import CONTRADICTS, outdated, turns_of_another_camera
 from dashcalib_ros.pipeline import Calibrator, Status
-from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.workers.memory import mapped_copy
 
@@ -139,7 +138,6 @@ class _Bank:
 
     number: int
     calibrator: Calibrator
-    questions: Questions
     depth: BitDepth = field(default_factory=BitDepth)
     tried: frozenset[TurnId] = frozenset()
     told: frozenset[TurnId] = frozenset()
@@ -268,7 +266,7 @@ class Learner:
             self.config, mask=self._mask, live=True, use_stored=use_stored,
             warn=lambda text: self._tell(Trouble('store', text)),
             on_trouble=lambda text: self._tell(Trouble('workers', text)), on_wait=self._serve)
-        return _Bank(number, calibrator, Questions(calibrator))
+        return _Bank(number, calibrator)
 
     def _begin(self, new: _Bank, keep_stored: bool) -> None:
         old, self._now = self._now, new
@@ -324,7 +322,7 @@ class Learner:
         # a long drive thins them out
         if not bank.moved and not 0 <= pairs - bank.pairs < ASKED_EACH:
             bank.pairs = pairs
-            found = bank.questions.moved(camera.camera, ASKED)
+            found = bank.calibrator.moved(camera.camera, ASKED)
             if found is not None:
                 bank.moved = True
                 self._tell(Moved(camera, moved_text(f'than {found[0]:.0f} s ago', found[1])))
@@ -339,7 +337,7 @@ class Learner:
             bank.earlier = self._monitor
         # the same turns alone are not tried again
         bank.read |= turns
-        found = bank.questions.watch(camera.camera, camera.sigma)
+        found = bank.calibrator.watch(camera.camera, camera.sigma)
         if bank.earlier is not None:
             found = reduce(Monitor.after, found.readings, bank.earlier)
         if found.lens and found.lens.confirmed and found.lens.since.of_this_drive:
@@ -374,7 +372,7 @@ class Learner:
                 # both have the same clock, whichever it is
                 bank.calibrator.sense(replace(stream.shifted(-found.start_s), absolute=False))
             calibration = bank.calibrator.calibrate(self._progress, final=False)
-            check = None if given is None else bank.questions.check(
+            check = None if given is None else bank.calibrator.check(
                 given.camera, calibration, self._progress)
             of_another = turns_of_another_camera(calibration.misfits, self.config.verdict)
             bank.calibrator.scenes.exclude(dict.fromkeys(

@@ -32,7 +32,7 @@ from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import load_camera
 from dashcalib_ros.ros.background import Moved, Result
 from dashcalib_ros.ros.store import Store, Whose
-from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
+from dashcalib_ros.store.turn_store import Origin, StoredTurn, TurnStore
 
 MOUNT = Mount('accepted', (), 2.0, -1.0, None, None,
               {'yaw_left_deg': 0.1, 'pitch_up_deg': 0.1, 'roll_right_deg': None,
