@@ -3,19 +3,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.formats import Given, given_camera
+from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.source import by
+from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.check import export_command, same_shape
 from dashcalib_ros.judge.difference import Difference as WholeDifference
 from dashcalib_ros.judge.difference import NamedCamera, answers_of, difference_between
-from dashcalib_ros.report.camera_file import Given, given_camera
-from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.wording import digits_of, mounts_text, number, optional
 
 
@@ -80,6 +82,26 @@ def mount_dict(mount: Mount | None, other: Mount | None) -> dict[str, Any] | Non
     return {'moved': mount.moved_from(other), **{
         name: {'difference': degrees, 'sigma': sigma}
         for name, (degrees, sigma) in mount.apart(other).items()}}
+
+
+def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None,
+                mount: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the answer of a drive about a given calibration as types of strict JSON.
+
+    changes: of the camera during the drive, in words. motion: the comparison with true poses.
+    mount: how far the mounting is from the calibration's.
+    """
+    values: dict[str, Any] = plain_values(found) | {'changes': list(changes), 'mount': mount}
+    if motion is not None:
+        values |= motion.medians()
+        values['turns'] = [{'center': turn.turn.number, 'true_deg': turn.angle_deg,
+                            'length_m': turn.length_m,
+                            'rotation_deg': {name: turn.rotation_deg(name)
+                                             for name in motion.names},
+                            'scale_drift': {name: turn.scale_drift(name)
+                                            for name in motion.names}}
+                           for turn in motion.turns]
+    return values
 
 
 def compare(a: Given, b: Given) -> Comparison:

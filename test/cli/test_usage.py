@@ -25,8 +25,8 @@ from dashcalib_ros.cli import main
 from dashcalib_ros.cli.arguments import COMMANDS, JSON, KINDS, LENSES, MODELS
 from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.demo import DEMOS
+from dashcalib_ros.formats.export import EXPORTS
 from dashcalib_ros.report import write_results
-from dashcalib_ros.report.export import EXPORTS
 from dashcalib_ros.report.tables import line
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 

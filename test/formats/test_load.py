@@ -14,8 +14,8 @@ from rosbags.rosbag1 import Writer as Writer1
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.report import load_camera
-from dashcalib_ros.report.camera_file import load_with_faults
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.formats.load import load_with_faults
 
 BROWN, FISHEYE = EACH_MODEL['brown'], EACH_MODEL['fisheye']
 SMALL = (640, 480)
