@@ -16,13 +16,17 @@ from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.check import export_command, same_shape
-from dashcalib_ros.judge.difference import Difference as WholeDifference
-from dashcalib_ros.judge.difference import NamedCamera, answers_of, difference_between
+from dashcalib_ros.judge.difference import (
+    Difference,
+    NamedCamera,
+    answers_of,
+    difference_between,
+)
 from dashcalib_ros.report.wording import digits_of, mounts_text, number, optional
 
 
 @dataclass(frozen=True)
-class Difference:
+class ParameterDifference:
     """One parameter of both. difference is a - b; percent is of b, None where b is zero.
 
     sigma: of the difference, from the sides that have one (both: the root of the sum of squares).
@@ -47,8 +51,8 @@ class Comparison:
 
     a: NamedCamera
     b: NamedCamera
-    differences: tuple[Difference, ...]
-    whole: WholeDifference
+    differences: tuple[ParameterDifference, ...]
+    whole: Difference
     unseen: float = 0.0
 
     @property
@@ -135,15 +139,16 @@ def _common_names(a: Camera, b: Camera) -> tuple[str, ...]:
     return max(a.names(), b.names(), key=len)
 
 
-def _difference(name: str, a: NamedCamera, b: NamedCamera) -> Difference:
+def _difference(name: str, a: NamedCamera, b: NamedCamera) -> ParameterDifference:
     value, reference = (each.camera.named.get(name, 0.0) for each in (a, b))
     difference = value - reference
     sigmas = [each.sigma[name] for each in (a, b)
               if each.sigma is not None and name in each.sigma]
     sigma = math.hypot(*sigmas) if sigmas else None
-    return Difference(name, value, reference, difference,
-                      100 * difference / abs(reference) if reference else None,
-                      sigma, difference / sigma if sigma else None)
+    return ParameterDifference(
+        name, value, reference, difference,
+        100 * difference / abs(reference) if reference else None,
+        sigma, difference / sigma if sigma else None)
 
 
 def comparison_rows(found: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
@@ -172,7 +177,7 @@ def unseen_text(found: Comparison) -> str:
         f'{found.a.camera.model} model cannot see')
 
 
-def difference_row(d: Difference) -> tuple[str, ...]:
+def difference_row(d: ParameterDifference) -> tuple[str, ...]:
     """Return a parameter's name, both values, their difference, in percent and in sigmas."""
     digits = max(4, digits_of(d.name))
     return (d.name, number(d.name, d.a), number(d.name, d.b), f'{d.difference:+.{digits}f}',
