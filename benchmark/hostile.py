@@ -68,10 +68,10 @@ from dashcalib_ros import Calibrator
 from dashcalib_ros.camera import Radial, ros_camera
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.formats.ros import camera_of_message
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion_files import read_motion
-from dashcalib_ros.report import load_camera
-from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.calibrator_node import camera_info
 from dashcalib_ros.ros.images import LASTING
 from dashcalib_ros.ros.settings import specs

@@ -23,11 +23,11 @@ from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input import Frame
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.solve import solve
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ScenePool

@@ -18,6 +18,7 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.formats import Given, given_camera
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.input.inputs import Paths, as_list, fits_bag, open_frames
@@ -27,7 +28,6 @@ from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Calibration, Check, Odometry, Poses, track_poses
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.report.camera_file import Given, given_camera
 from dashcalib_ros.workers.worker import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None

@@ -23,9 +23,9 @@ from dashcalib_ros.camera.camera import ColmapModel
 from dashcalib_ros.demo import Lens
 from dashcalib_ros.detect.detection import Detection, detect
 from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.formats import calibration_yaml, load_camera, result_dict
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.reconstruct import reconstruct
-from dashcalib_ros.report import calibration_yaml, load_camera, result_dict
 from dashcalib_ros.solve import solve
 
 # one term is all that this lens has

@@ -37,8 +37,8 @@ BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera was refused;
                    'not be read or a camera was refused; 2 bad manifest or usage')
 # names of models, exports and demos; to take them from their tables would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
-KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'foxglove',
-         'gyroflow', 'rays', 'maps')
+KINDS = ('colmap', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove', 'ros',
+         'opencv', 'rays', 'maps')
 LENSES = ('radial', 'brown', 'fisheye', 'windscreen', 'shutter', 'stabilised', 'straight')
 # files that no command takes as a drive
 NO_DRIVES = ('.yaml', '.yml', '.json', '.xml', '.txt', '.csv', '.npz')

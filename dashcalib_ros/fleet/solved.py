@@ -14,8 +14,9 @@ from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.errors import InputError, one_line
 from dashcalib_ros.fleet import lens_prior
 from dashcalib_ros.fleet.lens_prior import LensPrior, OfMake, Unit, conditioned
+from dashcalib_ros.formats import result_dict
+from dashcalib_ros.formats.ours import calibration_of
 from dashcalib_ros.judge import Calibration, Verdict
-from dashcalib_ros.report.result import calibration_of, result_dict
 from dashcalib_ros.solve.spread import PictureSigma
 
 # of the JSON text

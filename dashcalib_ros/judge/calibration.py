@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.camera import FISHEYE, Camera
+from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import sensitivity
+from dashcalib_ros.camera.remap import rectify
 from dashcalib_ros.camera.rotation import rotation_matrices
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
@@ -428,22 +429,13 @@ class Calibration:
         The field is taken out, too, where one is used. Raises InputError for an image of another
         size, and where there is no camera.
         """
-        import cv2
         camera = self._camera
         if image.shape[1::-1] != camera.image_size:
             raise InputError('E-OTHER-IMAGE-SIZE',
                              f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
                              f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}: '
                              f'resize the image, or use `dashcalib export --size`')
-        if self._used_field is not None:
-            y, x = np.indices(image.shape[:2])
-            ahead = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy,
-                              np.ones(x.shape)], axis=-1)
-            x, y = np.moveaxis(self.project(ahead).astype(np.float32), -1, 0)
-            return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR))
-        if camera.family == FISHEYE:
-            return np.asarray(cv2.fisheye.undistortImage(image, self.K, self.D, Knew=self.K))
-        return np.asarray(cv2.undistort(image, self.K, self.D))
+        return rectify(image, camera, field=self._used_field)
 
     @property
     def _camera(self) -> Camera:

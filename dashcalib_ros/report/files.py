@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.formats import calibration_yaml, load_camera, result_json
+from dashcalib_ros.formats.ros import CAMERA_NAME
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.difference import NamedCamera
-from dashcalib_ros.report.camera_file import load_camera
 from dashcalib_ros.report.page import report_html
-from dashcalib_ros.report.result import CAMERA_NAME, calibration_yaml, result_json
 from dashcalib_ros.whole_files import prepared, remove_leftovers, sync, write_whole
 
 ACCEPTED = 'calibration.yaml'

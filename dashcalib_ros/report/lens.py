@@ -8,7 +8,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Pixels
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.camera_info import WIDEST, rectified_matrix
+from dashcalib_ros.camera.remap import WIDEST, rectified_matrix, rectify, seen_at
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.agreement import focal_alone, sigma_by_count
 from dashcalib_ros.judge.calibration import Material, Mount
@@ -274,35 +274,25 @@ def undistorted(image: Pixels, camera: Camera, rectified: str
     the bent one of the original, then the straight one. Last comes how far the lens moves a
     point at the most, px, within 75 degrees of its axis.
     """
-    import cv2
     height, width = image.shape[:2]
     with np.errstate(all='ignore'):
+        straight = rectify(image, camera, rectified)
         matrix = rectified_matrix(camera, rectified)
-        u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height))
-        source = _seen_at(np.stack([u, v], -1), matrix, camera).astype(np.float32)
-        straight = cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_LINEAR)
         step = width / GRID_LINES
         lines = []
         for x in np.arange(step / 2, width, step):
             lines.append(np.column_stack([np.full(60, x), np.linspace(0, height - 1, 60)]))
         for y in np.arange(step / 2, height, step):
             lines.append(np.column_stack([np.linspace(0, width - 1, 60), np.full(60, y)]))
-        bent = [_seen_at(each, matrix, camera) for each in lines]
+        bent = [seen_at(each, matrix, camera) for each in lines]
         places = np.concatenate(lines)
         rays = camera.rays(places)
         plain = rays[:, :2] / rays[:, 2:] * camera.params[:2] + camera.params[2:4]
         moved = np.linalg.norm(plain - places, axis=1)[rays[:, 2] > np.cos(WIDEST)]
     most = float(moved.max(initial=0.0))
     seen = [xy[np.abs(xy).max(axis=1) < 1e5] for xy in bent]
-    return (np.asarray(straight, np.uint8), outline(xy for xy in seen if len(xy) > 1),
+    return (straight, outline(xy for xy in seen if len(xy) > 1),
             outline(each[[0, -1]] for each in lines), most)
-
-
-def _seen_at(pixels: Floats, matrix: Floats, camera: Camera) -> Floats:
-    """Return where the lens puts what the rectified picture with K shows at pixels (..., 2)."""
-    rays = np.concatenate([(pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]],
-                           np.ones((*pixels.shape[:-1], 1))], axis=-1)
-    return np.asarray(np.nan_to_num(camera.project(rays), nan=-1e6))
 
 
 def _heat(share: Floats, width: float, height: float) -> str:

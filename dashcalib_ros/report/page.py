@@ -12,9 +12,9 @@ import numpy as np
 
 from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.config import Config
+from dashcalib_ros.formats import calibrated_camera
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.difference import NamedCamera
-from dashcalib_ros.report.camera_file import calibrated_camera
 from dashcalib_ros.report.charts import arrows, magnitude_svg, mask_data_uri
 from dashcalib_ros.report.compare import Comparison, answers, compare, comparison_rows
 from dashcalib_ros.report.lens import (

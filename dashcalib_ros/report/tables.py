@@ -32,7 +32,10 @@ from dashcalib_ros.report.wording import (
 # columns between two of a table
 APART = 3
 TURNS = ('at s', 'frames', 'yaw °', 'images', 'error px', 'used')
-COLOURS = {'accepted': 'bold green', 'weak': 'bold yellow', 'refused': 'bold red'}
+# of verdicts, and of answers
+COLOURS = {'accepted': 'bold green', 'weak': 'bold yellow', 'refused': 'bold red',
+           'right': 'bold green', 'differs': 'bold cyan', 'cannot tell': 'bold yellow',
+           'wrong': 'bold red'}
 
 
 def line(text: str) -> Text:
@@ -55,15 +58,15 @@ def summary(calibration: Calibration) -> RenderableType:
 
 def conclusion(verdict: Verdict) -> RenderableType:
     """Return the verdict, coloured, and its reasons."""
-    parts: list[RenderableType] = [labelled('verdict', verdict.level, COLOURS[verdict.level])]
+    parts: list[RenderableType] = [labelled('verdict', verdict.level)]
     parts += [Padding.indent(line(f'{what} [{code}]' if code else what), 2)
               for code, what, _ in objections(verdict)]
     return Group(*parts)
 
 
-def labelled(label: str, word: str, colour: str) -> Text:
+def labelled(label: str, word: str) -> Text:
     """Return the line that all others explain: its word is coloured."""
-    return Text.assemble(f'{label}: ', (word, colour))
+    return Text.assemble(f'{label}: ', (word, COLOURS[word]))
 
 
 def next_step(verdict: Verdict) -> RenderableType:

@@ -355,7 +355,4 @@ def driver_services(node: Node, images: ImageInput) -> tuple[str, ...]:
 
 def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:
     """Return the camera as a message; rectified: as ros_camera()'s."""
-    c = ros_camera(camera, rectified)
-    width, height = c.image_size
-    return CameraInfo(header=header, width=width, height=height,
-                      distortion_model=c.distortion_model, d=c.d, k=c.k, r=c.r, p=c.p)
+    return CameraInfo(header=header, **vars(ros_camera(camera, rectified)))

@@ -10,9 +10,9 @@ from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
 from dashcalib_ros.errors import InputError, coded
+from dashcalib_ros.formats.ros import camera_of_message
 from dashcalib_ros.judge import Check, with_faults
 from dashcalib_ros.report import NamedCamera, answer_dict
-from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.background import Result, Watched
 from dashcalib_ros.ros.diagnostics import OK, WARN, Health, log_line
 from dashcalib_ros.ros.images import Source, SourceWatch

@@ -21,11 +21,11 @@ from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 
 from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, coded
+from dashcalib_ros.formats.ros import check_camera_name
 from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.judge import Monitor, Verdict
 from dashcalib_ros.pipeline import Status
 from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.report.result import check_camera_name
 from dashcalib_ros.report.wording import witness_texts
 from dashcalib_ros.ros.background import Learner, Moved, News, Result, Trouble, Watched
 from dashcalib_ros.ros.car import Sensors

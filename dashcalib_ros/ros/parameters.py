@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError
-from dashcalib_ros.report.result import CAMERA_NAME
+from dashcalib_ros.formats.ros import CAMERA_NAME
 from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, specs, with_changes
 
 # history, depth and reliability; not durability, as a latched topic that is not latched would

@@ -16,10 +16,10 @@ from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import command, main
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
+from dashcalib_ros.formats import result_json
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
 from dashcalib_ros.pipeline import Calibrator
-from dashcalib_ros.report import result_json
 from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.solve.spread import PictureSigma
 

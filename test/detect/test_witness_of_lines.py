@@ -15,10 +15,10 @@ from synthetic import LENS, SIZE
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.formats import result_dict
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
 from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import judge
-from dashcalib_ros.report import result_dict
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.tables import summary
 

@@ -12,10 +12,9 @@ from made_calibration import EACH_MODEL, TRUTH, calibration_of, make_calibration
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.formats import export, load_camera, result_dict
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.report import load_camera, result_dict
-from dashcalib_ros.report.export import exported
 from dashcalib_ros.solve.solution import LeftOut
 from dashcalib_ros.solve.spread import PictureSigma
 
@@ -144,7 +143,7 @@ def test_only_a_calibration_of_this_package_is_one(tmp_path):
         with pytest.raises(InputError) as caught:
             Calibration.load(tmp_path)
         assert caught.value.code == 'E-CALIBRATION-DAMAGED'
-    (tmp_path / 'ost.yaml').write_text(exported(TRUTH, 'ros'))
+    (tmp_path / 'ost.yaml').write_text(export(TRUTH, 'ros'))
     with pytest.raises(InputError) as caught:
         Calibration.load(tmp_path / 'ost.yaml')
     assert caught.value.code == 'E-OTHER-CALIBRATION'

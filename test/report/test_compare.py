@@ -22,14 +22,8 @@ from scipy.spatial.transform import Rotation
 from dashcalib_ros.camera import Brown, Fisheye, Radial, camera_from_ros
 from dashcalib_ros.camera.mapping import apart, mapping_error
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.report import (
-    NamedCamera,
-    calibrated_camera,
-    calibration_yaml,
-    compare,
-    load_camera,
-    result_json,
-)
+from dashcalib_ros.formats import calibrated_camera, calibration_yaml, load_camera, result_json
+from dashcalib_ros.report import NamedCamera, compare
 from dashcalib_ros.report.compare import answers
 from dashcalib_ros.report.page import difference_html
 from dashcalib_ros.solve.spread import PictureSigma

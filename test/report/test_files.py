@@ -15,9 +15,9 @@ import yaml
 from made_calibration import TRUTH, make_calibration
 
 from dashcalib_ros.errors import OutputError
+from dashcalib_ros.formats import load_camera
 from dashcalib_ros.report import (
     check_writable,
-    load_camera,
     output_folder,
     set_aside,
     write_results,

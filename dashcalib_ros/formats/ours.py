@@ -1,11 +1,7 @@
-"""What other programs rely on: result.json, strict JSON, and calibration.yaml; and a check's JSON.
+"""Our own files: result.json, strict JSON, and calibration.yaml, ROS's with one extra block.
 
-calibration.yaml is the file that camera_info_manager, usb_cam, v4l2_camera and others load. Keys,
-order and layout are those that camera_calibration_parsers writes. Its parser looks keys up by
-name, so it ignores our one extra block, dashcalib, which has sigma and provenance.
-
-OpenCV's FileStorage reads the file, too. Version 4 wants the line %YAML; 4 and 5 want lists that
-are indented, texts of 4096 characters at the most, and quotes: 4.2.1 is a broken number to them.
+Both have the same values by the same names. What reads a camera takes what there is, also of older
+versions; what reads a whole calibration wants all that such a file has.
 """
 from __future__ import annotations
 
@@ -13,31 +9,44 @@ import dataclasses
 import json
 import math
 import os
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from dashcalib_ros.camera import Camera, ros_camera
-from dashcalib_ros.camera.camera_info import SAME
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera import MODELS, Camera, Radial
 from dashcalib_ros.camera.field import BASIS, Field
+from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
-from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, one_line, shortened
-from dashcalib_ros.judge import Calibration, Check, Odometry, TurnSummary, Verdict
+from dashcalib_ros.errors import DashcalibError, InputError, one_line
+from dashcalib_ros.formats import opencv, ros
+from dashcalib_ros.formats.values import (
+    Cameras,
+    Data,
+    check_lens,
+    read_number,
+    read_pair,
+    read_sigma,
+    read_size,
+    unknown_model,
+)
+from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import (
+    ANGLES,
     LensField,
+    Mount,
     Shutter,
     Stabiliser,
     StoredTurnSummary,
     Witness,
     Witnesses,
 )
+from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, read_text
-from dashcalib_ros.report.camera_file import parse_camera, read_mount
 from dashcalib_ros.solve.solution import LeftOut
 from dashcalib_ros.solve.spread import PictureSigma
 
@@ -97,7 +106,7 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     place = place / 'result.json' if place.is_dir() else place
     text = read_text(place, JSON_BYTES)
     if text.lstrip().startswith('{'):
-        data = parse_json(text, str(place))
+        data = values = parse_json(text, str(place))
         missing = [key for key in ('verdict', 'image_size', 'intrinsics') if key not in data]
         if missing:
             raise InputError('E-NO-RESULT-FILE',
@@ -105,21 +114,20 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
                              f'{missing[0]!r}; use the file that dashcalib run wrote')
     else:
         data = parse_yaml(text, str(place))
-        own = data.get('dashcalib') if isinstance(data, Mapping) else None
-        if not isinstance(own, Mapping):
+        if not _has_block(data):
             raise InputError('E-OTHER-CALIBRATION', f'{place} is not a calibration of dashcalib; '
                              f'use load_camera() for it')
-        data = {**own, 'image_size': [data.get('image_width'), data.get('image_height')]}
-    refused = data.get('verdict') == 'refused'
-    camera = None if refused else parse_camera(text, place).camera
+        values = {**data[ros.OWN],
+                  'image_size': [data.get('image_width'), data.get('image_height')]}
+    camera = None if values.get('verdict') == 'refused' else _read(data, place).camera
     try:
-        return calibration_of(data, camera)
+        return calibration_of(values, camera)
     except (KeyError, TypeError, ValueError, AttributeError, DashcalibError) as error:
         raise InputError('E-CALIBRATION-DAMAGED',
                          f'{place} is damaged ({one_line(error)}); calibrate again') from error
 
 
-def calibration_of(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
+def calibration_of(data: Data, camera: Camera | None) -> Calibration:
     """Return the calibration that result_dict() gave these values."""
     def made(kind: type[Any], values: Mapping[str, Any] | None, **more: Any) -> Any:
         return None if values is None else kind(**more, **{
@@ -154,7 +162,7 @@ def calibration_of(data: Mapping[str, Any], camera: Camera | None) -> Calibratio
         field=None if field is None else LensField(
             Field(size, np.array(field['coefficients'], np.float64)), bool(field['used']),
             field['rms_px'], field['worst_px'], field['sigma_px']),
-        mount=read_mount(data.get('mount')),
+        mount=_mount(data.get('mount')),
         held_out=tuple(held_out), straight_lines=made(Bend, data.get('straight_lines')),
         witnesses=Witnesses(**{name: made(Witness, said) for name, said
                                in (data.get('witnesses') or {}).items()}))
@@ -198,32 +206,7 @@ def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
             if key != 'id'}
 
 
-def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None,
-                mount: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the answer of a drive about a given calibration as types of strict JSON.
-
-    changes: of the camera during the drive, in words. motion: the comparison with true poses.
-    mount: how far the mounting is from the calibration's.
-    """
-    values: dict[str, Any] = plain_values(found) | {'changes': list(changes), 'mount': mount}
-    if motion is not None:
-        values |= motion.medians()
-        values['turns'] = [{'center': turn.turn.number, 'true_deg': turn.angle_deg,
-                            'length_m': turn.length_m,
-                            'rotation_deg': {name: turn.rotation_deg(name)
-                                             for name in motion.names},
-                            'scale_drift': {name: turn.scale_drift(name)
-                                            for name in motion.names}}
-                           for turn in motion.turns]
-    return values
-
-
-CAMERA_NAME = 'dashcam'
-# OpenCV's limit is 4096, and an escaped character has up to ten
-TEXT_LENGTH = 400
-
-
-def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
+def calibration_yaml(calibration: Calibration, camera_name: str = ros.CAMERA_NAME,
                      created: str | None = None) -> str:
     """Return the YAML text of an accepted or weak calibration, at full precision.
 
@@ -231,83 +214,11 @@ def calibration_yaml(calibration: Calibration, camera_name: str = CAMERA_NAME,
     Raises ConfigError for a camera name that the drivers would refuse, ValueError without
     intrinsics.
     """
-    check_camera_name(camera_name)
+    ros.check_camera_name(camera_name)
     if calibration.camera is None or not np.isfinite(calibration.camera.params).all():
         raise ValueError('a calibration without finite intrinsics has no calibration.yaml')
-    document = _document(calibration.camera, camera_name, calibration.config.rectified)
-    return yaml_text({**document, 'dashcalib': _provenance(calibration, created)})
-
-
-def camera_info_yaml(camera: Camera) -> str:
-    """Return the YAML text of a camera alone, without a calibration's sigma and provenance."""
-    return yaml_text(_document(camera, CAMERA_NAME, SAME))
-
-
-def _document(camera: Camera, camera_name: str, rectified: str) -> dict[str, Any]:
-    c = ros_camera(camera, rectified)
-    width, height = camera.image_size
-    return {
-        'image_width': int(width),
-        'image_height': int(height),
-        'camera_name': camera_name,
-        'camera_matrix': matrix_block(3, 3, c.k),
-        'distortion_model': c.distortion_model,
-        'distortion_coefficients': matrix_block(1, len(c.d), c.d),
-        'rectification_matrix': matrix_block(3, 3, c.r),
-        'projection_matrix': matrix_block(3, 4, c.p),
-    }
-
-
-def yaml_text(document: Mapping[str, Any]) -> str:
-    """Return a camera_info document as text that ROS's parsers and OpenCV 4 and 5 read."""
-    own = {key: _quoted(document[key]) for key in ('dashcalib',) if key in document}
-    name = document.get('camera_name')
-    if isinstance(name, str) and not name.isidentifier():  # OpenCV: 4k is a broken number
-        own['camera_name'] = _Text(name)
-    return str(yaml.dump({**document, **own}, Dumper=_Dumper, sort_keys=False,
-                         default_flow_style=None, width=2**20, allow_unicode=True,
-                         version=(1, 2)))
-
-
-def check_camera_name(name: str) -> None:
-    """Raise ConfigError for a name that camera_info_manager or image_pipeline would not take."""
-    if not re.fullmatch(r'[A-Za-z0-9_]+', name):
-        raise ConfigError('E-CAMERA-NAME',
-                          f'the camera name {name!r} may have only letters, digits and '
-                          'underscores: camera_info_manager refuses others')
-    if name == 'narrow_stereo':
-        raise ConfigError('E-CAMERA-NAME-TAKEN', 'the camera name narrow_stereo belongs to the '
-                          'stereo files of image_pipeline; choose another one')
-
-
-class _Text(str):
-    """A text that is written with quotes."""
-
-
-class _Dumper(yaml.SafeDumper):
-    """Writes plain values, texts with quotes, and lists that are indented."""
-
-    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
-        super().increase_indent(flow, False)
-
-
-_Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(
-    'tag:yaml.org,2002:str', str(text), style='"'))
-
-
-def _quoted(value: Any) -> Any:
-    """Return a value with every text in it, other than keys, as one that is written in quotes."""
-    if isinstance(value, str):
-        return _Text(shortened(value, TEXT_LENGTH))
-    if isinstance(value, Mapping):
-        return {key: _quoted(each) for key, each in value.items()}
-    return [_quoted(each) for each in value] if isinstance(value, (list, tuple)) else value
-
-
-def matrix_block(rows: int, cols: int, data: Sequence[float]) -> dict[str, Any]:
-    """Return a matrix as the document has it."""
-    # dt: OpenCV reads the matrix by it, as doubles; the other readers look up what they know
-    return {'rows': rows, 'cols': cols, 'dt': 'd', 'data': [float(value) for value in data]}
+    content = ros.document(calibration.camera, camera_name, calibration.config.rectified)
+    return ros.yaml_text({**content, ros.OWN: _provenance(calibration, created)})
 
 
 def _provenance(calibration: Calibration, created: str | None) -> dict[str, Any]:
@@ -325,3 +236,142 @@ def _provenance(calibration: Calibration, created: str | None) -> dict[str, Any]
         **({} if calibration.mount is None else {'mount': calibration.mount}),
     })
     return block if created is None else {**block, 'created': created}
+
+
+def cameras(data: Any, path: Path) -> Cameras:
+    """Return the camera of a result.json or calibration.yaml; see formats/table.py."""
+    known = isinstance(data, dict) and {'verdict', 'image_size'} <= data.keys()
+    return {'': partial(_read, data, path)} if known or _has_block(data) else {}
+
+
+def _has_block(data: Any) -> bool:
+    """Return whether a file's data is a calibration.yaml with our block."""
+    return opencv.has_matrix(data) and isinstance(data.get(ros.OWN), dict)
+
+
+def _read(data: Data, path: Path) -> NamedCamera:
+    """Return the camera, with what else the file says of it; all of that may be missing."""
+    if _has_block(data):
+        values, found = data[ros.OWN], opencv.read(data, path)
+    else:
+        values, found = data, NamedCamera(str(path), _intrinsics(data, path))
+    camera, verdict = found.camera, values.get('verdict')
+    sigma = read_sigma(values.get('sigma'), camera)
+    return dataclasses.replace(
+        found, sigma=sigma, verdict=None if verdict is None else str(verdict),
+        covariance=_covariance(values.get('details'), camera, sigma),
+        sigma_px=_sigma_px(values.get('sigma_px')),
+        field=_used_field(values.get('field'), camera.image_size),
+        mount=_mount(values.get('mount')),
+        readout_ms=_readout_ms(values.get('rolling_shutter')))
+
+
+def _intrinsics(data: Data, path: Path) -> Camera:
+    """Return result.json's camera. Raises InputError."""
+    given = data.get('intrinsics')
+    if not given:
+        raise _no_intrinsics(str(path), data['verdict'], data.get('reasons'))
+    name = data.get('camera_model', Radial.model)
+    if not isinstance(name, str) or name not in MODELS:
+        raise unknown_model(name, path)
+    if not isinstance(given, dict):
+        raise InputError('E-CALIBRATION-MISSING',
+                         f'{path} has no intrinsics; use a complete calibration')
+    size = read_size(*read_pair(data, 'image_size', path), path=path)
+    camera = MODELS[name].of(
+        size, [read_number(given, each, path) for each in MODELS[name].names()])
+    check_lens(camera, path)
+    return camera
+
+
+def _no_intrinsics(name: str, verdict: Any, reasons: Any) -> InputError:
+    """Return the error for a refused calibration."""
+    known = '; '.join(map(str, reasons)) if isinstance(reasons, (list, tuple)) else ''
+    return InputError('E-NO-INTRINSICS',
+                      f'{name} has no intrinsics to compare, its verdict is {verdict}'
+                      + (f': {known}' if known else '') + '; calibrate a drive with more turns')
+
+
+def calibrated_camera(calibration: Calibration, name: str = 'estimate') -> NamedCamera:
+    """Return the camera of a calibration. Raises InputError when it was refused."""
+    if calibration.camera is None:
+        raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.reasons)
+    shutter, field = calibration.rolling_shutter, calibration.field
+    return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
+                       _covariance(calibration.details, calibration.camera, calibration.sigma),
+                       calibration.sigma_px,
+                       field.field if field is not None and field.used else None,
+                       mount=calibration.mount,
+                       readout_ms=None if shutter is None else shutter.readout_ms)
+
+
+def _covariance(details: Any, camera: Camera, sigma: Mapping[str, float] | None
+                ) -> Floats | None:
+    """Return the covariance in result.json's details, None where there is none that can be one.
+
+    That of the picture may be of the wider model's parameters: the camera's own come first. Files
+    of 0.2.0 have the correlations only, which say nearly the same.
+    """
+    data, count = details if isinstance(details, Mapping) else {}, len(camera.params)
+    try:
+        covariance = np.array(data.get('picture_covariance'), np.float64)
+        if covariance.ndim == 2:
+            covariance = covariance[:count, :count]
+        if 'picture_covariance' not in data and sigma is not None:
+            each = [sigma[name] for name in camera.names()]
+            covariance = np.array(data.get('correlation'), np.float64) * np.outer(each, each)
+        if covariance.shape == (count, count) and np.isfinite(covariance).all():
+            np.linalg.cholesky(covariance)
+            return covariance
+    except (TypeError, ValueError, np.linalg.LinAlgError):
+        pass
+    return None
+
+
+def _used_field(data: Any, image_size: tuple[int, int]) -> Field | None:
+    """Return result.json's field, None where there is none that is used."""
+    if not isinstance(data, Mapping) or data.get('used') is not True:
+        return None
+    try:
+        coefficients = np.array(data['coefficients'], np.float64)
+    except (KeyError, TypeError, ValueError):
+        coefficients = np.zeros(0)
+    if coefficients.shape != (2, len(FIELD_TERMS)) or not np.isfinite(coefficients).all():
+        raise InputError('E-CALIBRATION-FIELD',
+                         'its field has no coefficients that can be read; calibrate again')
+    return Field(image_size, coefficients)
+
+
+def _mount(data: Any) -> Mount | None:
+    """Return a file's mounting; a missing one, or one that cannot be read, is no error."""
+    try:
+        travel, sigma = ([float(value) for value in data['travel_px']],
+                         {name: None if data['sigma'][name] is None
+                          else read_number(data['sigma'], name, '')
+                          for name in (*ANGLES, 'height_m')})
+        roll, height = (None if data[name] is None else read_number(data, name, '')
+                        for name in ('roll_right_deg', 'height_m'))
+        return Mount('accepted' if data['verdict'] == 'accepted' else 'weak',
+                     tuple(map(str, data['reasons'])), read_number(data, 'yaw_left_deg', ''),
+                     read_number(data, 'pitch_up_deg', ''), roll, height, sigma,
+                     (travel[0], travel[1]), read_number(data, 'travel_sigma_px', ''),
+                     read_number(data, 'straight_m', ''),
+                     None if data.get('moved_s') is None else read_number(data, 'moved_s', ''))
+    except (KeyError, IndexError, TypeError, ValueError, InputError):
+        return None
+
+
+def _sigma_px(data: Any) -> PictureSigma | None:
+    """Return result.json's sigma over the picture; a missing one is no error."""
+    try:
+        return PictureSigma(*(read_number(data, key, '') for key in ('rms', 'worst')))
+    except (AttributeError, TypeError, InputError):
+        return None
+
+
+def _readout_ms(data: Any) -> float | None:
+    """Return result.json's readout time; a missing one is no error."""
+    try:
+        return read_number(data, 'readout_ms', '')
+    except (AttributeError, TypeError, InputError):
+        return None

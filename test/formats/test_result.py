@@ -13,9 +13,9 @@ from rich.console import Console
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.formats import load_calibration, result_dict, result_json
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.calibration import StoredTurnSummary, Witness, Witnesses
-from dashcalib_ros.report import load_calibration, result_dict, result_json
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.tables import summary
 
