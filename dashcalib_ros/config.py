@@ -117,6 +117,20 @@ class TracksConfig:
         0.0, 1.0)
 
 
+# of the setting reconstruct.engine; auto: pycolmap where it is installed, else opencv
+AUTO_ENGINE = 'auto'
+ENGINES = (AUTO_ENGINE, 'pycolmap', 'opencv')
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """What reconstructs a turn."""
+
+    engine: str = expert(
+        AUTO_ENGINE, 'library that estimates poses; auto: pycolmap where it is installed',
+        choices=ENGINES)
+
+
 @dataclass(frozen=True)
 class SceneConfig:
     """Tracks -> one scene per turn."""
@@ -291,6 +305,7 @@ class Config:
     mask: MaskConfig = field(default_factory=MaskConfig)
     turns: TurnsConfig = field(default_factory=TurnsConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
     lines: LinesConfig = field(default_factory=LinesConfig)
