@@ -6,26 +6,49 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dashcalib_ros.calibrator import Calibrator
     from dashcalib_ros.camera import Brown, Camera, Fisheye, Radial, Rational
     from dashcalib_ros.config import Config
+    from dashcalib_ros.errors import (
+        ConfigError,
+        DashcalibError,
+        InputError,
+        NotAcceptedError,
+        OutputError,
+        WorkerError,
+    )
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
-    from dashcalib_ros.recorded import calibrate, check
-    from dashcalib_ros.report import Calibration, load_camera
+    from dashcalib_ros.pipeline import Calibrator
+    from dashcalib_ros.report import (
+        AcceptedCalibration,
+        Calibration,
+        Verdict,
+        compare,
+        load_camera,
+    )
+    from dashcalib_ros.report.export import export
+    from dashcalib_ros.session import calibrate, check
+
+    __version__: str
 
 from dashcalib_ros.limits import PIXELS
 
 # OpenCV reads it when it is loaded; image headers are checked before decoding, too
 os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(PIXELS))
 
-__all__ = ['Brown', 'Calibration', 'Calibrator', 'Camera', 'Config', 'Fisheye', 'Frame', 'Radial',
-           'Rational', 'calibrate', 'check', 'load_camera', 'open_frames']
+__all__ = ['AcceptedCalibration', 'Brown', 'Calibration', 'Calibrator', 'Camera', 'Config',
+           'ConfigError', 'DashcalibError', 'Fisheye', 'Frame', 'InputError', 'NotAcceptedError',
+           'OutputError', 'Radial', 'Rational', 'Verdict', 'WorkerError', '__version__',
+           'calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames']
 
-_HOMES = {'Calibration': 'report', 'Calibrator': 'calibrator', 'Config': 'config',
-          'Frame': 'input', 'calibrate': 'recorded', 'check': 'recorded',
-          'load_camera': 'report', 'open_frames': 'input.inputs',
-          **dict.fromkeys(('Brown', 'Camera', 'Fisheye', 'Radial', 'Rational'), 'camera')}
+_HOMES = {'Calibrator': 'pipeline', 'Config': 'config', 'Frame': 'input',
+          'calibrate': 'session', 'check': 'session', 'export': 'report.export',
+          'open_frames': 'input.inputs',
+          **dict.fromkeys(('AcceptedCalibration', 'Calibration', 'Verdict', 'compare',
+                           'load_camera'), 'report'),
+          **dict.fromkeys(('Brown', 'Camera', 'Fisheye', 'Radial', 'Rational'), 'camera'),
+          **dict.fromkeys(('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError',
+                           'OutputError', 'WorkerError'), 'errors')}
 
 
 def __dir__() -> list[str]:
@@ -36,4 +59,10 @@ def __getattr__(name: str) -> Any:
     # loaded at the first use: `dashcalib --help` must not wait for OpenCV
     if name in _HOMES:
         return getattr(import_module(f'dashcalib_ros.{_HOMES[name]}'), name)
+    if name == '__version__':
+        from importlib.metadata import PackageNotFoundError, version
+        try:
+            return version('dashcalib_ros')
+        except PackageNotFoundError:
+            return 'not installed (running from its sources)'
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

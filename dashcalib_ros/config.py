@@ -1,7 +1,7 @@
 """The one home of every default, each with the reason for its value.
 
 Users set about fifteen of them, setting(); the others are for experts, expert(). The measurements
-behind a value are in docs/notebook/lessons.md.
+behind a value are in benchmark/settings.md.
 
 A setting's full name is SECTION.NAME ('turns.half_width'): the same in --set, in a configuration
 YAML and as a ROS parameter. Values are checked when a Config is made: one that exists is valid.
@@ -30,7 +30,7 @@ def setting(default: T, reason: str, minimum: float | None = None, maximum: floa
     """Declare a setting: its default, the reason for it in one line, and the other valid values.
 
     expert: few users set it; such settings are listed after the others. The measurements behind a
-    value are in docs/notebook/lessons.md under the setting's name.
+    value are in benchmark/settings.md under the setting's name.
     """
     metadata = {'reason': reason, 'minimum': minimum, 'maximum': maximum, 'choices': choices,
                 'pattern': pattern, 'expert': expert}

@@ -20,6 +20,12 @@ def one_line(error: BaseException, limit: int = 160) -> str:
     return shortened(' '.join(str(error).split()) or type(error).__name__, limit)
 
 
+def coded(error: Exception, limit: int = 1000) -> str:
+    """Return an error's message on one line, with its code at the end if it has one."""
+    code = error.code if isinstance(error, DashcalibError) else ''
+    return one_line(error, limit) + (f' [{code}]' if code else '')
+
+
 def shortened(text: str, limit: int = 160) -> str:
     """Return the text, or its beginning where it is too long for a message."""
     return text if len(text) <= limit else text[:limit - 1] + '…'
@@ -55,7 +61,11 @@ class ConfigError(DashcalibError):
 
 
 class OutputError(DashcalibError):
-    """A result cannot be written."""
+    """A result cannot be written: the disk is full, or the place is not writable."""
+
+
+class NotAcceptedError(DashcalibError):
+    """An accepted calibration is required, and this one is weak or refused."""
 
 
 class WorkerError(DashcalibError):

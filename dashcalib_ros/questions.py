@@ -6,15 +6,16 @@ from typing import Any
 
 from dashcalib_ros import judge
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Calibration, Check, Monitor, Odometry, Poses, Reading
+from dashcalib_ros.judge.check import CALIBRATION
 from dashcalib_ros.judge.monitor import readings_of
-from dashcalib_ros.selection import Progress
+from dashcalib_ros.pipeline import Calibrator
+from dashcalib_ros.workers.worker import Progress
 
 
 class Questions:
@@ -29,16 +30,17 @@ class Questions:
         self._watched: Camera | None = None
         self._read: dict[TurnId, Reading] = {}
 
-    def check(self, given: Camera, calibration: Calibration, progress: Progress | None = None
-              ) -> Check:
+    def check(self, given: Camera, calibration: Calibration, progress: Progress | None = None,
+              name: str = CALIBRATION) -> Check:
         """Say whether a given camera explains the drive.
 
-        calibration: what the last calibrate() returned. progress: as for calibrate().
+        calibration: what the last calibrate() returned. progress: as for calibrate(). name: of
+        the given camera's file, for the command that a message offers.
         """
         config = self._asked.scenes.config
         found: Check = self._run('the turns with the given camera', progress, judge.check, given,
                                  calibration.image_size, self._asked.solution,
-                                 calibration.verdict, config)
+                                 calibration.verdict, config, name)
         lines = self._asked.detection.lines()
         return judge.with_lines(found, given, lines, calibration.image_size, config)
 
@@ -55,8 +57,10 @@ class Questions:
             return None
         if given.image_size != size:
             raise InputError(
+                'E-CALIBRATION-SIZE',
                 f'the calibration is for {by(given.image_size)} pictures, and those of the drive '
-                f'have {by(size)}: poses tell nothing of it')
+                f'have {by(size)}, so that poses cannot test it; resize it with dashcalib export '
+                f'--size')
         own, config = solution.camera, self._asked.scenes.config
         cameras = {'given': given.resized(1 / Scale.of(size, config).px, own.image_size),
                    'ours': own, 'guess': judge.trivial_guess(own.image_size)}
@@ -104,12 +108,13 @@ class Questions:
         """Return a camera of the resized pictures."""
         size, scale = self._asked.detection.size, self._asked.detection.scale
         if camera.image_size != size:
-            raise InputError(f'the camera in use is for pictures of another size: '
-                             f'{by(camera.image_size)}')
+            raise InputError('E-CALIBRATION-SIZE',
+                             f'the camera in use is for pictures of another size: '
+                             f'{by(camera.image_size)}; resize it with dashcalib export --size')
         return camera.resized(1 / scale.px, scale.size(size))
 
     def _run(self, stage: str, progress: Progress | None, function: Callable[..., Any],
              *arguments: Any) -> Any:
         if progress is not None:
             progress(stage, 0.0)
-        return self._asked.scenes.run(function, *arguments)
+        return self._asked.workers.run(function, *arguments)

@@ -60,11 +60,13 @@ def write_stdout(text: str, styled: bool = False) -> None:
         _discard(sys.stdout)
     except (AttributeError, ValueError) as error:
         # AttributeError: it is None; ValueError: it was closed by this process
-        raise OutputError('stdout is closed; give it a terminal, a file or a pipe') from error
+        raise OutputError('E-STDOUT-CLOSED', 'stdout is closed; connect it to a terminal, a file '
+                                             'or a pipe') from error
     except OSError as error:
         _discard(sys.stdout)
-        raise OutputError(f'cannot write to stdout: {error.strerror or error}; send the output '
-                          f'to another place') from error
+        raise OutputError('E-STDOUT-UNWRITABLE',
+                          f'cannot write to stdout: {error.strerror or error}; redirect the '
+                          f'output to another place') from error
 
 
 def write_stderr(text: str, styled: bool = False) -> None:

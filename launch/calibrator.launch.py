@@ -8,13 +8,13 @@ from launch_ros.substitutions import FindPackageShare
 from launch import LaunchDescription
 
 ARGUMENTS = (
-    ('namespace', '', "the camera's namespace; it names the camera, too"),
-    ('image', 'image_raw', 'its image topic, without /compressed'),
-    ('camera_info', 'camera_info', 'where its calibration is published'),
-    ('image_transport', 'raw', 'raw, compressed or video, whatever the file of parameters says'),
-    ('use_sim_time', 'false', 'true with a bag that is played with --clock; not from the file'),
+    ('namespace', '', 'the namespace of the camera, which also gives it its name'),
+    ('image', 'image_raw', 'the image topic, without /compressed'),
+    ('camera_info', 'camera_info', 'the topic on which the calibration is published'),
+    ('image_transport', 'raw', 'raw, compressed or video; overrides the parameter file'),
+    ('use_sim_time', 'false', 'true for a bag played with --clock; overrides the parameter file'),
     ('config', PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'config',
-                                     'calibrator.yaml']), 'the file of parameters'),
+                                     'calibrator.yaml']), 'the parameter file'),
     ('rviz', 'false', 'true starts RViz with the images, the overlay and the rectified picture'),
 )
 RVIZ = PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'config', 'dashcalib.rviz'])

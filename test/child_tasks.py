@@ -75,7 +75,7 @@ def echo(value):
 
 
 def fail(kind):
-    raise {'input': InputError('no turn: drive one'), 'os': FileNotFoundError(2, 'gone'),
+    raise {'input': InputError('E-NO-TURN', 'drive one'), 'os': FileNotFoundError(2, 'gone'),
            'eof': EOFError('end'), 'value': ValueError('odd'), 'awkward': AwkwardError(1, 2),
            'local': type('LocalError', (Exception,), {})('made here')}[kind]
 

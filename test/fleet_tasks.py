@@ -12,7 +12,7 @@ def double(number: int) -> int:
 
 
 def fail(text: str) -> None:
-    raise InputError(text)
+    raise InputError('E-TRIED', text)
 
 
 def break_down() -> None:

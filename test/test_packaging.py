@@ -66,9 +66,10 @@ def unpacked(tmp_path_factory):
 def test_the_source_distribution_has_what_a_clone_has(unpacked):
     inside = {str(path.relative_to(unpacked)) for path in unpacked.rglob('*')}
     dropped = ('.ci', '.github', '.gitignore', '.pre-commit-config.yaml', '.dockerignore',
-               'MANIFEST.in')
+               'MANIFEST.in', 'benchmark/')
     missing = {name for name in tracked_files() if not name.startswith(dropped)} - inside
     assert missing == set(), 'add them to MANIFEST.in'
+    assert not (unpacked / 'benchmark').exists()
 
 
 def test_the_wheel_of_the_source_distribution_is_complete(unpacked, tmp_path):

@@ -2,6 +2,12 @@
 from __future__ import annotations
 
 import inspect
+import json
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,16 +16,32 @@ from fakes import stands_in_for
 from made_calibration import TRUTH, make_calibration
 
 import dashcalib_ros
-from dashcalib_ros import Calibrator, calibrate, check, recorded
-from dashcalib_ros.errors import InputError
+from dashcalib_ros import Calibrator, calibrate, check, compare, export, open_frames, session
+from dashcalib_ros.errors import DashcalibError, InputError, NotAcceptedError
+from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.judge import Check
 from dashcalib_ros.questions import Questions
 
-NAMES = ('calibrate', 'check', 'load_camera', 'open_frames', 'Calibration', 'Calibrator', 'Config',
-         'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye', 'Rational')
+FUNCTIONS = ('calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames')
+ERRORS = ('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError', 'OutputError',
+          'WorkerError')
+NAMES = (*FUNCTIONS, *ERRORS, 'AcceptedCalibration', 'Calibration', 'Calibrator', 'Config',
+         'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye', 'Rational', 'Verdict')
+# what mypy --strict accepts of a user
+SCRIPT = """
+from dashcalib_ros import calibrate
+found = calibrate('drive.mp4').accepted()
+print(found.camera.fx, found.sigma['fx'], found.K @ found.rays([[0.0, 0.0]])[0], found.D.tolist())
+"""
 
 
 def test_all_names_are_there_to_see():
-    assert set(NAMES) == set(dashcalib_ros.__all__) <= set(dir(dashcalib_ros))
+    assert {*NAMES, '__version__'} == set(dashcalib_ros.__all__) <= set(dir(dashcalib_ros))
+    assert dashcalib_ros.__version__[0].isdigit() or 'sources' in dashcalib_ros.__version__
+
+
+def test_every_error_is_a_child_of_one():
+    assert all(issubclass(getattr(dashcalib_ros, name), DashcalibError) for name in ERRORS)
 
 
 @pytest.mark.parametrize('name', NAMES)
@@ -36,23 +58,23 @@ def test_help_stands_alone(name):
 class FakeCalibrator:
     """Takes note of what it is given."""
 
-    def __init__(self, config=None, mask=None):
-        type(self).mask = mask
+    def __init__(self, config=None, mask=None, verbose=False):
+        type(self).mask, type(self).motion, type(self).frames = mask, None, 0
 
-    def expect(self, frames):
-        type(self).frames = frames
+    def sense(self, motion):
+        type(self).motion = motion
 
     def push(self, frame):
-        pass
+        type(self).frames += 1
 
     def calibrate(self, progress=None):
         progress('solving', 1.0)
         return make_calibration()
 
-    def __enter__(self):
-        return self
+    def turns(self):
+        return ()
 
-    def __exit__(self, kind, error, trace):
+    def close(self):
         pass
 
 
@@ -63,14 +85,19 @@ class FakeQuestions:
     def __init__(self, calibrator):
         pass
 
-    def check(self, given, calibration, progress=None):
+    def check(self, given, calibration, progress=None, name=''):
+        type(self).given = given
         progress('checking', 1.0)
+        return Check('right', (), 0.0, 1.0)
+
+    def watch(self, camera, sigma=None, progress=None):
+        return types.SimpleNamespace(changes=())
 
 
 @pytest.fixture
 def drive(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorded, 'Calibrator', FakeCalibrator)
-    monkeypatch.setattr(recorded, 'Questions', FakeQuestions)
+    monkeypatch.setattr(session, 'Calibrator', FakeCalibrator)
+    monkeypatch.setattr(session, 'Questions', FakeQuestions)
     (tmp_path / 'drive').mkdir()
     for n in range(4):
         cv2.imwrite(str(tmp_path / 'drive' / f'{n}.png'), np.full((48, 64), 60 + n, np.uint8))
@@ -86,10 +113,81 @@ def test_a_mask_and_the_progress(drive, tmp_path, run):
         told = []
         run(drive, mask=given, progress=lambda stage, done, told=told: told.append((stage, done)))
         np.testing.assert_array_equal(FakeCalibrator.mask, mask > 0)
-        assert FakeCalibrator.frames == 4
-        assert told[:4] == [('reading', share) for share in (0.25, 0.5, 0.75, 1.0)]
-        assert told[4] == ('solving', 1.0)
+        assert told[:5] == [('reading', share) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+        assert told[5] == ('solving', 1.0)
     with pytest.raises(InputError, match='64x47'):
         run(drive, mask=mask[1:])
     with pytest.raises(InputError, match='height, width'):
         run(drive, mask=np.zeros((48, 64, 3)))
+
+
+@pytest.mark.parametrize('run', [calibrate, lambda path, **more: check(TRUTH, path, **more)])
+def test_the_sensors_of_a_drive_are_heard(drive, tmp_path, run):
+    (tmp_path / 'gyro.csv').write_text('stamp_s,gyro_x,gyro_y,gyro_z\n0,0,0.1,0\n1,0,0.2,0\n')
+    run(drive, motion=tmp_path / 'gyro.csv')
+    assert FakeCalibrator.motion is not None
+    given = SensorStream()
+    run(drive, motion=given)
+    assert FakeCalibrator.motion is given
+    run(drive)
+    assert FakeCalibrator.motion is None
+
+
+@pytest.mark.parametrize('run', [calibrate, open_frames,
+                                 lambda path: check(TRUTH, path)], ids=['run', 'open', 'check'])
+@pytest.mark.parametrize('path', [None, 3, b'drive.mp4', [None], ['a.mp4', 3]])
+def test_what_is_no_path_is_an_input_error(run, path):
+    with pytest.raises(InputError) as error:
+        run(path)
+    assert error.value.code == 'E-PATH-TYPE'
+
+
+def test_paths_that_come_one_by_one_are_a_drive(drive):
+    calibrate(each for each in (drive, drive))
+    assert FakeCalibrator.frames == 8
+
+
+def test_a_calibration_is_given_in_any_form(drive, tmp_path):
+    result = make_calibration()
+    result.save(tmp_path / 'a')
+    named = dashcalib_ros.load_camera(tmp_path / 'a')
+    for given in (result, TRUTH, named, tmp_path / 'a', str(tmp_path / 'a/calibration.yaml')):
+        check(given, drive)
+        assert FakeQuestions.given == TRUTH
+        assert compare(given, result).mapping_px == pytest.approx(0.0, abs=1e-6)
+        assert json.loads(export(given, 'nerfstudio'))['fl_x'] == TRUTH.fx
+    for use in (lambda given: check(given, drive), lambda given: compare(given, TRUTH),
+                lambda given: export(given, 'ros')):
+        with pytest.raises(InputError) as error:
+            use(None)
+        assert error.value.code == 'E-CALIBRATION-TYPE'
+
+
+def test_accepted_returns_the_same_result_or_raises_with_the_reasons():
+    result = make_calibration()
+    found = result.accepted()
+    assert found.camera == result.camera and found.sigma == result.sigma
+    assert found.material is result.material and repr(found) == repr(result)
+    assert found.intrinsics == result.intrinsics and found.accepted() == found
+    for level in ('weak', 'refused'):
+        other = make_calibration(level)
+        with pytest.raises(NotAcceptedError) as error:
+            other.accepted()
+        assert error.value.code == 'E-NOT-ACCEPTED' and level in str(error.value)
+        assert all(reason in str(error.value) for reason in other.verdict.reasons)
+
+
+def test_a_script_of_three_lines_is_clean_for_mypy(tmp_path):
+    pytest.importorskip('mypy')
+    root = Path(__file__).parents[1]
+
+    def checked(script):
+        (tmp_path / 'script.py').write_text(script)
+        return subprocess.run(
+            [sys.executable, '-m', 'mypy', '--strict', str(tmp_path / 'script.py')], cwd=root,
+            env={**os.environ, 'MYPYPATH': str(root)}, capture_output=True, text=True, timeout=300)
+    done = checked(SCRIPT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    # accepted() is what does it
+    done = checked(SCRIPT.replace('.accepted()', ''))
+    assert done.returncode == 1 and 'None' in done.stdout

@@ -89,7 +89,14 @@ def apart(camera: Camera, reference: Camera) -> Apart | None:
     the camera cannot see one of the others, and where none is left.
     """
     pixels = grid_of(reference)
-    rays = reference.rays(pixels)
+    return apart_at(camera, reference.rays(pixels), pixels)
+
+
+def apart_at(camera: Camera, rays: Floats, pixels: Floats) -> Apart | None:
+    """Return how far the camera's images of rays (n, 3) are from the pixels (n, 2) that see them.
+
+    None where apart() is.
+    """
     if not np.isfinite(rays).all():
         return None
     possible = _possible(camera, rays)

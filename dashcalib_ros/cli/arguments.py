@@ -2,8 +2,11 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import math
-from collections.abc import Callable, Sequence
+import os
+import shlex
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -14,13 +17,13 @@ from dashcalib_ros.standard_streams import write_stdout
 PROGRAM = 'dashcalib'
 # exit codes
 ACCEPTED = 0
-WRONG = 1  # of check: the calibration does not explain the drive
+WRONG = 1  # of check: the calibration does not fit the drive
 BAD_INPUT = 2  # or bad usage: one line on stderr says what and the cure
 NOT_ENOUGH = 3  # weak or refused: the input was fine, the evidence was not enough
 INTERRUPTED = 130  # Ctrl-C or SIGTERM, as shells have it
 INPUT_HELP = ('a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, or a folder of images; '
-              "several of one camera, in this order; or a folder of videos, or a pattern "
-              "('clips/*.mp4'): bags by their time, all else by name")
+              'several of one camera are one drive, in this order; a folder of videos or a '
+              "pattern ('clips/*.mp4') is sorted: bags by time, other files by name")
 EXIT_HELP = ('exit codes: 0 accepted; 3 weak or refused (the input was fine, the evidence was '
              'not enough); 2 bad input or usage')
 CALIBRATION_HELP = ('result.json (or its folder), calibration.yaml, a file of ROS, OpenCV, '
@@ -28,13 +31,18 @@ CALIBRATION_HELP = ('result.json (or its folder), calibration.yaml, a file of RO
                     'k2 ..., width and height, or a bag with camera_info; FILE:NAME for one of '
                     'several cameras')
 SHORT_EXIT_HELP = 'exit codes: 0 done; 2 bad input or usage'
-CHECK_EXIT_HELP = 'exit codes: 0 right; 1 wrong; 3 the drive cannot tell; 2 bad input or usage'
-BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera refused; 3 some were not; '
-                   '2 bad manifest or usage')
-# the names of models and exports are not taken from their tables: that would load OpenCV
+CHECK_EXIT_HELP = ('exit codes: 0 right, or differs but is good enough; 1 wrong; 3 the drive '
+                   'cannot tell; 2 bad input or usage')
+BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera was refused; 3 a clip could '
+                   'not be read or a camera was refused; 2 bad manifest or usage')
+# names of models, exports and demos; to take them from their tables would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
 KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'foxglove',
          'gyroflow', 'rays', 'maps')
+LENSES = ('radial', 'brown', 'fisheye', 'windscreen', 'shutter', 'stabilised', 'straight')
+# files that no command takes as a drive
+NO_DRIVES = ('.yaml', '.yml', '.json', '.xml', '.txt', '.csv', '.npz')
+
 
 def exit_code(verdict: str) -> int:
     """Return the exit code of a verdict."""
@@ -43,6 +51,26 @@ def exit_code(verdict: str) -> int:
 
 class UsageError(DashcalibError):
     """The arguments are wrong."""
+
+
+def arguments_of(argv: Sequence[str]) -> list[str]:
+    """Return the arguments for the parser. Raises UsageError for an unknown command."""
+    if argv and not argv[0].startswith('-') and argv[0] not in COMMANDS:
+        raise UsageError('E-COMMAND-UNKNOWN',
+                         f'unknown command {argv[0]!r}: {_command_for(argv[0])}')
+    # `--json -` means --json: earlier versions of run needed it
+    return [each for before, each in zip(['', *argv], argv, strict=False)
+            if (before, each) != ('--json', '-')]
+
+
+def _command_for(word: str) -> str:
+    """Return a hint for a word that is no command: it may be a drive."""
+    if not word.lower().endswith(NO_DRIVES) and (
+            os.path.lexists(word) or set(word) & {os.sep, '.', '*', '?'}):
+        return f'did you mean `{PROGRAM} run {shlex.quote(word)}`?'
+    near = difflib.get_close_matches(word, COMMANDS, 1)
+    return (f'did you mean `{PROGRAM} {near[0]}`?' if near else
+            f'use one of {", ".join(COMMANDS)}; see {PROGRAM} --help')
 
 
 class _Lines(argparse.HelpFormatter):
@@ -61,13 +89,16 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError: one line that names --help."""
-        raise UsageError(f'{message}; see {self.prog} --help')
+        raise UsageError('E-USAGE', f'{message}; see {self.prog} --help')
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """Parse them all: what a command does not know must name that command's --help."""
+        """Parse all arguments: an unknown one must name the --help of its own command."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self.error(f'unrecognized arguments: {" ".join(unknown)}')
+            near = _nearest(unknown, self._option_string_actions)
+            hint = f'did you mean {", ".join(near)}? See' if near else 'see'
+            raise UsageError('E-ARGUMENT-UNKNOWN', f'unknown argument {" ".join(unknown)}: '
+                                                   f'{hint} {self.prog} --help')
         return found, []
 
     def print_help(self, file: Any = None) -> None:
@@ -75,25 +106,28 @@ class Parser(argparse.ArgumentParser):
         write_stdout(self.format_help().rstrip('\n'))
 
 
+def _nearest(unknown: Iterable[str], flags: Iterable[str]) -> list[str]:
+    """Return the flag that is most like each unknown one."""
+    known = list(flags)
+    return [near for each in unknown if each.startswith('-')
+            for near in difflib.get_close_matches(each.partition('=')[0], known, 1)]
+
+
 class Version(argparse.Action):
-    """--version; looks the version up only when it is used."""
+    """--version; the version is only looked up when it is used."""
 
     def __init__(self, option_strings: Sequence[str], dest: str) -> None:
         super().__init__(option_strings, dest, nargs=0, help='print the version and exit')
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         """Print the installed package's version."""
-        from importlib.metadata import PackageNotFoundError, version
-        try:
-            found = version('dashcalib_ros')
-        except PackageNotFoundError:
-            found = 'not installed (running from its sources)'
-        write_stdout(f'{PROGRAM} {found}')
+        from dashcalib_ros import __version__
+        write_stdout(f'{PROGRAM} {__version__}')
         parser.exit()
 
 
 def whole_numbers(between: str, count: int, like: str) -> Callable[[str], tuple[int, ...]]:
-    """Return a type of argument: so many whole numbers, such as a size or a part of a picture."""
+    """Return a type of argument: `count` whole numbers, such as a size or a part of a picture."""
     def numbers(text: str) -> tuple[int, ...]:
         parts = text.lower().split(between)
         # int() refuses thousands of digits in words of its own
@@ -105,7 +139,7 @@ def whole_numbers(between: str, count: int, like: str) -> Callable[[str], tuple[
 
 
 def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
-    """Return a type of argument: a finite number that fits. what: it must be."""
+    """Return a type of argument: a finite number that fits. what: the range, for the message."""
     def value(text: str) -> float:
         try:
             found = float(text)
@@ -121,7 +155,7 @@ def path_or(cure: str) -> Callable[[str], Path]:
     """Return a type of argument: a path that is not - (standard output elsewhere)."""
     def path(text: str) -> Path:
         if text == '-':
-            raise argparse.ArgumentTypeError(f'it cannot be -: {cure}')
+            raise argparse.ArgumentTypeError(f'must not be -: {cure}')
         return Path(text)
     return path
 
@@ -129,7 +163,7 @@ def path_or(cure: str) -> Callable[[str], Path]:
 def count(text: str) -> int:
     """Return a number of processes; a type of argument."""
     if not (text.isdecimal() and 1 <= int(text) <= 10_000):
-        raise argparse.ArgumentTypeError(f'must be a number from 1 on, not {text!r}')
+        raise argparse.ArgumentTypeError(f'must be a whole number from 1 to 10000, not {text!r}')
     return int(text)
 
 
@@ -144,10 +178,10 @@ INPUT: Argument = ('input', {'metavar': 'INPUT', 'nargs': '+', 'help': INPUT_HEL
 CALIBRATION: Argument = ('calibration', {'metavar': 'CALIBRATION', 'type': Path,
                                          'help': CALIBRATION_HELP})
 MODEL: Argument = ('--model', {
-    'metavar': 'NAME', 'help': 'of the lens: radial, brown, fisheye, or auto: the one that the '
-                               'turns prove (default)'})
+    'metavar': 'NAME', 'help': 'lens model: radial, brown, fisheye, or auto (default): the one '
+                               'that the turns prove'})
 SEED: Argument = ('--seed', {'type': int, 'metavar': 'S',
-                             'help': 'same input and seed: same result'})
+                             'help': 'the same input and seed give the same result'})
 SETTINGS: tuple[Argument, ...] = (
     ('--config', {'type': Path, 'metavar': 'YAML', 'help': 'settings from a file'}),
     ('--set', {'action': 'append', 'default': [], 'metavar': 'KEY=VALUE',
@@ -156,46 +190,48 @@ QUIET: Argument = ('--quiet', {
     **FLAG, 'help': 'no progress and no summary: only warnings and errors'})
 NO_PROGRESS: Argument = ('--quiet', {**FLAG, 'help': 'no progress'})
 VERBOSE: Argument = ('--verbose', {**FLAG, 'help': "show COLMAP's own log"})
-JSON: Argument = ('--json', {**FLAG, 'help': 'print JSON'})
+JSON: Argument = ('--json', {**FLAG, 'help': 'print JSON on stdout, and nothing else there'})
 # of the drive, behind INPUT
 DRIVE: tuple[Argument, ...] = (
     ('--topic', {'metavar': 'T', 'help': "the bag's image topic"}),
     ('--stream', {'metavar': 'N', 'dest': 'topic',
                   'help': "the video's stream, where it has several: 1, 2 ..."}),
-    ('--fps', {'type': POSITIVE, 'metavar': 'F', 'help': 'rate of a video or image folder'}),
+    ('--fps', {'type': POSITIVE, 'metavar': 'F',
+               'help': 'images per second of a video or an image folder'}),
     ('--start', {'type': SECONDS, 'default': 0.0, 'metavar': 'S',
-                 'help': 'leave out the first S seconds of the drive'}),
+                 'help': 'skip the first S seconds of the drive'}),
     ('--duration', {'type': POSITIVE, 'metavar': 'S', 'help': 'use S seconds of the drive'}),
-    ('--turns', {'type': int, 'metavar': 'N', 'help': 'how many turns are wanted'}),
+    ('--turns', {'type': int, 'metavar': 'N', 'help': 'use N turns'}),
     ('--mask', {'type': Path, 'metavar': 'PNG',
-                'help': 'black pixels are not used; as large as the images'}),
+                'help': 'a picture of the size of the images; its black pixels are not used'}),
     ('--segmentation', {'metavar': 'MODEL.onnx',
-                        'help': 'a segmentation network that finds the own car, used in addition '
-                                'to the automatic mask'}),
+                        'help': "a segmentation network that finds the camera's own car; used in "
+                                'addition to the automatic mask'}),
     *SETTINGS)
-# of the car's own sensors, which say how much it turned
+# of the car's own sensors, which measure how much it turned
 MOTION: tuple[Argument, ...] = (
     ('--motion', {'type': Path, 'metavar': 'FILE',
-                  'help': "the car's own sensors: a CSV (head line: stamp_s from the first image "
-                          'on, and any of gyro_x, gyro_y, gyro_z [rad/s], speed [m/s], latitude, '
-                          'longitude, altitude), a GPX, a KITTI oxts folder, or a video that has '
-                          'them inside'}),
-    *((f'--{name}', {'metavar': 'TOPIC', 'help': f"the bag's {what} topic, where it has several"})
+                  'help': "data of the car's own sensors: a CSV (header: stamp_s, which counts "
+                          'from the first image, and any of gyro_x, gyro_y, gyro_z [rad/s], speed '
+                          '[m/s], latitude, longitude, altitude), a GPX file, a KITTI oxts '
+                          'folder, or a video that contains them'}),
+    *((f'--{name}', {'metavar': 'TOPIC',
+                     'help': f"the bag's {what} topic, if there are several"})
       for name, what in (('imu', 'Imu'), ('gps', 'NavSatFix'), ('odom', 'Odometry or Twist'))),
     ('--gyro-scale-sigma', {'type': number('0 or more', lambda value: value >= 0), 'metavar': 'S',
-                            'help': "how far the gyro's angles may be off, of them: 0.03 unless "
-                                    'given, a calibrated one has 0.001'}))
+                            'help': "relative standard deviation (sigma) of the gyro's scale; "
+                                    'default: 0.03; a calibrated gyro has about 0.001'}))
 # what the shell may complete: argcomplete looks for it
 COMPLETED = {'--model': MODELS, '--to': KINDS}
-# of these, a command takes one at the most
+# a command takes only one of these
 ALONE = ('--size', '--crop', '--workers', '--address', '--shard')
 
 
 def out_folder(default: str, cure: str = '') -> Argument:
     """Return --out for a folder of results."""
-    return '--out', {'type': path_or(f'the results are several files: give a folder{cure}'),
+    return '--out', {'type': path_or(f'the results are several files, use a folder{cure}'),
                      'default': Path(default), 'metavar': 'DIR',
-                     'help': f'where the results go (default: ./{default})'}
+                     'help': f'folder for the results (default: ./{default})'}
 
 
 @dataclass(frozen=True)
@@ -213,47 +249,49 @@ class Command:
 COMMANDS = {
     'run': Command(
         'dashcalib_ros.cli.run', 'calibrate a recorded drive',
-        'Finds the turns of a drive, reconstructs the best and calibrates the camera from them. '
-        'Writes result.json, report.html and, when accepted, calibration.yaml to DIR.',
+        'Finds the turns of a drive, reconstructs the best ones and calibrates the camera from '
+        'them. Writes result.json, report.html and, if accepted, calibration.yaml to DIR.',
         "dashcalib run 'clips/*.mp4' --out calibration", (
             INPUT, *DRIVE, *MOTION, MODEL, SEED,
             ('--threads', {'type': int, 'metavar': 'N',
-                           'help': 'processes that reconstruct turns side by side; the result is '
-                                   'the same with any'}),
+                           'help': 'processes that reconstruct turns in parallel; the result does '
+                                   'not depend on it'}),
             ('--speed', {'type': POSITIVE, 'metavar': 'KMH',
-                         'help': 'on straight stretches, constant: tells how high the camera '
-                                 'sits'}),
+                         'help': 'constant speed of the car on straight roads; from it follows '
+                                 'the height of the camera'}),
             ('--no-mount', {'action': 'store_false', 'default': None, 'dest': 'mount',
-                            'help': 'do not say how the camera sits on the car'}),
+                            'help': 'do not estimate how the camera is mounted on the car'}),
             ('--write-bag', {'type': Path, 'metavar': 'OUT',
-                             'help': 'when accepted: write a copy of the one bag INPUT with a '
-                                     'camera_info for each image'}),
-            out_folder('calibration', '; --json - prints result.json'),
-            ('--json', {'choices': ('-',), 'metavar': '-',
-                        'help': 'print result.json on stdout, all else on stderr'}),
-            QUIET, VERBOSE), exit_codes=EXIT_HELP),
+                             'help': 'if accepted: write a copy of INPUT, which must be one bag, '
+                                     'with a camera_info for each image'}),
+            out_folder('calibration', '; --json prints result.json'),
+            JSON, QUIET, VERBOSE), exit_codes=EXIT_HELP),
     'turns': Command(
         'dashcalib_ros.cli.run', 'find the turns of a drive, without calibrating',
         'Lists the turns that a calibration would choose from, best first.',
         'dashcalib turns drive.mp4 --start 60 --duration 300', (
             INPUT, *DRIVE, JSON, NO_PROGRESS)),
     'demo': Command(
-        'dashcalib_ros.cli.run', 'render a drive, calibrate it, compare with the truth',
-        'Renders a drive with a known lens into a ROS 2 bag, calibrates that and compares the '
-        'result with the truth.',
-        'dashcalib demo --keep-bag --out demo', (
+        'dashcalib_ros.cli.demo', 'render a drive, calibrate it, compare with the truth',
+        'Renders a drive with a known lens into a ROS 2 bag, calibrates it and compares the '
+        'result with the truth, which is written to DIR/truth.json. A stabilised drive should be '
+        'weak, and a straight one refused.',
+        'dashcalib demo --lens fisheye --keep-bag --out demo', (
+            ('--lens', {'choices': LENSES, 'metavar': 'KIND', 'default': LENSES[0],
+                        'help': f'what is rendered: {", ".join(LENSES)} (default: {LENSES[0]})'}),
             MODEL, SEED, out_folder('demo'),
-            ('--keep-bag', {**FLAG, 'help': 'leave the bag in DIR/bag'}), QUIET, VERBOSE),
+            ('--keep-bag', {**FLAG, 'help': 'keep the bag in DIR/bag'}), JSON, QUIET, VERBOSE),
         exit_codes=EXIT_HELP),
     'compare': Command(
         'dashcalib_ros.cli.cameras', 'compare two calibrations',
-        'How far apart both see a ray, in pixels over the picture, best common rotation removed; '
-        'whether that can be told, and whether it matters.',
+        'Compares where both calibrations see the same rays, in pixels over the picture, after '
+        'the best common rotation; whether the difference is significant, and whether it '
+        'matters.',
         'dashcalib compare calibration /etc/camera/old.yaml --html compare.html', (
             ('a', {'metavar': 'A', 'type': Path, 'help': CALIBRATION_HELP}),
             ('b', {'metavar': 'B', 'type': Path,
                    'help': 'the reference: the same kinds of files'}),
-            ('--html', {'type': path_or('give a file'), 'metavar': 'FILE',
+            ('--html', {'type': path_or('use the name of a file'), 'metavar': 'FILE',
                         'help': 'write a page with maps of the difference, in px and in sigmas'}),
             JSON)),
     'export': Command(
@@ -267,56 +305,59 @@ COMMANDS = {
                         'help': 'for pictures that were resized to this'}),
             ('--crop', {'type': whole_numbers(',', 4, '0,100,1280,520'), 'metavar': 'X,Y,W,H',
                         'help': 'for this part of the pictures'}),
-            ('--out', {'type': path_or('leave --out away for standard output'), 'metavar': 'FILE',
+            ('--out', {'type': path_or('omit --out for standard output'), 'metavar': 'FILE',
                        'help': 'default: standard output'}))),
     'check': Command(
         'dashcalib_ros.cli.check', 'tell whether a calibration explains a drive',
-        'Says whether CALIBRATION is right (to so many pixels), wrong (in which way and by how '
+        'Says whether CALIBRATION is right, differs from what the drive determines but is good '
+        'enough (by how many pixels, and for which uses), is wrong (in which way and by how '
         'much), or whether the drive cannot tell.',
         'dashcalib check calibration drive.mcap', (
             CALIBRATION,
             ('input', {'metavar': 'INPUT', 'nargs': '*',
-                       'help': f'left away: the bag that CALIBRATION is; else: {INPUT_HELP}'}),
+                       'help': f'omit it if CALIBRATION is a bag with images; else '
+                               f'{INPUT_HELP}'}),
             *DRIVE, *MOTION, MODEL, SEED,
             ('--poses', {'type': Path, 'metavar': 'FILE',
-                         'help': 'true poses, as KITTI, TUM or EuRoC, or a GPS track (GPX, a '
-                                 'bag with NavSatFix): compare the rotation and the scale that '
-                                 'each camera finds with them'}),
+                         'help': 'true poses in the format of KITTI, TUM or EuRoC, or a GPS track '
+                                 '(GPX, or a bag with NavSatFix): compare the rotation and the '
+                                 'scale that each camera finds with them'}),
             ('--mount', {**FLAG, 'dest': 'mounting',
                          'help': 'a camera that was moved on the car is wrong, too'}),
-            ('--out', {'type': path_or('--out is a folder'), 'metavar': 'DIR',
+            ('--out', {'type': path_or('--out must be a folder'), 'metavar': 'DIR',
                        'help': 'with --poses: write a plot of the paths, and the paths for evo'}),
             JSON, NO_PROGRESS, VERBOSE), exit_codes=CHECK_EXIT_HELP),
     'batch': Command(
         'dashcalib_ros.cli.batch', 'calibrate many cameras from many clips',
         'Writes to DIR: a folder for each camera, tables of cameras and of clips, overview.html. '
-        'Started again, it does what is missing.',
+        'If it is started again, it continues where it stopped.',
         'dashcalib batch clips.csv --out fleet', (
             ('manifest', {'metavar': 'MANIFEST',
-                          'help': '.csv, .jsonl or .parquet with a column clip, and where known '
-                                  'camera, make, fps, topic, time; a folder of clips; or a glob '
-                                  'in quotes'}),
+                          'help': '.csv, .jsonl or .parquet with a column clip, and optional '
+                                  'columns camera, make (the model of camera), fps, topic, time; '
+                                  'a folder of clips; or a glob in quotes'}),
             ('--out', {'required': True, 'metavar': 'DIR',
                        'help': 'a folder, or an address such as s3://bucket/fleet'}),
             ('--group-by', {'metavar': 'REGEX',
                             'help': "takes the camera from a clip's name: its first group, or "
                                     'its groups (?P<camera>...) and (?P<make>...)'}),
             ('--workers', {'type': count, 'metavar': 'N',
-                           'help': 'processes (default: one a core, while memory lasts); the '
-                                   'result is the same with any'}),
-            ('--address', {'metavar': 'A', 'help': "a Ray cluster's; auto: the one here"}),
+                           'help': 'number of processes (default: one per core, as far as memory '
+                                   'allows); the result does not depend on it'}),
+            ('--address', {'metavar': 'A',
+                           'help': 'address of a Ray cluster; auto: the one on this machine'}),
             ('--shard', {'metavar': 'I/N',
-                         'help': 'do the I-th of N parts, with one process; a run without '
-                                 '--shard then makes the tables'}),
-            *SETTINGS, MODEL, SEED, QUIET), exit_codes=BATCH_EXIT_HELP)}
+                         'help': 'process part I of N, in one process; afterwards a run without '
+                                 '--shard writes the tables'}),
+            *SETTINGS, MODEL, SEED, JSON, QUIET), exit_codes=BATCH_EXIT_HELP)}
 
 
 def make_parser() -> Parser:
     """Return the parser; the parsed arguments have the command's name as `command`."""
     parser = Parser(
-        prog=PROGRAM, epilog=f'{PROGRAM} COMMAND --help tells more\n{EXIT_HELP}',
-        description='Calibrates a dashcam from the turns the car takes anyway.')
-    parser.add_argument('--version', action=Version)
+        prog=PROGRAM, epilog=f'{PROGRAM} COMMAND --help explains a command\n{EXIT_HELP}',
+        description='Calibrates a dashcam from the turns that the car takes.')
+    parser.add_argument('-V', '--version', action=Version)
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True,
                                      parser_class=Parser)
     for name, command in COMMANDS.items():

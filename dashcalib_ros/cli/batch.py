@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from typing import Any
 
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH
 from dashcalib_ros.cli.drive import read_config
@@ -19,9 +20,10 @@ from dashcalib_ros.fleet.batch import batch as calibrate_fleet
 from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.engine import Engine, LocalEngine, RayEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
+from dashcalib_ros.fleet.overview import duration
 from dashcalib_ros.fleet.storage import joined, remove, write
 from dashcalib_ros.report.tables import line
-from dashcalib_ros.standard_streams import write_stderr
+from dashcalib_ros.standard_streams import write_stderr, write_stdout
 from dashcalib_ros.workers.child import ChildWorker
 
 # problems that are shown; the table has all
@@ -38,25 +40,27 @@ def batch(args: argparse.Namespace) -> int:
     probe = joined(args.out, '.writable')
     write(probe, b'')
     remove(probe)
-    progress = _Progress(sum(len(each.rows) for each in cameras), Screen(args.quiet),
-                         Stages(args.quiet))
+    progress = _Progress(sum(len(each.rows) for each in cameras),
+                         Screen(args.quiet, to_stderr=args.json), Stages(args.quiet))
     if not args.quiet:  # before workers start, which takes a while
         write_stderr(
             f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(cameras), "camera")}; '
-            f'Ctrl-C keeps what is done in {args.out}, and the same command goes on')
+            f'after Ctrl-C, the same command continues from what is in {args.out}')
     with closing(_engine(args, config)) as engine:
         try:
             with progress.stages:
                 files = calibrate_fleet(cameras, args.out, config, engine, args.shard is None,
                                         progress.tell)
         except KeyboardInterrupt:
-            warn([f'{progress.done} of {counted(progress.clips, "clip")} done, and kept in '
-                  f'{args.out}: the same command goes on'])
+            warn([f'{progress.done} of {counted(progress.clips, "clip")} are done and kept in '
+                  f'{args.out}: the same command continues from there'])
             raise
     name = '' if args.shard is None else f'-{shard[0]}-of-{shard[1]}'
     write(joined(args.out, f'effort{name}.json'), progress.effort_json(engine))
     if files:
         progress.screen.show(line(f'written to {args.out}: ' + ', '.join(files)))
+    if args.json:
+        write_stdout(json.dumps(_as_dict(cameras, files), indent=2, allow_nan=False))
     return _summarise(cameras, progress.screen)
 
 
@@ -76,13 +80,22 @@ def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
     found = list(problems(cameras))
     lines = [_problem(row, why) for row, why in found[:SHOWN]]
     if len(found) > SHOWN:
-        lines.append(f'{len(found) - SHOWN} more clips could not be read: see the table of clips')
+        lines.append(f'{len(found) - SHOWN} more clips could not be read; the table of clips '
+                     f'lists them')
     warn(lines)
     verdicts = [camera.verdict for camera in cameras if camera.name]
     counts = ', '.join(f'{verdicts.count(level)} {level}' for level in LEVELS)
     screen.show(line(f'{counted(len(verdicts), "camera")}: {counts}; '
                      f'{counted(len(found), "clip")} could not be read'))
     return NOT_ENOUGH if found or 'refused' in verdicts else ACCEPTED
+
+
+def _as_dict(cameras: Sequence[Camera], files: Sequence[str]) -> dict[str, Any]:
+    """Return what --json prints: verdicts by camera, clips that could not be read, and files."""
+    return {'cameras': {camera.name: camera.verdict for camera in cameras if camera.name},
+            'not_read': [{'row': row.number, 'clip': row.clip, 'why': why}
+                         for row, why in problems(cameras)],
+            'files': list(files)}
 
 
 def _problem(row: Row, why: str) -> str:
@@ -92,7 +105,7 @@ def _problem(row: Row, why: str) -> str:
 
 @dataclass
 class _Progress:
-    """Shows rate and time left, and each camera as it is solved."""
+    """Shows the rate, the time left, and each camera as soon as it is solved."""
 
     clips: int
     screen: Screen
@@ -103,7 +116,7 @@ class _Progress:
     video_s: float = 0.0
 
     def tell(self, camera: Camera, clip: ClipResult | None) -> None:
-        """Take the news of a clip, or of a camera that is solved."""
+        """Count a clip that is done, or show a camera that is solved."""
         if clip is None:
             if camera.own is None or not camera.own.again:
                 self.screen.show(line(f'{camera.name}: {camera.verdict}'))
@@ -120,20 +133,14 @@ class _Progress:
         left = (self.clips - self.done) / rate if rate else 0.0
         note = (f'{self.done} of {self.clips} clips, {60 * rate:.0f} a minute, '
                 f'{self.video_s / max(passed, 1e-9):.1f} s of video a second, '
-                f'{_duration(left)} left')
+                f'{duration(left)} left')
         self.stages.show('clips', self.done / max(self.clips, 1), note)
 
     def effort_json(self, engine: Engine) -> bytes:
-        """Return what the run took, for people who plan larger ones."""
+        """Return the time and memory that the run took, to plan larger ones."""
         gather_s = engine.cpu_s['gather_clip']
         return (json.dumps({
             'wall_s': time.monotonic() - self.started, 'clips_read': self.read,
             'video_s': self.video_s, 'gather_cpu_s': gather_s,
             'solve_cpu_s': sum(engine.cpu_s.values()) - gather_s,
             'peak_mb_of_a_worker': engine.peak_mb}, indent=2) + '\n').encode()
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f'{seconds:.0f} s'
-    return f'{seconds / 60:.0f} min' if seconds < 7200 else f'{seconds / 3600:.1f} h'

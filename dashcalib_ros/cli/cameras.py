@@ -4,19 +4,29 @@ from __future__ import annotations
 import argparse
 import json
 
+import numpy as np
+
 from dashcalib_ros.camera.mapping import rayless_share
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
 from dashcalib_ros.cli.terminal import show, warn
+from dashcalib_ros.input.source import by
 from dashcalib_ros.report import compare as compare_cameras
 from dashcalib_ros.report import load_camera, write_text
-from dashcalib_ros.report.export import WITH_FIELD, WITH_READOUT, cropped, exported, resized
+from dashcalib_ros.report.export import (
+    WITH_FIELD,
+    WITH_READOUT,
+    check_suffix,
+    cropped,
+    exported,
+    resized,
+)
 from dashcalib_ros.report.page import difference_html
 from dashcalib_ros.report.tables import comparison
 from dashcalib_ros.standard_streams import write_stdout
 
 
 def compare(args: argparse.Namespace) -> int:
-    """Show the differences of A from B, and whether they matter."""
+    """Show how far A differs from B, and for which uses A is good enough."""
     found = compare_cameras(load_camera(args.a), load_camera(args.b))
     if args.html is not None:
         write_text(args.html, difference_html(found))
@@ -39,25 +49,31 @@ def export(args: argparse.Namespace) -> int:
         whole, camera = camera, cropped(camera, *args.crop)
         readout_ms = readout_ms and readout_ms * camera.image_size[1] / whole.image_size[1]
     if found.field is not None and args.to in WITH_FIELD and camera is not found.camera:
-        raise UsageError('the field over the picture holds for the whole one; leave --size and '
-                         '--crop away')
+        raise UsageError('E-FIELD-OF-PART', 'the field over the picture is known for the whole '
+                         'picture only; omit --size and --crop')
+    if args.out is not None:
+        check_suffix(args.out, args.to)
     text = exported(camera, args.to, found.field, readout_ms)
     if readout_ms is None and args.to in WITH_READOUT:
         warn([f'{found.name} has no readout time of a rolling shutter: set it in {args.to}, '
               f'unless the shutter is global'])
     if found.field is not None and args.to not in WITH_FIELD:
-        warn([f'{found.name} has a field over the picture, for which {args.to} has no place: it '
-              f'is left out; {", ".join(WITH_FIELD)} have it'])
+        lost = found.field.over(found.camera)
+        warn([f'{found.name} has a field over the picture, for which {args.to} has no place: '
+              f'without it pixels are off by {np.sqrt(np.mean(lost**2)):.2f} px RMS and '
+              f'{lost.max():.2f} px at the worst (of {by(found.image_size)}); export to '
+              f'{", ".join(WITH_FIELD)} to keep it'])
     unseen = rayless_share(camera)
     if unseen:
         warn([f'{found.name} has no ray for {100 * unseen:.0f} % of the picture: there its model '
-              f'folds over; calibrate anew, unless nothing is seen there'])
+              f'folds over; calibrate again, unless nothing is visible there'])
     if found.verdict == 'weak':
-        warn([f'{found.name} is weak: look at its sigmas before you use it'])
+        warn([f'{found.name} is weak: look at its standard deviations (sigma) before you use it'])
     if args.out is not None:
         write_text(args.out, text)
     elif isinstance(text, bytes):
-        raise UsageError(f'--to {args.to} is no text; add --out {args.to}.npz')
+        raise UsageError('E-OUT-NEEDED',
+                         f'--to {args.to} writes a binary file; add --out {args.to}.npz')
     else:
         write_stdout(text.rstrip('\n'))
     return ACCEPTED

@@ -5,44 +5,36 @@ import argparse
 import json
 from collections.abc import Sequence
 
-from dashcalib_ros.camera import Camera
 from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
-from dashcalib_ros.cli.drive import (
-    feed,
-    open_calibrator,
-    open_drive,
-    read_config,
-    read_sensors,
-)
+from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Stages, show, warn
 from dashcalib_ros.errors import InputError, counted
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, is_motion, read_motion
 from dashcalib_ros.judge import (
-    Calibration,
     Check,
     Odometry,
     Poses,
     path_files,
     read_poses,
-    track_poses,
     with_faults,
 )
-from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.camera_file import load_with_faults
 from dashcalib_ros.report.compare import mount_dict
 from dashcalib_ros.report.tables import TextTable, labelled, line
 from dashcalib_ros.report.wording import mounts_text
+from dashcalib_ros.session import check_drive
 from dashcalib_ros.standard_streams import write_stdout
 
-COLOURS = {'right': 'bold green', 'wrong': 'bold red', 'cannot tell': 'bold yellow'}
-EXIT_CODES = {'right': ACCEPTED, 'wrong': WRONG, 'cannot tell': NOT_ENOUGH}
-# what is said of the poses, by its name in the JSON
-MEASURED = {'rotation_deg': ('rotation missed, degrees', 1.0),
+COLOURS = {'right': 'bold green', 'differs': 'bold cyan', 'wrong': 'bold red',
+           'cannot tell': 'bold yellow'}
+EXIT_CODES = {'right': ACCEPTED, 'differs': ACCEPTED, 'wrong': WRONG, 'cannot tell': NOT_ENOUGH}
+# what the poses show, by its name in the JSON
+MEASURED = {'rotation_deg': ('rotation error, degrees', 1.0),
             'rotation_deg_per_100m': ('the same, in 100 m', 1.0),
-            'scale_drift': ('scale changes within a turn, %', 100.0)}
+            'scale_drift': ('change of scale within a turn, %', 100.0)}
 
 
 def check(args: argparse.Namespace) -> int:
@@ -51,39 +43,30 @@ def check(args: argparse.Namespace) -> int:
     if not args.input:
         # a bag's own camera_info, beside its pictures
         if not fits_bag(args.calibration):
-            raise UsageError('INPUT is missing, the drive: only a bag has its calibration beside '
+            raise UsageError('E-INPUT-MISSING',
+                             'INPUT, the drive, is missing: only a bag has its calibration beside '
                              'its pictures; see dashcalib check --help')
         args.input = [str(args.calibration)]
         named = load_with_faults(args.calibration, args.topic)
     else:
         named = load_with_faults(args.calibration)
     if args.mounting and named.mount is None:
-        raise UsageError(f'{named.name} does not say how the camera sits on the car: give a '
-                         f'result.json or calibration.yaml that dashcalib run has written')
+        raise UsageError('E-MOUNT-UNKNOWN',
+                         f'{named.name} has no mounting of the camera: use a result.json or '
+                         f'calibration.yaml that dashcalib run has written')
     poses, track = _poses(args)
     warn(poses.warnings if poses else ())
     if args.out is not None:
         if args.poses is None:
-            raise UsageError('--out is for the paths that --poses compares; add --poses FILE')
+            raise UsageError('E-OUT-WITHOUT-POSES',
+                             '--out is for the paths that --poses compares; add --poses FILE')
         check_writable(args.out)
-    source, mask = open_drive(args)
-    given = source.shown(named.camera)
-    sensors, motion = read_sensors(args), None
-    with open_calibrator(config, mask, args.verbose) as calibrator, Stages(args.quiet) as stages:
-        if sensors is not None:
-            calibrator.sense(sensors)
-        feed(calibrator, source, mask, stages)
-        calibration, questions = calibrator.calibrate(stages.show), Questions(calibrator)
-        found = with_faults(questions.check(given, calibration, stages.show), named.faults)
-        # one for pictures of another size is wrong, and explains no motion
-        changes = _changes(questions, given, calibration)
-        if track is not None:
-            track = track.since(calibration.start_s)
-            assert track.position is not None
-            poses = track_poses(track.position, calibration.start_s)
-        if poses is not None and given.image_size == calibration.image_size:
-            motion = questions.odometry(given, calibration, poses, stages.show)
-    warn((*source.warnings, *calibration.warnings, *(track.warnings if track else ())))
+    drive = open_drive(args)
+    with Stages(args.quiet) as stages:
+        checked = check_drive(drive, named, config, stages, poses, track, args.verbose)
+    found, motion = with_faults(checked.check, named.faults), checked.odometry
+    calibration, changes = checked.calibration, checked.changes
+    warn((*drive.source.warnings, *calibration.warnings, *(track.warnings if track else ())))
     now, before = calibration.mount, named.mount
     if args.json:
         write_stdout(json.dumps(answer_dict(found, changes, motion, mount_dict(now, before)),
@@ -93,13 +76,14 @@ def check(args: argparse.Namespace) -> int:
         if now is not None and before is not None:
             show(line(f'- {mounts_text(now, before)}'))
         elif args.mounting:
-            show(line('- mounting: the drive does not tell it: drive straight on for longer'))
+            show(line('- mounting: this drive does not determine it; record a longer straight '
+                      'stretch'))
     if motion is not None and args.out is not None:
         for name, text in path_files(motion).items():
             write_text(args.out / name, text)
         if not args.json:
-            write_stdout(f'written: {args.out / "paths.svg"}, and beside it the paths for evo')
-    if args.mounting and found.answer == 'right' and (
+            write_stdout(f'written: {args.out / "paths.svg"}; beside it the paths as TUM files')
+    if args.mounting and EXIT_CODES[found.answer] == ACCEPTED and (
             now is None or before is None or now.moved_from(before)):
         return NOT_ENOUGH if now is None else WRONG
     return EXIT_CODES[found.answer]
@@ -116,16 +100,10 @@ def _poses(args: argparse.Namespace) -> tuple[Poses | None, SensorStream | None]
     track = bag_motion([path], {'gps': args.gps}, args.topic) if is_bag else read_motion(path)
     if track is None or track.position is None:
         why = '; '.join(() if track is None else track.warnings)
-        raise InputError(f'{path} has no GPS track{why and f" ({why})"}: give one with positions '
+        raise InputError('E-NO-GPS-TRACK',
+                         f'{path} has no GPS track{why and f" ({why})"}: use one with positions '
                          f'(NavSatFix, GPX), or poses in the format of KITTI, TUM or EuRoC')
     return None, track
-
-
-def _changes(questions: Questions, given: Camera, calibration: Calibration) -> list[str]:
-    """Return in words what has changed during the drive: a long one may be of two cameras."""
-    if given.image_size != calibration.image_size:
-        return []
-    return [str(change) for change in questions.watch(given).changes]
 
 
 def _show(found: Check, motion: Odometry | None, changes: Sequence[str]) -> None:

@@ -19,9 +19,10 @@ from dashcalib_ros.cli.arguments import (
     INTERRUPTED,
     PROGRAM,
     VERBOSE,
+    arguments_of,
     make_parser,
 )
-from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.errors import DashcalibError, InputError, OutputError, WorkerError
 from dashcalib_ros.standard_streams import open_closed_streams, own_stderr, write_stderr
 from dashcalib_ros.workers.worker import one_thread_for_numpy
 
@@ -35,8 +36,9 @@ def command() -> NoReturn:
     except Exception as error:
         # a defect of ours; Python's own exit code, 1, would be an answer: the calibration is wrong
         write_stderr(''.join(traceback.format_exception(error)).rstrip())
-        code = _fail(f'this is a defect of dashcalib_ros ({type(error).__name__}): report it with '
-                     f'the lines above, and the input if you can')
+        code = _fail(DashcalibError(
+            'E-DEFECT', f'this is a defect of dashcalib_ros ({type(error).__name__}): report it '
+                        f'with the lines above, and with the input if you can'))
     if code == INTERRUPTED:
         # Ctrl-C in the middle of a lock's own code leaves it locked: no thread is waited for
         os._exit(code)
@@ -51,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         parser = make_parser()
         _complete(parser)
-        args = parser.parse_args(argv)
+        args = parser.parse_args(arguments_of(sys.argv[1:] if argv is None else argv))
         # SIGTERM unwinds the program as Ctrl-C does, so that everything is closed
         with handling(signal.default_int_handler, signal.SIGTERM):
             # imported only here: --help must not wait for numpy and OpenCV
@@ -65,25 +67,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as end:  # argparse's way to end after --help and --version
         return end.code if isinstance(end.code, int) else BAD_INPUT
     except DashcalibError as error:
-        return _fail(f'{error} [{error.code}]' if error.code else str(error))
+        return _fail(error)
     except KeyboardInterrupt:
         # `python -m` ends with SIGINT instead of our exit code when an interrupt, caught or not,
         # came out of exec('text'), as dataclasses call it on import; the next exec() resets that
         exec('pass')
-        return _fail('interrupted', INTERRUPTED)
+        return _interrupted()
     except RuntimeError as error:
         # what Condition.wait() makes of Ctrl-C in the middle of its own code: its lock is free
         if not isinstance(error.__context__, KeyboardInterrupt):
             raise
-        return _fail('interrupted', INTERRUPTED)
+        return _interrupted()
     except ModuleNotFoundError as error:
         if not error.name or error.name.startswith('dashcalib_ros'):
             raise
-        return _fail(f'the Python package {error.name} is missing; install it with pip')
+        return _fail(InputError('E-PACKAGE-MISSING', f'the Python package {error.name} is '
+                                                     f'missing; install it with pip'))
     except MemoryError:
-        return _fail('out of memory; close other programs or lower turns.capacity')
+        return _fail(WorkerError('E-OUT-OF-MEMORY', 'out of memory; close other programs or lower '
+                                                    'turns.capacity'))
     except BrokenPipeError:
-        return _fail('the program that reads the output has ended')
+        return _fail(OutputError('E-OUTPUT-CLOSED', 'the program that reads the output has ended'))
     except OSError as error:
         return _fail(_os_error(error))
 
@@ -111,13 +115,21 @@ def handling(handler: Any, *signals: signal.Signals) -> Iterator[None]:
             signal.signal(each, earlier)
 
 
-def _fail(message: str, code: int = BAD_INPUT) -> int:
-    write_stderr(f'{PROGRAM}: error: {" ".join(message.split())}')
-    return code
+def _fail(error: DashcalibError) -> int:
+    code = f' [{error.code}]' if error.code else ''
+    write_stderr(f'{PROGRAM}: error: {" ".join(str(error).split())}{code}')
+    return BAD_INPUT
 
 
-def _os_error(error: OSError) -> str:
+def _interrupted() -> int:
+    write_stderr(f'{PROGRAM}: error: interrupted')
+    return INTERRUPTED
+
+
+def _os_error(error: OSError) -> DashcalibError:
     where = f' ({error.filename})' if error.filename else ''
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f'no space left on the disk{where}; free some, or set TMPDIR to another disk'
-    return f'{error.strerror or error}{where}; check the path and its permissions'
+        return OutputError('E-DISK-FULL', f'no space is left on the disk{where}; free some, or '
+                                          f'set TMPDIR to another disk')
+    return InputError('E-FILE-ACCESS', f'{error.strerror or error}{where}; check the path and its '
+                                       f'permissions')

@@ -1,13 +1,15 @@
 """stdout for results, stderr for progress, warnings and errors; plain text in a pipe.
 
-Colours are left out where NO_COLOR is set.
+No colours are used if NO_COLOR is set.
 """
 from __future__ import annotations
 
 import io
+import signal
 import sys
 import time
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from types import TracebackType
 
 from rich.console import Console, Group, RenderableType
@@ -21,11 +23,13 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from dashcalib_ros.cli.program import handling
 from dashcalib_ros.errors import OutputError, visible
+from dashcalib_ros.session import Observer
 from dashcalib_ros.standard_streams import write_stderr, write_stdout
 
 PIPE_WIDTH = 80  # columns where there is no terminal
-EVERY_S = 10.0  # where there is no terminal, progress is told so often
+EVERY_S = 10.0  # between two lines of progress, where there is no terminal
 STEPS = 1000  # a stage's fraction is shown in thousandths
 
 
@@ -68,10 +72,10 @@ def warn(lines: Iterable[str]) -> None:
         write_stderr(f'dashcalib: warning: {" ".join(line.split())}')
 
 
-class Stages:
+class Stages(Observer):
     """The progress of one command, a stage at a time.
 
-    It is drawn on a terminal; elsewhere there is a line from time to time, in long runs only.
+    It is drawn on a terminal; elsewhere a line is printed from time to time, in long runs only.
     """
 
     def __init__(self, quiet: bool = False) -> None:
@@ -96,10 +100,10 @@ class Stages:
         """Remove the drawing."""
         self._progress.stop()
 
-    def show(self, stage: str, fraction: float | None = None, note: str = '') -> None:
-        """Show a stage at fraction 0..1 (None: unknown), and a note beside its name."""
+    def show(self, stage: str, share: float | None = None, note: str = '') -> None:
+        """Show a stage with the share done, 0 to 1 (None: unknown), and a note beside it."""
         text = visible(f'{stage}: {note}' if note else stage)
-        done = None if fraction is None else min(max(fraction, 0.0), 1.0)
+        done = None if share is None else min(max(share, 0.0), 1.0)
         if self._lines:
             self._tell(text, done)
             return
@@ -110,6 +114,10 @@ class Stages:
             self._stage = stage
         self._progress.update(self._task, description=text, total=None if done is None else STEPS,
                               completed=0 if done is None else STEPS * done)
+
+    def closing(self) -> AbstractContextManager[None]:
+        """Let the child processes end, even if Ctrl-C is pressed again meanwhile."""
+        return handling(signal.SIG_IGN, signal.SIGINT, signal.SIGTERM)
 
     def _tell(self, text: str, done: float | None) -> None:
         now = time.monotonic()

@@ -49,7 +49,8 @@ def pack(textures: Sequence[Texture]) -> Atlas:
         table[index, level] = (x + 1, y + 1, wide, high)
         x += wide + 2
     if max(width, y + shelf) > MAX_SIDE:
-        raise ConfigError('the rendered drive is too long: take fewer turns or shorter straights')
+        raise ConfigError('E-DEMO-TOO-LONG', 'the rendered drive is too long: use fewer turns or '
+                                             'shorter straights')
     atlas = np.zeros((y + shelf, width), np.uint8)
     for x, y, image in places:
         high, wide = image.shape

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from dashcalib_ros.demo.drive import Drive
@@ -9,11 +10,12 @@ from dashcalib_ros.demo.drive import Drive
 TOPIC = '/camera/image_raw'
 
 
-def render_to_bag(drive: Drive, path: str | os.PathLike[str]) -> None:
+def render_to_bag(drive: Drive, path: str | os.PathLike[str],
+                  progress: Callable[[float], None] = lambda done: None) -> None:
     """Render a complete drive into a new ROS 2 bag, as mono8 Images.
 
-    path: the bag's folder, which must not exist yet; it appears only when all went well. Raises
-    OutputError or WorkerError.
+    path: the bag's folder, which must not exist yet; it appears only when all went well.
+    progress: called with the share that is rendered, 0 to 1. Raises OutputError or WorkerError.
     """
     from rosbags.typesys import Stores, get_typestore
 
@@ -31,3 +33,4 @@ def render_to_bag(drive: Drive, path: str | os.PathLike[str]) -> None:
                 height=height, width=width, encoding='mono8', is_bigendian=0, step=width,
                 data=frame.image.reshape(-1))
             writer.write(topic, frame.stamp_ns, store.serialize_cdr(message, topic.msgtype))
+            progress((frame.index + 1) / len(drive))

@@ -3,12 +3,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property, partial
 
 import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage
+from dashcalib_ros.demo.fisheye import FisheyeLens, WholeRaycaster
 from dashcalib_ros.demo.lens import Lens
 from dashcalib_ros.demo.overlay import Overlay
 from dashcalib_ros.demo.parallel import render_parallel
@@ -25,12 +27,16 @@ from dashcalib_ros.input import Frame
 START_NS = 1_767_614_400 * 10**9
 # of the exposure, when the light is sampled
 INSTANTS = (-1.0 / 3.0, 0.0, 1.0 / 3.0)
+# s; a stabiliser's low pass over the camera's heading
+STEADY_S = 0.5
+
+AnyLens = Lens | FisheyeLens
 
 
 class Drive:
     """A lens and a spec: every frame can be rendered on its own, in any process, the same."""
 
-    def __init__(self, lens: Lens, spec: DriveSpec) -> None:
+    def __init__(self, lens: AnyLens, spec: DriveSpec) -> None:
         self.lens = lens
         self.spec = spec
         self.course: Course = course_of(spec)
@@ -89,9 +95,30 @@ class Drive:
         return Traffic(self.course, self.ride, self.spec)
 
     @cached_property
-    def raycaster(self) -> Raycaster:
-        """Return the renderer of this lens and town."""
-        return Raycaster(self.lens, self.town.atlas)
+    def raycaster(self) -> Raycaster | WholeRaycaster:
+        """Return the renderer of this lens and town; a stabiliser needs wider pictures."""
+        margin = self._margin_px
+        lens = replace(self.lens, width=self.lens.width + 2 * margin, cx=self.lens.cx + margin)
+        return (WholeRaycaster(lens, self.town.atlas) if isinstance(lens, FisheyeLens)
+                else Raycaster(lens, self.town.atlas))
+
+    @cached_property
+    def crop_px(self) -> Floats:
+        """Return how far the stabiliser moves its crop to the right in each frame, (n,) px.
+
+        The crop follows what the camera sees: against each turn, until it reaches its limit.
+        """
+        most = self.spec.stabilised * self.lens.width
+        keep, steady = math.exp(-1.0 / (self.spec.rate * STEADY_S)), self.yaw.copy()
+        for index in range(1, len(self)):
+            steady[index] += keep * (steady[index - 1] - steady[index])
+        return np.clip(self.lens.fx * (self.yaw - steady), -most, most)
+
+    @property
+    def _margin_px(self) -> int:
+        # what the resampling needs beyond the crop, too
+        most = self.spec.stabilised * self.lens.width
+        return math.ceil(most) + 2 if most > 0.0 else 0
 
     def stamp_ns(self, index: int) -> int:
         """Return a frame's time stamp in nanoseconds."""
@@ -140,6 +167,8 @@ class Drive:
         light = sum(self.raycaster.render(scene, *self.row_poses(index, later_s))
                     for later_s in instants)
         image = np.asarray(light, np.float32) / np.float32(len(instants))
+        if self._margin_px:
+            image = self._cropped(image, self._margin_px + float(self.crop_px[index]))
         return Frame(index, self.stamp_ns(index), self._expose(image, index))
 
     def scene(self, index: int) -> Quads:
@@ -147,6 +176,12 @@ class Drive:
         cars = QuadList()
         self.traffic.add_to(cars, self.times[index] + MARGIN_S, self.town.cars)
         return Quads.join([self.town.quads, cars.quads()]) if cars.rows else self.town.quads
+
+    def _cropped(self, image: Floats32, left: float) -> Floats32:
+        """Return the picture that begins at a column, which need not be a whole number."""
+        return np.asarray(cv2.warpAffine(
+            image, np.array([[1.0, 0.0, left], [0.0, 1.0, 0.0]]), self.lens.size,
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP), np.float32)
 
     def _expose(self, image: Floats32, index: int) -> GreyImage:
         """Turn light into grey levels as the camera's electronics would."""
@@ -177,9 +212,3 @@ class Drive:
 def render(lens: Lens, spec: DriveSpec, processes: int = 1) -> Iterator[Frame]:
     """Yield all frames of a drive, rendered as they are asked for."""
     return Drive(lens, spec).frames(processes=processes)
-
-
-def demo_drive(seed: int = 0) -> Drive:
-    """Return the standard demo: 960 x 540 at 10 Hz, five turns, a lens with faults."""
-    lens = Lens.of(960, 540, 75.0, -0.30, 0.10, offset=(14.0, -9.0), aspect=1.003)
-    return Drive(lens, DriveSpec(seed=seed, bonnet=True, timestamp=True))

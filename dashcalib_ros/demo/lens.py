@@ -39,11 +39,13 @@ class Lens:
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 16 or min(self.fx, self.fy) <= 0.0:
-            raise ConfigError('a lens needs a picture of 16 x 16 px or more and fx, fy > 0')
+            raise ConfigError('E-LENS-RANGE',
+                              'a lens needs a picture of 16 x 16 px or more and fx, fy > 0')
         if self.distorted_radius(self.valid_radius) < self._corner_radius() * 1.001:
             raise ConfigError(
-                f'the distortion k1 = {self.k1:g}, k2 = {self.k2:g} folds over inside the '
-                'picture: take a longer focal length or weaker distortion')
+                'E-LENS-FOLDS', f'the distortion k1 = {self.k1:g}, k2 = {self.k2:g}, k3 = '
+                                f'{self.k3:g} folds over inside the picture: use a longer focal '
+                                f'length or weaker distortion')
 
     @classmethod
     def of(cls, width: int, height: int, hfov_deg: float, k1: float = 0.0, k2: float = 0.0,
@@ -60,8 +62,15 @@ class Lens:
     @property
     def truth(self) -> dict[str, float]:
         """Return what a calibration should find, by the names of result.json."""
-        return {'fx': self.fx, 'fy': self.fy, 'cx': self.cx, 'cy': self.cy, 'k1': self.k1,
-                'k2': self.k2}
+        found = {'fx': self.fx, 'fy': self.fy, 'cx': self.cx, 'cy': self.cy, 'k1': self.k1,
+                 'k2': self.k2}
+        more = {'p1': self.p1, 'p2': self.p2, 'k3': self.k3}
+        return {**found, **more} if any(more.values()) else found
+
+    @property
+    def model(self) -> str:
+        """Return the name of the camera model that describes the lens."""
+        return 'brown' if 'k3' in self.truth else 'radial'
 
     @property
     def matrix(self) -> Floats:
@@ -114,6 +123,12 @@ class Lens:
             distorted_by_radius = found * self._stretch(_square(found)) - error
             found = self._undistorted_radially(distorted_by_radius)
         return found
+
+    def rays(self, pixels: npt.ArrayLike) -> Floats:
+        """Return unit viewing rays (n, 3) of pixels (n, 2), glass included."""
+        xy = self.undistort(pixels)
+        rays = np.column_stack([xy, np.ones(len(xy))])
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     @property
     def size(self) -> tuple[int, int]:

@@ -53,8 +53,8 @@ def render_parallel(make_renderer: Callable[[], Renderer], first: int, last: int
         while pending:
             yield from pending.popleft().result()
     except BrokenProcessPool as error:
-        raise WorkerError('a process that rendered died: free some memory, or use fewer '
-                          'processes') from error
+        raise WorkerError('E-RENDERER-DIED', 'a process that renders ended unexpectedly: free '
+                                             'some memory, or use fewer processes') from error
     finally:
         # a caller that stops early must not wait for frames that it does not need
         stop.set()

@@ -10,6 +10,7 @@ from dashcalib_ros.errors import ConfigError
 
 Kind = Literal['drive', 'parked', 'spin']
 MAX_FRAME_MS = 200.0
+MAX_STABILISED = 0.2
 
 
 @dataclass(frozen=True)
@@ -36,13 +37,14 @@ class DriveSpec:
     right alternate, 60 to 100 degrees, radius 8 to 14 m); 0 is a straight drive.
     straight_m: between turns. lead_m: before the first and after the last turn.
     speed_mps on straights, turn_speed_mps in turns, accel_mps2 between them.
-    height_m: of the camera; mount_deg: yaw, pitch and roll of its mounting at the most.
+    height_m: of the camera; mount_deg: largest yaw, pitch and roll of its mounting.
     vibration_deg: RMS of pitch from the road; roll is 0.7 of it, and
     the body also dives when it brakes and leans in turns. 0 switches all of these off.
     noise: sigma in grey levels. blur: sigma in pixels. exposure_ms: how long each row is exposed;
     its time is the middle of that, and 0 has no motion blur. vignetting: of the light, lost in
     the corners. bonnet, pillar, timestamp: what dashcams see of their own car, and burn in.
     rolling_shutter_ms: from the first row to the last; a frame's time is its middle row's.
+    stabilised: how far a stabiliser moves its crop at most, of the width; 0 has none.
     moving_cars: oncoming, leading and crossing ones.
     stops: red lights. night: dark and noisy. flicker: RMS of the exposure's relative variation.
     jpeg_quality: compress as a dashcam would; None does not.
@@ -68,6 +70,7 @@ class DriveSpec:
     pillar: bool = False
     timestamp: bool = False
     rolling_shutter_ms: float = 0.0
+    stabilised: float = 0.0
     moving_cars: int = 0
     stops: tuple[Stop, ...] = ()
     night: bool = False
@@ -81,21 +84,28 @@ class DriveSpec:
                     'accel_mps2', 'height_m', 'duration_s')
         for name in positive:
             if not getattr(self, name) > 0.0:
-                raise ConfigError(f'a drive needs {name} > 0, not {getattr(self, name)!r}')
+                raise ConfigError('E-DRIVE-RANGE', f'a drive needs {name} > 0, not '
+                                                   f'{getattr(self, name)!r}')
         for name in ('vibration_deg', 'noise', 'blur', 'exposure_ms', 'vignetting',
-                     'rolling_shutter_ms', 'moving_cars', 'flicker', 'seed'):
+                     'rolling_shutter_ms', 'stabilised', 'moving_cars', 'flicker', 'seed'):
             if not getattr(self, name) >= 0:
-                raise ConfigError(f'a drive needs {name} >= 0, not {getattr(self, name)!r}')
+                raise ConfigError('E-DRIVE-RANGE', f'a drive needs {name} >= 0, not '
+                                                   f'{getattr(self, name)!r}')
         if self.exposure_ms + self.rolling_shutter_ms > MAX_FRAME_MS:
-            raise ConfigError(f'a picture is taken within {MAX_FRAME_MS:g} ms: exposure_ms and '
-                              f'rolling_shutter_ms together may not be longer')
-        if self.vignetting > 1.0:
-            raise ConfigError(f'a drive needs vignetting <= 1, not {self.vignetting!r}')
+            raise ConfigError('E-DRIVE-RANGE', f'a picture is taken within {MAX_FRAME_MS:g} ms: '
+                                               f'exposure_ms and rolling_shutter_ms together '
+                                               f'must not be longer')
+        for name, most in (('vignetting', 1.0), ('stabilised', MAX_STABILISED)):
+            if getattr(self, name) > most:
+                raise ConfigError('E-DRIVE-RANGE', f'a drive needs {name} <= {most:g}, not '
+                                                   f'{getattr(self, name)!r}')
         if any(abs(turn.angle_deg) > 170.0 or turn.radius_m < 4.0 for turn in self.turn_list):
-            raise ConfigError('a turn needs at most 170 degrees and a radius of 4 m or more')
+            raise ConfigError('E-DRIVE-RANGE',
+                              'a turn needs at most 170 degrees and a radius of 4 m or more')
         for stop in self.stops:
             if not 0 <= stop.before_turn <= len(self.turn_list):
-                raise ConfigError(f'there is no straight {stop.before_turn} to stop on')
+                raise ConfigError('E-DRIVE-RANGE',
+                                  f'there is no straight {stop.before_turn} to stop on')
 
     @property
     def turn_list(self) -> tuple[Turn, ...]:

@@ -2,8 +2,8 @@
 
 A straight line in the world and the camera's centre lie in a plane. Its picture is known when the
 plane is: what is left between it and the points found is the bend. It owes nothing to motion, and
-no camera's rotation or focal length can hide it. One number is asked: which k1, all else as it is,
-would make the lines straight. (Straight lines have to be straight: Devernay and Faugeras 2001;
+no camera's rotation or focal length can hide it. One number is sought: the k1 that makes the lines
+straight, all else unchanged. (Straight lines have to be straight: Devernay and Faugeras 2001;
 Santana-Cedres et al. 2017 calibrate dashcams by it alone.)
 """
 from __future__ import annotations
@@ -28,25 +28,25 @@ LEAST_NOISE_PX = 0.03
 SYSTEMATIC_PX = 0.01
 # of the larger of both ways in which a ray moves a pixel, squared; less is next to the fold
 LEAST_SPREAD = 1e-4
-# fewer lines, or groups of images, tell nothing about their own scatter
+# with fewer lines, or groups of images, their own scatter is unknown
 LEAST_LINES, LEAST_GROUPS = 20, 4
-# each is left out in turn; more cost time and change nothing
+# each is omitted in turn; more cost time and change nothing
 MOST_GROUPS = 40
-# of what the most sensitive line tells
-LEAST_TOLD = 1e-9
+# of the most sensitive line's
+LEAST_SENSITIVITY = 1e-9
 # of the plane through a line's points, and of the weights
 PLANE_STEPS, WEIGHT_STEPS = 3, 30
 
 
 @dataclass(frozen=True)
 class Bend:
-    """What straight lines say of a camera's distortion.
+    """What straight lines show about a camera's distortion.
 
-    lines: how many were measured; groups: of images that share none. bend_px: root mean square
-    distance of their points from straight, by the lines' weights, px. k1: what must be added to
-    the camera's k1, all else as it is, to make them straight; sigma: its standard deviation.
+    lines: number of lines measured; groups: number of groups of images that share no line.
+    bend_px: RMS distance of their points from a straight line, weighted, px. k1: the change of the
+    camera's k1 that makes them straight, all else unchanged; sigma: its standard deviation.
     camera_sigma: that of the same number by the camera's own covariance; None where it has none.
-    picture_px: by how many pixels that k1 moves the picture, RMS, the best rotation removed.
+    picture_px: RMS motion of the pixels by that change, the best rotation removed, px.
     """
 
     lines: int
@@ -63,7 +63,7 @@ class Bend:
 
     @property
     def sigmas(self) -> float:
-        """Return how far lines and camera are apart, in standard deviations of both together."""
+        """Return the difference of lines and camera, in standard deviations of both together."""
         return abs(self.k1) / float(np.hypot(self.sigma, self.camera_sigma or 0.0))
 
 
@@ -87,27 +87,27 @@ class _Measured:
 
 def bend(lines: Lines, camera: Camera, config: LinesConfig | None = None,
          covariance: Floats | None = None) -> Bend | None:
-    """Return how the camera bends the lines; None where they are too few to tell.
+    """Return how the camera bends the lines; None where there are too few.
 
     lines: in pixels of the camera's pictures. covariance: (p, p) of the camera's parameters.
     """
-    measured = _telling(_measured(lines, camera, (config or LinesConfig()).group_s))
+    measured = _sensitive(_measured(lines, camera, (config or LinesConfig()).group_s))
     groups = int(measured.group.max(initial=-1)) + 1
     if len(measured.group) < LEAST_LINES or groups < LEAST_GROUPS:
         return None
     along = measured.along
     squares = np.sum(along**2, axis=1)
-    asked = np.sum(along * measured.residual, axis=1) / squares
-    rest = measured.residual - asked[:, None] * along
+    wanted = np.sum(along * measured.residual, axis=1) / squares
+    rest = measured.residual - wanted[:, None] * along
     # a line that wavers is bent by as much for other reasons than the lens
     noise = np.hypot(LEAST_NOISE_PX, _rms(rest))
     information = squares / along.shape[1] / noise**2
-    k1, weight = _location(asked, information)
+    k1, weight = _location(wanted, information)
     px_by_k1 = float(np.sqrt(np.average(squares / along.shape[1], weights=weight)))
-    sigma = float(np.hypot(_sigma(asked, information, measured.group, groups),
+    sigma = float(np.hypot(_sigma(wanted, information, measured.group, groups),
                            SYSTEMATIC_PX / px_by_k1))
     return Bend(
-        len(asked), groups,
+        len(wanted), groups,
         float(np.sqrt(np.average(_rms(measured.residual)**2, weights=weight))), k1, sigma,
         _camera_sigma(measured, weight / squares, covariance), _picture_px(camera, k1))
 
@@ -145,11 +145,12 @@ def _measured(lines: Lines, camera: Camera, group_s: float) -> _Measured:
     return _Measured(together[:, :, 0], together[:, :, 1:], _groups(stamps_s, group_s))
 
 
-def _telling(measured: _Measured) -> _Measured:
-    """Leave out the lines that no k1 bends: those through the middle of the distortion."""
+def _sensitive(measured: _Measured) -> _Measured:
+    """Omit the lines that no k1 bends: those through the middle of the distortion."""
     squares = np.sum(measured.along**2, axis=1)
-    tell = squares > LEAST_TOLD * squares.max(initial=0.0)
-    return _Measured(measured.residual[tell], measured.derivatives[tell], measured.group[tell])
+    sensitive = squares > LEAST_SENSITIVITY * squares.max(initial=0.0)
+    return _Measured(measured.residual[sensitive], measured.derivatives[sensitive],
+                     measured.group[sensitive])
 
 
 def _planes(rays: Floats, across: Floats) -> tuple[Floats, Floats]:
@@ -191,24 +192,24 @@ def _rms(values: Floats) -> Floats:
     return np.asarray(np.sqrt(np.mean(values**2, axis=1)))
 
 
-def _location(asked: Floats, information: Floats) -> tuple[float, Floats]:
-    """Return what most lines ask for, and the lines' weights (n,), for a Cauchy distribution.
+def _location(wanted: Floats, information: Floats) -> tuple[float, Floats]:
+    """Return the k1 of most lines, and the lines' weights (n,), for a Cauchy distribution.
 
-    asked: (n,) by each line; information: (n,) inverse variances. What is curved in the world
-    asks for anything, and hardly counts.
+    wanted: (n,) k1 of each line; information: (n,) inverse variances. What is curved in the world
+    gives any k1, and hardly counts.
     """
-    order = np.argsort(asked)
+    order = np.argsort(wanted)
     share = np.cumsum(np.sqrt(information[order]))
-    place = float(asked[order][np.searchsorted(share, share[-1] / 2)])
+    place = float(wanted[order][np.searchsorted(share, share[-1] / 2)])
     for _ in range(WEIGHT_STEPS):
-        weight = information / (1 + information * (asked - place)**2)
-        place = float(np.average(asked, weights=weight))
+        weight = information / (1 + information * (wanted - place)**2)
+        place = float(np.average(wanted, weights=weight))
     return place, np.asarray(weight)
 
 
-def _sigma(asked: Floats, information: Floats, group: Ints, groups: int) -> float:
+def _sigma(wanted: Floats, information: Floats, group: Ints, groups: int) -> float:
     """Return the standard deviation by leaving out each group of images in turn (jackknife)."""
-    without = [_location(asked[keep], information[keep])[0]
+    without = [_location(wanted[keep], information[keep])[0]
                for keep in (group != left for left in range(groups))]
     # of few groups it is uncertain itself: the wider t distribution, for as many
     return float(np.sqrt((groups - 1) * np.var(without) * (groups - 1) / (groups - 3)))

@@ -1,4 +1,4 @@
-"""Whether an image follows the one before without a loss: the motion of the points tells.
+"""Whether an image follows the one before without a loss: by the motion of the points.
 
 From one image to the next the speed of the car hardly changes; what changes quickly are the
 camera's angles, on a bumpy road. Let u be a point's step between the two images before, and v its
@@ -28,11 +28,11 @@ SHARE_KEPT = 0.6
 MAX_RATIO = 1.7
 # a point agrees when it is this far, px, and this share of its step, from where it should be
 AGREES_PX, AGREES_SHARE = 1.0, 0.15
-# px; a standing car's points move so much by noise, which does not tell its speed
+# px; a standing car's points move so much by noise, whatever its speed
 STILL_PX = 0.3
 # of reweighted least squares; it has settled after half of them
 ROUNDS = 10
-# px²; what no point tells is 0
+# px²; a parameter that no point determines is 0
 LEAST_NORMAL = 1e-6
 
 
@@ -43,7 +43,7 @@ def goes_on(first: Floats32, middle: Floats32, last: Floats32, followed: float, 
     first, middle, last: (n, 2) px, the same points in each. followed: the share of the middle
     image's points that were found in the last one; usual: the smallest such share before.
 
-    False is also the answer where too little is seen to tell. While the car stands a loss does
+    Returns False also where there are too few points. While the car stands a loss does
     not show.
     """
     if len(last) < MIN_POINTS:
@@ -66,8 +66,8 @@ def _ratio(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
     one, none = np.ones(len(xy)), np.zeros(len(xy))
     design = np.stack([before, np.stack([one, none], 1), np.stack([none, one], 1),
                        np.stack([-around[:, 1], around[:, 0]], 1)], axis=2)
-    # the first parameter is the ratio less 1: 0 where nothing tells it. As if each point had moved
-    # by STILL_PX more; and equal points determine no roll
+    # the first parameter is the ratio less 1: 0 where nothing determines it. As if each point had
+    # moved by STILL_PX more; and equal points determine no roll
     wanted = now - before
     params, off = reweighted(design, wanted, np.array([0.0, *np.median(wanted, axis=0), 0.0]),
                              np.array([STILL_PX ** 2, 0.0, 0.0, 0.0]))

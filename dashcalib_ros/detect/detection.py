@@ -20,24 +20,28 @@ from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import check_mask
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
 
-# images after which the stamps' unit is checked; ns between images of a camera of 2 kHz: in
-# microseconds, any camera above 2 Hz seems to be faster
+# images after which the unit of the time stamps is checked; ns between images of a camera of
+# 2 kHz: with microseconds, any camera above 2 Hz seems to be faster
 FIRST_FRAMES = 10
 SHORTEST_NS = 500_000
-# other units in which somebody may count, and how long so many images take at the most
+# other units that a program may use, and the longest time that the first images may take
 UNITS_NS = {'microseconds': 10**3, 'milliseconds': 10**6, 'seconds': 10**9}
 LONGEST_NS = 60 * 10**9
 
 
 class Detection:
-    """Takes the images of one camera; keeps the best turns, with their images.
+    """Finds the turns in the images of one camera, and keeps the best ones with their images.
 
-    size: (width, height) of the images, None before the first. scale: how they are resized
-    first. frames: how many there were. standing: the car stands now.
+    size: (width, height) of the images in px, None before the first one. scale: how images are
+    resized before they are used. frames: number of images so far. standing: whether the car
+    stands now.
     """
 
     def __init__(self, config: Config, mask: Mask | None = None, beside: bool = False) -> None:
-        """mask: (h, w), False where the ego vehicle is. beside: lines are sought in a thread."""
+        """mask: (h, w), False on the ego vehicle. beside: a thread of its own finds the lines.
+
+        Raises ConfigError where the segmentation model cannot be used.
+        """
         self._mask = mask
         if mask is not None:
             mask = Scale.of((mask.shape[1], mask.shape[0]), config).mask(mask)
@@ -61,7 +65,7 @@ class Detection:
 
     @property
     def seconds(self) -> float:
-        """Return how long the drive lasts so far, from the first image to the last, s."""
+        """Return the duration of the drive so far, from the first image to the last, s."""
         return (self._last_ns - self._first_ns) / 1e9
 
     @property
@@ -70,10 +74,10 @@ class Detection:
         return self._turns.magnitude
 
     def push(self, frame: Frame) -> list[Turn]:
-        """Take the next frame; return the turns that it completes or changes.
+        """Take the next frame; return the turns that are new. They do not change any more.
 
-        Raises InputError when its size differs from the first one's, or from the mask's, when it
-        is no grey picture of bytes, and when the stamps cannot be nanoseconds.
+        Raises InputError where its size differs from the first one's or from the mask's, where it
+        is not a grey image of bytes, and where the stamps cannot be nanoseconds.
         """
         _check_image(frame)
         self._check_size(frame)
@@ -86,26 +90,26 @@ class Detection:
         self.standing = motion.standing
         if not motion.standing:
             self._lines.push(frame.image, frame.stamp_ns)
-        return self._fixed(self._turns.push(frame, motion))
+        return self._turns.push(frame, motion)
 
     def finish(self) -> list[Turn]:
-        """End the drive; return the turns that this completes or changes."""
-        return self._fixed(self._turns.finish())
+        """End the drive; return the turns that are new."""
+        return self._turns.finish()
 
     def close(self) -> None:
-        """End the thread that looks for lines; what it found stays."""
+        """End the thread that finds lines; the lines found are kept."""
         self._lines.close()
 
     def turns(self) -> tuple[Turn, ...]:
-        """Return the turns found so far, the most prominent first."""
+        """Return the best turns so far, the most prominent first."""
         return self._turns.bank.turns()
 
     def release(self, center: int) -> None:
-        """Drop a turn's frames, once they are handed over."""
-        self._turns.bank.release(center)
+        """Free the images of the turn with this center; the turn itself is kept."""
+        self._turns.bank.exchange(center, ())
 
     def exchange(self, center: int, frames: tuple[Frame, ...]) -> None:
-        """Take the same frames, stored in another way, for those of a turn."""
+        """Replace the images of the turn with this center by the same ones, stored elsewhere."""
         self._turns.bank.exchange(center, frames)
 
     def magnitudes(self) -> Floats:
@@ -113,7 +117,7 @@ class Detection:
         return self._turns.magnitudes()
 
     def valid(self) -> Mask | None:
-        """Return (h, w) of the resized images, False where the ego vehicle is; None: nowhere."""
+        """Return (h, w) of the resized images, False on the ego vehicle; None: no mask."""
         return self._motion.valid()
 
     def points(self) -> TrackedPoints:
@@ -141,24 +145,13 @@ class Detection:
 
     @property
     def other_camera(self) -> OtherCamera | None:
-        """Return what images show that are left out; None where they are of the same camera."""
+        """Return the other camera that skipped images show; None where there is none."""
         return self._motion.one_camera.other
 
     @property
     def mixed(self) -> bool:
         """Return whether the newest images are of two cameras."""
         return self._motion.one_camera.mixed
-
-    def _fixed(self, new: list[Turn]) -> list[Turn]:
-        """Fix the frames of all turns: a later turn that overlaps one of them is trimmed.
-
-        This is done when a turn is confirmed, not when it is reconstructed: the result must not
-        depend on the speed of the workers.
-        """
-        if new:
-            for turn in self.turns():
-                self._turns.bank.fix(turn.center)
-        return new
 
     def _check_size(self, frame: Frame) -> None:
         if self.size is None:
@@ -167,9 +160,9 @@ class Detection:
             self.size = frame.size
         elif frame.size != self.size:
             raise InputError(
-                f'the image size changes from {self.size[0]}x{self.size[1]} to '
-                f'{frame.size[0]}x{frame.size[1]} at frame {frame.index}: calibrate each size '
-                f'on its own')
+                'E-IMAGE-SIZE-CHANGES', f'the image size changes from {self.size[0]}x'
+                f'{self.size[1]} to {frame.size[0]}x{frame.size[1]} at frame {frame.index}: '
+                f'calibrate each size separately')
 
     def _check_stamps(self, frame: Frame) -> None:
         """Check once that time passes between the first images, in the right unit."""
@@ -185,16 +178,18 @@ class Detection:
         if self.frames == FIRST_FRAMES and (too_short or self._rises < FIRST_FRAMES // 2):
             unit = next((name for name, ns in UNITS_NS.items()
                          if FIRST_FRAMES * SHORTEST_NS <= passed * ns < LONGEST_NS), '')
-            what = f'they seem to be {unit}' if unit else 'they do not rise, or count images'
+            what = (f'the unit seems to be {unit}' if unit
+                    else 'they do not increase, or they count images')
             raise InputError(
-                f'{FIRST_FRAMES} images pass in {passed} ns: their stamps (Frame.stamp_ns) must '
-                f'rise, and be nanoseconds; {what}; mend what writes them')
+                'E-STAMP-UNIT', f'the first {FIRST_FRAMES} images cover {passed} ns: time stamps '
+                f'(Frame.stamp_ns) must increase and be in nanoseconds; {what}; correct the '
+                f'program that writes them')
 
 
 def detect(frames: Iterable[Frame], config: Config, mask: Mask | None = None) -> Detection:
     """Find the turns of a drive. For a stream, call Detection.push() for each frame.
 
-    mask: (h, w), False where the ego vehicle is. Raises InputError when the images change size.
+    mask: (h, w), False on the ego vehicle. Raises InputError as Detection.push() does.
     """
     detection = Detection(config, mask)
     for frame in frames:
@@ -207,6 +202,6 @@ def _check_image(frame: Frame) -> None:
     if frame.image.ndim != 2 or frame.image.dtype != np.uint8:
         shape = 'x'.join(map(str, frame.image.shape))
         raise InputError(
-            f'Frame.image must be grey, (height, width) of uint8, and frame {frame.index} has '
-            f'{shape} of {frame.image.dtype}: convert it, with '
-            f'cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if it is in colour')
+            'E-FRAME-NOT-GREY', f'Frame.image must be grey, (height, width) of uint8, and frame '
+            f'{frame.index} is {shape} of {frame.image.dtype}: convert a colour image with '
+            f'cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)')

@@ -36,7 +36,7 @@ BORDER = 3
 MIN_LENGTH_PX = 40
 # grey levels per px across a line; noise of 6 levels comes to 0.7
 CONTRAST = 4.0
-# edges kept of a picture, the longest: they tell most, and a fence may have hundreds
+# edges kept of a picture, the longest: they show most, and a fence may have hundreds
 MOST = 50
 # s between the images that are searched; more often costs time and adds little
 PERIOD_S = 0.5

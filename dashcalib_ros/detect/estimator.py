@@ -18,8 +18,8 @@ from dashcalib_ros.detect.one_camera import OneCamera
 from dashcalib_ros.detect.points import Tracking, find_clear_corners, follow_points
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
 from dashcalib_ros.detect.straights import PAIRS, STRAIGHT, StraightCollector, Straights
-from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.decode import check_mask
 from dashcalib_ros.input.scale import shrink_image
 from dashcalib_ros.input.stamps import EARLY, Looks, least_step_ns
 
@@ -42,11 +42,11 @@ class Motion:
     """Motion at one image, measured over the triplet of images that ends with it.
 
     index, stamp_ns: of the image. center, center_ns: index and stamp of the triplet's middle
-    image, which the magnitude belongs to; None before there is a triplet.
-    magnitude: turning magnitude, of the image width (see epipoles.py); 0 when standing, NaN when
-    no epipole is found. standing: the picture does not move. moved_px: how far the median point
-    moved since the last processed image, at full resolution. points: how many were tracked.
-    after_gap: the tracking began anew: nothing from here on belongs to what was before.
+    image, which the magnitude belongs to; None before there is a triplet. magnitude: turning
+    magnitude, as a share of the image width (see epipoles.py); 0 where the car stands, NaN where
+    no epipole is found. standing: the car stands. moved_px: motion of the median point since the
+    last processed image, in px at full resolution. points: number of tracked points. after_gap:
+    the tracking started again, and this image does not follow the last one.
     """
 
     index: int
@@ -85,10 +85,19 @@ class _Seen:
     followed: float
 
 
+@dataclass(frozen=True)
+class _Triplet:
+    """Three processed images, a spacing apart."""
+
+    first: _Seen
+    middle: _Seen
+    last: _Seen
+
+
 class MotionEstimator:
     """Tracks points through the drive and measures how much the car turns.
 
-    one_camera: whether the images that are left out are of the same camera as the others.
+    one_camera: whether the skipped images are of the same camera as the others.
     """
 
     _last: GreyImage | None = None
@@ -126,55 +135,34 @@ class MotionEstimator:
             self._start(frame.image.shape)
         # a skipped image leaves the question to the next one
         self._perhaps_gap |= frame.perhaps_after_gap
-        after_gap = False
-        if self._seen:
-            step = frame.stamp_ns - self._seen[-1].stamp_ns
-            after_gap = step < 0 or frame.after_gap
-            if after_gap:
-                self._reset()
-            elif step < least_step_ns(self.config.rate):
-                if self._looks.due(frame.stamp_ns):
-                    self._between = shrink_image(frame.image, self._factor)
-                return None
+        after_gap = self._resets(frame)
+        if self._skips(frame):
+            return None
         image = shrink_image(frame.image, self._factor)
-        followed = self._follow(image)
-        if self._perhaps_gap and self._seen and not self._goes_on(followed):
-            after_gap, followed = True, math.nan
-            self._reset()
-        self._perhaps_gap = False
-        before = self._seen[-1] if self._seen else None
-        now = _Seen(frame.index, frame.stamp_ns, self._ids, self._xy, followed)
-        moved = math.nan if before is None else _median_shift(*_common(before, now))
-        if before is not None and self._last is not None and self._between is not None:
-            self.one_camera.look((self._last, self._between), *_common(before, now),
-                                 self._tracking)
-        self._between = None
+        now, lost = self._track(frame, image)
+        step = _common(self._seen[-1] if self._seen else None, now)
+        moved_px = _median_shift(*step)
+        self._compare_between(*step)
         self._seen.append(now)
-        first, middle = self._triplet()
-        standing = moved < self.config.standing_px
-        if first is not None:
-            # in the dark, points of a standing car jitter by more, but do not move away
-            over_triplet = _median_shift(*_common(first, now))
-            standing |= over_triplet < min(JITTER * self.config.standing_px, JITTER_GROWTH * moved)
-        magnitude = 0.0 if standing else self._magnitude(first, middle)
-        if first is not None and 0 < magnitude < STRAIGHT and self._straights.wants(now.stamp_ns):
-            self._straights.push(first.stamp_ns, now.stamp_ns, *_common(first, now))
-        if middle is not None and not standing:
-            self._look_for_ego(image, middle, now)
-            if self._segmented is not None and self._segmented.push(frame.image, frame.stamp_ns):
-                self._exclude(self.valid())
+        triplet = self._triplet()
+        standing = self._is_standing(moved_px, triplet)
+        magnitude = 0.0 if standing else self._magnitude(triplet)
+        if triplet is not None and not standing:
+            self._collect_straight(triplet, magnitude)
+            self._look_for_vehicle(frame, image, triplet)
         self._replenish(image)
         self._last = image
+        middle = triplet.middle if triplet else None
         return Motion(
-            frame.index, frame.stamp_ns, magnitude, standing,
-            moved * self._factor, len(now.ids), middle.index if middle else None,
-            middle.stamp_ns if middle else None, after_gap)
+            frame.index, frame.stamp_ns, magnitude, standing, moved_px * self._factor,
+            len(now.ids), middle.index if middle else None, middle.stamp_ns if middle else None,
+            after_gap or lost)
 
     def valid(self) -> Mask | None:
-        """Return (height, width) of the full image: False on the ego vehicle and the user's mask.
+        """Return (height, width) of the full image, False where it is masked; None: no mask.
 
-        The vehicle is found by both the automatic mask and the segmentation model. None while
-        nothing is masked.
+        Masked is what the user masks, and the ego vehicle as the automatic mask and the
+        segmentation model find it.
         """
         valid = self._user
         if self._shape is None:
@@ -200,7 +188,7 @@ class MotionEstimator:
 
     @property
     def straight_pairs(self) -> int:
-        """Return how many pairs of images of straight driving there are."""
+        """Return the number of pairs of images of straight driving."""
         return len(self._straights)
 
     def straights(self, newest: int = PAIRS) -> Straights:
@@ -228,10 +216,7 @@ class MotionEstimator:
 
     def _start(self, shape: tuple[int, ...]) -> None:
         """Begin with images of this shape."""
-        if self._user is not None and self._user.shape != shape[:2]:
-            raise InputError(
-                f'the mask is {self._user.shape[1]}x{self._user.shape[0]}, the images are '
-                f'{shape[1]}x{shape[0]}: give a mask of the images\' size')
+        check_mask(self._user, (shape[1], shape[0]))
         self._reset()
         self._shape = (shape[0], shape[1])
         self._factor = -(-shape[1] // self.config.width)
@@ -249,6 +234,62 @@ class MotionEstimator:
         if valid is not None:
             small = cv2.resize(valid.astype(np.uint8), self._size, interpolation=cv2.INTER_NEAREST)
             self._valid = small > 0
+
+    def _resets(self, frame: Frame) -> bool:
+        """Drop all points where the clock was set back, or a gap is known; return whether so."""
+        if not self._seen:
+            return False
+        after_gap = frame.after_gap or frame.stamp_ns < self._seen[-1].stamp_ns
+        if after_gap:
+            self._reset()
+        return after_gap
+
+    def _skips(self, frame: Frame) -> bool:
+        """Return whether the image comes too early; some of those are compared later."""
+        if not self._seen or (frame.stamp_ns - self._seen[-1].stamp_ns
+                              >= least_step_ns(self.config.rate)):
+            return False
+        if self._looks.due(frame.stamp_ns):
+            self._between = shrink_image(frame.image, self._factor)
+        return True
+
+    def _track(self, frame: Frame, image: GreyImage) -> tuple[_Seen, bool]:
+        """Return the points in this image, and whether it does not follow the last one."""
+        followed = self._follow(image)
+        lost = self._perhaps_gap and bool(self._seen) and not self._goes_on(followed)
+        if lost:
+            followed = math.nan
+            self._reset()
+        self._perhaps_gap = False
+        return _Seen(frame.index, frame.stamp_ns, self._ids, self._xy, followed), lost
+
+    def _compare_between(self, before: Floats32, now: Floats32) -> None:
+        """Compare a skipped image with those around it; before, now: (n, 2) px in these."""
+        if self._last is not None and self._between is not None:
+            self.one_camera.look((self._last, self._between), before, now, self._tracking)
+        self._between = None
+
+    def _is_standing(self, moved_px: float, triplet: _Triplet | None) -> bool:
+        """Return whether the car stands; moved_px: the median point since the last image."""
+        if moved_px < self.config.standing_px:
+            return True
+        if triplet is None:
+            return False
+        # in the dark, points of a standing car jitter by more, but do not move away
+        over_triplet = _median_shift(*_common(triplet.first, triplet.last))
+        return over_triplet < min(JITTER * self.config.standing_px, JITTER_GROWTH * moved_px)
+
+    def _collect_straight(self, triplet: _Triplet, magnitude: float) -> None:
+        """Keep the triplet's ends, now and then, where the car drives straight on."""
+        first, last = triplet.first, triplet.last
+        if 0 < magnitude < STRAIGHT and self._straights.wants(last.stamp_ns):
+            self._straights.push(first.stamp_ns, last.stamp_ns, *_common(first, last))
+
+    def _look_for_vehicle(self, frame: Frame, image: GreyImage, triplet: _Triplet) -> None:
+        """Let the automatic mask and the segmentation model see an image of the moving car."""
+        self._look_for_ego(image, triplet.middle, triplet.last)
+        if self._segmented is not None and self._segmented.push(frame.image, frame.stamp_ns):
+            self._exclude(self.valid())
 
     def _look_for_ego(self, image: GreyImage, middle: _Seen, now: _Seen) -> None:
         epipoles = self._pairs.get((middle.index, now.index))
@@ -283,9 +324,9 @@ class MotionEstimator:
         return float(np.mean(trusted))
 
     def _goes_on(self, followed: float) -> bool:
-        """Return whether the points tell that the image they are in now follows the last one.
+        """Return whether the image with the points of now follows the last one without a gap.
 
-        followed: the share of the last image's points that is left.
+        followed: the share of the last image's points that were found.
         """
         usual = [seen.followed for seen in self._seen if not math.isnan(seen.followed)]
         if not usual:
@@ -311,22 +352,23 @@ class MotionEstimator:
         self._xy = np.concatenate([self._xy, corners.astype(np.float32)])
         self._born += len(corners)
 
-    def _triplet(self) -> tuple[_Seen | None, _Seen | None]:
-        """Return the first and the middle image of the triplet that ends now; None without one."""
-        middle = self._earlier(self._seen[-1])
+    def _triplet(self) -> _Triplet | None:
+        """Return the triplet that ends with the newest image; None before there is one."""
+        last = self._seen[-1]
+        middle = self._earlier(last)
         first = self._earlier(middle) if middle else None
-        return (first, middle) if first else (None, None)
+        return _Triplet(first, middle, last) if first and middle else None
 
-    def _magnitude(self, first: _Seen | None, middle: _Seen | None) -> float:
+    def _magnitude(self, triplet: _Triplet | None) -> float:
         """Return the triplet's turning magnitude; NaN without a triplet, or without epipoles.
 
         With three images a spacing or more, it is measured once a spacing; between, the last one
         is returned.
         """
-        if first is None or middle is None:
+        if triplet is None:
             return math.nan
-        last = self._seen[-1]
-        # triplets at each image cost three times as much, and tell no more; a slow camera has few,
+        first, middle, last = triplet.first, triplet.middle, triplet.last
+        # triplets at each image cost three times as much and add nothing; a slow camera has few,
         # and each counts
         spacing_ns = 1e9 * self.config.spacing_s
         fast = last.stamp_ns - self._seen[-2].stamp_ns < 0.4 * spacing_ns
@@ -359,8 +401,10 @@ class MotionEstimator:
         return epipoles_of(before, after, self._size, EPIPOLAR_PX)
 
 
-def _common(a: _Seen, b: _Seen) -> tuple[Floats32, Floats32]:
+def _common(a: _Seen | None, b: _Seen) -> tuple[Floats32, Floats32]:
     """Return the positions of the points seen in both images, (n, 2) in each."""
+    if a is None:
+        return b.xy[:0], b.xy[:0]
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     return a.xy[in_a], b.xy[in_b]
 

@@ -17,15 +17,15 @@ from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
 from dashcalib_ros.input.scale import shrink_image
 
 # px at the mask's resolution; with less flow the world does not count as moving
-MOVED = 2.5
+LEAST_FLOW_PX = 2.5
 # px, the same for flow from rotation, above the horizon: epipoles are less exact than points
-TURNED = 4.0
+LEAST_ROTATION_PX = 4.0
 # samples a cell needs before it is classified
 SAMPLES = 12
 # samples of a cell at which all sums are halved: new samples count more than old ones
 REMEMBERED = 2000
 # least coherence of a pixel's gradient
-PIXEL_STAYS = 0.7
+PIXEL_COHERENCE = 0.7
 # effective number of samples a pixel needs: a few may be alike by chance
 PIXEL_SAMPLES = 6.0
 # of a cell's pixels that must stay: text covers little of a cell
@@ -37,7 +37,7 @@ ENCLOSED = 0.4
 # px at the working width; resolution of the mask
 CELL = 16
 # coherence of a cell's gradient: the world's is about 0, the vehicle's 0.7
-CELL_STAYS = 0.4
+CELL_COHERENCE = 0.4
 # of the picture; a mask of the vehicle that hides more is not used
 LARGEST = 0.4
 
@@ -67,7 +67,7 @@ class EgoMask:
         if flow is None:
             return
         moves = np.linalg.norm(flow, axis=2)
-        counts = moves > MOVED
+        counts = moves > LEAST_FLOW_PX
         if not counts.any():
             return
         half = shrink_image(image, 2).astype(np.float32)
@@ -99,7 +99,7 @@ class EgoMask:
             return None
         stays, strength, pixels = self._evidence()
         flat = known & (strength < FLAT)
-        ego = known & ~flat & (stays > CELL_STAYS) | known & (pixels > PIXELS)
+        ego = known & ~flat & (stays > CELL_COHERENCE) | known & (pixels > PIXELS)
         ego = _without_specks(ego)
         filled = _closed(ego | self._flat_parts(flat & ~ego, ego, stays))
         for cells in (filled, ego):
@@ -131,7 +131,7 @@ class EgoMask:
         most = squared - self._squares
         stays = self._pool(products) / np.maximum(self._pool(most), 1e-6)
         strength = self._pool(self._strength) / np.maximum(self._pool(self._weight), 1e-6)
-        lasting = ((products > PIXEL_STAYS * most) & (squared > PIXEL_SAMPLES * self._squares)
+        lasting = ((products > PIXEL_COHERENCE * most) & (squared > PIXEL_SAMPLES * self._squares)
                    & (self._strength > 2 * FLAT * self._weight))
         return stays, strength, self._pool(lasting) / self._cell ** 2
 
@@ -159,7 +159,7 @@ class EgoMask:
         world = (_quadratic(places / width) @ fit).reshape(*self.grid, 2)
         horizon = height / 2 + epipoles[:, 1].max() * width
         rotation = (epipoles[1] - epipoles[0]) * width
-        if np.linalg.norm(rotation) < TURNED:
+        if np.linalg.norm(rotation) < LEAST_ROTATION_PX:
             rotation = np.zeros(2)
         world[places[:, 1].reshape(self.grid) < horizon + self._cell] = rotation
         return np.asarray(world, np.float32)
@@ -179,7 +179,7 @@ class EgoMask:
             region = labels == label
             outline = (cv2.dilate(region.astype(np.uint8), cross) > 0) & ~region
             enclosed = outline.any() and ego[outline].mean() >= ENCLOSED
-            shaded = region[-1].any() and np.median(stays[region]) > CELL_STAYS
+            shaded = region[-1].any() and np.median(stays[region]) > CELL_COHERENCE
             if (region & border).any() and (enclosed or shaded):
                 result |= region
         return result

@@ -1,10 +1,10 @@
-"""Whether all images of a stream are of one camera: some of those left out are compared.
+"""Whether all images of a stream are of one camera: some of the skipped ones are compared.
 
-A camera faster than motion.rate is thinned, and what is used may all be of one camera while the
-images between are of another. So one of these is looked at now and then: its points must lie where
-the images before and after it say. Let u be a point's step between these two, and v its step from
-the first to the image between. The car's speed hardly changes in so short a time; the road shifts
-and turns the picture a little, now to one side, now to the other:
+Images that come faster than motion.rate are skipped, and all images used may be of one camera
+while the skipped ones are of another. So one of these is compared now and then: its points must
+lie where the images before and after it predict. Let u be a point's step between these two, and v
+its step from the first to the skipped image. The car's speed hardly changes in so short a time;
+the road shifts and turns the picture a little, now to one side, now to the other:
 
     v = share u + shift + roll + zoom
 
@@ -24,7 +24,7 @@ from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
 from dashcalib_ros.detect.continuity import MIN_POINTS, reweighted
 from dashcalib_ros.detect.points import Tracking, follow_points
 
-APART = 'record each camera on its own, or give each a topic of its own'
+APART = 'record each camera separately, with one topic per camera'
 # looks that count, and how many of them must show the same other camera: where it sends every
 # fourth of the images between, a quarter of the looks
 RECENT, SAME = 20, 5
@@ -47,10 +47,10 @@ SPEED_PRIOR, CAMERA_PRIOR = 1e-3, 1e-4
 
 @dataclass(frozen=True)
 class OtherCamera:
-    """What looks at images between those used show: that they are of two cameras.
+    """Another camera in the stream, seen in images that are skipped.
 
-    shown: how many of the newest looks show the other camera, looks: of how many. what: they show,
-    in words.
+    shown: number of the newest comparisons that show it; looks: number of all of these. what:
+    they show, in words.
     """
 
     shown: int
@@ -58,15 +58,14 @@ class OtherCamera:
     what: str
 
     def __str__(self) -> str:
-        return (f'the images are of two cameras: between those that are used, {self.shown} of '
-                f'{self.looks} that were looked at show {self.what}')
+        return (f'the images are of two cameras: of {self.looks} skipped images that were '
+                f'compared, {self.shown} show {self.what}')
 
 
 class OneCamera:
-    """Compares images with those around them.
+    """Compares skipped images with those around them.
 
-    other: the other camera, from when it was first seen on. mixed: whether the newest looks show
-    it.
+    other: the other camera, once it was seen. mixed: whether the newest comparisons show it.
     """
 
     def __init__(self) -> None:
@@ -78,10 +77,10 @@ class OneCamera:
 
     def look(self, images: Sequence[GreyImage], before: Floats32, after: Floats32,
              tracking: Tracking) -> None:
-        """Look at an image between.
+        """Compare a skipped image.
 
-        images: the one before it, and itself. before, after: (n, 2) px, where the same points are
-        in the images before and after it.
+        images: the one before it, and itself. before, after: (n, 2) px, the same points in the
+        images before and after it.
         """
         first, between = images
         if len(before) < MIN_POINTS or between.std() < LEAST_CONTRAST * first.std():
@@ -116,7 +115,7 @@ class OneCamera:
 
 
 def _in_words(off: Floats) -> str:
-    """Return what an image shows that is so far off: (4,) as _off() has it."""
+    """Return in words what an image shows; off: (4,) as _off() returns it."""
     zoom = float(off[3])
     if abs(zoom) < np.linalg.norm(off[:3]):
         return 'the same view from another mounting'

@@ -2,15 +2,13 @@
 from __future__ import annotations
 
 import math
+import sys
 from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass
 
 # Hz; the paper's k counts images of 10 fps
 PAPER_RATE = 10.0
-# of a turn that an edge cuts; so whole turns are better. 0.5 prefers a start at 12 degrees of yaw
-# to a turn of 46 in one of two real drives that have both
-SEEN = 0.25
 
 
 class StreamingMedian:
@@ -59,136 +57,90 @@ class StreamingMedian:
         return stamp_ns, 0.5 * (self._sorted[middle - 1] + self._sorted[middle])
 
 
-@dataclass(frozen=True)
+@dataclass
 class Peak:
-    """A local maximum of enough prominence.
+    """A local maximum of the signal.
 
-    position: of the sample, counted from 0; a plateau's middle, rounded down.
-    prominence: how far the signal falls, at least, between the peak and any higher place. Until
-    the peak is settled this is a lower bound: later samples can only increase it.
+    stamp_ns: the middle of a flat top. left: the lowest sample before the peak, back to the next
+    higher one, or to the beginning. right: the lowest sample after it, up to the next higher one,
+    or so far. open: there is no higher sample after it so far.
     """
 
-    position: int
+    stamp_ns: int
     height: float
-    prominence: float
-    settled: bool
-
-
-@dataclass
-class _Open:
-    """A peak without a higher sample after it; left_min is final, right_min may still fall."""
-
-    position: int
-    height: float
-    left_min: float
-    right_min: float
-    reported: bool = False
+    left: float
+    right: float
+    open: bool = True
 
     @property
     def prominence(self) -> float:
-        return self.height - max(self.left_min, self.right_min)
+        """Return the topographic prominence in the signal so far; it can only grow."""
+        return self.height - max(self.left, self.right)
+
+    @property
+    def limit(self) -> float:
+        """Return the largest prominence that the peak can still reach."""
+        return self.height - self.left if self.open else self.prominence
 
 
 class PeakFinder:
-    """As scipy.signal.find_peaks(signal, prominence=min_prominence), for a stream.
+    """Finds the peaks of a stream, as scipy.signal.find_peaks(signal, prominence=min_prominence).
 
-    rest: a signal that begins or ends higher has a peak there. As nobody saw how far it falls
-    beyond, SEEN of its height above rest counts.
-    Each peak is reported as soon as its prominence so far reaches the minimum, again whenever it
-    has grown, and once more when it is settled; the last reports equal scipy's result.
-    Open peaks are a stack of decreasing heights: memory and time per sample depend on its depth,
-    not on the length of the signal.
+    The open peaks are a stack of heights that do not increase: memory and time per sample depend
+    on its depth, not on the length of the signal.
     """
 
-    def __init__(self, min_prominence: float, rest: float = math.inf) -> None:
-        self.min_prominence = min_prominence
-        self._open: list[_Open] = []
-        self._count = 0
-        self._rest = rest
-        self._last = math.inf
-        self._lowest = math.inf
-        # where the current rise reached its present height; None while falling
-        self._summit: int | None = None
-        self._fresh = False
+    def __init__(self, min_prominence: float, longest_ns: int) -> None:
+        """longest_ns: of a flat top; of a longer one only the end counts."""
+        self._min_prominence = min_prominence
+        self._longest_ns = longest_ns
+        self._open: list[Peak] = []
+        self._value = self._lowest = math.inf
+        self._rises = False
+        # the last samples of equal height; before the first one a peak may be at any time
+        self._top: deque[int] = deque([-sys.maxsize])
 
     @property
-    def needed_from(self) -> int:
-        """Return the earliest sample at which a peak can still appear."""
-        return self._count if self._summit is None else (self._summit + self._count - 1) // 2
+    def earliest_ns(self) -> int:
+        """Return the earliest time at which a new peak can still be found."""
+        return self._top[(len(self._top) - 1) // 2 if self._rises else -1]
 
-    @property
-    def newcomer(self) -> Peak | None:
-        """Return the peak that the last sample opened, with its highest possible prominence."""
-        top = self._open[-1] if self._fresh else None
-        if top is None or top.height - top.left_min < self.min_prominence:
-            return None
-        return Peak(top.position, top.height, top.height - top.left_min, False)
+    def push(self, stamp_ns: int, value: float) -> Peak | None:
+        """Take the next sample (not NaN); return the peak that ends with the one before it.
 
-    def alive(self) -> set[int]:
-        """Return the positions of the peaks that are open and may still count."""
-        return {peak.position for peak in self._open
-                if peak.height - peak.left_min >= self.min_prominence}
-
-    def push(self, value: float) -> list[Peak]:
-        """Take the next sample (not NaN); return the peaks that appeared, grew or are settled."""
-        reports: list[Peak] = []
-        self._fresh = False
-        if not self._count:
-            self._last = self._lowest = self._beyond(value)
-        if value > self._last:
-            self._summit = self._count
+        Peaks that cannot reach the least prominence are omitted.
+        """
+        found = None
+        if value > self._value:
             while self._open and self._open[-1].height < value:
-                reports += self._settle(self._open.pop())
-        elif value < self._last:
-            if self._summit is not None:
-                self._rise((self._summit + self._count - 1) // 2, self._last)
-            self._summit = None
-            reports += self._fall(value)
-        self._lowest = min(self._lowest, value)
-        self._last = value
-        self._count += 1
-        return reports
-
-    def end(self) -> list[Peak]:
-        """Take the last edge; return the peaks that appeared or grew there."""
-        return self.push(min(self._last, self._beyond(self._last)))
-
-    def finish(self) -> list[Peak]:
-        """End the signal; return the peaks that this settles."""
-        reports: list[Peak] = []
-        while self._open:
-            reports += self._settle(self._open.pop())
-        return reports
-
-    def _beyond(self, value: float) -> float:
-        """Return what the signal counts as beyond an edge at which it has a value."""
-        return value - SEEN * (value - self._rest) if value > self._rest else math.inf
-
-    def _rise(self, position: int, height: float) -> None:
-        """Open a peak. Lower ones were settled before; those of equal height are still open."""
-        left_min = self._lowest
+                self._open.pop().open = False
+        elif value < self._value and self._rises:
+            found = self._peak()
+        if value != self._value:
+            self._rises = value > self._value
+            self._top.clear()
+        self._top.append(stamp_ns)
+        while stamp_ns - self._top[0] > self._longest_ns:
+            self._top.popleft()
+        # the deeper in the stack, the lower the signal was since: stop where nothing changes
         for peak in reversed(self._open):
-            if peak.height > height:
-                left_min = peak.right_min
+            if peak.right <= value:
                 break
-        self._open.append(_Open(position, height, left_min, height))
-        self._fresh = True
+            peak.right = value
+        self._value, self._lowest = value, min(self._lowest, value)
+        return found
 
-    def _fall(self, value: float) -> list[Peak]:
-        reports: list[Peak] = []
-        # deeper peaks have a lower or equal right_min: stop at the first that does not change
-        for peak in reversed(self._open):
-            if peak.right_min <= value:
-                break
-            before = peak.prominence
-            peak.right_min = value
-            if peak.prominence >= self.min_prominence and not (
-                    peak.reported and peak.prominence == before):
-                peak.reported = True
-                reports.append(Peak(peak.position, peak.height, peak.prominence, False))
-        return reports
+    def finish(self) -> None:
+        """End the signal: no peak is open any more."""
+        for peak in self._open:
+            peak.open = False
+        self._open.clear()
 
-    def _settle(self, peak: _Open) -> list[Peak]:
-        if peak.prominence < self.min_prominence:
-            return []
-        return [Peak(peak.position, peak.height, peak.prominence, True)]
+    def _peak(self) -> Peak | None:
+        """Return the peak at the last sample; those of equal height do not end each other."""
+        higher = (peak.right for peak in reversed(self._open) if peak.height > self._value)
+        peak = Peak(self.earliest_ns, self._value, next(higher, self._lowest), self._value)
+        if peak.limit < self._min_prominence:
+            return None
+        self._open.append(peak)
+        return peak

@@ -34,7 +34,7 @@ SPREAD = np.array([0.229, 0.224, 0.225], np.float32)
 
 
 class SegmentationModel:
-    """An ONNX model that was tried once, and the classes that are masked."""
+    """An ONNX model that was run once as a test, and the classes that are masked."""
 
     def __init__(self, path: str, classes: str) -> None:
         """classes: their numbers, as in '63,64'. Raises ConfigError if the model does not fit."""
@@ -47,12 +47,12 @@ class SegmentationModel:
         if len(shape) != 4 or not all(fits) or inputs[0].type != 'tensor(float)':
             takes = ' and '.join(f'{"x".join(map(str, each.shape))} {each.type}'
                                  for each in inputs)
-            raise ConfigError(f'the segmentation model {path} takes {takes or "nothing"}; export '
-                              f'it with one input of 1x3xHxW float32')
+            raise ConfigError('E-SEGMENTATION-INPUT', f'the segmentation model {path} takes '
+                              f'{takes or "no input"}; export it with one input, 1x3xHxW float32')
         self._input = inputs[0].name
         self._size = (SIZE[0] if _open(shape[3]) else shape[3],
                       SIZE[1] if _open(shape[2]) else shape[2])
-        # try it now: an error must not come in the middle of the drive
+        # run it now: an error must not come in the middle of the drive
         self.vehicle(np.zeros((self._size[1], self._size[0]), np.uint8))
 
     def vehicle(self, image: GreyImage) -> Mask:
@@ -66,8 +66,8 @@ class SegmentationModel:
             # the first output is the result; others are for training
             output = np.asarray(self._session.run(None, {self._input: planes[None]})[0])
         except Exception as error:  # onnxruntime's have no parent in common
-            raise ConfigError(f'the segmentation model {self._path} does not run '
-                              f'({one_line(error)}); export it anew') from error
+            raise ConfigError('E-SEGMENTATION-FAILED', f'the segmentation model {self._path} '
+                              f'does not run ({one_line(error)}); export it again') from error
         return self._decided(output)
 
     def _decided(self, output: npt.NDArray[Any]) -> Mask:
@@ -76,17 +76,17 @@ class SegmentationModel:
         if output.ndim == 4 and shape[0] == 1 and shape[1] > 1 and output.dtype.kind == 'f':
             if max(self._classes) >= shape[1]:
                 raise ConfigError(
-                    f'the segmentation model {self._path} has the classes 0 to {shape[1] - 1}: '
-                    f'set mask.segmentation_classes to those of the own car, not to '
-                    f'{",".join(map(str, self._classes))}')
+                    'E-SEGMENTATION-CLASSES', f'the segmentation model {self._path} has the '
+                    f'classes 0 to {shape[1] - 1}, not {",".join(map(str, self._classes))}: set '
+                    f'mask.segmentation_classes to those of the ego vehicle')
             # 15 times as fast as argmax, and False for NaN
             return np.asarray(output[0][self._classes].max(axis=0) == output[0].max(axis=0))
         if output.ndim in (3, 4) and set(shape[:-2]) == {1} and output.dtype.kind in 'iu':
             return np.isin(output.reshape(shape[-2:]), self._classes)
         raise ConfigError(
-            f'the segmentation model {self._path} gives {"x".join(map(str, shape))} '
-            f'{output.dtype}; export it with 1xCxHxW logits (float) or 1xHxW labels (integer) as '
-            f'its first output')
+            'E-SEGMENTATION-OUTPUT', f'the segmentation model {self._path} returns '
+            f'{"x".join(map(str, shape))} {output.dtype}; export it with 1xCxHxW logits (float) '
+            f'or 1xHxW labels (integer) as its first output')
 
 
 class SegmentationMask:
@@ -124,16 +124,18 @@ class SegmentationMask:
         return np.asarray(widened > 0)
 
     def warning(self) -> str | None:
-        """Return a warning for the user if the result looks wrong, in one line."""
+        """Return a warning for the user, one line; None where the result looks right."""
         found = self._found()
         cure = 'check mask.segmentation_classes'
         if found is None:
             return None
         if not found.any():
-            return f'the segmentation model sees no part of the own car; if there is one, {cure}'
+            return (f'the segmentation model finds no part of the ego vehicle; if the images show '
+                    f'one, {cure}')
         if found.mean() > LARGEST:
-            return (f'the segmentation model takes {100 * found.mean():.0f} % of the picture for '
-                    f'the own car, which is too much and not used; {cure}')
+            return (f'the mask of the segmentation model is not used: it covers '
+                    f'{100 * found.mean():.0f} % of the image, and the limit is '
+                    f'{100 * LARGEST:.0f} %; {cure}')
         return None
 
     def _found(self) -> Mask | None:
@@ -162,14 +164,15 @@ def _session(path: str) -> Any:
     try:
         check_file(file, f'the segmentation model {path}', MODEL_BYTES)
     except InputError as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(error.code, str(error)) from error
     except OSError as error:
-        raise ConfigError(f'there is no segmentation model {path}; check the path') from error
+        raise ConfigError('E-SEGMENTATION-PATH', f'the segmentation model {path} cannot be opened '
+                          f'({error.strerror}); check the path') from error
     try:
         import onnxruntime
     except ImportError as error:
-        raise ConfigError('a segmentation model needs onnxruntime, which is not installed: '
-                          'pip install onnxruntime') from error
+        raise ConfigError('E-EXTRA-NOT-INSTALLED', 'a segmentation model needs onnxruntime, which '
+                          'is not installed: pip install onnxruntime') from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = THREADS
     # otherwise its threads keep a core busy between two images
@@ -179,8 +182,8 @@ def _session(path: str) -> Any:
     try:
         return onnxruntime.InferenceSession(str(file), options, ['CPUExecutionProvider'])
     except Exception as error:  # onnxruntime's have no parent in common
-        raise ConfigError(f'{path} is no ONNX model that onnxruntime can load '
-                          f'({one_line(error)}); export it anew, or upgrade onnxruntime'
+        raise ConfigError('E-SEGMENTATION-UNREADABLE', f'onnxruntime cannot load {path} '
+                          f'({one_line(error)}); export the model again, or upgrade onnxruntime'
                           ) from error
 
 

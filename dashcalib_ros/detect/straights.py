@@ -14,7 +14,7 @@ PERIOD_S = 0.3
 # of the image width: half of what the epipole moves between a pair's images. 2 degrees of yaw
 # move that of a lens of 90 degrees by twice as much
 STRAIGHT = 0.01
-# points; fewer do not tell a direction
+# points; fewer do not determine a direction
 LEAST_POINTS = 40
 
 
@@ -43,7 +43,7 @@ class StraightCollector:
         self._found: list[tuple[int, int, Floats32]] = []
 
     def wants(self, stamp_ns: int) -> bool:
-        """Return whether the last pair is long enough ago."""
+        """Return whether enough time has passed since the last pair."""
         return not self._found or not 0 <= stamp_ns - self._found[-1][0] < self._period_ns
 
     def push(self, first_ns: int, stamp_ns: int, before: Floats32, after: Floats32) -> None:

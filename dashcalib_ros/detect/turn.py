@@ -10,8 +10,8 @@ from dashcalib_ros.input import Frame
 class TurnId:
     """Identifies a turn in one run. Turns of earlier drives sort before those of this one.
 
-    of_this_drive: False for a stored turn of an earlier drive. number: for a turn of this drive,
-    the index of its centre's frame; for a stored one, its place among the stored turns.
+    of_this_drive: False for a stored turn of an earlier drive. number: the index of the center
+    frame; for a stored turn, its place among the stored turns.
     """
 
     of_this_drive: bool
@@ -36,10 +36,10 @@ class TurnId:
 class Turn:
     """One turn and its images (paper, 3.1: the 2k + 1 images around a peak).
 
-    center, first, last: indices of input frames; stamp_s: time of the centre in seconds.
-    prominence: topographic prominence of the filtered turning magnitude, of the image width.
-    frames: the images from first to last, thinned to the detector's rate, in order; empty after
-    the turn is released: then only their number is left, released_images.
+    center, first, last: indices of input frames; stamp_s: time of the center in s. prominence:
+    topographic prominence of the filtered turning magnitude, as a share of the image width.
+    frames: the images from first to last, thinned to the detector's rate, in order; empty once
+    they are released: released_images is their number then.
     """
 
     center: int
@@ -52,7 +52,7 @@ class Turn:
 
     @property
     def images(self) -> int:
-        """Return how many images the turn has."""
+        """Return the number of images, released ones too."""
         return len(self.frames) or self.released_images
 
     @property

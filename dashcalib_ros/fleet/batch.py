@@ -1,7 +1,8 @@
 """A fleet, from its manifest to its tables: the whole story.
 
-Each clip is gathered, each camera solved as soon as its clips are, each make's prior made from its
-cameras, and each camera published with it. Whatever is done has a file, and is not done again.
+Each clip is gathered, each camera solved as soon as its clips are, the prior of each model of
+camera made from its units, and each camera published with it. Whatever is done has a file, and is
+not done again.
 """
 from __future__ import annotations
 
@@ -12,10 +13,11 @@ from itertools import chain
 from typing import Any
 
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import ConfigError, InputError, one_line
+from dashcalib_ros.errors import ConfigError, InputError, coded
 from dashcalib_ros.fleet import lens_prior, overview, solved, tables
 from dashcalib_ros.fleet.clips import (
     GONE,
+    LONGEST,
     ClipResult,
     gather_clip,
     gathered,
@@ -37,7 +39,8 @@ from dashcalib_ros.whole_files import temporary_folder
 class Own:
     """What the fleet needs of a camera's own result. file: has the result.
 
-    shares: by clip. unit: what the camera tells of its make. again: this was known before.
+    shares: by clip. unit: what the camera adds to the prior of its model. again: this was known
+    before.
     """
 
     file: str
@@ -93,7 +96,7 @@ def cameras_of(rows: Sequence[Row], shard: tuple[int, int] = (1, 1)) -> list[Cam
 
 def batch(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
           whole: bool = True, tell: Told = lambda camera, clip: None) -> tuple[str, ...]:
-    """Calibrate cameras; return the files that tell of all.
+    """Calibrate cameras; return the files about all of them.
 
     out: the folder for everything. whole: they are all of the manifest; of a part there is no
     prior and no table. Raises OutputError where the tables cannot be written.
@@ -129,7 +132,7 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
         if isinstance(outcome, DiedError):
             outcome = set_aside(row, out, config)
         elif isinstance(outcome, Exception):
-            outcome = ClipResult(one_line(outcome, 300))
+            outcome = ClipResult(coded(outcome, LONGEST))
         camera.results[row.number] = outcome
         tell(camera, outcome)
         if len(camera.results) == len(camera.rows):
@@ -137,7 +140,8 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
             # where it has files of earlier, they must not stay as they are
             if (all(result.problem == GONE for _, result in camera.gathered)
                     and not stamp(joined(out, tables.camera_folder(camera.name)))):
-                _failed(camera, InputError('none of its clips is there; check the paths'))
+                _failed(camera, InputError('E-CLIPS-MISSING',
+                                           'none of its clips exists; check the paths'))
                 tell(camera, None)
             elif camera.name:
                 engine.submit(Task(solve_camera, (camera.name, camera.make, camera.gathered, out,
@@ -146,7 +150,7 @@ def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engin
 
 def _failed(camera: Camera, error: Exception) -> None:
     camera.own, camera.verdict = None, 'refused'
-    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, one_line(error, 300))
+    camera.row = tables.failed_row(camera.name, camera.make, camera.clips, coded(error, LONGEST))
 
 
 def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.OfMake], out: str,
@@ -177,7 +181,8 @@ def shard_of(text: str) -> tuple[int, int]:
     """Return i and n of 'i/n'; raises ConfigError."""
     i, _, n = text.partition('/')
     if not (i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
-        raise ConfigError(f'--shard must be like 1/8, the first of eight parts, not {text[:40]!r}')
+        raise ConfigError('E-SHARD-INVALID', f'--shard must be like 1/8, the first of eight '
+                                             f'parts, not {text[:40]!r}')
     return int(i), int(n)
 
 
@@ -203,8 +208,9 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
         for clip, (file, content) in used.items():
             found = gathered(out, file)
             if found is None:
-                raise InputError(f'{file} has gone or changed while the fleet was solved; remove '
-                                 f'it and start again')
+                raise InputError('E-FLEET-FILE-CHANGED',
+                                 f'{file} was removed or changed while the fleet was solved; '
+                                 f'remove it and start the command again')
             # what was read has this content, whatever it says
             loaded[clip] = replace(found, content=content)
         data = solved.encoded(fuse(camera, make, loaded, config))
@@ -229,12 +235,12 @@ def publish_camera(name: str, found: lens_prior.OfMake | None, clips: Sequence[M
                    out: str) -> dict[str, Any]:
     """Write calibration.yaml, result.json and report.html of a camera; return its row.
 
-    name: the file of its own result. found: what its make tells of it. clips: the rows of its
-    clips.
+    name: the file of its own result. found: the prior of its model. clips: the rows of its clips.
     """
     data = read(joined(out, name))
     if data is None:
-        raise InputError(f'{name} has gone while the fleet was solved; start again')
+        raise InputError('E-FLEET-FILE-CHANGED', f'{name} was removed while the fleet was solved; '
+                                                 f'start the command again')
     result = solved.decoded(data, name)
     final = solved.final_of(result, found)
     yaml_name = re.sub(r'[^A-Za-z0-9_]+', '_', result.camera).strip('_') or 'camera'

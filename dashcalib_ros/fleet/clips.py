@@ -13,7 +13,7 @@ from pathlib import Path
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import detect
 from dashcalib_ros.detect.one_camera import APART
-from dashcalib_ros.errors import DashcalibError, InputError, one_line
+from dashcalib_ros.errors import DashcalibError, InputError, WorkerError, coded, one_line
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.storage import (
     clip_files,
@@ -41,7 +41,9 @@ from dashcalib_ros.reconstruct.scene_file import (
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.')
 LATER_NAMES = ('threads', 'rectified', 'turns.store')
-GONE = 'there is no such file; check the path'
+GONE = coded(InputError('E-CLIP-MISSING', 'there is no such file; check the path'))
+# characters of an error in a table, without its code
+LONGEST = 300
 # bytes of a file that are hashed at a time
 BLOCK = 2**20
 
@@ -90,22 +92,23 @@ def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
         now = stamp(row.place) or ''
         return _earlier(name, out, now) or _noted(name, _gathered(row, out, config, now))
     except InputError as error:
-        return _noted(name, ClipResult(one_line(error, 300), now))
+        return _noted(name, ClipResult(coded(error, LONGEST), now))
     except DashcalibError as error:  # not the clip's own fault
-        return ClipResult(one_line(error, 300))
+        return ClipResult(coded(error, LONGEST))
     except OSError as error:
-        return ClipResult(f'cannot be read here: {one_line(error)}')
+        return ClipResult(f'this machine cannot read it: {one_line(error)}')
 
 
 def set_aside(row: Row, out: str, config: Config) -> ClipResult:
-    """Note that a clip is not tried again, as it killed its worker so many times."""
-    return _noted(clip_file(row, out, config), ClipResult(
-        f'killed its worker {config.fleet.attempts} times: it is set aside; is it damaged, or is '
-        f'there too little memory?', stamp(row.place) or ''))
+    """Note that a clip is not tried again, as its worker died each time."""
+    error = WorkerError('E-CLIP-SET-ASIDE',
+                        f'its worker process died {config.fleet.attempts} times, and it is set '
+                        f'aside; check that the clip is sound and that there is enough memory')
+    return _noted(clip_file(row, out, config), ClipResult(coded(error), stamp(row.place) or ''))
 
 
 def clip_file(row: Row, out: str, config: Config) -> str:
-    """Return the place of the file that tells what became of a clip."""
+    """Return the place of the file about what became of a clip."""
     key = hash_of([row.place, settings_hash(config, row.fps, row.topic)])
     return joined(out, f'clips/{key[:2]}/{key}.json')
 
@@ -135,14 +138,14 @@ def _noted(name: str, result: ClipResult) -> ClipResult:
         try:
             write(name, json.dumps(asdict(result), sort_keys=True).encode())
         except DashcalibError as error:
-            return ClipResult(one_line(error, 300))
+            return ClipResult(coded(error, LONGEST))
     return result
 
 
 def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
     """Write a clip's turns to their file. Raises DashcalibError, OSError."""
     if not now:
-        raise InputError(GONE)
+        return ClipResult(GONE)
     with local_copy(row.place) as path:
         try:
             content = content_hash(path)
@@ -155,12 +158,13 @@ def _gathered(row: Row, out: str, config: Config, now: str) -> ClipResult:
                 found = _given(path) if given else gather(path, content, row.fps, row.topic,
                                                           config)
                 if content_hash(path) != content:
-                    raise InputError(f'{path} changed while it was read: start again when it is '
-                                     f'complete')
+                    raise InputError('E-CLIP-CHANGED',
+                                     f'{path} changed while it was read: start the command again '
+                                     f'when the clip is complete')
                 write(joined(out, name), encoded(found))
         except InputError as error:
             # the tables must not depend on where the clip, or its copy, lies
-            raise InputError(str(error).replace(str(path), row.clip)) from error
+            raise InputError(error.code, str(error).replace(str(path), row.clip)) from error
     width, height = found.origin.image_size
     return ClipResult('', now, name, content, width, height, found.frames, found.seconds,
                       found.found, len(found.turns),
@@ -181,8 +185,9 @@ def _given(path: Path) -> SceneFile:
     try:
         return decoded(read_file(path, LARGEST))
     except ValueError as error:
-        raise InputError(f'{path.name} is no file of gathered turns ({one_line(error)}); gather '
-                         f'its clip anew') from error
+        raise InputError('E-GATHERED-DAMAGED',
+                         f'{path.name} is not a file of gathered turns ({one_line(error)}); '
+                         f'gather its clip again') from error
 
 
 def settings_hash(config: Config, fps: float | None, topic: str | None) -> str:
@@ -209,7 +214,8 @@ def content_hash(path: Path) -> str:
                     found.update(block)
                     left -= len(block)
     except OSError as error:
-        raise InputError(f'cannot read {path} ({error.strerror or error})') from error
+        raise InputError('E-FILE-UNREADABLE', f'cannot read {path} ({error.strerror or error}); '
+                                                f'check its permissions') from error
     return found.hexdigest()[:32]
 
 
@@ -223,7 +229,7 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
     source = open_frames(path, topic, fps)
     detection = detect(source, config)
     if detection.other_camera is not None:
-        raise InputError(f'{detection.other_camera}: {APART}')
+        raise InputError('E-TWO-CAMERAS', f'{detection.other_camera}: {APART}')
     best = detection.turns()[:max(config.turns.wanted, config.turns.at_most)]
     valid = detection.valid()
     turns = []

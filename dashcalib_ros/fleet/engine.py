@@ -87,7 +87,8 @@ class Engine(ABC):
                 if isinstance(found, WorkerDiedError):
                     task.deaths += 1
                     found = None if task.deaths < self._attempts else DiedError(
-                        f'killed its worker {task.deaths} times: {one_line(found)}')
+                        'E-TASK-DIED', f'its worker process died {task.deaths} times: '
+                                       f'{one_line(found)}')
                 if found is None:
                     self.submit(task, first=True)
                 elif isinstance(found, BaseException):
@@ -124,8 +125,8 @@ def _known(error: BaseException) -> DashcalibError:
         return error
     if not isinstance(error, Exception):
         raise error  # such as Ctrl-C
-    return WorkerError(f'{type(error).__name__}: {one_line(error)}; this is a defect of '
-                       f'dashcalib: report it with the clip')
+    return WorkerError('E-UNEXPECTED', f'{type(error).__name__}: {one_line(error)}; this is a '
+                                       f'defect of dashcalib: report it with the clip')
 
 
 def measured(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float, float]:
@@ -193,8 +194,9 @@ class RayEngine(Engine):
             self._ray.init(address, log_to_driver=False, logging_level='ERROR',
                            configure_logging=True, runtime_env=variables)
         except Exception as error:  # of many kinds, none of them ours
-            raise WorkerError(f'there is no Ray cluster at {address} ({one_line(error)}); check '
-                              f'the address, or leave --address away') from error
+            raise WorkerError('E-RAY-NOT-REACHABLE',
+                              f'there is no Ray cluster at {address} ({one_line(error)}); check '
+                              f'the address, or omit --address') from error
         self._remote = self._ray.remote(num_cpus=1, max_retries=0, memory=memory_mb * 2**20)(
             _in_one_thread)
 
@@ -203,8 +205,9 @@ class RayEngine(Engine):
         try:
             yield from super().outcomes()
         except Exception as error:  # of many kinds, none of them ours
-            raise WorkerError(f'Ray has ended ({one_line(error)}); start the command again: '
-                              f'what is done stays') from error
+            raise WorkerError('E-RAY-ENDED',
+                              f'Ray has ended ({one_line(error)}); start the command again: it '
+                              f'continues where it stopped') from error
 
     def _places(self) -> int:
         if time.monotonic() - self._counted_at > COUNT_S:
@@ -231,9 +234,10 @@ class RayEngine(Engine):
         except (errors.NodeDiedError, errors.ObjectLostError, errors.RaySystemError):
             return None
         except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
-            return None if self._node_was_lost() else WorkerDiedError(one_line(error))
+            return None if self._node_was_lost() else WorkerDiedError('E-WORKER-DIED',
+                                                                      one_line(error))
         except errors.RayError as error:
-            return WorkerError(one_line(error))
+            return WorkerError('E-RAY-TASK-FAILED', one_line(error))
 
     def _node_was_lost(self) -> bool:
         """Return whether a node of the cluster died since the last look."""

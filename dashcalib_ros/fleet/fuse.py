@@ -113,10 +113,10 @@ def _other_origins(clips: Clips) -> dict[str, str]:
         return sum(map(bool, turns)), sum(turns), len(turns), str(origin)
 
     main = max({clip.origin for clip in clips.values()}, key=weight, default=Origin((0, 0)))
-    return {name: f'is {by(clip.origin.image_size)}, most of this camera are '
+    return {name: f'is {by(clip.origin.image_size)}, and most clips of this camera are '
                   f'{by(main.image_size)}'
             if clip.origin.image_size != main.image_size else
-            'was gathered with other settings of max_width or min_width than most'
+            'was gathered with another max_width or min_width than most clips of this camera'
             for name, clip in clips.items() if clip.origin != main}
 
 
@@ -163,7 +163,7 @@ def _evidence(clips: Clips, origin: Origin, stored: Sequence[StoredTurn],
         warnings=tuple(f'the clip {name} was left out: it {why}'
                        for name, why in sorted(left_out.items())),
         turns=(), built={}, magnitudes=np.zeros((0, 2)), mask=None, timing={},
-        straights=StraightCollector().straights())  # none are gathered: the turns' paths tell
+        straights=StraightCollector().straights())  # none: the turns' paths stand in
 
 
 def _nothing_found(clips: Clips) -> str:
@@ -173,7 +173,7 @@ def _nothing_found(clips: Clips) -> str:
     scenes = sum(len(clip.turns) for clip in clips.values())
     what = counted(len(clips), 'clip')
     if not turns:
-        return f'no turn was found in {what}: more clips with turns are needed'
+        return f'no turn was found in {what}; add clips in which the car turns at crossings'
     if not scenes:
         return f'none of the {turns} turns in {what} could be reconstructed'
     return f'no common camera explains the {scenes} turns of {what}'
@@ -183,14 +183,15 @@ def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn],
                   shares: Mapping[str, ClipShare], config: VerdictConfig) -> dict[str, str]:
     """Return the clips, less than half of all, that are of another camera, and why.
 
-    Two things tell: the cost of a clip's turns, and what fx they alone would have.
+    Two things show it: the cost of a clip's turns, and the fx of these turns alone.
     """
     if solution is None:
         return {}
     of_another = turns_of_another_camera(solution.misfits, config)
     used = Counter(turns[key].clip for key in solution.misfits)
     against = Counter(turns[key].clip for key in of_another)
-    found = {clip: f'fits another camera: its turns cost {worst:.1f} times as much with this one'
+    found = {clip: f'shows another camera: the cost of its turns is {worst:.1f} times as high '
+                   f'with this camera as with one of their own'
              for clip, count in sorted(against.items()) if 2 * count >= used[clip]
              for worst in [max(solution.misfits[key] for key in of_another
                                if turns[key].clip == clip)]}
@@ -212,14 +213,14 @@ def _other_focal(shares: Mapping[str, ClipShare]) -> dict[str, str]:
     passed = np.cumsum(weight[order])
     middle = float(fx[order][np.searchsorted(passed, passed[-1] / 2)])
     limit = np.maximum(tolerance, OTHER_FOCAL * sigma)
-    return {known[n][0]: f'fits another camera: its turns alone have an fx of {fx[n]:.0f} px, '
-                         f'those of most clips {middle:.0f} px'
+    return {known[n][0]: f'shows another camera: fx from its turns alone is {fx[n]:.0f} px, and '
+                         f'{middle:.0f} px from most clips'
             for n in np.flatnonzero(np.abs(fx - middle) > limit)}
 
 
 def shares_of(solution: Solution | None, turns: Mapping[TurnId, ClipTurn], px: float
             ) -> dict[str, ClipShare]:
-    """Return what each clip gave, and what its turns alone say of fx."""
+    """Return what each clip gave, and the fx of its turns alone."""
     if solution is None:
         return {}
     found = {}

@@ -1,12 +1,13 @@
 """What units of one model have in common: a normal distribution of their lenses, from the fleet.
 
-The units of a make have nearly the same focal length and distortion (the centre is each unit's
-own). Each unit is measured with its own covariance S; between units the lenses differ by a
-covariance B, which is estimated by maximum likelihood (EM), so that S is not mistaken for B. The
-spreads below count as some more units. A unit with one turn has no scatter between turns
-in its S: by how much such S are too small is estimated, too. A unit that is several sigmas off is
-in another mode of its sensor: it is thrown out, and has no prior. Nor has a unit that knows so
-little that it may well be in another mode. A unit's prior is made without itself.
+The units of a model, which is called its make here, have nearly the same focal length and
+distortion (the centre is each unit's own). Each unit is measured with its own covariance S;
+between units the lenses differ by a covariance B, which is estimated by maximum likelihood (EM),
+so that S is not mistaken for B. The spreads below count as some more units. A unit with one turn
+has no scatter between turns in its S: by how much such S are too small is estimated, too. A unit
+that is several sigmas off is in another mode of its sensor: it is thrown out, and has no prior.
+Nor has a unit that knows so little that it may well be in another mode. A unit's prior is made
+without itself.
 
 Focal lengths are compared by their curvature, -(w/f)^2 / 2. What a bend of the road shows beyond a
 shift of the picture is proportional to the square of x/f, so that this is what a bend measures
@@ -116,15 +117,16 @@ def focal_length(curvature: Floats) -> Floats:
 
 def _of_make(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> OfMake:
     if prior is None:
-        return OfMake(None, f'of its make there are {others} other usable cameras, '
-                             f'{config.least_units} that agree are needed')
+        return OfMake(None, f'its model has {others} other usable cameras; a prior needs '
+                            f'{config.least_units} that agree')
     if off_by(unit, prior) > config.other_mode:
         percent = 100 * (focal_length(unit.lens[0]) / focal_length(prior.mean[0]) - 1)
-        return OfMake(None, f'its fx is {percent:+.1f} % off that of its make, or its distortion '
-                             f'is another: another mode of the sensor, or another device', True)
+        return OfMake(None, f'its fx differs by {percent:+.1f} % from the prior of its model, or '
+                            f'its distortion differs: another mode of the sensor, or another '
+                            f'device', True)
     if odds_of_mode(unit, prior) < LEAST_ODDS:
-        return OfMake(None, 'its own turns know too little to tell whether its sensor is in the '
-                             'mode of its make')
+        return OfMake(None, 'its own turns cannot show whether its sensor is in the usual mode of '
+                            'its model')
     return OfMake(prior)
 
 
@@ -215,7 +217,7 @@ def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:
 
 
 def unit_of(name: str, make: str, camera: Camera, covariance: Floats, one_turn: bool) -> Unit:
-    """Return what a camera, with its covariance (n, n), tells of its make."""
+    """Return what a camera, with its covariance (n, n), adds to the prior of its make."""
     values, slopes = _in_curvatures(camera)
     which = _lens_places(len(values))
     spread = (covariance * np.outer(slopes, slopes))[np.ix_(which, which)]

@@ -46,7 +46,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """Return what tells this clip from others: each topic of a bag is one of its own."""
+        """Return a name that no other clip has: each topic of a bag is a clip of its own."""
         return f'{self.clip} (topic {self.topic})' if self.topic else self.clip
 
 
@@ -60,8 +60,8 @@ def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
     try:
         pattern = None if group_by is None else re.compile(group_by)
     except re.error as error:
-        raise ConfigError(f'--group-by {shortened(group_by or "")} is no regular expression '
-                          f'({error})') from error
+        raise ConfigError('E-GROUP-BY-INVALID', f'--group-by {shortened(group_by or "")} is not '
+                                                f'a regular expression ({error})') from error
     reader = next((each for suffix, each in READERS.items() if place.lower().endswith(suffix)),
                   None)
     if reader is None or storage.is_folder(place):
@@ -69,15 +69,16 @@ def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
     else:
         data = storage.read(place, MANIFEST_BYTES)
         if data is None:
-            raise InputError(f'there is no manifest {place}; check the path')
+            raise InputError('E-MANIFEST-MISSING', f'there is no manifest {place}; check the path')
         folder = posixpath.dirname(place)
         rows = [_row(number, values, folder) for number, values in enumerate(
             islice(reader(place, data), MANIFEST_ROWS + 1), 1)]
         if len(rows) > MANIFEST_ROWS:
-            raise InputError(f'{place} has more than {MANIFEST_ROWS} rows: cut it into parts')
+            raise InputError('E-MANIFEST-TOO-LONG', f'{place} has more than {MANIFEST_ROWS} rows: '
+                                                    f'divide it into parts')
     if not rows:
-        raise InputError(f'{place} names no clip; give a CSV with a column clip, a folder or a '
-                         f'glob')
+        raise InputError('E-MANIFEST-EMPTY', f'{place} names no clip; use a CSV with a column '
+                                             f'clip, a folder of clips, or a glob in quotes')
     return rows if pattern is None else [_grouped(row, pattern) for row in rows]
 
 
@@ -87,9 +88,10 @@ def _found(place: str) -> list[str]:
         return storage.listed(place)
     if not storage.is_folder(place):
         if storage.stamp(place) is None:
-            raise InputError(f'there is no manifest {place}; check the path')
-        raise InputError(f'{place} is no manifest: give a .csv, .jsonl or .parquet file, a folder '
-                         f'of clips, or a glob in quotes')
+            raise InputError('E-MANIFEST-MISSING', f'there is no manifest {place}; check the path')
+        raise InputError('E-MANIFEST-UNKNOWN-TYPE',
+                         f'{place} is not a manifest: use a .csv, .jsonl or .parquet file, a '
+                         f'folder of clips, or a glob in quotes')
     found = storage.listed(place)
     if found and all(name.lower().endswith(tuple(IMAGE_SUFFIXES)) for name in found):
         return [place]  # the images of one drive
@@ -111,23 +113,25 @@ def _csv(place: str, data: bytes) -> Iterator[Values]:
     try:
         head = [name.strip().lower() for name in next(reader, [])]
         if 'clip' not in head:
-            raise InputError(f'{place} has no column clip; its first line must name the columns: '
+            raise InputError('E-MANIFEST-NO-CLIP-COLUMN',
+                             f'{place} has no column clip; its first line must name the columns: '
                              f'{", ".join(COLUMNS)}')
         for values in reader:
             if any(map(str.strip, values)):
                 yield (dict(zip(head, values, strict=False)) if len(values) <= len(head) else
                        f'has {len(values)} values for {len(head)} columns')
     except csv.Error as error:
-        raise InputError(f'{place} is no CSV (line {reader.line_num}: {error})') from error
+        raise InputError('E-MANIFEST-DAMAGED', f'{place} is not a CSV file (line '
+                                               f'{reader.line_num}: {error})') from error
 
 
 def _json_lines(place: str, data: bytes) -> Iterator[Values]:
     for line in filter(str.strip, _text_of(place, data).split('\n')):
         try:
             values = json.loads(line)
-            yield values if isinstance(values, dict) else 'is no JSON object'
+            yield values if isinstance(values, dict) else 'is not a JSON object'
         except (ValueError, RecursionError) as error:
-            yield f'is no JSON ({one_line(error, 80)})'
+            yield f'is not valid JSON ({one_line(error, 80)})'
 
 
 def _text_of(place: str, data: bytes) -> str:
@@ -135,7 +139,8 @@ def _text_of(place: str, data: bytes) -> str:
         return data.decode('utf-8-sig')
     except UnicodeDecodeError as error:
         line = data[:error.start].count(b'\n') + 1
-        raise InputError(f'{place} is not UTF-8 (line {line}); save it as UTF-8') from error
+        raise InputError('E-MANIFEST-NOT-UTF8',
+                         f'{place} is not UTF-8 (line {line}); save it as UTF-8') from error
 
 
 def _parquet(place: str, data: bytes) -> Iterator[Values]:
@@ -145,9 +150,11 @@ def _parquet(place: str, data: bytes) -> Iterator[Values]:
     try:
         table = parquet.read_table(arrow.BufferReader(data))
     except (arrow.ArrowException, OSError) as error:
-        raise InputError(f'{place} is no Parquet file ({one_line(error)})') from error
+        raise InputError('E-MANIFEST-DAMAGED',
+                         f'{place} is not a Parquet file ({one_line(error)})') from error
     if 'clip' not in table.column_names:
-        raise InputError(f'{place} has no column clip; the columns may be {", ".join(COLUMNS)}')
+        raise InputError('E-MANIFEST-NO-CLIP-COLUMN', f'{place} has no column clip; the columns '
+                                                      f'may be {", ".join(COLUMNS)}')
     yield from table.select([name for name in COLUMNS if name in table.column_names]).to_pylist()
 
 
@@ -184,22 +191,22 @@ def _time(text: str) -> float:
         try:
             date = datetime.fromisoformat(text.replace('Z', '+00:00'))
         except ValueError:
-            raise ValueError(f'time must be like 2026-01-31T12:00:00, or s since 1970, not '
-                             f'{shortened(text, 40)}') from None
+            raise ValueError(f'time must be a date such as 2026-01-31T12:00:00, or seconds since '
+                             f'1970, not {shortened(text, 40)}') from None
         seconds = (date if date.tzinfo else date.replace(tzinfo=timezone.utc)).timestamp()
     if not abs(seconds) <= LAST_S:
-        raise ValueError('time must be a date before 2261')
+        raise ValueError('time must be a date before the year 2261')
     return seconds
 
 
 def _grouped(row: Row, pattern: re.Pattern[str]) -> Row:
-    """Return the row with the camera, and the make, that its clip's name tells."""
+    """Return the row with the camera, and the make, that stand in its clip's name."""
     if not row.clip:
         return row
     found = pattern.search(row.clip)
     if found is None:
         return row if row.camera else replace(
-            row, problem=row.problem or '--group-by finds no camera in its name')
+            row, problem=row.problem or '--group-by matches no camera in the name of the clip')
     named = found.groupdict()
     camera = named.get('camera') or (found.group(1) if pattern.groups else found.group(0))
     return replace(row, camera=row.camera or camera or '',

@@ -26,12 +26,17 @@ MAKES = 20
 DRIFTS = 3
 LEVELS = ('accepted', 'weak', 'refused')
 YEAR_0 = 1970
+# clips and cameras that are named in a row
+NAMED = 10
 # what a column has, where its name does not say it
 TITLES = {
-    'sigma %': 'one standard deviation of fx, in % of it', 'spread %': 'between cameras, robust',
-    'sigma px': 'over the picture, the best rotation removed',
-    'prior %': 'of the information about fx, from its make', 'clips': 'used of all',
-    'turns': 'used', '% per year': 'change of fx'}
+    'camera model': 'the column make of the manifest',
+    'spread %': 'robust standard deviation of fx between cameras, in % of it',
+    'sigma fx %': 'standard deviation (sigma) of fx, in % of it',
+    'sigma px': 'standard deviation over the picture, in px, the best rotation removed',
+    'prior %': 'share of the information about fx that is from other units of the model',
+    'clips used': 'of all clips of the camera', 'fx, % per year': 'change of fx with time',
+    'sigma, % per year': 'standard deviation of that change'}
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -55,24 +60,32 @@ def overview_html(cameras: Rows, clips: Rows) -> str:
     sections = [
         Section('Clips', ('status', 'clips'), sorted(statuses.items())), _makes(cameras),
         _sigma_by_turns(cameras), _drift(cameras, clips),
-        Section('In another mode than their make', ('camera', 'make', ''),
+        Section('In another sensor mode than other cameras of their model',
+                ('camera', 'camera model', 'why'),
                 [(_link(row), row['make'] or '', row['prior_note'])
                  for row in cameras if row['other_mode']]),
-        _reasons('Clips that are not used', [
-            (row['reason'], row['clip']) for row in clips
-            if row['status'] in ('unreadable', 'left out', 'no scene')]),
-        _reasons('Cameras that are not accepted', [
+        _reasons('Clips that are not used', 'clips', [
+            (row['reason'], row['clip'] or f'row {row["row"]}')
+            for row in clips if row['status'] != 'used']),
+        _reasons('Cameras that are not accepted', 'cameras', [
             (reason, row['camera']) for row in cameras if row['verdict'] != 'accepted'
             for reason in row['reasons']]),
         _listed(cameras)]
     return template('overview.html').render(
         cameras=len(cameras), clips=len(clips), titles=TITLES, sections=sections,
-        hours=sum(row['seconds'] for row in clips) / 3600,
+        video=duration(sum(row['seconds'] for row in clips)),
         verdicts=[(level, verdicts[level]) for level in LEVELS])
 
 
+def duration(seconds: float) -> str:
+    """Return a time in the unit that suits it."""
+    if seconds < 120:
+        return f'{seconds:.0f} s'
+    return f'{seconds / 60:.0f} min' if seconds < 7200 else f'{seconds / 3600:.1f} h'
+
+
 def _makes(cameras: Rows) -> Section:
-    """Return each make's focal lengths: their middle and spread, and all of them in a plot."""
+    """Return each model's focal lengths: their middle and spread, and all of them in a plot."""
     makes: dict[str, list[Mapping[str, Any]]] = {}
     for row in cameras:
         if row['fx']:
@@ -83,7 +96,8 @@ def _makes(cameras: Rows) -> Section:
         middle = float(np.median(values))
         spread = 1.4826 * float(np.median(np.abs(values - middle)))
         rows.append((make, len(known), f'{middle:.1f}', f'{100 * spread / middle:.2f}'))
-    return Section('Focal lengths by make', ('make', 'cameras', 'median fx', 'spread %'), rows,
+    return Section('Focal lengths by camera model',
+                   ('camera model', 'cameras', 'median fx, px', 'spread %'), rows,
                    *_fx_by_make(makes) if rows else ())
 
 
@@ -95,11 +109,11 @@ def _fx_by_make(makes: Mapping[str, Rows]) -> tuple[str, str]:
     for n, make in enumerate(sorted(shown)):
         parts.append(text(180, float(axes.down(-n)) + 4, shortened(make, 26), 'end'))
         parts.append(_dots(axes, [(row['fx'], -n, row['verdict']) for row in makes[make]]))
-    return _figure('fx of each camera by make and image width', axes, parts)
+    return _figure('fx of each camera, by camera model and image width', axes, parts)
 
 
 def _sigma_by_turns(cameras: Rows) -> Section:
-    title = 'What turns are worth'
+    title = 'Sigma of fx by number of turns'
     found = [(max(row['turns_used'], 1), 100 * row['sigma_fx'] / row['fx'], row['verdict'])
              for row in cameras if row['fx'] and row['sigma_fx']]
     if not found:
@@ -109,14 +123,15 @@ def _sigma_by_turns(cameras: Rows) -> Section:
     axes = Axes(900, 320, x, y, log_x=True, log_y=True)
     parts = [axes.frame('turns used', 'sigma of fx, %', log_ticks(*x), log_ticks(*y)),
              _dots(axes, found)]
-    return Section(title, (), (), *_figure('sigma of fx against the turns that were used', axes,
-                                           parts))
+    return Section(title, (), (), *_figure(
+        'standard deviation (sigma) of fx of each camera, by the number of its turns that are '
+        'used', axes, parts))
 
 
 def _drift(cameras: Rows, clips: Rows) -> Section:
-    """Return what each dated clip alone says of fx, over time; lines: cameras that drift."""
-    own = {row['camera']: row['fx'] for row in cameras if row['fx']}
-    found = [(YEAR_0 + row['time'] / YEAR_S, 100 * (row['fx'] / own[row['camera']] - 1),
+    """Return the fx of each dated clip alone, over time; lines: cameras that drift."""
+    own = {row['camera']: row for row in cameras if row['fx']}
+    found = [(YEAR_0 + row['time'] / YEAR_S, 100 * (row['fx'] / own[row['camera']]['fx'] - 1),
               row['camera']) for row in clips
              if row['time'] and row['fx'] and row['camera'] in own]
     if not found:
@@ -124,7 +139,7 @@ def _drift(cameras: Rows, clips: Rows) -> Section:
     x, y = _ends([year for year, _, _ in found]), _ends([off for _, off, _ in found])
     axes = Axes(900, 320, x, y)
     parts = [axes.frame('year', 'fx of a clip, % off its camera', ticks(*x), ticks(*y)),
-             _dots(axes, [(year, off, '') for year, off, _ in found])]
+             _dots(axes, [(year, off, own[name]['verdict']) for year, off, name in found])]
     drifting = sorted((row for row in cameras if row['drift_sigma']
                        and abs(row['drift_percent_per_year']) > DRIFTS * row['drift_sigma']),
                       key=lambda row: -abs(row['drift_percent_per_year']))
@@ -136,11 +151,11 @@ def _drift(cameras: Rows, clips: Rows) -> Section:
             line = off + row['drift_percent_per_year'] * (ends - middle)
             parts.append(strokes([axes.places(ends, line)], 'all-turns'))
     return Section(
-        'Drift', ('camera', '% per year', 'sigma'),
+        'Drift', ('camera', 'fx, % per year', 'sigma, % per year'),
         [(row['camera'], f'{row["drift_percent_per_year"]:+.2f}', f'{row["drift_sigma"]:.2f}')
          for row in drifting],
-        *_figure(f'fx that each dated clip alone has; lines: cameras that drift by more than '
-                 f'{DRIFTS} sigma', axes, parts))
+        *_figure(f'dots: fx from each dated clip alone; lines: cameras whose fx drifts by more '
+                 f'than {DRIFTS} sigma', axes, parts))
 
 
 def _ends(values: Sequence[float]) -> tuple[float, float]:
@@ -157,7 +172,7 @@ def _dots(axes: Axes, found: Sequence[tuple[float, float, str]]) -> str:
         f'<g class="{verdict}">' + strokes(axes.places(
             np.array([x for x, _, each in some if each == verdict], float),
             np.array([y for _, y, each in some if each == verdict], float))[:, None],
-            'dot all' if verdict else 'dot own') + '</g>'
+            'dot all') + '</g>'
         for verdict in sorted({each for _, _, each in some}))
 
 
@@ -165,15 +180,21 @@ def _figure(caption: str, axes: Axes, parts: Sequence[str]) -> tuple[str, str]:
     return svg(axes.width, axes.height, caption, ''.join(parts)), caption
 
 
-def _reasons(title: str, found: Iterable[tuple[str, str]]) -> Section:
-    """Return how often each reason came; reasons that differ in numbers only are one."""
+def _reasons(title: str, what: str, found: Iterable[tuple[str, str]]) -> Section:
+    """Return how often each reason came, and with what; if only numbers differ, it is one."""
     groups: dict[str, list[tuple[str, str]]] = {}
     for reason, name in found:
         plain = re.sub(r'\d+(\.\d+)?', 'N', reason.replace(name, '')) if name else reason
         groups.setdefault(plain, []).append((reason, name))
     ranked = sorted(groups.values(), key=lambda group: (-len(group), group[0]))
-    return Section(title, ('reason', 'how many', 'such as'),
-                   [(group[0][0], len(group), group[0][1]) for group in ranked[:50]])
+    return Section(title, ('reason', 'how many', what),
+                   [(group[0][0], len(group), _names([name for _, name in group]))
+                    for group in ranked[:50]])
+
+
+def _names(names: Sequence[str]) -> str:
+    more = len(names) - NAMED
+    return ', '.join(names[:NAMED]) + (f' and {more} more' if more > 0 else '')
 
 
 def _listed(cameras: Rows) -> Section:
@@ -185,14 +206,14 @@ def _listed(cameras: Rows) -> Section:
              f'{row["clips_used"]} of {row["clips"]}', row['turns_used'])
             for row in cameras[:LISTED]]
     more = len(cameras) - LISTED
-    return Section('Cameras', ('camera', 'make', 'verdict', 'model', 'fx', 'sigma %', 'sigma px',
-                               'prior %', 'clips', 'turns'), rows,
-                   note=f'{more} more are in the table of cameras.' if more > 0 else '')
+    return Section('Cameras', ('camera', 'camera model', 'verdict', 'lens model', 'fx, px',
+                               'sigma fx %', 'sigma px', 'prior %', 'clips used', 'turns used'),
+                   rows, note=f'{more} more are in the table of cameras.' if more > 0 else '')
 
 
 def _link(row: Mapping[str, Any]) -> str:
     """Return a camera's name, with a link to its report where there is one."""
-    # loaded with jinja2, by who writes a page
+    # loaded with jinja2, by those who write a page
     from markupsafe import Markup
     if row['verdict_alone'] == 'refused' and row['model'] is None and not row['width']:
         return str(row['camera'])

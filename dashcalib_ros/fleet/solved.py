@@ -1,4 +1,4 @@
-"""A camera's own result, as a JSON text; with the prior of its make, the final calibration."""
+"""A camera's own result, as a JSON text; with the prior of its model, the final calibration."""
 from __future__ import annotations
 
 import json
@@ -20,16 +20,16 @@ from dashcalib_ros.solve.spread import PictureSigma
 
 # of the JSON text
 FORMAT = 3
-# of the information about fx; with more the prior decided, not the camera's own turns
-DECIDES = 0.5
+
 
 
 @dataclass(frozen=True)
 class ClipShare:
     """What a clip gave to its camera's calibration.
 
-    used: turns in the adjustment. left_out: why none is, '' otherwise. fx, fx_sigma: what its
-    turns alone say, in px of the input, linearised at the camera's solution; None where unknown.
+    used: turns in the adjustment. left_out: why none is, '' otherwise. fx, fx_sigma: of its turns
+    alone, in px of the input, linearised at the camera's solution; None where unknown. The sigma
+    is that of their noise, without how much turns differ beyond it.
     """
 
     used: int = 0
@@ -43,8 +43,8 @@ class Estimate:
     """A camera as its own turns have it, whatever the verdict, in px of the input.
 
     covariance: (n, n). of_its_noise: the same without what a single turn gets for how much turns
-    differ: a make shows that better. sound: nothing but a lack of knowledge speaks against it: a
-    prior of its make may help.
+    differ: the other units of its model show that better. sound: nothing but a lack of knowledge
+    speaks against it: a prior of its model may help.
     """
 
     camera: Camera
@@ -81,7 +81,7 @@ def encoded(solved: Solved) -> bytes:
         'camera': solved.camera, 'make': solved.make, 'shares': solved.shares,
         'estimate': None if estimate is None else {**vars(estimate), 'camera': (
             estimate.camera.model, estimate.camera.image_size, estimate.camera.params)},
-        # a make's prior moves the camera, and these are of the one before
+        # the prior moves the camera, and these are of the one before
         'calibration': result_dict(replace(solved.calibration, field=None, held_out=()))},
         sort_keys=True, default=_plain).encode()
 
@@ -106,8 +106,9 @@ def decoded(data: bytes, name: str) -> Solved:
             content['camera'], content['make'], calibration, estimate,
             {clip: ClipShare(**share) for clip, share in content['shares'].items()})
     except Exception as error:  # damaged files raise errors of all kinds
-        raise InputError(f'{name} is no result of a camera ({one_line(error, 120)}); remove it, '
-                         f'and the camera is solved again') from error
+        raise InputError('E-FLEET-FILE-DAMAGED',
+                         f'{name} is not the result of a camera ({one_line(error, 120)}); remove '
+                         f'it, and the next run solves the camera again') from error
 
 
 def _estimate(camera: tuple[str, list[int], list[float]], covariance: list[list[float]],
@@ -125,7 +126,7 @@ def sigmas(camera: Camera, covariance: Floats) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Final:
-    """A camera's result with the prior of its make, where there is one.
+    """A camera's result with the prior of its model, where there is one.
 
     prior_units: cameras that the prior is made from; prior_share: of the information about fx that
     it gave. prior_note: why there is none, '' if there is. other_mode: it is in another mode.
@@ -139,7 +140,7 @@ class Final:
 
 
 def unit_of(solved: Solved) -> Unit | None:
-    """Return what a camera tells of its make; None where it tells nothing that can be trusted."""
+    """Return what a camera adds to the prior of its model; None where it cannot be trusted."""
     estimate = solved.estimate
     if (estimate is None or not solved.make or not estimate.sound
             or not np.isfinite(estimate.of_its_noise).all()):
@@ -149,15 +150,16 @@ def unit_of(solved: Solved) -> Unit | None:
 
 
 def final_of(solved: Solved, found: OfMake | None) -> Final:
-    """Return the camera's result with what was found for it of its make."""
+    """Return the camera's result with the prior that was found for its model."""
     own = solved.calibration
     if found is None:
-        return Final(own, prior_note='it has no estimate of its own that could be combined with '
-                                     'one' if solved.make else 'its make is not known')
+        return Final(own, prior_note='its own turns give no estimate to combine with a prior'
+                     if solved.make else 'the model of the camera is unknown (column make)')
     if found.prior is not None:
         return _with_prior(solved, found.prior)
     if found.other_mode:
-        own = replace(own, warnings=(*own.warnings, f'the make {solved.make}: {found.why_not}'))
+        own = replace(own, warnings=(
+            *own.warnings, f'camera model {solved.make}: {found.why_not}'))
     return Final(own, prior_note=found.why_not, other_mode=found.other_mode)
 
 
@@ -185,11 +187,11 @@ def _verdict(own: Calibration, make: str, camera: Camera, covariance: Floats, pr
     if own.verdict.level == 'accepted':
         return own.verdict
     sigma = 100 * float(np.sqrt(covariance[0, 0])) / camera.fx
-    what = 'decided' if share > DECIDES else 'took part'
     return Verdict('weak', (
-        f'the prior of the make {make}, from {prior.units} other cameras, {what}: it gave '
-        f'{100 * share:.0f} % of the information about fx (sigma {sigma:.1f} % with it)',
-        *(f'alone: {reason}' for reason in own.verdict.reasons)))
+        f'{100 * share:.0f} % of the information about fx comes from the prior of the camera '
+        f'model {make} ({prior.units} other cameras), the rest from its own turns; sigma of fx '
+        f'with it: {sigma:.1f} %',
+        *(f'without the prior: {reason}' for reason in own.verdict.reasons)))
 
 
 def _picture_sigma(camera: Camera, covariance: Floats, alone: PictureSigma) -> PictureSigma:

@@ -26,7 +26,7 @@ URL = re.compile(r'[a-z][a-z0-9+.-]+://')
 FULL = (errno.ENOSPC, errno.EDQUOT)
 # bytes of one of our own files
 LARGEST = 2**28
-# by which an object store tells that a file changed
+# by which an object store shows that a file changed
 CHANGES = ('size', 'ETag', 'etag', 'mtime', 'created', 'LastModified', 'generation')
 
 
@@ -83,8 +83,9 @@ def clip_files(path: Path) -> list[tuple[Path, os.stat_result]]:
                 found.append((each, about))
                 size += about.st_size
         if size > CLIP_BYTES or len(found) > CLIP_FILES:
-            raise InputError(f'{path} has more than {CLIP_FILES} files or {CLIP_BYTES >> 30} GB: '
-                             f'is it one clip?')
+            raise InputError('E-CLIP-TOO-LARGE',
+                             f'{path} has more than {CLIP_FILES} files or {CLIP_BYTES >> 30} GB: '
+                             f'check that it is one clip')
     return sorted(found, key=lambda pair: pair[0])
 
 
@@ -106,7 +107,7 @@ def stamp(place: str) -> str | None:
 
 
 def _stored_stamps(url: str) -> list[str]:
-    """Return what tells that a file of a store changed, or each of a folder; [] without one."""
+    """Return what changes with a file of a store, or with each of a folder; [] without one."""
     system, path = _system(url)
     entries: dict[str, Any] = {}
     with _store_errors(f'read {url}'), suppress(FileNotFoundError):
@@ -144,7 +145,8 @@ def read(place: str, limit: int = LARGEST) -> bytes | None:
     with _store_errors(f'read {place}'), suppress(FileNotFoundError):
         data = bytes(system.cat_file(path, start=0, end=limit + 1))
     if data is not None and len(data) > limit:
-        raise InputError(f'{place} is larger than {limit / 2**20:.0f} MB: is it the right file?')
+        raise InputError('E-FILE-TOO-LARGE', f'{place} is larger than {limit / 2**20:.0f} MB: '
+                                             f'check that it is the right file')
     return data
 
 
@@ -158,10 +160,12 @@ def write(place: str, data: bytes) -> None:
             Path(place).parent.mkdir(parents=True, exist_ok=True)
             write_whole(Path(place), data)
     except OSError as error:
-        cure = ('free some space, and start again: what is done stays' if error.errno in FULL
-                else 'choose an output folder you may write to')
-        raise OutputError(f'cannot write {place}: {error.strerror or one_line(error)}; '
-                          f'{cure}') from error
+        what = f'cannot write {place}: {error.strerror or one_line(error)}'
+        if error.errno in FULL:
+            raise OutputError('E-DISK-FULL', f'{what}; free some space and start the command '
+                                             f'again: it continues where it stopped') from error
+        raise OutputError('E-OUTPUT-NOT-WRITABLE',
+                          f'{what}; choose an output folder that you may write to') from error
 
 
 def remove(place: str) -> None:
@@ -182,8 +186,8 @@ def _store_errors(what: str) -> Iterator[None]:
     except Exception as error:
         if getattr(error, 'errno', None) in FULL:
             raise
-        raise InputError(f'cannot {what} ({one_line(error)}); check the address and your access '
-                         f'to it') from error
+        raise InputError('E-ADDRESS-UNREADABLE', f'cannot {what} ({one_line(error)}); check '
+                                                   f'the address and your access to it') from error
 
 
 def _system(url: str) -> tuple[Any, str]:
@@ -192,9 +196,11 @@ def _system(url: str) -> tuple[Any, str]:
     try:
         system, path = fsspec.core.url_to_fs(url)
     except (ImportError, ValueError) as error:
-        raise InputError(f'cannot use {url} ({one_line(error)})') from error
+        raise InputError('E-ADDRESS-UNKNOWN', f'cannot use {url} ({one_line(error)}); use a '
+                                              f'kind of address that fsspec supports') from error
     if 'file' in system.protocol:
-        raise InputError(f'{url} is a file of this machine: give its path')
+        raise InputError('E-ADDRESS-OF-LOCAL-FILE',
+                         f'{url} is a file of this machine: use its path')
     return system, str(path)
 
 
@@ -203,7 +209,8 @@ def needs(library: str, what: str) -> ModuleType:
     try:
         return import_module(library)
     except ImportError as error:
-        raise ConfigError(f"{what} need {library}: install it with pip install "
+        raise ConfigError('E-EXTRA-NOT-INSTALLED',
+                          f"{what} need {library}: install it with pip install "
                           f"'dashcalib_ros[fleet]' ({one_line(error)})") from error
 
 

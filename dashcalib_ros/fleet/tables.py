@@ -27,7 +27,7 @@ from dashcalib_ros.report.result import plain_values
 PARAMETERS = tuple(dict.fromkeys(name for model in calibrated_models() for name in model.names()))
 MOUNT = (*ANGLES, 'height_m')
 YEAR_S = 365.25 * 86400
-# clips at different times from which a drift is told
+# clips at different times that a drift needs
 LEAST_CLIPS = 3
 # the end of a camera's folder whose name is not the camera's
 HASHED = re.compile(r'-[0-9a-f]{32}$')
@@ -54,7 +54,7 @@ CLIP_COLUMNS = {
     'row': 'number', **dict.fromkeys(('clip', 'camera', 'make', 'status', 'reason'), 'text'),
     'width': 'number', 'height': 'number', 'frames': 'number', 'seconds': 'real',
     **dict.fromkeys(('turns', 'scenes', 'turns_used'), 'number'),
-    **dict.fromkeys(('fx', 'fx_sigma', 'time'), 'real'), 'content': 'text', 'file': 'text',
+    **dict.fromkeys(('fx', 'sigma_fx_noise', 'time'), 'real'), 'content': 'text', 'file': 'text',
     'warnings': 'texts'}
 
 
@@ -87,7 +87,7 @@ def camera_row(solved: Solved, final: Final, clips: Sequence[Mapping[str, Any]])
 
 def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]], reason: str = ''
                ) -> dict[str, Any]:
-    """Return the row of a camera without a result: what its clips tell, and why there is none."""
+    """Return the row of a camera without a result: of its clips, and why there is none."""
     drift, drift_sigma = _drift(clips)
     count = Counter(row['status'] for row in clips)
     return {
@@ -118,7 +118,7 @@ def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
     for row, result in clips:
         share = shares.get(row.name, ClipShare())
         if result.file and first.setdefault(row.name, row.number) != row.number:
-            share = ClipShare(left_out=f'is the clip of row {first[row.name]} again')
+            share = ClipShare(left_out=f'is the same clip as in row {first[row.name]}')
         status, reason = _status(result, share)
         # videos count from 0, which is no date
         time = next((time for time in (row.time_s, result.time)
@@ -126,7 +126,7 @@ def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
         found.append({
             **vars(result), 'row': row.number, 'clip': row.clip, 'camera': camera,
             'make': make or None, 'status': status, 'reason': reason, 'turns_used': share.used,
-            'fx': share.fx, 'fx_sigma': share.fx_sigma, 'time': time})
+            'fx': share.fx, 'sigma_fx_noise': share.fx_sigma, 'time': time})
     return found
 
 
@@ -147,10 +147,10 @@ def _status(result: ClipResult, share: ClipShare) -> tuple[str, str]:
 def _drift(clips: Sequence[Mapping[str, Any]]) -> tuple[float | None, float | None]:
     """Return by how much fx changes in a year, %, and its sigma; None without dates.
 
-    A line through what each clip alone says, weighted; sigma grows with the scatter about it.
+    A line through the fx of each clip alone, weighted; sigma grows with the scatter about it.
     """
-    known = [(row['time'], row['fx'], row['fx_sigma']) for row in clips
-             if row['fx_sigma'] and row['time'] is not None]
+    known = [(row['time'], row['fx'], row['sigma_fx_noise']) for row in clips
+             if row['sigma_fx_noise'] and row['time'] is not None]
     if len({time for time, _, _ in known}) < LEAST_CLIPS:
         return None, None
     time, fx, sigma = np.array(known).T

@@ -87,8 +87,7 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     Raises InputError if there is nothing to read, or if the topic is ambiguous.
     """
     _check_numbers(fps, start_s, duration_s)
-    given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
-    groups = [_expanded(os.fspath(each)) for each in given]
+    groups = [_expanded(os.fspath(each)) for each in as_list(path)]
     if not groups:
         raise InputError('E-INPUT-MISSING',
                          'no input was given: pass a bag, a video or a folder of images')
@@ -97,6 +96,18 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     else:
         source = _joined(groups, topic, fps)
     return source if not start_s and duration_s is None else source.excerpt(start_s, duration_s)
+
+
+def as_list(path: Paths) -> list[str | os.PathLike[str]]:
+    """Return the paths of a drive. Raises InputError for what is no path."""
+    given = ([path] if isinstance(path, (str, os.PathLike)) else
+             list(path) if isinstance(path, Iterable) else [path])
+    for each in given:
+        if not isinstance(each, (str, os.PathLike)):
+            raise InputError('E-PATH-TYPE', f'a path must be a str or a Path, not {each!r:.80}: '
+                                            f'pass a bag, a video, a folder of images, or a list '
+                                            f'of these')
+    return given
 
 
 def _check_numbers(fps: float | None, start_s: float, duration_s: float | None) -> None:

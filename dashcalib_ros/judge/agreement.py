@@ -11,6 +11,10 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve.solution import Solution
 
+# why turns do not count
+CONTRADICTS = 'the camera of the other turns does not explain it'
+OTHER_CAMERA = 'the turns of this drive are of another camera'
+
 
 def turns_of_another_camera(misfits: Mapping[TurnId, float], config: VerdictConfig) -> set[TurnId]:
     """Return the turns that their own camera explains far better than the shared one.
@@ -20,24 +24,27 @@ def turns_of_another_camera(misfits: Mapping[TurnId, float], config: VerdictConf
     return {turn for turn, misfit in misfits.items() if not misfit <= config.max_misfit}
 
 
-def evidence_of(solution: Solution | None, config: VerdictConfig) -> set[TurnId]:
-    """Return the turns to keep for the next solution: those used, and those of another camera.
-
-    Without the latter the next verdict would not mention that the camera changed.
-    """
+def turns_of_earlier_cameras(scenes: Sequence[Scene], solution: Solution | None
+                             ) -> dict[TurnId, str]:
+    """Return the turns of earlier drives that solve() left out for those of this one, and why."""
     if solution is None:
-        return set()
-    of_another = turns_of_another_camera(solution.misfits, config)
-    return {scene.turn for scene in solution.scenes} | of_another
-
-
-def earlier_of_another_camera(scenes: Sequence[Scene], solution: Solution | None
-                              ) -> set[TurnId]:
-    """Return the given turns of earlier drives that solve() left out, as this drive says."""
-    if solution is None:
-        return set()
-    return {scene.turn for scene in scenes
+        return {}
+    return {scene.turn: OTHER_CAMERA for scene in scenes
             if not scene.turn.of_this_drive and scene.turn not in solution.misfits}
+
+
+def contradicting_turns(scenes: Sequence[Scene], solution: Solution | None,
+                        config: VerdictConfig) -> dict[TurnId, str]:
+    """Return the turns that no common camera explains, and why they do not count any more.
+
+    Turns of another camera count on: without them the next verdict would not mention that the
+    camera changed.
+    """
+    keep = set(turns_of_earlier_cameras(scenes, solution))
+    if solution is not None:
+        keep |= {scene.turn for scene in solution.scenes}
+        keep |= turns_of_another_camera(solution.misfits, config)
+    return {scene.turn: CONTRADICTS for scene in scenes if scene.turn not in keep}
 
 
 def outdated(turns: Set[TurnId], of_another: Set[TurnId]) -> set[TurnId]:

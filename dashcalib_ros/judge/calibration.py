@@ -4,7 +4,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from dataclasses import field as default
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,7 +20,7 @@ from dashcalib_ros.camera.rotation import rotation_matrices
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, NotAcceptedError
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.solve.solution import LeftOut, Solution
 from dashcalib_ros.solve.spread import PictureSigma, sigma_over
@@ -305,6 +305,17 @@ class Calibration:
         text = f'{self.verdict.level}, {self.camera.model}, {", ".join(found)}'
         return f'Calibration({"; ".join(part for part in (text, self.caveat) if part)})'
 
+    def accepted(self) -> AcceptedCalibration:
+        """Return the same calibration, whose camera and sigma are known not to be None.
+
+        Raises NotAcceptedError with the reasons if it is weak or refused.
+        """
+        if self.verdict.level != 'accepted':
+            raise NotAcceptedError('E-NOT-ACCEPTED', f'the calibration is {self.verdict.level}: '
+                                                     f'{"; ".join(self.verdict.reasons)}')
+        return AcceptedCalibration(**{each.name: getattr(self, each.name)
+                                      for each in fields(self)})
+
     @property
     def caveat(self) -> str:
         """Return what must stand wherever the numbers stand; '' where nothing must."""
@@ -452,3 +463,16 @@ class Calibration:
     def turns_used(self) -> int:
         """Return how many turns the result is based on, including those of earlier drives."""
         return len(self.used_turns)
+
+
+@dataclass(frozen=True, repr=False)
+class AcceptedCalibration(Calibration):
+    """An accepted calibration, from Calibration.accepted(): camera and sigma are there."""
+
+    camera: Camera
+    sigma: Mapping[str, float]
+
+    @property
+    def intrinsics(self) -> dict[str, float]:
+        """Return the camera's parameters by name."""
+        return self.camera.named

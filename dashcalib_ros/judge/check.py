@@ -1,10 +1,11 @@
-"""The answer: right, wrong and in which way, or that the drive cannot tell."""
+"""The answer: right, good enough, wrong and in which way, or that the drive cannot tell."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from dataclasses import field as default
 from fractions import Fraction
-from typing import Literal
+from shlex import quote
 
 import numpy as np
 
@@ -13,28 +14,38 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.calibration import Verdict
-from dashcalib_ros.judge.difference import Difference, difference_of, reasons_of
+from dashcalib_ros.judge.difference import (
+    Answer,
+    Difference,
+    Use,
+    difference_of,
+    reasons_of,
+)
 from dashcalib_ros.judge.verdict import lines_contradict
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import PictureSigma
 
-Answer = Literal['right', 'wrong', 'cannot tell']
+# what messages call the file of a camera whose file they do not know
+CALIBRATION = 'CALIBRATION'
 
 
 @dataclass(frozen=True)
 class Check:
     """What a drive says of a calibration that was given.
 
-    answer: wrong means that neither chance nor what good calibrations differ by explains the
-    difference; right, that the drive would have shown an error of 2 % in the focal length, or one
-    as large in pixels. rms_px, worst_px: over the picture, between the given camera and the
-    drive's own, the best common rotation removed; None where they cannot be compared. sigma_px:
-    of the drive's own. told_apart: whether more than chance is between them. distance: of the
-    given parameters from the nearest that good calibrations may have, in sigmas with all
-    correlations; limit: what chance exceeds once in a thousand drives. loss: by how much worse the
-    turns are explained when they must use the given camera, of the cost with their own; None where
-    it was not tried. straight_lines: what they say of the given camera; None where there are too
-    few.
+    answer: right: the given camera and the drive's own are the same within what the drive can
+    determine, and near enough for the uses in good_for. differs: the difference is more than
+    chance, and small enough for the uses in good_for. wrong: it is more than chance, and too large
+    for every use. cannot tell: neither is shown.
+    rms_px, worst_px: over the picture, between the given camera and the drive's own, the best
+    common rotation removed; None where they cannot be compared. sigma_px: of the drive's own.
+    told_apart: whether distance exceeds limit. distance: between the given camera and the drive's
+    own, in standard deviations (sigma) with all correlations; limit: what chance exceeds once in
+    a thousand drives. loss: by how much worse the turns are explained when they must use the
+    given camera, of the cost with their own; None where it was not tried. straight_lines: what
+    they say of the given camera; None where there are too few. bound_px: what the given camera's
+    error stays below with 95 % confidence. limits_px: by use, what rms_px may be; bound_px may be
+    twice that. good_for: the uses that allow the difference.
     """
 
     answer: Answer
@@ -47,23 +58,28 @@ class Check:
     limit: float | None = None
     loss: float | None = None
     straight_lines: Bend | None = None
+    bound_px: float | None = None
+    limits_px: Mapping[Use, float] = default(default_factory=dict)
+    good_for: tuple[Use, ...] = ()
 
 
 def check(given: Camera, image_size: tuple[int, int], solution: Solution | None, verdict: Verdict,
-          config: Config) -> Check:
+          config: Config, name: str = CALIBRATION) -> Check:
     """Say whether a given camera explains a drive.
 
     image_size: of the drive's pictures. solution, verdict: of the drive; a solution that is not
-    accepted neither confirms nor contradicts a calibration. Loads COLMAP.
+    accepted neither confirms nor contradicts a calibration. name: of the given camera's file, for
+    the command that a message offers. Loads COLMAP.
     """
     if verdict.level != 'accepted' or solution is None:
         if given.image_size == image_size:
             return Check('cannot tell', tuple(
-                f'the drive gives no calibration of its own: {text}' for text in verdict.reasons))
-        return Check('wrong', (size_reason(given, image_size, None),))
+                f'the drive has no accepted calibration of its own: {text}'
+                for text in verdict.reasons))
+        return Check('wrong', (size_reason(given, image_size, None, name),))
     if not given.covers_picture():
-        return Check('wrong', ('its distortion folds over inside the picture: points near its '
-                               'corners are missing',))
+        return Check('wrong', ('its distortion folds over inside the picture: points near the '
+                               'corners have no place in it',))
     px = Scale.of(image_size, config).px
 
     def difference(camera: Camera) -> Difference:
@@ -72,24 +88,22 @@ def check(given: Camera, image_size: tuple[int, int], solution: Solution | None,
     here = difference(replace(given, image_size=image_size))
     if given.image_size != image_size:
         # pixels of one size are no error in those of another
-        return Check('wrong', (size_reason(given, image_size, difference),))
+        return Check('wrong', (size_reason(given, image_size, difference, name),))
     loss = loss_of(given.resized(1 / px, solution.camera.image_size), solution, config)
-    scaled = scaled_parameters(here, difference) if here.significant else ''
-    reasons = (*((scaled,) if scaled else reasons_of(here)), _loss_text(loss))
-    return Check(_answer(here, loss), reasons, here.rms_px, here.worst_px, here.sigma_px,
-                 here.told_apart, here.distance, here.limit, loss)
+    scaled = scaled_parameters(here, difference) if here.answer == 'wrong' else ''
+    said = (scaled,) if scaled else reasons_of(here)
+    answer = here.answer
+    if answer == 'wrong' and loss <= 0:
+        # a calibration that explains the turns as well as their own is not contradicted by them
+        answer, said = 'cannot tell', (UNDECIDED, *said[1:])
+    return Check(answer, (*said, _loss_text(loss)), here.rms_px, here.worst_px, here.sigma_px,
+                 here.told_apart, here.distance, here.limit, loss, bound_px=here.bound_px,
+                 limits_px=here.limits_px, good_for=here.good_for)
 
 
 def with_faults(found: Check, faults: tuple[str, ...]) -> Check:
     """Return a check with the faults of what stands beside the camera: with any, it is wrong."""
     return replace(found, answer='wrong', reasons=(*faults, *found.reasons)) if faults else found
-
-
-def _answer(found: Difference, loss: float) -> Answer:
-    if found.matters:
-        # a calibration that explains the turns as well as their own is not contradicted by them
-        return 'wrong' if loss > 0 else 'cannot tell'
-    return 'cannot tell' if found.matters is None else 'right'
 
 
 def loss_of(given: Camera, solution: Solution, config: Config) -> float:
@@ -108,51 +122,67 @@ def loss_of(given: Camera, solution: Solution, config: Config) -> float:
 
 
 def _loss_text(loss: float) -> str:
-    change = 'more' if loss >= 0 else 'less'
-    return (f'with it the turns cost {100 * abs(loss):.1f} % {change} than with the camera they '
-            f'ask for, poses and points adjusted anew to each')
+    change = 'larger' if loss >= 0 else 'smaller'
+    return (f'turns: their reprojection cost is {100 * abs(loss):.1f} % {change} with it than '
+            f'with the camera that they determine, poses and points adjusted to each')
 
 
-# of the ratio of the sides; pictures that were resized keep it but for rounding
-SAME_ASPECT = 0.01
+UNDECIDED = ('it differs from the camera that the turns determine, but explains the turns as '
+                 'well: nothing decides between them')
+# px; by so much the sides of pictures that were resized are rounded
+ROUNDING_PX = 1.0
 # of 1; nearer to it, parameters are not said to be for pictures of another size
 LEAST_SCALE = 0.05
 # pictures are mostly resized by a simple fraction: with so many parts, and if it is so near
 MOST_PARTS = 4
 SIMPLE = 0.01
 
+# from here on lines do not agree with a camera, though they do not contradict it yet
+DOUBT_SIGMAS = 2.0
+
 Compare = Callable[[Camera], Difference]
 
 
-def size_reason(given: Camera, image_size: tuple[int, int], compare: Compare | None) -> str:
-    """Return what is wrong with a calibration for another size.
+def size_reason(given: Camera, image_size: tuple[int, int], compare: Compare | None,
+                name: str = CALIBRATION) -> str:
+    """Return what is wrong with a calibration for another size, and the command that resizes it.
 
-    compare: with the drive's own solution; None where there is none.
+    compare: with the drive's own solution; None where there is none. name: of its file.
     """
     width, height = image_size
     theirs = f'{given.image_size[0]}x{given.image_size[1]}'
     text = f'it is for {theirs} pictures, and those of the drive have {width}x{height}'
     if width != height and given.image_size == (height, width):
         return f'{text}: are width and height exchanged, or the pictures turned by 90 degrees?'
-    factor = width / given.image_size[0]
-    if abs(height / given.image_size[1] / factor - 1) <= SAME_ASPECT:
+    if same_shape(given.image_size, image_size):
+        resize = export_command(name, f'--size {width}x{height}')
         if compare is None:
-            return text
-        scaled = compare(given.resized(factor, image_size))
-        if scaled.significant:
+            return f'{text}; if the pictures were resized: {resize}'
+        scaled = compare(given.resized(width / given.image_size[0], image_size))
+        if scaled.answer == 'wrong':
             unscaled = compare(replace(given, image_size=image_size))
-            return text + ('; scaled to that size, it is wrong, too' if unscaled.significant else
-                           f'; its parameters fit these as they are (to {unscaled.bound_px:.1f} '
-                           f'px): only the size is wrong')
-        return (f'{text}; scaled to that size, it fits them (to {scaled.bound_px:.1f} px): '
-                f'dashcalib export --size {width}x{height}')
+            return text + ('; scaled to that size, it is wrong, too' if unscaled.answer == 'wrong'
+                           else f'; its parameters fit these as they are (to '
+                                f'{unscaled.bound_px:.1f} px): only the size is wrong')
+        return f'{text}; scaled to that size, it fits them (to {scaled.bound_px:.1f} px): {resize}'
     part = None if compare is None else _part(given, image_size, compare)
     if part is None:
         return text
     if min(part) < 0:
         return f'{text}; its focal length and distortion fit: it is for a part of these pictures'
-    return (f'{text}; its focal length and distortion fit a part of its pictures: dashcalib '
-            f'export --crop {part[0]},{part[1]},{width},{height}')
+    crop = export_command(name, f'--crop {part[0]},{part[1]},{width},{height}')
+    return f'{text}; its focal length and distortion fit a part of its pictures: {crop}'
+
+
+def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return whether pictures of (width, height) may be those of the other size, resized."""
+    x, y = other[0] / one[0], other[1] / one[1]
+    return abs(other[1] - x * one[1]) <= ROUNDING_PX or abs(other[0] - y * one[0]) <= ROUNDING_PX
+
+
+def export_command(name: str, change: str) -> str:
+    """Return the command that writes a calibration for other pictures. name: of its file."""
+    return f'dashcalib export {quote(name)} --to ros {change} --out fitting.yaml'
 
 
 def _part(given: Camera, image_size: tuple[int, int], compare: Compare) -> tuple[int, int] | None:
@@ -162,7 +192,7 @@ def _part(given: Camera, image_size: tuple[int, int], compare: Compare) -> tuple
     x, y = (int(value) for value in np.clip(np.round(found.offsets[2:4]), np.minimum(spare, 0),
                                             np.maximum(spare, 0)))
     shifted = replace(given, image_size=image_size, cx=given.cx - x, cy=given.cy - y)
-    return None if compare(shifted).significant else (x, y)
+    return None if compare(shifted).answer == 'wrong' else (x, y)
 
 
 def scaled_parameters(found: Difference, compare: Compare) -> str:
@@ -178,10 +208,10 @@ def scaled_parameters(found: Difference, compare: Compare) -> str:
     factor = simple if abs(simple / factor - 1) < SIMPLE else factor
     if abs(factor - 1) < LEAST_SCALE or np.ptp(ratios) > LEAST_SCALE * factor:
         return ''
-    if compare(given.resized(1 / factor, given.image_size)).significant:
+    if compare(given.resized(1 / factor, given.image_size)).answer == 'wrong':
         return ''
     width, height = (round(side * factor) for side in given.image_size)
-    return (f'its parameters are for pictures of {width}x{height}, and it says '
+    return (f'its parameters are for pictures of {width}x{height}, but its size is '
             f'{given.image_size[0]}x{given.image_size[1]}')
 
 
@@ -190,7 +220,8 @@ def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int,
     """Return a check with what straight lines say of the given camera, if there are enough.
 
     lines: of the resized pictures. image_size: of the drive's. Lines alone call no camera wrong:
-    where they contradict one that the turns call right, the drive cannot tell.
+    where they contradict one that the turns call right, the drive cannot tell. One that differs
+    they confirm, unless they find more than detection allows.
     """
     if given.image_size != image_size:
         return found
@@ -200,12 +231,22 @@ def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int,
         return found
     said = said.resized(scale.px)
     against = lines_contradict(said, image_size[0], config.verdict)
-    answer = 'cannot tell' if against and found.answer == 'right' else found.answer
-    return replace(found, answer=answer, reasons=(*found.reasons, _text(said, against)),
-                   straight_lines=said)
+    allowed = {'right': 0.0, 'differs': found.limits_px.get('detection', 0.0)}
+    answer = ('cannot tell' if against and said.picture_px > allowed.get(found.answer, np.inf)
+              else found.answer)
+    return replace(found, answer=answer, straight_lines=said, reasons=(
+        *found.reasons, _lines_text(said, against, config.verdict.max_line_sigmas)))
 
 
-def _text(said: Bend, against: bool) -> str:
-    return (f'{said.lines} upright lines (poles, edges of houses) '
-            f'{"contradict" if against else "do not contradict"} its distortion: they ask for k1 '
-            f'{said.k1:+.3f} ± {said.sigma:.3f}')
+def _lines_text(said: Bend, against: bool, limit: float) -> str:
+    """Return what lines say, and whether it counts; limit: sigmas from which on it may."""
+    text = (f'{said.lines} upright lines (poles, edges of houses) indicate that its k1 is off: '
+            f'{said.k1:+.3f} ± {said.sigma:.3f} is missing, {said.picture_px:.1f} px over the '
+            f'picture: {said.sigmas:.1f} sigma, limit {limit:.1f}: ')
+    if against:
+        return text + 'they contradict its distortion'
+    if said.sigmas > limit:
+        return text + 'real, but too few pixels to decide'
+    if said.sigmas > DOUBT_SIGMAS:
+        return text + 'they lean against its distortion, but not enough to decide'
+    return text + 'they agree with its distortion'

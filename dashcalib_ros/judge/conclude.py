@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
@@ -21,7 +21,7 @@ from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.input.motion import SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
-from dashcalib_ros.judge.agreement import focal_disagreement
+from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
 from dashcalib_ros.judge.calibration import (
     Calibration,
     LensField,
@@ -49,7 +49,6 @@ from dashcalib_ros.solve.evidence import largest_crop
 from dashcalib_ros.solve.solution import Solution, cross_validation
 
 # why turns are not used
-CONTRADICTS = 'the camera of the other turns does not explain it'
 NOT_NEEDED = 'more prominent turns were enough'
 STOOD = 'the car stood, its speed says: what turned were others, or the camera alone'
 
@@ -108,6 +107,17 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
                        if not other or not line.startswith(str(other))),
         other_camera=other, start_s=detection.start_s, lines=detection.lines(),
         straights=detection.straights())
+
+
+def turns_that_stood(scenes: Sequence[Scene], motion: SensorStream | None, start_s: float
+                     ) -> dict[TurnId, str]:
+    """Return the turns of this drive during which the car stood, as its speed says.
+
+    start_s: stamp of the drive's first image.
+    """
+    stream = (motion or SensorStream()).since(start_s)
+    return {scene.turn: STOOD for scene in scenes if scene.turn.of_this_drive
+            and stream.stood(*(scene.tracks.stamps_ns[[0, -1]] / 1e9 - start_s))}
 
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:

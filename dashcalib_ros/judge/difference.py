@@ -1,10 +1,11 @@
-"""How far two calibrations are apart, whether that can be told, and whether it matters.
+"""How far two calibrations are apart, in one scale: the same, good enough for some uses, wrong.
 
 One answer for `check`, where a given camera meets a drive's own, and for `compare`, where two
 files meet. The camera that was found is a normal distribution of its n parameters. The other is a
-point among them, at a Mahalanobis distance that chance explains or not. Good calibrations of one
-lens differ by a little in any case: only what goes beyond that matters. Which parameters make it
-far is asked by leaving them out: what the rest alone is away from its own distribution.
+point among them, at a Mahalanobis distance that chance explains or not: that decides whether they
+are the same. How far they are apart over the picture, beside what each use of a camera allows,
+decides whether the difference is good enough or wrong. Which parameters make it is found by
+omitting them: how far the rest alone is from its own distribution.
 """
 from __future__ import annotations
 
@@ -29,15 +30,27 @@ from dashcalib_ros.solve.spread import PictureSigma, SigmaMap, sigma_over
 Way = Literal['focal length', 'centre', 'distortion']
 # the first parameters of every camera; all behind them are of the distortion
 PLACES: dict[Way, tuple[int, ...]] = {'focal length': (0, 1), 'centre': (2, 3)}
-# by how much good calibrations of one lens differ: of fx and fy (two that KITTI ships: 0.44 %),
-# and px of cx and cy (pixels begin half a pixel elsewhere in some programs)
-ALLOWED_FOCAL = 0.005
-ALLOWED_CENTRE_PX = 1.0
-# of the focal length; a drive that calls a camera right must be able to see what this one makes
-RELEVANT = 0.02
-# how often chance alone exceeds the limit of a distance, and where it begins to be doubtful
+Answer = Literal['right', 'differs', 'wrong', 'cannot tell']
+Use = Literal['detection', 'mapping', 'metrology']
+# what each use allows: as much, over the picture, as an error of the focal length by this share
+USES: dict[Use, float] = {
+    # the distance of a car by its size is off by the same share; its box is good to 2 or 3 %
+    'detection': 0.01,
+    # two calibrations that KITTI ships for one lens differ by 0.4 %; with 0.3 % of distortion in
+    # one of them, the scale of a path of 559 m drifts by 44 % instead of 9 %
+    'mapping': 0.0025,
+    # what a calibration with a chessboard reaches: 0.1 to 0.3 px
+    'metrology': 0.0005}
+# with 95 % confidence the error must be below this many times what the use allows
+SURE = 2.0
+# of the focal length: a drive that calls a camera right must be able to see what this one makes
+RELEVANT = SURE * USES['detection']
+# of the width: a centre that is shown to be farther off turns every direction by half a degree
+CENTRE = 0.01
+# how often chance alone exceeds the limit of a distance
 CHANCE = 1e-3
-DOUBT = 0.05
+# px; a smaller sigma is none
+LEAST_SIGMA_PX = 1e-9
 
 
 @dataclass(frozen=True)
@@ -58,43 +71,62 @@ class Difference:
 
     @property
     def limit(self) -> float:
-        """Return the distance that chance alone exceeds once in a thousand drives."""
+        """Return the distance that chance alone exceeds once in a thousand drives, in sigmas."""
         return limit_of(len(self.offsets))
 
     @cached_property
     def distance(self) -> float | None:
-        """Return by how many sigmas they differ more than good calibrations of one lens do."""
-        return None if self.covariance is None else distance(self.offsets, self.covariance,
-                                                             self._allowed)
+        """Return by how many sigmas they differ; None where no sigma is known.
 
-    @property
-    def significant(self) -> bool:
-        """Return whether they differ more than chance and good calibrations do."""
-        if self.distance is None or self.sigma_px is None:
-            return self.rms_px is None or self.rms_px > self.allowed_px
-        return not self.distance <= self.limit or (
-            self.rms_px is not None and self.rms_px - 2 * self.sigma_px.rms > self.relevant_px)
+        The Mahalanobis distance of the parameters, or the distance over the picture where that is
+        larger: two models may differ where no parameter does.
+        """
+        if self.covariance is None or self.sigma_px is None:
+            return None
+        return max(distance(self.offsets, self.covariance),
+                   np.inf if self.rms_px is None
+                   else self.rms_px / max(self.sigma_px.rms, LEAST_SIGMA_PX))
 
     @property
     def told_apart(self) -> bool | None:
         """Return whether more than chance is between them; None where no sigma is known."""
-        if self.covariance is None or self.sigma_px is None:
-            return None
-        return not distance(self.offsets, self.covariance) <= self.limit or (
-            self.rms_px is None or self.rms_px > self.limit * self.sigma_px.rms)
+        return None if self.distance is None else not self.distance <= self.limit
+
+    @property
+    def answer(self) -> Answer:
+        """Return what the distance and the pixels say.
+
+        right: chance explains the difference, and it is small enough for detection. differs: it is
+        real, and small enough. wrong: it is real, and not small enough. cannot tell: chance
+        explains it, but an error that is too large may be there.
+        """
+        same = (self.rms_px is not None and self.rms_px <= self.limits_px['metrology']
+                if self.told_apart is None else not self.told_apart)
+        if same:
+            return 'right' if self.good_for else 'cannot tell'
+        return 'differs' if self.good_for and not self.centre_off else 'wrong'
 
     @property
     def matters(self) -> bool | None:
-        """Return whether the difference is one that good calibrations do not have.
+        """Return whether the difference is too large for every use; None where nothing tells."""
+        return None if self.answer == 'cannot tell' else self.answer == 'wrong'
 
-        False: it is below what a focal length RELEVANT off makes, with 95 %. None: neither.
+    @property
+    def good_for(self) -> tuple[Use, ...]:
+        """Return for which uses the given camera is near enough to the one that was found."""
+        return tuple(use for use, limit in self.limits_px.items() if self.rms_px is not None
+                     and self.rms_px <= limit and self.bound_px <= SURE * limit)
+
+    @property
+    def centre_off(self) -> bool:
+        """Return whether the centre is shown to be farther off than CENTRE.
+
+        Over the picture hardly anything of it is seen: it looks like a camera that is turned.
         """
-        if self.significant:
-            return True
-        if self.distance is None:
-            return False
-        doubtful = self.distance > limit_of(len(self.offsets), DOUBT)
-        return False if self.bound_px <= self.relevant_px and not doubtful else None
+        sigma = (np.zeros(2) if self.covariance is None
+                 else np.sqrt(np.diag(self.covariance)[2:4]))
+        return bool(np.max(np.abs(self.offsets[2:4]) - 2 * sigma)
+                    > CENTRE * self.given.image_size[0])
 
     @property
     def rms_px(self) -> float | None:
@@ -112,17 +144,13 @@ class Difference:
         sigma = 0.0 if self.sigma_px is None else self.sigma_px.rms
         return np.inf if self.rms_px is None else self.rms_px + 2 * sigma
 
-    @property
-    def allowed_px(self) -> float:
-        """Return what the focal length moves, over the picture, where good calibrations differ."""
-        return ALLOWED_FOCAL / RELEVANT * self.relevant_px
-
     @cached_property
-    def relevant_px(self) -> float:
-        """Return what a focal length RELEVANT off moves, over the picture."""
+    def limits_px(self) -> Mapping[Use, float]:
+        """Return how far apart, over the picture, each use allows the cameras to be."""
         moves, _ = sensitivity(self.found)
-        longer = RELEVANT * self.found.params * (np.arange(len(self.found.params)) < 2)
-        return float(np.sqrt(np.mean(np.sum((moves @ longer)**2, axis=1))))
+        longer = self.found.params * (np.arange(len(self.found.params)) < 2)
+        whole = float(np.sqrt(np.mean(np.sum((moves @ longer)**2, axis=1))))
+        return {use: share * whole for use, share in USES.items()}
 
     @property
     def sigma_map(self) -> SigmaMap | None:
@@ -132,13 +160,6 @@ class Difference:
         model = self.found if len(self.found.params) == len(self.offsets) else self.given
         moves, pixels = sensitivity(model)
         return SigmaMap(pixels, sigma_over(moves, self.covariance))
-
-    @property
-    def _allowed(self) -> Floats:
-        allowed = np.zeros(len(self.offsets))
-        allowed[:2] = ALLOWED_FOCAL * self.found.params[:2]
-        allowed[2:4] = ALLOWED_CENTRE_PX
-        return allowed
 
     def ways(self) -> Mapping[Way, Floats]:
         """Return the fewest parts of the camera that explain the distance, the largest first.
@@ -165,35 +186,24 @@ class Difference:
     def _without(self, ways: Sequence[Way]) -> float:
         assert self.covariance is not None
         rest = np.setdiff1d(np.arange(len(self.offsets)), self._places(ways))
-        return distance(self.offsets[rest], self.covariance[np.ix_(rest, rest)],
-                        self._allowed[rest])
+        return distance(self.offsets[rest], self.covariance[np.ix_(rest, rest)])
 
     def _places(self, ways: Sequence[Way]) -> list[int]:
         count = len(self.offsets)
         return [place for way in ways for place in PLACES.get(way, range(4, count))]
 
 
-def limit_of(count: int, chance: float = CHANCE) -> float:
-    """Return the Mahalanobis distance of so many parameters that chance exceeds so often."""
+def limit_of(count: int) -> float:
+    """Return the Mahalanobis distance of so many parameters that chance exceeds by CHANCE."""
     from scipy import special
-    return float(np.sqrt(special.chdtri(count, chance))) if count else 0.0
+    return float(np.sqrt(special.chdtri(count, CHANCE))) if count else 0.0
 
 
-def distance(offsets: Floats, covariance: Floats, allowed: Floats | None = None) -> float:
-    """Return the Mahalanobis distance of offsets (n,); 0 for none.
-
-    allowed: (n,) by how much each may be nearer to 0; the nearest point counts.
-    """
-    from scipy.optimize import lsq_linear
+def distance(offsets: Floats, covariance: Floats) -> float:
+    """Return the Mahalanobis distance of offsets (n,) of this covariance (n, n); 0 for none."""
     if not len(offsets):
         return 0.0
-    root = np.linalg.cholesky(covariance)
-    free = np.zeros(0, int) if allowed is None else np.flatnonzero(allowed)
-    away = np.linalg.solve(root, offsets)
-    if allowed is None or not len(free):
-        return float(np.linalg.norm(away))
-    slack = np.linalg.solve(root, np.diag(allowed)[:, free])
-    return float(np.sqrt(2 * lsq_linear(slack, away, (-1.0, 1.0), method='bvls').cost))
+    return float(np.linalg.norm(np.linalg.solve(np.linalg.cholesky(covariance), offsets)))
 
 
 def difference_of(given: Camera, solution: Solution, px: float) -> Difference:
@@ -244,7 +254,9 @@ class NamedCamera:
     def without_faults(self) -> NamedCamera:
         """Return it; raises InputError where something beside the camera is wrong."""
         if self.faults:
-            raise InputError(f'{self.name}: {"; ".join(self.faults)}; no model here has that')
+            raise InputError('E-CAMERA-FAULTS',
+                             f'{self.name}: {"; ".join(self.faults)}; no supported camera model '
+                             f'has that: correct the file')
         return self
 
     @property
@@ -286,42 +298,68 @@ CROPPED = 0.04
 
 
 def answers_of(found: Difference, whose: str) -> tuple[str, ...]:
-    """Return what a difference says: how far, whether it can be told, whether it matters.
+    """Return what a difference says, with the numbers that decide.
 
-    whose: the sigma is.
+    First the answer and how far apart the cameras are, then the distance beside what chance
+    explains, then the largest likely error beside what each use allows. whose: the sigma is.
     """
-    far = ('apart: unknown, a lens model is blind in parts of the picture' if found.apart is None
-           else f'apart: {found.apart.rms:.2f} px over the picture, {found.apart.worst:.2f} px at '
-                f'the worst, best rotation removed')
-    sigma = None if found.sigma_px is None else found.sigma_px.rms
-    told = ('unknown, neither file has a covariance: give a result.json of dashcalib run'
-            if sigma is None or found.told_apart is None else
-            f'{"yes" if found.told_apart else "no, chance explains it"}; the sigma of {whose} is '
-            f'{sigma:.2f} px')
-    return (far, f'told apart: {told}', f'matters: {_matters(found)}')
+    return (_answer_text(found), _distance_text(found, whose), _limits_text(found))
 
 
-def _matters(found: Difference) -> str:
-    limit = f'{found.relevant_px:.1f} px, as of a focal length {100 * RELEVANT:.0f} % off'
-    if found.matters:
-        return (f'yes, good calibrations of one lens differ by less: '
-                f'{100 * ALLOWED_FOCAL:.1f} % of the focal length ({found.allowed_px:.1f} px over '
-                f'the picture), {ALLOWED_CENTRE_PX:.0f} px of the centre')
-    if found.sigma_px is None:
-        return (f'no, good calibrations of one lens differ by up to {found.allowed_px:.1f} px, as '
-                f'of a focal length {100 * ALLOWED_FOCAL:.1f} % off')
-    if found.matters is None and found.bound_px <= found.relevant_px:
-        return ('cannot be told: good calibrations of one lens hardly differ as much, but chance '
-                'may explain the rest')
-    if found.matters is None:
-        return f'cannot be told: an error of {limit}, may be there'
-    return f'no, with 95 % it is below {found.bound_px:.1f} px; the limit is {limit}'
+def _answer_text(found: Difference) -> str:
+    if found.apart is None:
+        return 'not comparable: one lens model has no ray for a part of the picture'
+    far = (f'{found.apart.rms:.2f} px RMS over the picture, {found.apart.worst:.2f} px at the '
+           f'worst, best rotation removed')
+    enough = f'good enough for {", ".join(found.good_for)}'
+    if found.answer == 'right':
+        return f'the same within what can be determined; {far}: {enough}'
+    if found.answer == 'cannot tell':
+        return f'chance explains the difference, but the error may be too large; {far}'
+    if found.answer == 'differs':
+        return f'differs by {far}: {enough}'
+    parts = ' and '.join(_blamed(found))
+    return f'off by {far}{parts and f", because of the {parts}"}'
+
+
+def _distance_text(found: Difference, whose: str) -> str:
+    if found.distance is None or found.sigma_px is None:
+        return ('statistic: unknown, because neither file has a covariance; use a result.json of '
+                'dashcalib run')
+    explained = 'does not explain' if found.told_apart else 'explains'
+    return (f'statistic: distance {found.distance:.1f} sigma (Mahalanobis), limit '
+            f'{found.limit:.1f}: chance {explained} the difference; the standard deviation '
+            f'(sigma) of {whose} is {found.sigma_px.rms:.2f} px')
+
+
+def _limits_text(found: Difference) -> str:
+    if found.rms_px is None:
+        return 'limits: no pixels to compare them with'
+    limits = ', '.join(f'{use} {_px(limit)} ({_px(SURE * limit)})'
+                       for use, limit in found.limits_px.items())
+    first = (f'{_px(found.rms_px)} px' if found.sigma_px is None else
+             f'{_px(found.rms_px)} px, with 95 % confidence below {_px(found.bound_px)} px')
+    centre = '' if not found.centre_off else (
+        f'; the centre is off by more than {CENTRE * found.given.image_size[0]:.0f} px')
+    return f'limits in px (with 95 % confidence): {limits}; here {first}{centre}'
+
+
+def _px(value: float) -> str:
+    """Return pixels with two digits, so that a value and its limit can be compared."""
+    return f'{value:.2f}'
+
+
+def _blamed(found: Difference) -> Sequence[Way]:
+    """Return the parts of the camera that make it differ, where its parameters do."""
+    if found.covariance is None or distance(found.offsets, found.covariance) <= found.limit:
+        return ()
+    return tuple(found.ways())
 
 
 def reasons_of(found: Difference) -> tuple[str, ...]:
     """Return in words what the difference from a drive's own camera says."""
     parts = ([_PARTS[way](found, offsets) for way, offsets in found.ways().items()]
-             if found.matters else [])
+             if _blamed(found) else [])
     return (*answers_of(found, 'the drive'), *(text for text in parts if text))
 
 

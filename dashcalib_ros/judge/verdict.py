@@ -313,7 +313,9 @@ def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
     asked, px = solution.camera, solution.px
     chosen = next((each for each in solution.tried if each.chosen), None)
     if chosen is not None and MODELS[chosen.model].family != asked.family:
-        far = 'far' if chosen.apart_px is None else f'{px * chosen.apart_px:.1f} px'
+        apart_px = next((each.apart_px for each in solution.tried if each.model == asked.model),
+                        None)
+        far = 'far' if apart_px is None else f'{px * apart_px:.1f} px'
     elif solution.written.apart_px > MAX_MODEL_SIGMAS * solution.rays_sigma_px:
         chosen, far = None, f'{px * solution.written.apart_px:.1f} px'
     else:

@@ -1,7 +1,7 @@
 """The focal profile of a turn: how well each focal length, held fixed, explains its tracks.
 
 Incremental reconstruction with a free focal length often diverges, although it registers every
-image with small residuals (docs/notebook/lessons.md: f = 157 for 1353). With a wrong focal length
+image with small residuals (docs/lessons.md: f = 157 for 1353). With a wrong focal length
 held fixed it cannot diverge; it only explains fewer observations. So the turn is chained at
 several fixed focal lengths, and the one with the lowest cost over *all* observations is the start.
 """

@@ -103,7 +103,7 @@ def _sample(doubled: Floats32, xy: Floats32) -> Floats32:
 
     OpenCV rounds positions to 1/32 px, and its cubic kernel shifts the picture by up to 0.05 px.
     Linear interpolation in the doubled image is off by 0.004 px. Lanczos in the original image is
-    off by 0.008 px, and takes ten times as long (docs/notebook/lessons.md).
+    off by 0.008 px, and takes ten times as long (docs/lessons.md).
     """
     where = 2 * xy
     return np.asarray(cv2.remap(doubled, where[:, 0], where[:, 1], cv2.INTER_LINEAR,

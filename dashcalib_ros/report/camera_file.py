@@ -1,8 +1,8 @@
 """Reads a camera from a calibration of any common kind: load_camera().
 
-What a file says must be one of the models in camera/ exactly: what they lack (skew, thin prisms,
-other projections) is an InputError, and is never left out. Where a file has several cameras, its
-reader gives them all by name, and the caller names one.
+A file's lens must be one of the models in camera/ exactly: what they lack (skew, thin prisms,
+other projections) is an InputError, and is never omitted. Where a file has several cameras, its
+reader returns them all by name, and the caller names one.
 """
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ from dashcalib_ros.limits import (
 from dashcalib_ros.solve.spread import PictureSigma
 
 Data = Mapping[str, Any]
-# reads one camera of a file; one that says nothing but the camera gives just that
+# reads one camera of a file; where the file has nothing but the camera, it returns just that
 Reader = Callable[[], Camera | NamedCamera]
 
 # the first of these that a folder has is read
@@ -131,14 +131,14 @@ def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedC
 
     Returns a NamedCamera: its `camera` is a Radial, Brown, Rational or Fisheye, in px of the full
     pictures, with the centre of the first pixel at (0, 0). Raises InputError, in one line that
-    says what to do, for a file that cannot be read, a lens that none of these describes, and a
-    choice that is not made.
+    names the cure, for a file that cannot be read, a lens that none of these describes, and a file
+    with several cameras of which none is named.
     """
     return load_with_faults(path, name).without_faults()
 
 
 def load_with_faults(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
-    """Read a camera as load_camera() does; what stands wrong beside it is in its faults."""
+    """Read a camera as load_camera() does; what is wrong beside it (R, P) is in its faults."""
     return _seeing(_loaded(path, name))
 
 
@@ -156,7 +156,8 @@ def _loaded(path: str | os.PathLike[str], name: str | None) -> NamedCamera:
         if place.is_dir():
             inside = [place / each for each in IN_FOLDER if (place / each).exists()]
             if not inside:
-                raise InputError(f'{place} is a folder without a calibration; give {KNOWN}')
+                raise InputError('E-CALIBRATION-FOLDER',
+                                 f'{place} is a folder without a calibration; use {KNOWN}')
             place = inside[0]
         if place.suffix == '.npz':
             return _chosen(_cameras_of(_arrays(place), place), name, place)
@@ -181,10 +182,12 @@ def camera_of_message(message: Any, name: str) -> NamedCamera:
     _check_whole(size, (message.binning_x, message.binning_y),
                  (roi.x_offset, roi.y_offset, roi.width, roi.height), name)
     if not k or not k[0] > 0:
-        raise InputError(f'{name} is uncalibrated: K[0] is not positive; give the driver a '
-                         f'calibration')
+        raise InputError('E-CALIBRATION-EMPTY',
+                         f'{name} is uncalibrated: K[0] is not positive; load a calibration into '
+                         f'the driver')
     if not np.isfinite([*k, *d, *r, *p]).all():
-        raise InputError(f'{name} has numbers that are not finite; give a calibration')
+        raise InputError('E-CALIBRATION-NUMBER',
+                         f'{name} has numbers that are not finite; calibrate the camera again')
     camera = _camera(size, _view(k), str(message.distortion_model), d, name)
     return NamedCamera(name, camera, faults=ros_faults(camera, k, r, p))
 
@@ -196,8 +199,9 @@ def _check_whole(size: tuple[int, int], binning: Sequence[float], roi: Sequence[
     roi: x, y, width, height.
     """
     if tuple(roi) not in ((0, 0, 0, 0), (0, 0, *size)) or max(binning) > 1:
-        raise InputError(f'{name} has binning or a region of interest: give the calibration of '
-                         f'the images as they are')
+        raise InputError('E-CALIBRATION-PART',
+                         f'{name} has binning or a region of interest: use the calibration of the '
+                         f'images as they are')
 
 
 def _chosen(cameras: Mapping[str, Reader], name: str | None, path: str | Path) -> NamedCamera:
@@ -209,9 +213,11 @@ def _chosen(cameras: Mapping[str, Reader], name: str | None, path: str | Path) -
             f'{path}:{name}' if len(cameras) > 1 else str(path), found)
     there = shortened(', '.join(cameras)) or 'one camera without a name'
     if name is not None:
-        raise InputError(f'{path} has no camera {shortened(name)!r}; there is {there}')
-    raise InputError(f'{path} has {len(cameras)} cameras; name one, as in '
-                     f'{path}:{next(iter(cameras), "1")}; there are {there}')
+        raise InputError('E-CAMERA-NAME',
+                         f'{path} has no camera {shortened(name)!r}; use one of {there}')
+    raise InputError('E-CAMERA-CHOICE',
+                     f'{path} has {len(cameras)} cameras; name one, as in '
+                     f'{path}:{next(iter(cameras), "1")}; it has {there}')
 
 
 def _parsed(text: str, path: Path) -> Mapping[str, Reader]:
@@ -229,11 +235,12 @@ def _parsed(text: str, path: Path) -> Mapping[str, Reader]:
     if re.search(rf'^\s*\[{INI_IMAGE}\]\s*$', text, re.MULTILINE):
         return _cameras_of_ini(text, path)
     try:
-        return _cameras_of(parse_yaml(_first_document(text), str(path)), path)
+        data = parse_yaml(_first_document(text), str(path))
     except InputError as error:
-        if 'not valid YAML' in str(error):
-            raise InputError(f'{error}; give {KNOWN}') from error
-        raise
+        if error.__cause__ is None:
+            raise  # a limit; the rest is what PyYAML cannot read
+        raise InputError(error.code, f'{error}; use {KNOWN}') from error
+    return _cameras_of(data, path)
 
 
 def _first_document(text: str) -> str:
@@ -296,7 +303,8 @@ def _cameras_of(data: Any, path: Path) -> Mapping[str, Reader]:
                 return found
         if any(each in _plain_keys(data) for each in MATRIX):
             return {'': partial(_opencv, data, path)}
-    raise InputError(f'{path} is no camera calibration known here; give {KNOWN}')
+    raise InputError('E-CALIBRATION-FORMAT',
+                     f'{path} is not a known camera calibration; use {KNOWN}')
 
 
 def _camera(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequence[float],
@@ -308,13 +316,14 @@ def _camera(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequence[f
     off, exchanged = (max(abs(cx / across - 0.5), abs(cy / down - 0.5))
                       for across, down in ((width, height), (height, width)))
     if exchanged < EXCHANGED and off > AS_GIVEN:
-        raise InputError(f'{path} is for pictures of {width}x{height}, but the centre ({cx:.0f}, '
+        raise InputError('E-CALIBRATION-EXCHANGED',
+                         f'{path} is for pictures of {width}x{height}, but the centre ({cx:.0f}, '
                          f'{cy:.0f}) is that of {height}x{width}: are width and height '
-                         f'exchanged? give the width first')
+                         f'exchanged? write the width first')
     try:
         camera = camera_from_ros((width, height), kind, [fx, 0, cx, 0, fy, cy, 0, 0, 1], d)
     except InputError as error:
-        raise InputError(f'{path}: {error}') from error
+        raise InputError(error.code, f'{path}: {error}') from error
     _check_lens(camera, path)
     return camera
 
@@ -323,15 +332,17 @@ def _check_lens(camera: Camera, path: str | Path) -> None:
     """Raise InputError for numbers that no lens has: nothing can be computed with them."""
     for name, value in camera.named.items():
         if abs(value) > LENS_NUMBER:
-            raise InputError(f'{path} has {name} = {value:.4g}, which no lens has; give a '
-                             f'complete calibration in px')
+            raise InputError('E-CALIBRATION-LENS',
+                             f'{path} has {name} = {value:.4g}, which no lens has; use a '
+                             f'calibration in px')
 
 
 def _seeing(found: NamedCamera) -> NamedCamera:
     """Return it; raises InputError where no pixel of its picture has a ray."""
     if rayless_share(found.camera) == 1:
-        raise InputError(f'{found.name} is of a lens that sees no ray in its picture of '
-                         f'{by(found.image_size)}; calibrate anew')
+        raise InputError('E-CALIBRATION-NO-RAY',
+                         f'{found.name} is of a lens that sees no ray in its picture of '
+                         f'{by(found.image_size)}; calibrate the camera again')
     return found
 
 
@@ -344,18 +355,20 @@ def _model(models: Mapping[str, str], name: Any, what: str, path: Path) -> str:
     """Return our distortion model for another program's. Raises InputError where it has none."""
     kind = models.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise InputError(f'{path} has {what} {shortened(repr(name))}, which is none of the models '
-                         f'here; calibrate or convert it as one of {", ".join(models)}')
+        raise InputError('E-LENS-MODEL',
+                         f'{path} has {what} {shortened(repr(name))}, which is not supported; '
+                         f'calibrate or convert it as one of {", ".join(models)}')
     return kind
 
 
 def _coefficients(data: Data, kind: str, path: Path) -> list[float]:
-    """Return D of coefficients by name; those left out are 0."""
+    """Return D of coefficients by name; those that are omitted are 0."""
     known = dict.fromkeys((*TERMS[RATIONAL], 'skew', 'xi'))
     there = [name for name in known if read_number(data, name, path, 0.0)]
     more = [name for name in there if name not in TERMS[kind]]
     if more:
-        raise InputError(f'{path} has {", ".join(there)}, and a {kind} model here has no '
+        raise InputError('E-LENS-COEFFICIENTS',
+                         f'{path} has {", ".join(there)}, but the {kind} model has no '
                          f'{", ".join(more)}; calibrate without')
     return [read_number(data, name, path, 0.0) for name in TERMS[kind]]
 
@@ -365,7 +378,8 @@ def _numbers(value: Any, what: str, path: str | Path) -> list[float]:
     if isinstance(value, Mapping):
         value = value.get('data')
     if not isinstance(value, list):
-        raise InputError(f'{path} has no {what}, a list of numbers; give a complete calibration')
+        raise InputError('E-CALIBRATION-MISSING',
+                         f'{path} has no {what}, a list of numbers; use a complete calibration')
     found: list[float] = []
     for each in value:
         found += (_numbers(each, what, path) if isinstance(each, list)
@@ -376,7 +390,8 @@ def _numbers(value: Any, what: str, path: str | Path) -> list[float]:
 def _values(data: Data, key: str, count: int, path: Path) -> list[float]:
     found = _numbers(data.get(key), key, path)
     if len(found) != count:
-        raise InputError(f'{path}: {key} must have data of {count} numbers')
+        raise InputError('E-CALIBRATION-COUNT',
+                         f'{path}: {key} must have {count} numbers, and has {len(found)}')
     return found
 
 
@@ -399,7 +414,8 @@ def _opencv(data: Data, path: Path) -> NamedCamera:
             return []
         found = _numbers(data[key], key, path)
         if counts and len(found) not in counts:
-            raise InputError(f'{path}: {key} must have data of {counts[-1]} numbers')
+            raise InputError('E-CALIBRATION-COUNT',
+                             f'{path}: {key} must have {counts[-1]} numbers, and has {len(found)}')
         return found
 
     k = numbers(MATRIX, 4, 9)
@@ -408,9 +424,11 @@ def _opencv(data: Data, path: Path) -> NamedCamera:
                numbers(('projectionmatrix', 'projection'), 0, 12))
     size = _size_in(first)
     kind, lens = first('distortionmodel'), str(first('cameramodel')).lower()
-    if not any(name in keys for name in DISTORTION) and str(kind).lower() not in NO_DISTORTION:
-        raise InputError(f'{path} has no distortion_coefficients, a list of numbers; give a '
-                         f'complete calibration')
+    ideal = 'distortionmodel' in keys and str(kind).lower() in NO_DISTORTION
+    if not any(name in keys for name in DISTORTION) and not ideal:
+        raise InputError('E-NO-DISTORTION',
+                         f'{path} has no distortion_coefficients; for pictures without '
+                         f'distortion, write 0 for each: distortion_coefficients: [0, 0, 0, 0, 0]')
     if 'binningx' in keys or 'roi' in keys:
         # the fields of a CameraInfo
         r, p = r or numbers(('r',), 0, 9), p or numbers(('p',), 0, 12)
@@ -424,8 +442,10 @@ def _opencv(data: Data, path: Path) -> NamedCamera:
     if kind is None:
         fisheye = 'fisheye' in lens or first('fisheyemodel', 'fisheye') in (1, '1', True)
         if len(d) == 4 and any(d) and not fisheye and 'pinhole' not in lens:
-            raise InputError(f'{path} has 4 distortion coefficients, which may be a fisheye\'s; '
-                             f'add a line distortion_model: {PLUMB_BOB}, or {EQUIDISTANT}')
+            raise InputError('E-LENS-AMBIGUOUS',
+                             f'{path} has 4 distortion coefficients, which may be those of a '
+                             f'fisheye; add a line distortion_model: {PLUMB_BOB}, or '
+                             f'{EQUIDISTANT}')
         kind = EQUIDISTANT if fisheye else PLUMB_BOB if len(d) <= 5 else RATIONAL
     camera = _camera(size, _view(k), str(kind), d, path)
     own = data.get('dashcalib')
@@ -448,7 +468,8 @@ def _size_in(first: Callable[..., Any]) -> Sequence[Any]:
 
 def _kalibr(data: Data, path: Path) -> Camera:
     if data.get('camera_model', 'pinhole') != 'pinhole':
-        raise InputError(f'{path} has the camera model {shortened(repr(data["camera_model"]))}; '
+        raise InputError('E-LENS-MODEL',
+                         f'{path} has the camera model {shortened(repr(data["camera_model"]))}; '
                          f'calibrate with --models pinhole-radtan, or pinhole-equi')
     kind = _model(KALIBR, data.get('distortion_model'), 'the distortion model', path)
     return _camera(_pair(data, 'resolution', path),
@@ -459,21 +480,24 @@ def _kalibr(data: Data, path: Path) -> Camera:
 def _pair(data: Data, key: str, path: Path) -> list[Any]:
     value = data.get(key)
     if not isinstance(value, list) or len(value) != 2:
-        raise InputError(f'{path}: {key} must be [width, height], not {shortened(repr(value))}')
+        raise InputError('E-CALIBRATION-PAIR',
+                         f'{path}: {key} must be [width, height], not {shortened(repr(value))}')
     return value
 
 
 def _colmap(values: Sequence[Any], path: Path) -> Camera:
     """Read a line of cameras.txt without its number: model, width, height, parameters."""
     if len(values) < 3:
-        raise InputError(f'{path} has a line without model, width and height; write it anew')
+        raise InputError('E-CALIBRATION-COUNT',
+                         f'{path} has a line without model, width and height; write it again')
     model, *size = values[:3]
     kind = _model({name: kind for name, _, kind, _ in COLMAP if kind}, model, 'the model', path)
     focals, count = next((each[1], each[3]) for each in COLMAP if each[0] == model)
     params = _numbers(list(values[3:]), model, path)
     if len(params) != focals + 2 + count:
-        raise InputError(f'{path}: a {model} has {focals + 2 + count} parameters, not '
-                         f'{len(params)}; write it anew')
+        raise InputError('E-CALIBRATION-COUNT',
+                         f'{path}: a {model} has {focals + 2 + count} parameters, not '
+                         f'{len(params)}; write it again')
     cx, cy = (value - HALF_PIXEL for value in params[focals:focals + 2])
     return _camera([int(side) if str(side).isdecimal() else side for side in size],
                    [params[0], params[focals - 1], cx, cy], kind, params[focals + 2:], path)
@@ -490,8 +514,9 @@ def _colmap_binary(path: Path) -> Mapping[str, Reader]:
             cameras[str(number)] = partial(_colmap, (name, *size, *params), path)
             at += 24 + 8 * len(params)
     except (struct.error, IndexError) as error:
-        raise InputError(f'{path} is no cameras.bin that can be read here; convert it '
-                         f'(colmap model_converter --output_type TXT)') from error
+        raise InputError('E-COLMAP-BINARY',
+                         f'{path} is no cameras.bin that can be read; convert it (colmap '
+                         f'model_converter --output_type TXT)') from error
     return cameras
 
 
@@ -525,8 +550,9 @@ def _gyroflow(data: Data, path: Path) -> NamedCamera:
     """Read Gyroflow's lens profile; without coefficients each of its models is a pinhole."""
     more = [key for key in GYROFLOW_MORE if data.get(key) not in (None, 0, 1, '', [], {})]
     if more:
-        raise InputError(f'{path} has {more[0]} = {shortened(repr(data[more[0]]))}, which no '
-                         f'model here has; give a profile of pictures as the lens shows them')
+        raise InputError('E-LENS-PROFILE',
+                         f'{path} has {more[0]} = {shortened(repr(data[more[0]]))}, which is not '
+                         f'supported; use a profile of pictures as the lens shows them')
     # the first profiles had no model's name, and a place for each
     standard = data.get('use_opencv_standard') is True and not data.get('use_opencv_fisheye')
     named = data.get('distortion_model')
@@ -535,8 +561,9 @@ def _gyroflow(data: Data, path: Path) -> NamedCamera:
     key = 'calib_params' if standard and not named else 'fisheye_params'
     lens, size = data.get(key), data['calib_dimension']
     if not isinstance(lens, Mapping) or not isinstance(size, Mapping):
-        raise InputError(f'{path} has no {key} with a camera_matrix, or no calib_dimension with w '
-                         f'and h; give a complete profile')
+        raise InputError('E-CALIBRATION-MISSING',
+                         f'{path} has no {key} with a camera_matrix, or no calib_dimension with w '
+                         f'and h; use a complete profile')
     k = _values(lens, 'camera_matrix', 9, path)
     d = _numbers(lens.get('distortion_coeffs'), 'distortion_coeffs', path)
     readout_ms = None if data.get('frame_readout_time') is None else read_number(
@@ -555,30 +582,37 @@ def _mrcal(text: str, path: Path) -> Camera:
     try:
         data = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
-        raise InputError(f'{path} is no .cameramodel that can be read; write it anew') from error
+        raise InputError('E-CAMERAMODEL',
+                         f'{path} is no .cameramodel that can be read; write it again') from error
     kind = _model(MRCAL, data.get('lensmodel'), 'the lensmodel', path)
     values = _numbers(data.get('intrinsics'), 'intrinsics', path)
     if len(values) < 4:
-        raise InputError(f'{path}: intrinsics must have 4 numbers or more')
+        raise InputError('E-CALIBRATION-COUNT',
+                         f'{path}: intrinsics must have 4 numbers or more')
     return _camera(_pair(data, 'imagersize', path), values[:4], kind, values[4:], path)
 
 
 def _plain(data: Data, path: Path) -> NamedCamera:
-    """Read fx, fy, cx, cy and coefficients by name; those after k2 may be left out."""
+    """Read fx, fy, cx, cy and coefficients by name; those after k2 may be omitted."""
     name = data.get('model', data.get('distortion_model'))
     ideal = isinstance(name, str) and name.lower() in NO_DISTORTION
     name = 'pinhole' if ideal else name
     models = [model for model in MODELS.values()
               if name in (None, model.model, model.ros_model, model.family)]
     if not models:
-        raise InputError(_no_model(name, path))
+        raise InputError('E-CAMERA-MODEL', _no_model(name, path))
     if name is None and read_number(data, 'k4', path, 0.0) and not {'k5', 'k6'} & data.keys():
-        raise InputError(f'{path} has k4, which may be a fisheye\'s; add "model": "fisheye", or '
-                         f'"{RATIONAL}"')
+        raise InputError('E-LENS-AMBIGUOUS',
+                         f'{path} has k4, which may be that of a fisheye; add "model": "fisheye", '
+                         f'or "{RATIONAL}"')
     kind = (EQUIDISTANT if models[0].family == FISHEYE else
             PLUMB_BOB if name == PLUMB_BOB else RATIONAL)
-    for needed in () if ideal else Radial.names()[4:]:
-        read_number(data, needed, path)
+    missing = [] if ideal else [each for each in Radial.names()[4:] if each not in data]
+    if missing:
+        zeros = ', '.join(f'"{each}": 0' for each in missing)
+        raise InputError('E-NO-DISTORTION',
+                         f'{path} has no {" and no ".join(missing)}; for pictures without '
+                         f'distortion, write 0: {zeros}')
     camera = _camera((data.get('width'), data.get('height')),
                      [read_number(data, key, path) for key in Radial.names()[:4]], kind,
                      _coefficients(data, kind, path), path)
@@ -588,12 +622,14 @@ def _plain(data: Data, path: Path) -> NamedCamera:
 def _result(data: Data, path: Path) -> NamedCamera:
     given = data.get('intrinsics')
     if not given:
-        raise InputError(no_intrinsics(str(path), data['verdict'], data.get('reasons')))
+        raise InputError('E-NO-INTRINSICS',
+                         no_intrinsics(str(path), data['verdict'], data.get('reasons')))
     name = data.get('camera_model', Radial.model)
     if not isinstance(name, str) or name not in MODELS:
-        raise InputError(_no_model(name, path))
+        raise InputError('E-CAMERA-MODEL', _no_model(name, path))
     if not isinstance(given, Mapping):
-        raise InputError(f'{path} has no intrinsics; give a complete calibration')
+        raise InputError('E-CALIBRATION-MISSING',
+                         f'{path} has no intrinsics; use a complete calibration')
     size = read_size(*_pair(data, 'image_size', path), path=path)
     camera = MODELS[name].of(
         size, [read_number(given, each, path) for each in MODELS[name].names()])
@@ -608,7 +644,7 @@ def _result(data: Data, path: Path) -> NamedCamera:
 
 
 def _no_model(name: Any, path: Path) -> str:
-    return (f'{path} has the camera model {shortened(repr(name))}; there are '
+    return (f'{path} has the camera model {shortened(repr(name))}; use one of '
             f'{", ".join(MODELS)}')
 
 
@@ -619,7 +655,8 @@ def _xml(text: str, path: Path) -> Any:
             raise ElementTree.ParseError('declarations')
         return _element(ElementTree.fromstring(text))
     except (ElementTree.ParseError, RecursionError, ValueError) as error:
-        raise InputError(f'{path} is no XML that can be read; give {KNOWN}') from error
+        raise InputError('E-CALIBRATION-XML',
+                         f'{path} is no XML that can be read; use {KNOWN}') from error
 
 
 def _element(node: ElementTree.Element) -> Any:
@@ -654,34 +691,60 @@ def _arrays(path: Path) -> Data:
     except InputError:
         raise
     except Exception as error:  # a damaged file makes numpy raise nearly anything
-        raise InputError(f'{path} is no .npz that can be read; write it anew') from error
+        raise InputError('E-CALIBRATION-NPZ',
+                         f'{path} is no .npz that can be read; write it again') from error
 
 
 def calibrated_camera(calibration: Calibration, name: str = 'estimate') -> NamedCamera:
     """Return the camera of a calibration. Raises InputError when it was refused."""
     if calibration.camera is None:
-        raise InputError(no_intrinsics(name, calibration.verdict.level,
-                                        calibration.verdict.reasons))
-    shutter = calibration.rolling_shutter
+        raise InputError('E-NO-INTRINSICS', no_intrinsics(
+            name, calibration.verdict.level, calibration.verdict.reasons))
+    shutter, field = calibration.rolling_shutter, calibration.field
     return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
                        read_covariance(calibration.details, calibration.camera,
                                        calibration.sigma),
-                       calibration.sigma_px, mount=calibration.mount,
+                       calibration.sigma_px,
+                       field.field if field is not None and field.used else None,
+                       mount=calibration.mount,
                        readout_ms=None if shutter is None else shutter.readout_ms)
+
+
+Given = Calibration | NamedCamera | Camera | str | os.PathLike[str]
+
+
+def given_camera(given: Given) -> NamedCamera:
+    """Return the camera of a calibration: a result, a file as for load_camera(), or a camera.
+
+    Raises InputError for a refused result, a file that cannot be read, and any other object.
+    """
+    if isinstance(given, NamedCamera):
+        return given
+    if isinstance(given, Calibration):
+        return calibrated_camera(given)
+    if isinstance(given, Camera):
+        return NamedCamera(f'the {given.model} camera', given)
+    if isinstance(given, (str, os.PathLike)):
+        return load_camera(given)
+    raise InputError('E-CALIBRATION-TYPE', f'a calibration cannot be {shortened(repr(given))}: '
+                                           f'pass a Calibration, a camera, or the path of a file')
 
 
 def read_size(width: Any, height: Any, *, path: str | Path) -> tuple[int, int]:
     """Check an image size that was read from a file. Raises InputError."""
     for key, value in (('width', width), ('height', height)):
         if value is None:
-            raise InputError(f'{path} does not say the image {key}; add image_{key}, in pixels')
+            raise InputError('E-CALIBRATION-NO-SIZE',
+                             f'{path} has no image {key}; add image_{key}, in px')
         if type(value) is float and value.is_integer():
             value = int(value)
         if type(value) is not int or value <= 0:
-            raise InputError(f'{path}: the image {key} must be a positive integer, not '
+            raise InputError('E-CALIBRATION-NO-SIZE',
+                             f'{path}: the image {key} must be a positive integer, not '
                              f'{shortened(repr(value))}')
         if value > SIDE:
-            raise InputError(f'{path}: the image {key} must be {SIDE} at the most; is it in px?')
+            raise InputError('E-CALIBRATION-TOO-LARGE',
+                             f'{path}: the image {key} must be at most {SIDE} px; write it in px')
     check_pixels(int(width), int(height), f'{path}: the image')
     return int(width), int(height)
 
@@ -699,14 +762,17 @@ def read_number(data: Mapping[str, Any], key: str, path: str | Path,
         number = math.nan
     if not math.isfinite(number):
         what = f'no {key}' if value is None else f'{key} = {shortened(repr(value))}'
-        raise InputError(f'{path} has {what}; give a complete calibration with finite numbers')
+        raise InputError('E-CALIBRATION-NUMBER',
+                         f'{path} has {what}; use a complete calibration with finite numbers')
     return number
 
 
 def check_focal(fx: float, fy: float, path: str | Path) -> None:
     """Raise InputError for the focal lengths of a camera that is not calibrated."""
     if not (fx > 0 and fy > 0):
-        raise InputError(f'{path} is uncalibrated: its focal length is not positive')
+        raise InputError('E-CALIBRATION-EMPTY',
+                         f'{path} is uncalibrated: its focal length is not positive; calibrate '
+                         f'the camera')
 
 
 def read_sigma(data: Any, camera: Camera) -> dict[str, float] | None:
@@ -751,7 +817,8 @@ def read_field(data: Any, image_size: tuple[int, int]) -> Field | None:
     except (KeyError, TypeError, ValueError):
         coefficients = np.zeros(0)
     if coefficients.shape != (2, len(FIELD_TERMS)) or not np.isfinite(coefficients).all():
-        raise InputError('its field has no coefficients that can be read; calibrate again')
+        raise InputError('E-CALIBRATION-FIELD',
+                         'its field has no coefficients that can be read; calibrate again')
     return Field(image_size, coefficients)
 
 

@@ -9,9 +9,12 @@ from typing import Any
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.source import by
 from dashcalib_ros.judge.calibration import Mount
+from dashcalib_ros.judge.check import export_command, same_shape
 from dashcalib_ros.judge.difference import Difference as WholeDifference
 from dashcalib_ros.judge.difference import NamedCamera, answers_of, difference_between
+from dashcalib_ros.report.camera_file import Given, given_camera
 from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.wording import digits_of, mounts_text, number, optional
 
@@ -62,8 +65,10 @@ class Comparison:
             **sides, 'image_size': self.b.image_size, 'parameters': rows,
             'mapping_px': self.mapping_px, 'worst_px': self.whole.worst_px,
             'unseen': self.unseen, 'sigma_px': self.whole.sigma_px,
+            'answer': self.whole.answer, 'good_for': self.whole.good_for,
             'told_apart': self.whole.told_apart, 'matters': self.whole.matters,
             'distance': self.whole.distance, 'limit': self.whole.limit,
+            'bound_px': self.whole.bound_px, 'limits_px': self.whole.limits_px,
             'mount': mount_dict(self.a.mount, self.b.mount)})
         return plain
 
@@ -77,16 +82,27 @@ def mount_dict(mount: Mount | None, other: Mount | None) -> dict[str, Any] | Non
         for name, (degrees, sigma) in mount.apart(other).items()}}
 
 
-def compare(a: NamedCamera, b: NamedCamera) -> Comparison:
-    """Compare camera a with the reference b. Raises InputError when the image sizes differ."""
+def compare(a: Given, b: Given) -> Comparison:
+    """Compare calibration a with the reference b.
+
+    a, b: a Calibration, what load_camera() returns, a camera, or the path of a file that
+    load_camera() reads. Returns a Comparison: mapping_px is how far apart both see the same rays,
+    px RMS over the picture. Raises InputError if the image sizes differ or a file cannot be read.
+    """
+    a, b = given_camera(a), given_camera(b)
     if a.image_size != b.image_size:
-        raise InputError(
-            f'{a.name} is for {a.image_size[0]} x {a.image_size[1]} images and {b.name} for '
-            f'{b.image_size[0]} x {b.image_size[1]}; compare calibrations of the same image size; '
-            f'dashcalib export --size WxH makes one for resized pictures')
+        raise InputError('E-COMPARE-SIZE', _sizes_text(a, b))
     names = _common_names(a.camera, b.camera)
     rows = tuple(_difference(name, a, b) for name in names)
     return Comparison(a, b, rows, difference_between(a, b), unseen_share(a.camera, b.camera))
+
+
+def _sizes_text(a: NamedCamera, b: NamedCamera) -> str:
+    text = (f'{a.name} is for pictures of {by(a.image_size)} and {b.name} for {by(b.image_size)}, '
+            f'and only calibrations of one size can be compared; ')
+    if same_shape(a.image_size, b.image_size):
+        return text + f'resize the first: {export_command(a.name, f"--size {by(b.image_size)}")}'
+    return text + 'crop one of them with dashcalib export --crop X,Y,W,H'
 
 
 def _common_names(a: Camera, b: Camera) -> tuple[str, ...]:
@@ -116,12 +132,12 @@ def comparison_rows(found: Comparison) -> tuple[tuple[str, ...], list[tuple[str,
 
 
 def answers(found: Comparison) -> list[str]:
-    """Return how far both are apart, whether that can be told, and whether it matters."""
+    """Return how far both are apart, with the numbers that decide, and their mountings."""
     whose = ' and '.join(side for side, camera in (('A', found.a), ('B', found.b))
                          if camera.sigma_px is not None)
-    lines = list(answers_of(found.whole, whose))
+    lines = [f'answer: {found.whole.answer}', *answers_of(found.whole, whose)]
     if found.whole.apart is not None:
-        lines[0] += unseen_text(found)
+        lines[1] += unseen_text(found)
     if found.a.mount is not None and found.b.mount is not None:
         lines.append(mounts_text(found.a.mount, found.b.mount))
     return lines
@@ -130,7 +146,7 @@ def answers(found: Comparison) -> list[str]:
 def unseen_text(found: Comparison) -> str:
     """Return which part of the picture a distance leaves out, as an end of its sentence."""
     return '' if not found.unseen else (
-        f', without the {100 * found.unseen:.0f} % of the picture that the '
+        f'; without the {100 * found.unseen:.0f} % of the picture that the '
         f'{found.a.camera.model} model cannot see')
 
 

@@ -10,6 +10,7 @@ import io
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -22,28 +23,52 @@ from dashcalib_ros.camera import FISHEYE, Camera, ros_camera
 from dashcalib_ros.camera.camera import HALF_PIXEL
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.input.source import by
+from dashcalib_ros.judge.check import same_shape
 from dashcalib_ros.limits import check_pixels
-from dashcalib_ros.report.camera_file import EQUIDISTANT, RATIONAL, TERMS
+from dashcalib_ros.report.camera_file import EQUIDISTANT, RATIONAL, TERMS, Given, given_camera
 from dashcalib_ros.report.result import camera_info_yaml
 
-# a resized picture's columns and rows may round differently by so much
-ROUNDING_PX = 1.0
+
+def export(calibration: Given, kind: str) -> str | bytes:
+    """Return a calibration as another program's camera file.
+
+    calibration: a Calibration, what load_camera() returns, a camera, or the path of a file that
+    load_camera() reads. kind: opencv, colmap, kalibr, opensfm, nerfstudio, mrcal, ros, foxglove,
+    gyroflow, rays or maps.
+
+    Returns the file's text; the bytes of an .npz for rays and maps. Raises InputError for a file
+    that cannot be read, and ConfigError for an unknown kind or a lens that it cannot describe.
+    """
+    found = given_camera(calibration)
+    return exported(found.camera, kind, found.field, found.readout_ms)
 
 
 def exported(camera: Camera, kind: str, field: Field | None = None,
              readout_ms: float | None = None) -> str | bytes:
     """Return the content of a camera file of one of EXPORTS: text, or bytes of an .npz.
 
-    field: what the camera leaves over; WITH_FIELD has the kinds that can tell it, the others
-    leave it out. readout_ms: of a rolling shutter, from the first row to the last; WITH_READOUT
-    has the kinds that can tell it. Raises ConfigError for a kind that there is not, and for a lens
-    that it cannot describe, and OutputError for one that mrcal's spline cannot.
+    field: what the camera leaves over; WITH_FIELD has the kinds with a place for it, the others
+    omit it. readout_ms: of a rolling shutter, from the first row to the last; WITH_READOUT has
+    the kinds with a place for it. Raises ConfigError for a kind that does not exist, and for a
+    lens that it cannot describe, and OutputError for one that mrcal's spline cannot.
     """
     if kind not in EXPORTS:
-        raise ConfigError(f'there is no export to {kind!r}; choose one of {", ".join(EXPORTS)}')
+        raise ConfigError('E-EXPORT-KIND',
+                          f'{kind!r} is no kind of export; use one of {", ".join(EXPORTS)}')
     if kind in WITH_READOUT:
         return WITH_READOUT[kind](camera, readout_ms)
     return WITH_FIELD[kind](camera, field) if kind in WITH_FIELD else EXPORTS[kind](camera)
+
+
+def check_suffix(path: Path, kind: str) -> None:
+    """Raise ConfigError where a file's name promises another content than an export's."""
+    # exported() refuses a kind that does not exist
+    known = SUFFIXES.get(kind)
+    if known and path.suffix.lower() not in known:
+        raise ConfigError('E-EXPORT-SUFFIX',
+                          f'--to {kind} writes {" or ".join(filter(None, known))}, not what '
+                          f'{path.name!r} says; use --out {path.with_suffix(known[0])}')
 
 
 def resized(camera: Camera, size: tuple[int, int]) -> Camera:
@@ -52,14 +77,14 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     Raises ConfigError where that would stretch them, and InputError beyond limits.
     """
     if min(size) < 1:
-        raise ConfigError(f'{size[0]}x{size[1]} is no size of a picture; give its width and '
-                          f'height in px')
+        raise ConfigError('E-SIZE-NOT-POSITIVE',
+                          f'{by(size)} is no size of a picture; write its width and height in px')
     check_pixels(*size, 'the resized picture')
-    width, height = camera.image_size
-    x, y = size[0] / width, size[1] / height
-    if abs(size[1] - x * height) > ROUNDING_PX and abs(size[0] - y * width) > ROUNDING_PX:
-        raise ConfigError(f'{size[0]}x{size[1]} has another shape than the {width}x{height} of '
-                          f'the calibration; was the picture cropped? use --crop')
+    if not same_shape(camera.image_size, size):
+        raise ConfigError('E-SIZE-SHAPE',
+                          f'{by(size)} has another shape than the {by(camera.image_size)} of the '
+                          f'calibration; if the picture was cropped, use --crop')
+    x, y = (new / old for new, old in zip(size, camera.image_size, strict=True))
     return camera.resized(x, size, y)
 
 
@@ -67,9 +92,10 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
     """Return the camera of a part of its pictures. Raises ConfigError where it sticks out."""
     if (min(left, top) < 0 or min(width, height) < 1 or left + width > camera.image_size[0]
             or top + height > camera.image_size[1]):
-        whole = 'x'.join(map(str, camera.image_size))
-        raise ConfigError(f'{left},{top},{width},{height} is no part of a picture of {whole}; '
-                          f'give X,Y,W,H in px, of the corner at the top left and of the part')
+        raise ConfigError('E-CROP-OUTSIDE',
+                          f'{left},{top},{width},{height} is no part of a picture of '
+                          f'{by(camera.image_size)}; write X,Y,W,H in px: the top left corner of '
+                          f'the part, and its size')
     return replace(camera, image_size=(width, height), cx=camera.cx - left, cy=camera.cy - top)
 
 
@@ -140,7 +166,7 @@ def _foxglove(camera: Camera) -> str:
 
 
 def _gyroflow(camera: Camera, readout_ms: float | None = None) -> str:
-    """Return a lens profile of Gyroflow, which takes all that it lacks for not known.
+    """Return a lens profile of Gyroflow, which treats all that it lacks as unknown.
 
     readout_ms: of a rolling shutter, from the first row to the last. Raises ConfigError for a
     fisheye without coefficients.
@@ -148,8 +174,9 @@ def _gyroflow(camera: Camera, readout_ms: float | None = None) -> str:
     kind = 'opencv_fisheye' if _is_fisheye(camera) else 'opencv_standard'
     d = camera.ros_distortion()
     if _is_fisheye(camera) and not any(d):
-        raise ConfigError('gyroflow takes a fisheye whose coefficients are all 0 for a pinhole; '
-                          'calibrate it with --model fisheye, or export to opencv')
+        raise ConfigError('E-EXPORT-FISHEYE-ZERO',
+                          'gyroflow reads a fisheye whose coefficients are all 0 as a pinhole; '
+                          'calibrate with --model fisheye, or export to opencv')
     width, height = camera.image_size
     size = {'w': width, 'h': height}
     return json.dumps({
@@ -235,7 +262,8 @@ def _coefficients(camera: Camera, most: int, program: str) -> dict[str, float]:
                      camera.ros_distortion(), strict=False))
     more = [name for name in list(named)[most:] if named[name]]
     if more:
-        raise ConfigError(f'{program} has no {", ".join(more)}; calibrate with --model radial, or '
+        raise ConfigError('E-EXPORT-LENS',
+                          f'{program} has no {", ".join(more)}; calibrate with --model radial, or '
                           f'export to opencv')
     return dict(list(named.items())[:most])
 
@@ -248,8 +276,14 @@ EXPORTS: dict[str, Callable[[Camera], str | bytes]] = {
     'opencv': _opencv, 'colmap': _colmap, 'kalibr': _kalibr, 'opensfm': _opensfm,
     'nerfstudio': _nerfstudio, 'mrcal': _mrcal, 'ros': camera_info_yaml, 'foxglove': _foxglove,
     'gyroflow': _gyroflow, 'rays': rays_file, 'maps': maps_file}
-# those that can tell a field
+# what a file's name may end with; the first is offered. Any text may be called so, or nothing
+SUFFIXES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(('opencv', 'kalibr', 'ros'), ('.yaml', '.yml', '.txt', '')),
+    **dict.fromkeys(('opensfm', 'nerfstudio', 'foxglove', 'gyroflow'), ('.json', '.txt', '')),
+    'colmap': ('.txt', ''), 'mrcal': ('.cameramodel', '.txt', ''),
+    'rays': ('.npz',), 'maps': ('.npz',)}
+# those with a place for a field
 WITH_FIELD: dict[str, Callable[[Camera, Field | None], str | bytes]] = {
     'mrcal': _mrcal, 'rays': rays_file, 'maps': maps_file}
-# those that can tell a readout time
+# those with a place for a readout time
 WITH_READOUT: dict[str, Callable[[Camera, float | None], str | bytes]] = {'gyroflow': _gyroflow}

@@ -56,8 +56,9 @@ def splined_lens(camera: Camera, field: Field | None) -> tuple[str, Floats]:
             name = (f'LENSMODEL_SPLINED_STEREOGRAPHIC_order={ORDER}_Nx={columns}_Ny={shape[0]}'
                     f'_fov_x_deg={fov_deg}')
             return name, np.concatenate([camera.params[:4], control.ravel()])
-    raise OutputError(f'mrcal\'s splined lens cannot say what this camera sees to {EXACT_PX} px, '
-                      f'but to {worst:.2g} px at the best; export to rays')
+    raise OutputError('E-EXPORT-SPLINE',
+                      f"mrcal's splined lens describes this camera to {worst:.2g} px at the best, "
+                      f'not to {EXACT_PX} px; export to rays')
 
 
 def _corrections(camera: Camera, field: Field | None, columns: Floats, rows: Floats

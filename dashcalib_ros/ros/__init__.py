@@ -5,13 +5,13 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.errors import ConfigError, DashcalibError, coded
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, write_stdout
 from dashcalib_ros.workers.worker import one_thread_for_numpy
 
-INSTALL = ("calibrator: error: the Python package {name} is missing: source your ROS 2 "
-           "installation (. /opt/ros/jazzy/setup.sh), or pip install "
-           "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces")
+INSTALL = ("the Python package {name} is missing: source your ROS 2 installation "
+           "(. /opt/ros/jazzy/setup.sh), or pip install 'ros-jazzy-rclpy[fastrtps]' "
+           "ros-jazzy-common-interfaces")
 ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
                 'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
                 'std_srvs')
@@ -42,15 +42,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         return run([each for each in arguments if each != '--lifecycle'], lifecycle,
                    lambda: bool(signals))
     except DashcalibError as error:
-        write_stderr(f'calibrator: error: {" ".join(str(error).split())}')
-        return 2
+        return _fail(error)
     except ModuleNotFoundError as error:
         missing = (error.name or '').partition('.')[0]
         if missing not in ROS_PACKAGES:
             raise
-        write_stderr(INSTALL.format(name=missing))
-        return 2
+        return _fail(ConfigError('E-ROS-NOT-INSTALLED', INSTALL.format(name=missing)))
     finally:
         # while the interpreter ends, they would kill it
         for each in SIGNALS:
             signal.signal(each, signal.SIG_IGN)
+
+
+def _fail(error: DashcalibError) -> int:
+    write_stderr(f'calibrator: error: {coded(error)}')
+    return 2

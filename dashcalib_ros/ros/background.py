@@ -10,17 +10,16 @@ from functools import reduce
 from typing import Any
 
 from dashcalib_ros.arrays import GreyImage, Mask
-from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.errors import DashcalibError, InputError, counted, one_line
+from dashcalib_ros.errors import DashcalibError, InputError, coded, counted, one_line
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge import Calibration, Check, Monitor, moved_text
-from dashcalib_ros.judge.agreement import outdated, turns_of_another_camera
-from dashcalib_ros.judge.conclude import CONTRADICTS
+from dashcalib_ros.judge.agreement import CONTRADICTS, outdated, turns_of_another_camera
+from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.workers.memory import mapped_copy
@@ -203,9 +202,9 @@ class Learner:
     def request(self) -> str:
         """Calibrate now, with the present turns; return why not, '' if it is started."""
         if self.activity.calibrating:
-            return 'a calibration is running already'
+            return 'a calibration is already running'
         if not self.activity.status.turns:
-            return 'no turn was found so far: drive some'
+            return 'no turn has been found yet: drive some turns'
         self.inbox.put(self._request)
         return ''
 
@@ -289,7 +288,7 @@ class Learner:
             image = mapped_copy(whole(message, size, bank.depth))
             status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
         except InputError as error:
-            self._tell(Trouble('undecodable', str(error)))
+            self._tell(Trouble('undecodable', coded(error)))
             return
         self._show(message.header, image, bank.calibrator.detection)
         self._note(bank, status)
@@ -314,8 +313,8 @@ class Learner:
         except Exception as error:
             if bank is self._now and not self._closed:
                 self._tell(Trouble('failed_watches', f'the drive could not be compared with the '
-                                                     f'calibration in use ({_named(error)}); the '
-                                                     f'next turn tries again'))
+                                                     f'calibration in use ({_named(error)}); this '
+                                                     f'is repeated at the next turn'))
 
     def _watch(self, bank: _Bank, camera: NamedCamera, turns: frozenset[TurnId]) -> None:
         """Compare what is new with the camera in use."""
@@ -378,7 +377,7 @@ class Learner:
             check = None if given is None else bank.questions.check(
                 given.camera, calibration, self._progress)
             of_another = turns_of_another_camera(calibration.misfits, self.config.verdict)
-            bank.calibrator.scenes.reject(dict.fromkeys(
+            bank.calibrator.scenes.exclude(dict.fromkeys(
                 outdated(of_another | calibration.used_turns, of_another), CONTRADICTS))
         except Exception as error:
             self._failed(bank, error)
@@ -401,20 +400,22 @@ class Learner:
         # the same turns are tried again
         bank.requested = True
         self._tell(Trouble('failed_calibrations', f'a calibration failed ({_named(error)}); the '
-                                                  f'turns are kept, next try in {delay:.0f} s'))
+                                                  f'turns are kept, and the next attempt is in '
+                                                  f'{delay:.0f} s'))
 
 
 def whole(message: Any, size: tuple[int, int], depth: BitDepth | None = None) -> GreyImage:
     """Decode a message whose header says this size; raises InputError if it is not so."""
     image = decode(message, depth)
     if image.shape[::-1] != size:
-        raise InputError(f'an image is {image.shape[1]}x{image.shape[0]} but its header says '
-                         f'{size[0]}x{size[1]}: the camera driver is broken')
+        raise InputError('E-IMAGE-SIZE-NOT-AS-HEADER',
+                         f'an image is {image.shape[1]}x{image.shape[0]} but its header says '
+                         f'{size[0]}x{size[1]}: fix the camera driver')
     return image
 
 
 def new_turns(told: Set[TurnId], now: Status, wanted: int, checking: bool) -> list[str]:
-    """Return 'turn 2 of 5: 89°, 179° in all' for each turn that is ready now and was not told.
+    """Return 'turn 2 of 5: 89°, 179° in all' for each turn that is ready now and was not logged.
 
     The total is that of the turns so far; a turn that replaces another has the last number.
     checking: the turns check a calibration in use.
@@ -441,6 +442,7 @@ def beginning(status: Status) -> str:
 
 
 def _named(error: Exception) -> str:
-    """Return an error in one line, with its kind where it is not one of this project's."""
-    text = one_line(error, 500)
-    return text if isinstance(error, DashcalibError) else f'{type(error).__name__}: {text}'
+    """Return an error in one line, with its code, or its type if it is not this project's."""
+    if isinstance(error, DashcalibError):
+        return coded(error, 500)
+    return f'{type(error).__name__}: {one_line(error, 500)}'

@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.errors import InputError, OutputError, coded
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import NamedCamera
@@ -90,15 +90,15 @@ class CalibratorNode(CameraNode):
         try:
             kept = self._store.load()
         except InputError as error:
-            self._log.warning(str(error))
+            self._log.warning(coded(error))
             return
         if kept is None:
             return
         wanted = kept.rectified(self._core.rectified)
         if wanted is not kept:
-            self._log.warning(f'the projection_matrix in {self._store.path} is not that of '
-                              f'rectified: {self._core.rectified}, which is published; ~/save '
-                              f'writes it there')
+            self._log.warning(f'the projection_matrix in {self._store.path} does not belong to '
+                              f'rectified: {self._core.rectified}; the node publishes the one '
+                              f'that does, and ~/save writes it to the file')
         self._use(wanted, confirmed=False)
         self._log.info(f'loaded {self._store.path}: {sigma_text(kept.camera)}; unconfirmed until '
                        f'turns agree with it')
@@ -136,7 +136,7 @@ class CalibratorNode(CameraNode):
                 self._adopt(calibration)
                 self._learner.restart()
             case 'give_up':
-                self._log.error(f'the published calibration is given up: {judged.why}')
+                self._log.error(f'the published calibration is withdrawn: {judged.why}')
                 self._give_up()
                 # the turns that contradict it stay, and are used for the next one
                 self._learner.forget_stored(calibration.used_turns)
@@ -180,7 +180,7 @@ class CalibratorNode(CameraNode):
             try:
                 self._store.update(self._kept)
             except OutputError as error:
-                self._complaints.say('unsaved', str(error))
+                self._complaints.say('unsaved', coded(error))
         if judged.confirmed:
             self._confirmed = True
             if calibration.mount is not None:
@@ -196,7 +196,7 @@ class CalibratorNode(CameraNode):
         return self._info
 
     def _show_mount(self, mount: Mount | None, frame_id: str) -> None:
-        """Publish a mounting, and tell where it is another one than the last, if nobody did."""
+        """Publish a mounting, and log where it is another one than the last, once."""
         before = self._mounting.mount
         if before and mount and mount.moved_from(before) and 'mount' not in self._changes():
             self._log.info(mounts_text(mount, before))
@@ -216,8 +216,8 @@ class CalibratorNode(CameraNode):
         try:
             return True, self._store.retire()
         except OutputError as error:
-            self._log.error(str(error))
-            return False, str(error)
+            self._log.error(coded(error))
+            return False, coded(error)
 
     def _reset(self) -> tuple[bool, str]:
         self._log.warning('reset by request: the turns and the calibration are dropped')
@@ -236,22 +236,22 @@ class CalibratorNode(CameraNode):
         try:
             return True, self._store.save(self._kept)
         except OutputError as error:
-            self._complaints.say('unsaved', str(error))
-            return False, f'not saved: {error}'
+            self._complaints.say('unsaved', coded(error))
+            return False, f'not saved: {coded(error)}'
 
     def _warnings(self) -> list[str]:
         """Return warnings about the file and the topic, for the operator."""
         found = [text for text in (self._store.taken, self._store.given_up) if text]
         if self._contradictions:
             found.append(f'{self._contradictions} of {self._own.contradictions} calibrations in '
-                         f'a row contradict the published one: was the camera moved, its lens '
-                         f'changed, or a stabiliser switched on?')
+                         f'a row contradict the published one: check whether the camera was '
+                         f'moved, its lens changed, or a stabiliser switched on')
         if self._kept is not None and self._kept.edited and not self._confirmed:
             found.append(f'{self._store.path} was edited since a node wrote it: unconfirmed until '
                          f'turns agree with it')
         beside = self._beside.topic_name
         if self.count_publishers(beside) > 1:
-            found.append(f'another node publishes {beside}: remap it, or its subscribers get both')
+            found.append(f'another node also publishes {beside}: remap one of the two topics')
         return found
 
     def _health(self, turns: str) -> Health:
@@ -292,7 +292,7 @@ class CalibratorNode(CameraNode):
 
 
 class Commit:
-    """Gives a calibration to the driver's service without waiting for it; logs the outcome.
+    """Sends a calibration to the driver's service without waiting for it; logs the outcome.
 
     There is one warning if the driver has no service, does not answer, or dies meanwhile.
     """
@@ -330,7 +330,7 @@ class Commit:
         elif self._answer.exception() is not None:
             trouble = f'{name} failed: {self._answer.exception()}'
         elif self._answer.result().success:
-            log.info(f'{name} took the calibration')
+            log.info(f'{name} accepted the calibration')
             return
         else:
             trouble = f'{name} refused: {self._answer.result().status_message}'

@@ -1,7 +1,7 @@
 """The car around the camera: its sensors come in; how the camera sits on it goes out.
 
-That is a pose, and a static transform (REP-103, REP-105). Sensors whose topics are named are kept,
-and asked at each calibration.
+That is a pose, and a static transform (REP-103, REP-105). What sensors measure is kept where their
+topics are set, and used at each calibration.
 """
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from dashcalib_ros.ros.settings import NodeConfig
 # of all that publish static transforms
 STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TOPIC = '/tf_static'
-# s; so long others may take to say that they have the frame
+# s; within this time others publish that they have the frame
 LISTEN_S = 2.0
 # variance of an angle of which nothing is known, rad^2
 UNKNOWN = math.pi**2 / 3
@@ -40,7 +40,7 @@ Take = Callable[[str, float, Sequence[float]], None]
 
 
 class Mounting:
-    """Publishes the mounting on ~/mount, and, where it is asked for, once on /tf_static."""
+    """Publishes the mounting on ~/mount, and with publish_tf once on /tf_static."""
 
     def __init__(self, node: Node, own: NodeConfig, warn: Callable[[str], None]) -> None:
         """warn: logs a line unless it was logged before."""
@@ -52,7 +52,7 @@ class Mounting:
         self._sent: Mount | None = None
         self._waiting: tuple[Mount, str] | None = None
         self._since = time.monotonic()
-        # the parent of each frame, as others say
+        # the parent of each frame, as others publish it
         self._parents: dict[str, str] = {}
         self._transforms: Any = None
         if own.publish_tf:
@@ -68,17 +68,17 @@ class Mounting:
             self._waiting = mount, self._own.camera_frame or frame_id
 
     def tick(self) -> None:
-        """Send the transform that waits, once others had the time to tell theirs."""
+        """Send the transform that waits, once others had the time to publish theirs."""
         if self._waiting is None or time.monotonic() - self._since < LISTEN_S:
             return
         (mount, frame), self._waiting = self._waiting, None
         if not frame:
-            self._warn('there is no static transform: the images have no frame_id; set '
+            self._warn('no static transform is published: the images have no frame_id; set '
                        'camera_frame')
         elif self._parents.get(frame, self._own.base_frame) != self._own.base_frame:
-            self._warn(f'there is no static transform: {frame} has the parent '
-                       f'{self._parents[frame]} already, and a frame has one; set publish_tf to '
-                       f'false, or camera_frame to another name')
+            self._warn(f'no static transform is published: the frame {frame} already has the '
+                       f'parent {self._parents[frame]}, and it can have only one; set publish_tf '
+                       f'to false, or camera_frame to another name')
         elif self._sent is None or differs(mount, self._sent):
             self._sent = mount
             self._transforms.publish(self._kind(transforms=[self._transform(mount, frame)]))
@@ -137,12 +137,12 @@ def differs(mount: Mount, other: Mount) -> bool:
 
 
 class Sensors:
-    """Subscribes the sensors that are named, and passes on what they say."""
+    """Subscribes to the sensors whose topics are set, and passes on what they measure."""
 
     def __init__(self, node: Node, own: NodeConfig, take: Take) -> None:
         """take: called as SensorBuffer.add(): with a kind, the stamp in s and the values.
 
-        Raises ConfigError for what is no name of a topic.
+        Raises ConfigError for an invalid topic name.
         """
         for name, kind, option in (('imu_topic', Imu, 'imu'), ('odom_topic', Odometry, 'odom'),
                                    ('fix_topic', NavSatFix, 'gps')):
@@ -152,13 +152,14 @@ class Sensors:
             try:
                 node.create_subscription(kind, topic, partial(_pass_on, take, option), SENSOR)
             except NameValidationException as error:
-                raise ConfigError(f'{name} {topic!r} is no name of a topic: set one that ros2 '
-                                  f'topic list tells') from error
+                raise ConfigError('E-TOPIC-NAME-INVALID',
+                                  f'{name} {topic!r} is not a valid topic name: use a name such '
+                                  f'as /car/{option}') from error
 
 
 def _pass_on(take: Take, option: str, message: Any) -> None:
     stamp_s = float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
     for kind, values in values_in(message, option):
-        # odometry is asked for its speed only
+        # of odometry only the speed is used
         if kind != 'odom_rate':
             take(kind, stamp_s, values)

@@ -9,7 +9,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, coded
 from dashcalib_ros.judge import Check, with_faults
 from dashcalib_ros.report import NamedCamera, answer_dict
 from dashcalib_ros.report.camera_file import camera_of_message
@@ -19,12 +19,14 @@ from dashcalib_ros.ros.images import Source, SourceWatch
 from dashcalib_ros.ros.node import CameraNode
 from dashcalib_ros.ros.parameters import OVERRIDES, latched
 
-NOT_YET = Check('cannot tell', ('the turns wanted are not there yet',))
-UNTOUCHED = 'check_only: the calibration is the driver\'s, and stays as it is'
+NOT_YET = Check('cannot tell', ('there are not enough turns yet',))
+UNTOUCHED = 'check_only is set: the calibration of the driver is not changed'
+# 'the calibration', one of these, then the reasons, which begin with 'differs' where that is so
+SAYS = {'right': 'is right: ', 'differs': '', 'wrong': 'is wrong: '}
 
 
 class CheckNode(CameraNode):
-    """Says on ~/check, latched, whether the calibration that a driver publishes is right."""
+    """Publishes on ~/check, latched, whether the calibration that a driver publishes is right."""
 
     doing = 'checking'
 
@@ -83,17 +85,17 @@ class CheckNode(CameraNode):
         if not result.complete and found.answer == before:
             return
         answer = self._answer()
-        said = f'the calibration on {self._given_topic} is'
+        what = f'the calibration on {self._given_topic}'
         log_line(self._log, answer.answer == 'wrong', (
-            f'the turns cannot tell whether {said} right' if answer.answer == 'cannot tell' else
-            f'{said} {answer.answer}') + f': {"; ".join(answer.reasons)}')
+            f'{what} {SAYS[answer.answer]}' if answer.answer in SAYS else
+            f'the turns cannot show whether {what} is right: ') + '; '.join(answer.reasons))
         if result.complete and found.answer != 'cannot tell':
             # the next answer must be independent: it uses new turns only
             self._learner.restart()
 
     def _drop(self) -> None:
         """Forget the answer and the changes; the driver's camera stays."""
-        # as another object: what is still said of the former one is out of date
+        # as another object: what still comes about the former one is out of date
         self._given = None if self._given is None else replace(self._given)
         self._monitor, self._moved = None, ''
         self._found = NOT_YET
@@ -120,17 +122,18 @@ class CheckNode(CameraNode):
 
     def _health(self, turns: str) -> Health:
         found = self._answer()
-        if found.answer == 'wrong':
-            level, message = WARN, f'the calibration is wrong: {found.reasons[0]}'
-        elif found.answer == 'right':
-            level, message = OK, f'the calibration is right; {turns} for the next check'
+        if found.answer == 'right':
+            message = f'the calibration is right; {turns} for the next check'
+        elif found.answer in SAYS:
+            message = f'the calibration {SAYS[found.answer]}{found.reasons[0]}'
         else:
-            level, message = OK, f'checking the calibration, {turns}: {found.reasons[0]}'
+            message = f'checking the calibration, {turns}: {found.reasons[0]}'
+        level = WARN if found.answer == 'wrong' else OK
         return Health('checking', level, message, self._trusted(), {
             'check': found.answer, 'check reasons': '; '.join(found.reasons)})
 
     def _answer(self) -> Check:
-        """Return what the turns say of it, and what no turn is needed for."""
+        """Return the answer of the turns, and the faults that need no turn."""
         return with_faults(self._found, self._given.faults if self._given else ())
 
     @property
@@ -145,7 +148,7 @@ class CheckNode(CameraNode):
             message.binning_y, roi.x_offset, roi.y_offset, roi.width, roi.height))
         if what == 'stray':
             self._complaints.say('other_calibrations', f'a camera_info on {self._given_topic} '
-                                 f'differs from those before: is there a second publisher?')
+                                 f'differs from those before: check for a second publisher')
         elif what != 'same':
             self._take(message, what == 'changed')
 
@@ -153,14 +156,14 @@ class CheckNode(CameraNode):
         """Check this calibration from now on."""
         topic = self._given_topic
         if changed:
-            self._log.warning(f'the calibration on {topic} has changed: it is checked anew')
+            self._log.warning(f'the calibration on {topic} has changed: it is checked again')
         try:
             self._given = camera_of_message(message, topic)
             if self._given.faults:
                 self._log.warning(f'the calibration on {topic} is wrong: '
                                   f'{"; ".join(self._given.faults)}')
         except InputError as error:
-            self._given, self._problem = None, str(error)
+            self._given, self._problem = None, coded(error)
         self._warn()
         self._verdict = None
         self._drop()

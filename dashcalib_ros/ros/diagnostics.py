@@ -1,4 +1,4 @@
-"""What goes wrong is counted and logged now and then; what the node does is in /diagnostics."""
+"""Problems are counted and logged now and then; what the node does is in /diagnostics."""
 from __future__ import annotations
 
 import time
@@ -77,7 +77,7 @@ class Complaints:
         """Count an unexpected exception; log its traceback the first time it comes from there."""
         where = traceback.extract_tb(error.__traceback__)[-1:]
         place = f'{type(error).__name__} at {where[0].filename}:{where[0].lineno}' if where else ''
-        text = f'the node goes on after {type(error).__name__}: {one_line(error)}'
+        text = f'the node continues after {type(error).__name__}: {one_line(error)}'
         if place in self._places:
             self.say(kind, text)
             return
@@ -100,7 +100,7 @@ class Complaints:
 
 @dataclass(frozen=True)
 class Health:
-    """What a node says of its calibration.
+    """What a node reports of its calibration.
 
     state: in one word. level, message: where nothing else is wrong. camera: the one in use.
     values: further ones for /diagnostics, by their names.

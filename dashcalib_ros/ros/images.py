@@ -1,7 +1,7 @@
-"""The camera's images: subscribed, told apart from strays, and asked for when they are missing.
+"""The camera's images: subscribed, separated from strays, and reported when they are missing.
 
-All of this runs in the executor's thread. It reads no pixels, but of images that tell of another
-camera than before: damaged ones must not be believed.
+All of this runs in the executor's thread. It reads no pixels, but of images that seem to be of
+another camera than before: damaged ones must not be believed.
 """
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.utilities import get_rmw_implementation_identifier
 
-from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.errors import InputError, coded, counted
 from dashcalib_ros.input.bag_write import TRANSPORTS
 from dashcalib_ros.input.decode import message_size
 from dashcalib_ros.input.stamps import StampGate
@@ -33,22 +34,20 @@ LASTING = 10
 T = TypeVar('T')
 
 CURES = {
-    'lost': 'images are lost between the camera and this node (gaps in the stamps): give the '
-            "camera driver's process config/fastdds_large_images.xml, or publish reliable or "
-            'compressed images',
-    'dropped': 'images are dropped because detection does not keep up: set motion.rate, '
-               'motion.width or motion.points lower',
-    'repeated': 'images have stamps that are not later than those before: is there a second '
-                'publisher on the topic?',
-    'unstamped': 'images without a stamp among others that have one: repair the camera driver',
-    'set_back': 'the stamps were set back (a bag that loops?): tracking begins anew, the turns '
-                'are kept',
+    'lost': 'images are lost between the camera and this node (gaps in the stamps)',
+    'dropped': 'images are dropped because detection does not keep up: lower motion.rate, '
+               'motion.width or motion.points',
+    'repeated': 'images have stamps that are not later than those before: check for a second '
+                'publisher on the topic',
+    'unstamped': 'some images have no stamp, and others have one: fix the camera driver',
+    'set_back': 'the stamps jumped back (as those of a bag that loops): tracking starts again, '
+                'and the turns are kept',
 }
 # images a subscription holds for a callback that is late; of a video, where a lost one costs more
 DEPTH, VIDEO_DEPTH = 5, 50
 # s between two checks of the publishers: images before the right subscription are lost
 LOOK_S = 0.25
-# s without an image before it is told, and between two such lines
+# s without an image before it is logged, and between two such lines
 SILENT_S, AGAIN_S = 4.0, 60.0
 # types of topics, and their transports
 PACKET, VIDEO = ('ffmpeg_image_transport_msgs/msg/FFMPEGPacket',
@@ -146,11 +145,11 @@ class Intake:
             source = Source(message_size(message), message.header.frame_id)
             what = self._watch.take(source, lambda: whole(message, source.size))
         except InputError as error:
-            self._complaints.say('undecodable', str(error))
+            self._complaints.say('undecodable', coded(error))
             return None
         if what == 'stray':
             self._complaints.say('strays', f'an image is {source}, the camera is '
-                                           f'{self.source}: is there a second publisher?')
+                                           f'{self.source}: check for a second publisher')
             return None
         if what != 'same':
             self._changed(self._watch.previous, source)
@@ -165,15 +164,18 @@ class Intake:
         """Begin anew with the stamps: turns and tracks were dropped."""
         self._stamps.forget()
 
-    def complain(self, dropped: int) -> None:
-        """Tell what went wrong since the last call; dropped: images dropped by the detection."""
+    def complain(self, dropped: int, why_lost: str) -> None:
+        """Log what went wrong since the last call.
+
+        dropped: images dropped by the detection. why_lost: the causes of lost ones, with cures.
+        """
         stamps = self._stamps
         if stamps.fault:
             self._complaints.once(f'{stamps.fault}: the times of reception are used instead; '
-                                  f'repair the driver')
-        for kind, count in (('lost', stamps.lost), ('dropped', dropped),
-                            ('repeated', stamps.repeated), ('unstamped', stamps.zero),
-                            ('set_back', stamps.set_back)):
+                                  f'fix the driver')
+        self._complaints.total('lost', stamps.lost, f'{CURES["lost"]}: {why_lost}')
+        for kind, count in (('dropped', dropped), ('repeated', stamps.repeated),
+                            ('unstamped', stamps.zero), ('set_back', stamps.set_back)):
             if kind != 'repeated' or not stamps.fault:
                 self._complaints.total(kind, count, CURES[kind])
 
@@ -261,7 +263,7 @@ class ImageInput:
                 return
 
     def _tell_missing(self, topic: str, kind: str) -> None:
-        """Tell once that a package is not installed."""
+        """Log once that a package is not installed."""
         if self._missing != kind:
             self._missing = kind
             package = kind.partition('/')[0].replace('_', '-')
@@ -277,14 +279,31 @@ class ImageInput:
             return
         fitting = 'reliable' if all(map(_reliable, infos)) else 'best_effort'
         if fitting != self.reliability:
-            self._node.get_logger().info(f'{self.topic}: subscribing {fitting}, as its publishers '
-                                         f'do')
+            self._node.get_logger().info(f'{self.topic}: subscribing {fitting}, like its '
+                                         f'publishers')
             self.stop()
             self.reliability = fitting
             self.start()
 
+    @property
+    def why_lost(self) -> str:
+        """Return what may lose images, with the cures that are not in use, as far as seen here."""
+        if self.reliability == 'reliable':
+            return ('publisher and subscription are reliable, so the camera driver skips images, '
+                    'or this computer is overloaded; check the rate of the driver and the load')
+        infos = self._node.get_publishers_info_by_topic(self.topic)
+        cures = ['set reliability to auto' if infos and all(map(_reliable, infos)) else
+                 'let the driver publish reliable images']
+        if self._kind == IMAGE:
+            cures.append('publish compressed images')
+            if get_rmw_implementation_identifier().startswith('rmw_fastrtps'):
+                cures.append("start the driver's process with config/fastdds_large_images.xml "
+                             '(this node cannot see whether it already does)')
+        return ('either the camera driver skips images: check its rate; or the best-effort '
+                f'transport loses them: {", or ".join(cures)}')
+
     def tell_silence(self, silent_s: float | None) -> None:
-        """Tell from time to time that images are missing; silent_s: since the last one."""
+        """Log from time to time that images are missing; silent_s: since the last one."""
         now = time.monotonic()
         missing_s = now - self._started if silent_s is None else silent_s
         if missing_s < SILENT_S:
@@ -307,15 +326,15 @@ class ImageInput:
             return (f'its publisher sends {", ".join(sorted(others))}: remap another topic with '
                     f'-r image_raw:=TOPIC')
         if self.reliability == 'reliable' and not all(map(_reliable, infos)):
-            return ('its publisher is best effort, which a reliable subscription does not hear: '
-                    'set -p reliability:=auto')
+            return ('its publisher is best effort, and a reliable subscription receives nothing '
+                    'from it: set -p reliability:=auto')
         if self._is_video:
-            return ('its publisher sent no key picture: let the encoder make one every few '
-                    'seconds (gop_size), or look at the camera driver')
-        return f'its {counted(len(infos), "publisher")} sent nothing: look at the camera driver'
+            return ('its publisher sent no key frame: configure the encoder to send one every few '
+                    'seconds (gop_size), or check the camera driver')
+        return f'its {counted(len(infos), "publisher")} sent nothing: check the camera driver'
 
     def _published(self) -> list[str]:
-        """Return the arguments that let the node hear others' images, for a few topics."""
+        """Return the arguments with which the node gets others' images, for a few topics."""
         node = self._node
         own = {name for name, _ in node.get_publisher_names_and_types_by_node(
             node.get_name(), node.get_namespace())}

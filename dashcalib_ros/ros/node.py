@@ -20,10 +20,10 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 
-from dashcalib_ros.calibrator import Status
-from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, one_line
+from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, coded
 from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.judge import Monitor, Verdict
+from dashcalib_ros.pipeline import Status
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.report.result import check_camera_name
 from dashcalib_ros.report.wording import witness_texts
@@ -35,10 +35,10 @@ from dashcalib_ros.ros.parameters import (
     OVERRIDES,
     camera_name,
     changed,
+    check_changeable,
     check_known,
     declare,
     refusal,
-    why_read_only,
 )
 from dashcalib_ros.ros.preview import Preview
 from dashcalib_ros.ros.video import VideoDecoding
@@ -271,8 +271,8 @@ class CameraNode(Node, ABC):
                           f'({", ".join(images.publishers)}): nothing is learned, published or '
                           f'saved until one is left; remap the others')
         elif mixed:
-            self._held = (f'{mixed}: nothing is published or saved until one is left; give each '
-                          f'a topic of its own')
+            self._held = (f'{mixed}: nothing is published or saved until one is left; remap each '
+                          f'camera to its own topic')
         if self._held and not before:
             self._log.error(self._held)
         elif before and not self._held:
@@ -291,10 +291,10 @@ class CameraNode(Node, ABC):
             try:
                 check_mask(self._mask, source.size)
             except InputError as error:
-                raise SetupError(str(error)) from error
+                raise SetupError(error.code, str(error)) from error
             self._log.info(f'the images on {self._images.topic} are {source}')
         else:
-            self._log.error(f'the camera changes from {before} to {source}: the turns and the '
+            self._log.error(f'the camera changed from {before} to {source}: the turns and the '
                             f'calibration are dropped')
             self.begin_anew()
         self._fit(source)
@@ -392,8 +392,8 @@ class CameraNode(Node, ABC):
                 return callback(request, response)
             except Exception as error:
                 self.survive(error)
-                return refusal(request, response,
-                               f'failed: {one_line(error)}; the log of the node has more')
+                return refusal(request, response, f'failed: {coded(error)}; see the log of the '
+                                                  f'node')
         return answer
 
     def _calibrate(self) -> tuple[bool, str]:
@@ -402,34 +402,35 @@ class CameraNode(Node, ABC):
         if self._learner.goal is None:
             return False, '; '.join(self._warnings())
         refused = self._learner.request()
-        return not refused, refused or 'started: /diagnostics will have the result'
+        return not refused, refused or 'started: /diagnostics and the log have the result'
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         before = self._core.turns.wanted
         try:
             self._core, self._own = changed(self._core, self._own, parameters, self._most_turns)
         except ConfigError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=False, reason=coded(error))
         wanted = self._core.turns.wanted
         if wanted != before:
-            self._log.info(f'{wanted} turns are wanted now, not {before}')
+            self._log.info(f'turns.wanted is now {wanted}, it was {before}')
             self._set_goal()
         return SetParametersResult(successful=True)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters as rclpy does, and say why where one is read-only."""
-        result = super().set_parameters_atomically(parameter_list)
-        for name in (each.name for each in parameter_list):
-            if not result.successful and result.reason.endswith(f'read-only parameter: {name}.'):
-                result.reason = why_read_only(name)
-        return result
+        """Set parameters as rclpy does; refuse unknown and read-only ones with the cure."""
+        try:
+            check_changeable(self, (each.name for each in parameter_list))
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=coded(error))
+        return super().set_parameters_atomically(parameter_list)
 
     # diagnostics -----------------------------------------------------------------------------
 
     def _on_tick(self) -> None:
         self._empty()
         images, intake, learner = self._images, self._intake, self._learner
-        intake.complain(learner.inbox.dropped + (self._video.dropped if self._video else 0))
+        intake.complain(learner.inbox.dropped + (self._video.dropped if self._video else 0),
+                        images.why_lost)
         if images.listening:
             images.tell_silence(intake.silent_s)
         self._hold()
@@ -477,7 +478,7 @@ class CameraNode(Node, ABC):
         """Return the level of /diagnostics and its message: the worst of what is to be said."""
         silent_s = self._intake.silent_s
         if not self._images.listening:
-            return WARN, 'inactive: the node subscribes no images until it is activated'
+            return WARN, 'inactive: the node subscribes to no images until it is activated'
         if silent_s is None or silent_s > SILENT_S:
             return STALE, f'no image on {self._images.topic} {since_text(silent_s)}'
         if self._held:

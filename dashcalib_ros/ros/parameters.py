@@ -32,7 +32,7 @@ RELIABILITIES = ('best_effort', 'reliable')
 
 
 def latched() -> QoSProfile:
-    """Return the QoS of a topic that late subscribers hear; rclpy writes overrides into it."""
+    """Return the QoS of a topic that late subscribers get; rclpy writes overrides into it."""
     return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -54,16 +54,29 @@ def declare(node: Node) -> tuple[Config, NodeConfig]:
 def check_known(names: Iterable[str], declared: Iterable[str]) -> None:
     """Check that each parameter that was given is one of this node.
 
-    Raises ConfigError with the nearest name that there is.
+    Raises ConfigError with the nearest name.
     """
     known = [*declared, *specs()]
     for name in names:
         if name in known:
             continue
         near = difflib.get_close_matches(name, known, 1)
-        raise ConfigError(f'there is no parameter {name!r}' + (
+        raise ConfigError('E-PARAMETER-UNKNOWN', f'there is no parameter {name!r}' + (
             f': did you mean {near[0]}?' if near else
-            ': remove it; if it is for another node, name that node in the file, not /**'))
+            ': remove it; if it is for another node, name that node in the parameter file instead '
+            'of /**'))
+
+
+def check_changeable(node: Node, names: Iterable[str]) -> None:
+    """Check that parameters exist and may be changed while the node runs; raises ConfigError."""
+    names = tuple(names)
+    check_known(names, node._parameters)
+    for name in names:
+        # those for experts are not declared unless they were given
+        if not node.has_parameter(name) or node.describe_parameter(name).read_only:
+            raise ConfigError('E-PARAMETER-READ-ONLY',
+                              f'{name} is read-only while the node runs: start the node with '
+                              f'-p {name}:=VALUE. These can be changed: {", ".join(CHANGEABLE)}')
 
 
 def changed(core: Config, own: NodeConfig, parameters: Iterable[Parameter], most_turns: int
@@ -75,15 +88,11 @@ def changed(core: Config, own: NodeConfig, parameters: Iterable[Parameter], most
     new = with_changes(core, own, {
         each.name: each.value for each in parameters if each.name in CHANGEABLE})
     if new[0].turns.wanted > most_turns:
-        raise ConfigError(f'turns.wanted can be {most_turns} at the most while the node runs, as '
-                          f'so many turns are kept; for more, start the node with it')
+        raise ConfigError('E-TURNS-ABOVE-CAPACITY',
+                          f'turns.wanted can be at most {most_turns} while the node runs, which '
+                          f'keeps {most_turns} turns; for more, start the node with '
+                          f'-p turns.wanted:={new[0].turns.wanted}')
     return new
-
-
-def why_read_only(name: str) -> str:
-    """Return why a parameter cannot be changed while the node runs, and what to do instead."""
-    return (f'{name} is read-only while the node runs: it is read at the start; start the node '
-            f'with -p {name}:=VALUE. These can be changed: {", ".join(CHANGEABLE)}')
 
 
 def refusal(request: Any, response: Any, reason: str) -> Any:
@@ -126,5 +135,6 @@ def _check_qos(name: str, value: Any) -> None:
     fits = {'history': value in ('keep_last', 'keep_all'), 'reliability': value in RELIABILITIES,
             'depth': type(value) is int and value > 0}
     if not fits.get(policy, True):
-        raise ConfigError(f'{name} cannot be {value!r}: history is keep_last or keep_all, depth a '
-                          f'number from 1 on, reliability reliable or best_effort')
+        raise ConfigError('E-QOS-OVERRIDE-INVALID',
+                          f'{name} cannot be {value!r}: history is keep_last or keep_all, depth a '
+                          f'whole number of at least 1, reliability reliable or best_effort')

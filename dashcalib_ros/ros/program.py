@@ -28,10 +28,10 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.01, 1.0
 
 
 def run(argv: Sequence[str], lifecycle: bool, stopped: Callable[[], bool]) -> int:
-    """Run the node until it is asked to stop; return 0. Raises DashcalibError.
+    """Run the node until it is stopped; return 0. Raises DashcalibError.
 
     argv: ROS's arguments. lifecycle: it waits for configure and activate. stopped: returns whether
-    a signal asked for the end.
+    a signal stopped it.
     """
     node: CameraNode | None = None
     reuse_image_buffers()
@@ -49,7 +49,7 @@ def run(argv: Sequence[str], lifecycle: bool, stopped: Callable[[], bool]) -> in
         # which may look like a wrong parameter
         if not stopped():
             if isinstance(error, ParameterException):
-                raise ConfigError(str(error)) from error
+                raise ConfigError('E-PARAMETER-VALUE-INVALID', str(error)) from error
             raise
     finally:
         if node is not None:
@@ -111,12 +111,12 @@ class ManagedCheckNode(Managed, CheckNode):
 
 
 def make_node(lifecycle: bool) -> CameraNode:
-    """Make the node that the parameters ask for."""
-    # a parameter tells which node is to be made, and only a node knows its parameters
-    asked = Node('calibrator', enable_rosout=False, start_parameter_services=False)
+    """Make the node that the parameters describe."""
+    # a parameter decides which node is to be made, and only a node knows its parameters
+    probe = Node('calibrator', enable_rosout=False, start_parameter_services=False)
     any_type = ParameterDescriptor(dynamic_typing=True)
-    check_only = asked.declare_parameter('check_only', False, any_type).value is True
-    asked.destroy_node()
+    check_only = probe.declare_parameter('check_only', False, any_type).value is True
+    probe.destroy_node()
     if lifecycle:
         return ManagedCheckNode() if check_only else ManagedCalibratorNode()
     return CheckNode() if check_only else CalibratorNode()
@@ -131,8 +131,9 @@ def start_ros(argv: Sequence[str]) -> None:
         # without the lines of rcl's sources
         text = re.sub(r', at [^ ,]*:\d+', '', str(error))
         text = text.removeprefix('failed to initialize rcl: ')
-        raise ConfigError(f'{text}; remappings are -r FROM:=TO, parameters -p NAME:=VALUE, '
-                          f'files --params-file FILE') from error
+        raise ConfigError('E-ROS-ARGUMENT-INVALID',
+                          f'{text}; write remappings as -r FROM:=TO, parameters as '
+                          f'-p NAME:=VALUE, files as --params-file FILE') from error
 
 
 class Executor(SingleThreadedExecutor):
@@ -163,12 +164,12 @@ class _Silent:
 
 
 def spin(node: CameraNode, stopped: Callable[[], bool]) -> None:
-    """Run the node's callbacks until the context is shut down, or a signal asked for the end.
+    """Run the node's callbacks until the context is shut down, or a signal comes.
 
     A signal that comes while rclpy installs its own handlers does not shut the context down; the
     next timer of the node then ends the wait.
 
-    Exceptions of callbacks, and of rclpy itself, are logged and counted, and the node goes on.
+    Exceptions of callbacks, and of rclpy itself, are logged and counted, and the node continues.
     Raises SetupError, and exceptions after which rclpy calls no callback any more: the node must
     then be started again, as the launch files do.
     """

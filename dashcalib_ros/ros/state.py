@@ -21,8 +21,8 @@ from dashcalib_ros.ros.settings import NodeConfig
 Action = Literal['wait', 'adopt', 'keep', 'replace', 'give_up']
 NEXT = {
     'weak': 'it is calculated again with each better turn',
-    'refused': 'it is tried again with each better turn: those of 60° or more, at town speed and '
-               'in daylight, teach most',
+    'refused': 'it is repeated with each better turn; turns of 60° or more, at town speed and in '
+               'daylight, help most',
 }
 
 
@@ -47,7 +47,7 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
     contradictions: how many in a row contradicted that. limits: `better` and `contradictions`.
     """
     if published is not None and STEADY in new.verdict.cures:
-        return _contradicted(f'the published one, as the picture moves now: {STEADY}',
+        return _contradicted(f'the published one, because the picture moves now: {STEADY}',
                              contradictions, limits, 'give_up')
     if new.verdict.level != 'accepted' or new.camera is None or new.sigma is None:
         action: Action = 'wait' if published is None else 'keep'
@@ -56,16 +56,16 @@ def judge(new: Calibration, complete: bool, published: NamedCamera | None, contr
         return Judgement('adopt')
     against = contradicted(published.camera, published.sigma, new.camera, new.sigma)
     if against:
-        return _contradicted(f'the published one: {", ".join(against)}; was the camera moved, or '
-                             f'its lens changed?', contradictions, limits,
+        return _contradicted(f'the published one: {", ".join(against)}; check whether the camera '
+                             f'was moved or its lens changed', contradictions, limits,
                              'replace' if complete else 'give_up')
-    # the sigma of a file that was edited is not known
-    before = 'not known' if published.sigma is None else f'± {published.sigma["fx"]:.2f} px'
+    # the sigma of a file that was edited is unknown
+    before = 'unknown' if published.sigma is None else f'{published.sigma["fx"]:.2f} px'
     after = new.sigma['fx']
     if complete and (published.sigma is None
                      or after <= limits.better * published.sigma['fx']):
-        return Judgement('replace', f'it is more exact: fx is known to ± {after:.2f} px, it was '
-                                    f'{before}')
+        return Judgement('replace', f'the new one is more precise: the standard deviation (sigma) '
+                                    f'of fx is {after:.2f} px; before, it was {before}')
     return Judgement('keep', 'it confirms the published one', confirmed=True)
 
 

@@ -98,18 +98,21 @@ class Kept:
         """
         camera = parse_camera(text, path)
         if camera.verdict != 'accepted' or camera.sigma is None:
-            raise InputError('it is no accepted calibration of this node; it is moved aside when '
-                             'there is one')
+            raise InputError('E-KEPT-NOT-ACCEPTED',
+                             'it is not an accepted calibration of this node; it is moved aside '
+                             'when the node has one')
         content = parse_yaml(text, str(path))
         own = content['dashcalib']
         name, topic = content.get('camera_name'), own.get('topic')
         if name != whose.name:
-            raise InputError(f'it is of the camera {name}, this one is {whose.name}; it is moved '
-                             f'aside when this one is calibrated')
+            raise InputError('E-KEPT-OF-OTHER-CAMERA',
+                             f'it belongs to the camera {name}, and this one is {whose.name}; it '
+                             f'is moved aside when this one is calibrated')
         if topic != whose.topic and not (topic is None and whose.plain):
-            of = f'of the images on {topic}' if topic else 'older and says no topic'
-            raise InputError(f'it is {of}, this node has {whose.topic}; set camera_name to give '
-                             f'each camera a file of its own')
+            of = f'belongs to the images on {topic}' if topic else 'is older and names no topic'
+            raise InputError('E-KEPT-OF-OTHER-TOPIC',
+                             f'it {of}, and this node uses {whose.topic}; set camera_name so '
+                             f'that each camera has its own file')
         count, frame_id = own.get(COUNT, 0), own.get('frame_id')
         # an older file has neither
         older = topic is None and CHECKSUM not in own
@@ -192,14 +195,14 @@ class Store:
         if self.claim():
             return ''
         return (f'another node uses {self.path}: this one neither publishes nor writes it; set '
-                f'camera_name or camera_info_url to give each a file of its own')
+                f'camera_name or camera_info_url so that each node has its own file')
 
     @property
     def given_up(self) -> str:
         """Return the line where the file still has a calibration that was given up, else ''."""
         if self._given_up is None or self._read() != self._given_up:
             return ''
-        return (f'{self.path} was given up, but could not be moved aside: remove it, or the next '
+        return (f'{self.path} was withdrawn, but could not be moved aside: remove it, or the next '
                 f'start of the node publishes it again')
 
     def load(self) -> Kept | None:
@@ -210,22 +213,24 @@ class Store:
         """
         self._text = None
         if self.taken:
-            raise InputError(self.taken)
+            raise InputError('E-KEPT-IN-USE', self.taken)
         try:
             if not (self.path.exists() or self.path.is_symlink()):
                 return None
             text = read_text(self.path, YAML_BYTES)
             kept = Kept.read(text, self.path, self._whose)
-        except (InputError, OSError, ValueError, OverflowError) as error:
-            raise InputError(f'{self.path} is ignored: {error}') from error
+        except InputError as error:
+            raise InputError(error.code, f'{self.path} is ignored: {error}') from error
+        except (OSError, ValueError, OverflowError) as error:
+            raise InputError('E-KEPT-UNREADABLE', f'{self.path} is ignored: {error}') from error
         if self.given_up:
-            raise InputError(self.given_up)
+            raise InputError('E-KEPT-WITHDRAWN', self.given_up)
         if why := implausible(kept.camera):
             try:
                 end = f'it is now {set_aside(self.path)}'
             except OutputError as error:
                 end = str(error)
-            raise InputError(f'{self.path} is not used: {why}; {end}')
+            raise InputError('E-KEPT-IMPLAUSIBLE', f'{self.path} is not used: {why}; {end}')
         self._text = text
         # its sigma may be what was edited
         return replace(kept, camera=replace(kept.camera, sigma=None)) if kept.edited else kept
@@ -233,12 +238,13 @@ class Store:
     def save(self, kept: Kept) -> str:
         """Write it, completely or not at all; return a line about it. Raises OutputError."""
         if self.taken:
-            raise OutputError(self.taken)
+            raise OutputError('E-KEPT-IN-USE', self.taken)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f'cannot make {self.path.parent}: {error.strerror}; set '
-                              f'camera_info_url to a place you may write to') from error
+            raise OutputError('E-KEPT-NOT-WRITABLE',
+                              f'cannot create {self.path.parent}: {error.strerror}; set '
+                              f'camera_info_url to a place that you may write to') from error
         moved = None if self._ours else set_aside(self.path)
         self._write(kept)
         self._given_up = None
@@ -262,8 +268,8 @@ class Store:
             moved = set_aside(self.path)
         except OutputError as error:
             self._given_up = self._read()
-            raise OutputError(f'{error}; until then the next start of the node publishes it '
-                              f'again') from error
+            raise OutputError(error.code, f'{error}; until then the next start of the node '
+                                          f'publishes it again') from error
         self._text = self._given_up = None
         return f'{self.path} is now {moved}' if moved else 'there was no file'
 
@@ -290,12 +296,12 @@ def implausible(kept: NamedCamera) -> str:
     if not FOCAL[0] <= camera.fx / width <= FOCAL[1]:
         return f'fx is {camera.fx:g} px in a picture {width} px wide'
     if not ASPECT[0] <= camera.fy / camera.fx <= ASPECT[1]:
-        return f'fy is {camera.fy:g} px beside an fx of {camera.fx:g} px'
+        return f'fy is {camera.fy:g} px, and fx is {camera.fx:g} px'
     if not (abs(camera.cx / width - 0.5) <= 0.5 + BESIDE
             and abs(camera.cy / height - 0.5) <= 0.5 + BESIDE):
         return f'the principal point ({camera.cx:g}, {camera.cy:g}) is far from the picture'
     if not _real(camera):
-        return 'its distortion is none of a lens'
+        return 'no lens has its distortion'
     bad = [name for name, value in sigma.items() if not (np.isfinite(value) and value > 0)]
     return f'the sigma of {", ".join(bad)} is not positive' if bad else ''
 
@@ -339,19 +345,21 @@ def camera_info_path(url: str, camera_name: str) -> Path:
     try:
         text = re.sub(r'\$\{(.*?)\}', lambda found: values[found[1]], url or DEFAULT)
     except KeyError as error:
-        raise InputError(f'camera_info_url {url}: there is no ${{{error.args[0]}}}; there are '
-                         f'${{ROS_HOME}} and ${{NAME}}') from error
+        raise InputError('E-URL-VARIABLE-UNKNOWN',
+                         f'camera_info_url {url}: there is no ${{{error.args[0]}}}; use '
+                         f'${{ROS_HOME}} and ${{NAME}} only') from error
     scheme, separator, path = text.rpartition('://')
     if scheme.lower() == 'package':
         return _in_package(text)
     if (scheme.lower() not in ('', 'file') or path.endswith('/') or not path
             or (separator and not path.startswith(('/', '~')))):
-        raise InputError(f'camera_info_url {url} names no file that can be kept; use {KNOWN}')
+        raise InputError('E-URL-INVALID',
+                         f'camera_info_url {url} does not name a local file; use {KNOWN}')
     try:
         return Path(path).expanduser()
     except RuntimeError as error:  # the user, or the own home folder, is unknown
-        raise InputError(f'there is no home folder for {path}; set camera_info_url to a path '
-                         f'without ~') from error
+        raise InputError('E-HOME-UNKNOWN', f'there is no home folder for {path}; set '
+                                           f'camera_info_url to a path without ~') from error
 
 
 def _in_package(url: str) -> Path:
@@ -359,10 +367,12 @@ def _in_package(url: str) -> Path:
     parts = urlsplit(url)
     rest = parts.path.strip('/')
     if not parts.netloc or not rest:
-        raise InputError(f'camera_info_url {url} names no file in a package; use {KNOWN}')
+        raise InputError('E-URL-INVALID',
+                         f'camera_info_url {url} does not name a file in a package; use {KNOWN}')
     try:
         share = get_package_share_directory(parts.netloc)
     except (PackageNotFoundError, ValueError, OSError) as error:
-        raise InputError(f'camera_info_url {url}: there is no package {parts.netloc}; source its '
+        raise InputError('E-ROS-PACKAGE-MISSING',
+                         f'camera_info_url {url}: there is no package {parts.netloc}; source its '
                          f'workspace, or use file://') from error
     return Path(share, rest)

@@ -9,11 +9,11 @@ from typing import Any
 
 from std_msgs.msg import Header
 
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, coded
 from dashcalib_ros.input.packets import PacketDecoder, codec_of
 from dashcalib_ros.input.video import FramePicture
 
-# packets that wait for the decoder; beyond them all are dropped, and a key picture is waited for
+# packets that wait for the decoder; with more, all are dropped and the next key frame is awaited
 WAITING = 60
 
 
@@ -37,7 +37,7 @@ class VideoDecoding:
 
     @property
     def waited(self) -> int:
-        """Return how many packets came without a key picture before them."""
+        """Return how many packets came without a key frame before them."""
         return self._decoder.waited
 
     def put(self, message: Any) -> None:
@@ -70,12 +70,13 @@ class VideoDecoding:
                 for image in self._images(message):
                     self._shown(image)
             except Exception as error:  # also what PyAV lets out: the next packet may be sound
-                self._failed(str(error))
+                self._failed(coded(error))
 
     def _images(self, message: Any) -> list[Any]:
         codec = codec_of(message)
         if codec is None:
-            raise InputError('a message is no packet of a video: set image_transport:=compressed')
+            raise InputError('E-NOT-A-VIDEO-PACKET',
+                             'a message is not a video packet: set image_transport:=compressed')
         header = getattr(message, 'header', None)
         if header is None:  # of foxglove_msgs
             header = Header(stamp=message.timestamp, frame_id=message.frame_id)

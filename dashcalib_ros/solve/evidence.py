@@ -23,8 +23,8 @@ from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import errors_px
 from dashcalib_ros.solve.linear import (
+    COUPLED_READOUT_S,
     IMAGE,
-    LEAST_READOUT_S,
     ImagePrior,
     Normal,
     normal_equations,
@@ -185,15 +185,15 @@ class _Step:
         return (self.gain - base.gain) / max(self.chance - base.chance, 1e-9)
 
 
-def fixed_camera_tests(found: Estimate, bent: bool = True) -> tuple[FixedCameraTest, ...]:
+def fixed_camera_tests(found: Estimate) -> tuple[FixedCameraTest, ...]:
     """Return the tests whether the camera is a fixed one, the clearest that it is not first.
 
-    With a part of the tracks. bent: False leaves out the local bend, which takes longer.
+    With a part of the tracks.
     """
     now = found.with_tracks(FIRST_TRACKS)
     loss_px, width = now.loss_px(), now.camera.image_size[0]
     variance = now.noise(loss_px).variance
-    further = partial(_bends, image_size=now.camera.image_size) if bent else None
+    further = partial(_bends, image_size=now.camera.image_size)
     normals = [normal_equations(scene, now.imaging, loss_px, True, further,
                                 variance=variance * now.inflation) for scene in now.scenes]
     prior = now.prior()
@@ -219,16 +219,15 @@ def fixed_camera_tests(found: Estimate, bent: bool = True) -> tuple[FixedCameraT
             turns if kind == 'zoom' else {})
 
     fixed, more = solved(None, own), ONE_TURN if len(now.scenes) == 1 else 1.0
-    if abs(now.imaging.readout_s) > LEAST_READOUT_S:
+    if abs(now.imaging.readout_s) > COUPLED_READOUT_S:
         more *= ROLLING
+    # a stabilised picture goes on moving
+    moving = shifts if now.moves else None
     tests = [test('shift', solved(shifts, own), fixed,
                   LEFT_SHIFT if now.moves else more * CLEAR['shift'], width),
-             test('zoom', solved(zooms, own), fixed, more * CLEAR['zoom'], 1.0)]
-    if bent:
-        # a stabilised picture goes on moving
-        moving = shifts if now.moves else None
-        tests.append(test('bend', solved(moving, np.arange(len(prior.score))),
-                          solved(moving, own), CLEAR['bend'], width / 1000))
+             test('zoom', solved(zooms, own), fixed, more * CLEAR['zoom'], 1.0),
+             test('bend', solved(moving, np.arange(len(prior.score))), solved(moving, own),
+                  CLEAR['bend'], width / 1000)]
     return tuple(sorted(tests, key=lambda each: (not each.clear, -each.strength / each.limit)))
 
 

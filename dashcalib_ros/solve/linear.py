@@ -26,7 +26,7 @@ SHAKE = 3
 # px; a residual of a point that is behind the camera
 BEHIND_PX = 1e3
 # s; with a shorter readout, how the poses change the camera's motion does not count
-LEAST_READOUT_S = 1e-3
+COUPLED_READOUT_S = 1e-3
 # groups of tracks, of which each is eliminated at once
 CHUNKS = 5
 # px^2; rendered images without noise would have none
@@ -283,7 +283,7 @@ def _linearised(scene: Scene, imaging: Imaging, loss_px: float, by_image: bool,
         weight = weights(residual, loss_px)
     # a small rotation w of the camera moves the local point by w x (R X)
     by_still, by_motion, follow = by_local, [], None
-    if abs(imaging.readout_s) > LEAST_READOUT_S:
+    if abs(imaging.readout_s) > COUPLED_READOUT_S:
         # a point X moves by turning x X + moving, and both follow the poses
         late = by_local * (imaging.readout_s * found.late)[:, None, None]
         by_still, by_motion = by_local + late @ cross(found.turning), [

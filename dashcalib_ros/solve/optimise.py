@@ -115,7 +115,12 @@ class Estimate:
             subsample_tracks(scene, count) for scene in self.scenes))
 
     def loss_px(self, least_px: float = 0.0) -> float:
-        """Return the scale of the Cauchy loss: intrinsics.loss times the median residual, px."""
+        """Return the scale of the Cauchy loss: intrinsics.loss times the median residual, px.
+
+        Raises LinAlgError where no turn is left: nothing determines the camera then.
+        """
+        if not self.scenes:
+            raise np.linalg.LinAlgError('no turn is left')
         median = float(np.median(np.linalg.norm(np.concatenate(self.residuals), axis=1)))
         return max(self.config.intrinsics.loss * median, LEAST_LOSS_PX, least_px)
 

@@ -113,7 +113,7 @@ class Solution:
     @property
     def rolling(self) -> bool:
         """Return whether there is clear evidence of a rolling shutter, and it matters."""
-        return abs(self.readout_s) >= max(CLEAR_SIGMAS * self.readout_sigma_s, LEAST_READOUT_S)
+        return abs(self.readout_s) >= max(CLEAR_SIGMAS * self.readout_sigma_s, NAMED_READOUT_S)
 
     @property
     def reprojection_error_px(self) -> float:
@@ -134,8 +134,8 @@ class Solution:
         return written(lens_alone(given), NONE, self.scenes, self.camera.model).camera.params
 
 
-# a shorter readout, in its sigmas and in s, is not named
-CLEAR_SIGMAS, LEAST_READOUT_S = 4.0, 1.0 / 1e3
+# a readout that is shorter, in its sigmas and in s, is not named
+CLEAR_SIGMAS, NAMED_READOUT_S = 4.0, 1e-3
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ class ChildWorker:
         if self._closed:
             if self._process is not None:
                 _end(self._process)
-            raise WorkerDiedError('the calibrator is closed')
+            raise WorkerDiedError('E-CALIBRATOR-CLOSED', 'the calibrator is closed')
         assert self._process is not None
         return self._process
 
@@ -148,8 +148,9 @@ class ChildWorker:
                 command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 env=environment, stderr=None if self._verbose else subprocess.DEVNULL)
         except OSError as error:
-            raise WorkerError(f'cannot start the reconstruction process: {error}; '
-                              f'check memory and process limits (ulimit -u)') from error
+            raise WorkerError('E-WORKER-CANNOT-START',
+                              f'cannot start the reconstruction process: {error}; check the free '
+                              f'memory and the limit of processes (ulimit -u)') from error
         assert process.stdin is not None
         # a child that hangs does not read: writing must not block, so that it can be watched
         os.set_blocking(process.stdin.fileno(), False)
@@ -190,10 +191,10 @@ class _WatchedPipe:
             if looks == LOOKS_TO_REPORT:
                 self._on_trouble(
                     f'the reconstruction process {self._pid} {silence}; after '
-                    f'{LOOKS_TO_KILL * LOOK_S:.0f} s it is ended and its work tried again')
+                    f'{LOOKS_TO_KILL * LOOK_S:.0f} s it is ended and its work is repeated')
             elif looks >= LOOKS_TO_KILL:
-                raise WorkerDiedError(f'the reconstruction process {self._pid} {silence} and was '
-                                      f'ended')
+                raise WorkerDiedError('E-WORKER-HANGS', f'the reconstruction process {self._pid} '
+                                                        f'{silence} and was ended')
 
 
 def _processor_time(pid: int) -> int | None:
@@ -212,8 +213,9 @@ def _processor_time(pid: int) -> int | None:
 def _died(process: subprocess.Popen[bytes]) -> WorkerDiedError:
     _end(process)
     return WorkerDiedError(
+        'E-WORKER-DIED',
         f'the reconstruction process died (exit code {process.returncode}); it is started '
-        f'again at the next try. If it dies each time, free memory or set scene.tracks lower')
+        f'again. If it dies every time, free memory or lower scene.tracks')
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -324,7 +326,7 @@ def _portable(error: Exception) -> Exception:
     try:
         pickle.loads(pickle.dumps(error, PROTOCOL))
     except Exception:
-        return WorkerError(f'{type(error).__name__}: {error}')
+        return WorkerError('E-UNEXPECTED', f'{type(error).__name__}: {error}')
     return error
 
 

@@ -12,7 +12,7 @@ from dashcalib_ros import reconstruct
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
-from dashcalib_ros.errors import DashcalibError, WorkerError
+from dashcalib_ros.errors import DashcalibError, WorkerError, coded
 from dashcalib_ros.reconstruct.scene import Draft, Scene, TurnPicture, picture_of
 from dashcalib_ros.workers.memory import return_free_memory
 from dashcalib_ros.workers.worker import Progress, Worker, WorkerDiedError
@@ -209,6 +209,11 @@ class ScenePool:
         with self._changed:
             return dict(self._pictures)
 
+    @property
+    def closed(self) -> bool:
+        """Return whether close() was called."""
+        return self._closed.is_set()
+
     def pids(self) -> list[int]:
         """Return the process ids of the workers that have one."""
         return [pid for worker in self._workers if (pid := worker.pid) is not None]
@@ -256,12 +261,13 @@ class ScenePool:
             self._wait(ended)
             if call.done and call.error is None:
                 return call.result
-            error = call.error or WorkerDiedError('the calibrator is closed')
+            error = call.error or WorkerDiedError('E-CALIBRATOR-CLOSED',
+                                                  'the calibrator is closed')
             failures += 1
             if (not isinstance(error, WorkerDiedError) or self._closed.is_set()
                     or failures == ATTEMPTS):
                 raise error
-            self._on_trouble(str(error))
+            self._on_trouble(coded(error))
             self._pause(back_off_s(failures))
             call = self.begin(call.function, *call.arguments, tells=call.tells)
 
@@ -365,6 +371,7 @@ class ScenePool:
             except Exception as reason:
                 # the turn is not the cause: workers die without it, too
                 self._try_again(job, WorkerError(
+                    'E-WORKER-CANNOT-LOAD',
                     f'no reconstruction process can start: {reason}; --verbose shows its output'))
             else:
                 # the other turns can still be used
@@ -375,6 +382,7 @@ class ScenePool:
             self._try_again(job, error)
         else:
             self._try_again(job, WorkerError(
+                'E-TURN-FAILED',
                 f'reconstruction of {job.name} failed: {type(error).__name__}: {error}'))
 
     def _try_again(self, job: Job, error: Exception, report: bool = True) -> None:
@@ -385,7 +393,7 @@ class ScenePool:
             if report:
                 self._errors[job.turn.id] = error
             self._put(job)
-        self._on_trouble(f'{error}; {job.name} is tried again')
+        self._on_trouble(f'{coded(error)}; {job.name} is tried again')
 
     # with the lock held (a thread may take a Condition's lock again)
 

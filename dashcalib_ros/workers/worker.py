@@ -16,7 +16,7 @@ THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'
 
 
 def one_thread_for_numpy() -> None:
-    """Ask numpy's libraries for one thread, unless the user asks for more; before numpy is loaded.
+    """Let numpy's libraries use one thread, unless the user set more; before numpy is loaded.
 
     The matrices here are small: a second thread does little but wait, at full speed.
     """
@@ -64,7 +64,8 @@ class InlineWorker:
     def __init__(self) -> None:
         """Raise WorkerError where results would differ from a child's, which has these set."""
         if any(os.environ.get(name) != '1' for name in THREAD_VARIABLES):
-            raise WorkerError('inline, results are the same only with one thread for numpy: set '
+            raise WorkerError('E-NUMPY-THREADS',
+                              'inline, results are the same only with one thread for numpy: set '
                               + ' '.join(f'{name}=1' for name in THREAD_VARIABLES)
                               + ' in the environment before Python starts')
         self._closed = False
@@ -74,7 +75,7 @@ class InlineWorker:
         """Run a function here; see Worker.call."""
         with _ONE_AT_A_TIME:
             if self._closed:
-                raise WorkerDiedError('the calibrator is closed')
+                raise WorkerDiedError('E-CALIBRATOR-CLOSED', 'the calibrator is closed')
             extra = {} if progress is None else {'progress': progress}
             return function(*arguments, **extra)
 

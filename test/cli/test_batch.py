@@ -30,6 +30,11 @@ def test_a_fleet_is_calibrated_here_and_nothing_is_done_twice(tmp_path, capsys):
     assert json.loads((out / 'effort.json').read_text())['clips_read'] == 2
     assert (out / 'overview.html').exists() and not list(out.rglob('.writable'))
     before = (out / 'overview.html').read_bytes()
+    code, text, err = run(capsys, manifest, '--out', out, '--workers', '1', '--json')
+    found = json.loads(text)
+    assert code == 3 and found['cameras'] == {'one': 'refused', 'two': 'refused'}
+    assert {each['row'] for each in found['not_read']} == {2, 3} and found['files']
+    assert '2 cameras: ' in err
     _, text, _ = run(capsys, manifest, '--out', out, '--shard', '1/1')
     assert 'one: refused' not in text
     run(capsys, manifest, '--out', out, '--workers', '1')
@@ -40,7 +45,7 @@ def test_a_fleet_is_calibrated_here_and_nothing_is_done_twice(tmp_path, capsys):
     ('clip\nä.avi\n', (), 'not UTF-8'), ('video\na.avi\n', (), 'no column clip'),
     ('clip\na.avi\n', ('--shard', '3/2'), '--shard must be like 1/8'),
     ('clip\na.avi\n', ('--workers', '0'), '--workers'),
-    ('clip\na.avi\n', ('--group-by', '('), 'no regular expression'),
+    ('clip\na.avi\n', ('--group-by', '('), 'E-GROUP-BY-INVALID'),
     ('clip\na.avi\n', ('--set', 'fleet.units=3'), 'did you mean'),
     ('clip\na.avi\n', ('--workers', '1', '--shard', '1/2'), 'not allowed with')])
 def test_bad_manifests_and_usage_are_one_line(tmp_path, capsys, text, options, message):

@@ -1,6 +1,7 @@
 """run and turns around a calibrator of our own making: all that the command itself decides."""
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -22,16 +23,15 @@ from made_calibration import TRUTH, make_calibration
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import AUTO, calibrated_models, ros_camera
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
-from dashcalib_ros.demo import demo_drive, render_to_bag
-from dashcalib_ros.demo.drive import Drive
+from dashcalib_ros.demo import Drive, Lens, demo_drive, render_to_bag
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import ConfigError, OutputError, WorkerError
+from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.report import write_results
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
@@ -73,7 +73,7 @@ class FakeCalibrator:
 @pytest.fixture
 def fake(monkeypatch):
     """Put the fake in the calibrator's place."""
-    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', FakeCalibrator)
+    monkeypatch.setattr('dashcalib_ros.session.Calibrator', FakeCalibrator)
     monkeypatch.setattr(FakeCalibrator, 'made', [])
     return FakeCalibrator
 
@@ -107,7 +107,7 @@ class FakeDetection:
 def fake_detection(monkeypatch):
     """Put the fake in the place of the first stage; nobody may calibrate."""
     monkeypatch.setattr('dashcalib_ros.cli.run.Detection', FakeDetection)
-    monkeypatch.setattr('dashcalib_ros.cli.drive.Calibrator', None)
+    monkeypatch.setattr('dashcalib_ros.session.Calibrator', None)
     return FakeDetection
 
 
@@ -165,22 +165,24 @@ def test_an_earlier_calibration_that_is_moved_aside_is_told(
     monkeypatch.setattr(fake, 'level', level)
     assert main(['run', drive]) == 3
     lines = capsys.readouterr().err.splitlines()
-    assert lines[-1] == ('dashcalib: warning: the calibration that was in calibration/'
-                         'calibration.yaml is now calibration/calibration.previous.yaml')
+    assert lines[-1] == ('dashcalib: warning: the earlier calibration calibration/'
+                         'calibration.yaml was renamed to calibration/calibration.previous.yaml')
 
 
 def test_the_result_alone_on_stdout(fake, drive, tmp_path, capsys):
-    assert main(['run', drive, '--fps', '10', '--json', '-']) == 0
-    shown = capsys.readouterr()
-    assert json.loads(shown.out) == json.loads(
-        (tmp_path / 'work/calibration/result.json').read_text())
-    assert shown.err.splitlines()[-1].startswith('next: ') and 'accepted' in shown.err
+    # `--json -` is what earlier versions needed
+    for json_flag in (['--json'], ['--json', '-']):
+        assert main(['run', drive, '--fps', '10', *json_flag]) == 0
+        shown = capsys.readouterr()
+        assert json.loads(shown.out) == json.loads(
+            (tmp_path / 'work/calibration/result.json').read_text())
+        assert shown.err.splitlines()[-1].startswith('next: ') and 'accepted' in shown.err
 
 
 def test_quiet(fake, drive, tmp_path, capsys):
     assert main(['run', drive, '--fps', '10', '--quiet']) == 0
     assert capsys.readouterr() == ('', 'dashcalib: warning: dark\n')
-    assert main(['run', drive, '--fps', '10', '--quiet', '--json', '-']) == 0
+    assert main(['run', '--json', drive, '--fps', '10', '--quiet']) == 0
     shown = capsys.readouterr()
     assert json.loads(shown.out)['verdict'] == 'accepted' and 'next' not in shown.err
 
@@ -196,7 +198,7 @@ def test_several_inputs_are_one_drive(fake, drive, tmp_path, capsys):
     assert result['input'] == f'{drive} and 1 more'
     capsys.readouterr()
     assert main(['run', drive, str(tmp_path / 'drive2'), '--write-bag', 'out']) == 2
-    assert 'on each bag alone' in capsys.readouterr().err
+    assert '[E-BAG-SEVERAL]' in capsys.readouterr().err
 
 
 def test_in_a_pipe_progress_is_a_line_from_time_to_time(fake, drive, monkeypatch, capsys):
@@ -240,14 +242,16 @@ def test_help_names_every_model(capsys):
         assert all(name in text for name in NAMES_OF_MODELS), text
 
 
-def test_a_model_that_there_is_not_is_told_before_a_drive_is_rendered(
+def test_an_unknown_model_is_an_error_before_a_drive_is_rendered(
         fake, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(['demo', '--model', 'mirror']) == 2
-    assert capsys.readouterr().err == ("dashcalib: error: there is no camera model 'mirror'; "
-                                       'there are auto, radial, brown, fisheye\n')
+    for args in (['--model', 'mirror'], ['--lens', 'mirror']):
+        assert main(['demo', *args]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith('dashcalib: error: ') and error.count('\n') == 1
+        assert 'mirror' in error and 'radial' in error and 'fisheye' in error
     assert names(tmp_path) == []
-    with pytest.raises(ConfigError, match='there are auto, radial'):
+    with pytest.raises(ConfigError, match='mirror'):
         Calibrator(Config(model='mirror'))
 
 
@@ -270,34 +274,34 @@ def load_projection(path):
 
 
 @pytest.mark.parametrize(('args', 'complaint'), [
-    (['--set', 'turns.wantd=3'], 'did you mean turns.wanted?'),
-    (['--set', 'turns.half_width=.nan'], 'finite'),
-    (['--set', 'turns.wanted'], 'KEY=VALUE'),
-    (['--set', 'turns.wanted=[1'], 'not valid YAML'),
-    (['--set', 'turns.wanted=' + '[' * 40 + ']' * 40], 'or 30 levels'),
-    (['--set', 'seed=0x' + 'f' * 5000], 'more than 300 digits'),
-    (['--set', 'seed=0x' + 'f' * 200], 'seed must be between'),
-    (['--set', 'turns.wanted=!!int ""'], 'not valid YAML'),
-    (['--turns', '0'], 'turns.wanted must be between'),
-    (['--seed', '-1'], 'seed must be between'),
-    (['--model', 'fish-eye'], 'there are auto, radial, brown, fisheye'),
-    (['--set', 'model=Radial'], 'there are auto, radial, brown, fisheye'),
-    (['--set', 'rectified=whole'], 'rectified must be one of same, crop, all'),
-    (['--config', 'missing.yaml'], 'missing.yaml'),
-    (['--config', '.'], 'cannot read the configuration'),
-    (['--config', 'broken.yaml'], 'not valid YAML at line 3'),
-    (['--config', 'list.yaml'], 'no settings'),
-    (['--config', 'pipe'], 'it is no regular file'),
-    (['--config', '/dev/full'], 'it is no regular file'),
-    (['--mask', 'pipe'], 'it is no regular file'),
-    (['--mask', '/dev/full'], 'it is no regular file'),
-    (['--config', 'binary.yaml'], 'not a text file'),
-    (['--mask', 'missing.png'], 'cannot read the mask'),
-    (['--mask', 'list.yaml'], 'no picture'),
-    (['--mask', 'empty.png'], 'no picture'),
-    (['--mask', 'black.png'], 'all black'),
-    (['--mask', 'small.png'], '32x24 and the images are 64x48'),
-    (['--out', 'list.yaml'], 'choose another output folder'),
+    (['--set', 'turns.wantd=3'], 'turns.wanted [E-CONFIG-UNKNOWN]'),
+    (['--set', 'turns.half_width=.nan'], 'turns.half_width [E-CONFIG-FINITE]'),
+    (['--set', 'turns.wanted'], '[E-SETTING-FORM]'),
+    (['--set', 'turns.wanted=[1'], '[E-YAML-INVALID]'),
+    (['--set', 'turns.wanted=' + '[' * 40 + ']' * 40], '[E-YAML-TOO-LARGE]'),
+    (['--set', 'seed=0x' + 'f' * 5000], '[E-YAML-NUMBER]'),
+    (['--set', 'seed=0x' + 'f' * 200], 'seed [E-CONFIG-RANGE]'),
+    (['--set', 'turns.wanted=!!int ""'], '[E-YAML-INVALID]'),
+    (['--turns', '0'], 'turns.wanted [E-CONFIG-RANGE]'),
+    (['--seed', '-1'], 'seed [E-CONFIG-RANGE]'),
+    (['--model', 'fish-eye'], 'auto, radial, brown, fisheye [E-MODEL-UNKNOWN]'),
+    (['--set', 'model=Radial'], 'auto, radial, brown, fisheye [E-MODEL-UNKNOWN]'),
+    (['--set', 'rectified=whole'], 'same, crop, all [E-CONFIG-CHOICE]'),
+    (['--config', 'missing.yaml'], 'missing.yaml [E-FILE-MISSING]'),
+    (['--config', '.'], '. [E-FILE-NOT-REGULAR]'),
+    (['--config', 'broken.yaml'], 'line 3 [E-YAML-INVALID]'),
+    (['--config', 'list.yaml'], '[E-CONFIG-EMPTY]'),
+    (['--config', 'pipe'], 'pipe [E-FILE-NOT-REGULAR]'),
+    (['--config', '/dev/full'], '/dev/full [E-FILE-NOT-REGULAR]'),
+    (['--mask', 'pipe'], 'pipe [E-FILE-NOT-REGULAR]'),
+    (['--mask', '/dev/full'], '/dev/full [E-FILE-NOT-REGULAR]'),
+    (['--config', 'binary.yaml'], 'binary.yaml [E-FILE-NOT-TEXT]'),
+    (['--mask', 'missing.png'], 'missing.png [E-FILE-MISSING]'),
+    (['--mask', 'list.yaml'], 'list.yaml [E-IMAGE-DAMAGED]'),
+    (['--mask', 'empty.png'], 'empty.png [E-IMAGE-DAMAGED]'),
+    (['--mask', 'black.png'], 'black.png [E-MASK-BLACK]'),
+    (['--mask', 'small.png'], '32x24 [E-MASK-SIZE]'),
+    (['--out', 'list.yaml'], 'list.yaml'),
 ])
 def test_what_is_wrong_is_one_line_and_nothing_is_left(
         fake, drive, tmp_path, capsys, args, complaint):
@@ -313,7 +317,9 @@ def test_what_is_wrong_is_one_line_and_nothing_is_left(
     assert main(['run', drive, *args]) == 2
     shown = capsys.readouterr()
     assert shown.err.startswith('dashcalib: error: ') and shown.err.count('\n') == 1
-    assert complaint in shown.err and shown.out == ''
+    # a value that it names, and the code
+    value, _, code = complaint.partition('[')
+    assert value.strip() in shown.err and code in shown.err and shown.out == ''
     assert names(work) == before
     assert all(made.closed for made in fake.made)
 
@@ -355,13 +361,14 @@ def interrupted_while_it_waits():
 
 
 @pytest.mark.parametrize(('failure', 'code', 'complaint'), [
-    (WorkerError('the worker was killed; try again'), 2, 'the worker was killed; try again'),
+    (WorkerError('E-WORKER', 'it was killed; try again'), 2, 'killed; try again [E-WORKER]\n'),
     (KeyboardInterrupt(), 130, 'interrupted'),
     (interrupted_while_it_waits(), 130, 'interrupted'),
-    (MemoryError(), 2, 'out of memory'),
-    (OSError(errno.ENOSPC, 'No space left on device', '/tmp/x'), 2, 'free some'),
-    (OSError(errno.EIO, 'Input/output error', '/media/x'), 2, '/media/x'),
-    (ModuleNotFoundError("No module named 'pycolmap'", name='pycolmap'), 2, 'install it'),
+    (MemoryError(), 2, '[E-OUT-OF-MEMORY]'),
+    (OSError(errno.ENOSPC, 'No space left on device', '/tmp/x'), 2, '[E-DISK-FULL]'),
+    (OSError(errno.EIO, 'Input/output error', '/media/x'), 2, '[E-FILE-ACCESS]'),
+    (ModuleNotFoundError("No module named 'pycolmap'", name='pycolmap'), 2,
+     '[E-PACKAGE-MISSING]'),
 ])
 def test_known_failures_close_everything_and_leave_nothing(
         fake, drive, tmp_path, monkeypatch, capsys, failure, code, complaint):
@@ -373,11 +380,11 @@ def test_known_failures_close_everything_and_leave_nothing(
     assert names(tmp_path / 'work') == []
 
 
-@pytest.mark.parametrize('options', [(), ('--json', '-')])
+@pytest.mark.parametrize('options', [(), ('--json',)])
 def test_a_disk_that_fills_up_meanwhile_does_not_hide_the_result(
         fake, drive, tmp_path, monkeypatch, capsys, options):
     def full(*_, **__):
-        raise OutputError('cannot write to calibration: No space left on device; free some')
+        raise OutputError('E-FULL', 'cannot write to calibration: No space left on device')
     monkeypatch.setattr('dashcalib_ros.cli.run.write_results', create_autospec(
         write_results, side_effect=full))
     assert main(['run', drive, '--fps', '10', *options]) == 2
@@ -385,7 +392,8 @@ def test_a_disk_that_fills_up_meanwhile_does_not_hide_the_result(
     assert 'fx' in shown.out and 'accepted' in shown.out
     if options:
         assert json.loads(shown.out)['intrinsics']['fx'] == TRUTH.fx
-    assert shown.err.splitlines()[-1].startswith('dashcalib: error: cannot write to calibration')
+    assert shown.err.splitlines()[-1] == ('dashcalib: error: cannot write to calibration: No '
+                                          'space left on device [E-FULL]')
     assert 'written to' not in shown.out + shown.err
     assert names(tmp_path / 'work') == []
 
@@ -396,7 +404,7 @@ def test_a_bag_at_the_place_of_the_results_is_told_before_the_calibration(
     made_drives.write_bag(tmp_path / 'drive', made_drives.images(made_drives.drive(3)))
     for bag in ('calibration', 'calibration/..'):
         assert main(['run', 'drive', '--write-bag', bag]) == 2
-        assert 'exists: choose another place' in capsys.readouterr().err
+        assert '[E-OUTPUT-EXISTS]' in capsys.readouterr().err
     assert fake.made == [] and names(tmp_path) == ['drive']
 
 
@@ -442,12 +450,12 @@ def test_turns_as_a_table(fake_detection, drive, monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert ['8.8', '88', '58', '118', '61', '0.0600'] in [line.split() for line in lines]
     assert any(line.startswith('prominence: ') for line in lines)  # the word is explained
-    assert lines[-2] == '1 of 3 turns wanted, in 4 frames' and 'dashcalib run' in lines[-1]
+    assert lines[-2].startswith('1 turn found in 4 frames') and 'best 3' in lines[-2]
+    assert lines[-1].startswith('next: dashcalib run')
     monkeypatch.setattr(fake_detection, 'found', ())
     assert main(['turns', drive]) == 0
-    assert capsys.readouterr().out == (
-        '0 of 5 turns wanted, in 4 frames\n'
-        'next: record a drive with turns at crossings, in daylight\n')
+    found, then = capsys.readouterr().out.splitlines()
+    assert found.startswith('0 turns found in 4 frames') and then.startswith('next: record')
 
 
 def test_progress_is_drawn_on_a_terminal(fake, drive, monkeypatch):
@@ -465,11 +473,20 @@ def test_progress_is_drawn_on_a_terminal(fake, drive, monkeypatch):
 @pytest.fixture
 def rendered(fake, drive, monkeypatch):
     """Let the demo's drive be the folder of pictures, and its truth 7 px of fx away."""
-    truth = {**TRUTH.named, 'fx': TRUTH.fx - 7}
-    monkeypatch.setattr('dashcalib_ros.demo.demo_drive', create_autospec(
-        demo_drive, return_value=create_autospec(Drive, instance=True, truth=truth)))
-    monkeypatch.setattr('dashcalib_ros.demo.render_to_bag', create_autospec(
-        render_to_bag, side_effect=lambda rendered, path: shutil.copytree(drive, path)))
+    lens = Lens(1242, 375, **{**TRUTH.named, 'fx': TRUTH.fx - 7})
+
+    def other_drive(seed=0, kind='radial'):
+        made = demo_drive(seed, kind)
+        return Drive(dataclasses.replace(lens, glass=made.lens.glass), made.spec)
+
+    def copied(rendered, path, progress):
+        shutil.copytree(drive, path)
+        progress(1.0)
+
+    monkeypatch.setattr('dashcalib_ros.cli.demo.demo_drive', create_autospec(
+        demo_drive, side_effect=other_drive))
+    monkeypatch.setattr('dashcalib_ros.cli.demo.render_to_bag', create_autospec(
+        render_to_bag, side_effect=copied))
 
 
 @pytest.mark.parametrize(('level', 'code'), [('accepted', 0), ('weak', 3), ('refused', 3)])
@@ -491,7 +508,27 @@ def test_demo_keeps_its_bag_when_asked_and_overwrites_none(fake, rendered, tmp_p
     assert main(['demo', '--keep-bag']) == 0
     assert len(names(tmp_path / 'work' / 'demo' / 'bag')) == 4
     assert main(['demo', '--keep-bag']) == 2
-    assert 'exists; remove it' in capsys.readouterr().err
+    assert '[E-BAG-EXISTS]' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('kind', 'said'), [
+    ('shutter', {'readout_ms': 25.0}), ('stabilised', {'stabiliser_px': pytest.approx(62.1)}),
+    ('windscreen', {'windscreen_rms_px': 1.0})])
+def test_the_truth_has_what_spoils_the_pictures(fake, rendered, tmp_path, capsys, kind, said):
+    assert main(['demo', '--lens', kind, '--out', 'out', '--json']) == 0
+    shown, out = capsys.readouterr(), tmp_path / 'work' / 'out'
+    found, truth = json.loads(shown.out), json.loads((out / 'truth.json').read_text())
+    assert found['truth'] == truth and truth.items() >= said.items()
+    assert found['verdict'] == 'accepted' and 'rendered: ' in shown.err
+    # this estimate has no field: what a windscreen bends adds to the error of 7 px of fx
+    bent = 1.0 if kind == 'windscreen' else 0.0
+    assert found['mapping_px'] == pytest.approx(np.hypot(3.649, bent), abs=0.1 * bent + 0.001)
+    rays = out / 'truth_rays.npz'
+    assert rays.exists() == bool(bent)
+    if bent:
+        assert np.load(rays)['rays'].shape == (375, 1242, 3)
+    # another demo in the same folder is not left with them
+    assert main(['demo', '--out', 'out']) == 0 and not rays.exists()
 
 
 def test_demo_leaves_no_temporary_bag(fake, rendered, tmp_path, monkeypatch):

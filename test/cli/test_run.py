@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zstandard
 
-pytest.importorskip('dashcalib_ros.calibrator')
+pytest.importorskip('dashcalib_ros.pipeline')
 
 from processes import processes_of
 from waiting import wait_for
@@ -44,7 +44,7 @@ from pathlib import Path
 from shared_drive import SharedDrive
 from dashcalib_ros import demo
 from dashcalib_ros.cli import main
-demo.demo_drive = lambda seed: SharedDrive(Path({str(shared_drive.path)!r}), bonnet=True,
+demo.demo_drive = lambda seed, lens: SharedDrive(Path({str(shared_drive.path)!r}), bonnet=True,
                                            timestamp=True)
 sys.exit(main())
 """)
@@ -235,4 +235,4 @@ def test_demo_prints_estimate_sigma_and_truth(demo):
     again = dashcalib('compare', out, out / 'truth.json', '--json')
     assert json.loads(again.stdout)['mapping_px'] is not None
     refused = dashcalib('demo', '--out', out, '--keep-bag')
-    assert refused.returncode == 2 and 'exists' in refused.stderr
+    assert refused.returncode == 2 and '[E-BAG-EXISTS]' in refused.stderr

@@ -18,10 +18,15 @@ import numpy as np
 import pytest
 from made_calibration import TRUTH, make_calibration
 
+import dashcalib_ros
+from dashcalib_ros.camera import AUTO, calibrated_models
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.cli import main
+from dashcalib_ros.cli.arguments import COMMANDS, JSON, KINDS, LENSES, MODELS
 from dashcalib_ros.cli.terminal import show, warn
+from dashcalib_ros.demo import DEMOS
 from dashcalib_ros.report import write_results
+from dashcalib_ros.report.export import EXPORTS
 from dashcalib_ros.report.tables import line
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
@@ -42,9 +47,11 @@ def here(capfd):
     return run
 
 
-def assert_one_line_error(done, code=2):
-    assert done.returncode == code, done.stderr
+def assert_one_line_error(done, code=''):
+    """Check that a command ended with one line of an error; code: in brackets at its end."""
+    assert done.returncode == 2, done.stderr
     assert done.stderr.startswith('dashcalib: error: '), done.stderr
+    assert not code or done.stderr.endswith(f' [{code}]\n'), done.stderr
     assert done.stderr.count('\n') == 1, done.stderr
     assert done.stdout == ''
 
@@ -65,7 +72,7 @@ def test_help_names_the_exit_codes(here, command):
     assert (done.returncode, done.stderr) == (0, '')
     assert done.stdout.startswith('usage: dashcalib')
     text = ' '.join(done.stdout.split())
-    # only these two end with a verdict
+    # only these end with a verdict
     assert ('3 weak or refused' in text) == (command in ([], ['run'], ['demo']))
     assert 'exit codes: 0 ' in text and '2 bad input or usage' in text
     assert f'example: dashcalib {command[0]} ' in text if command else 'COMMAND --help' in text
@@ -74,8 +81,40 @@ def test_help_names_the_exit_codes(here, command):
 
 def test_an_unknown_argument_names_the_help_of_its_command(here):
     done = here('demo', 'extra')
-    assert_one_line_error(done)
-    assert 'extra; see dashcalib demo --help' in done.stderr
+    assert_one_line_error(done, 'E-ARGUMENT-UNKNOWN')
+    assert 'extra' in done.stderr and 'dashcalib demo --help' in done.stderr
+
+
+@pytest.mark.parametrize(('args', 'code', 'hint'), [
+    (['drive.mp4'], 'E-COMMAND-UNKNOWN', '`dashcalib run drive.mp4`'),
+    (['clips/*.mp4', '--fps', '10'], 'E-COMMAND-UNKNOWN', "`dashcalib run 'clips/*.mp4'`"),
+    (['drives'], 'E-COMMAND-UNKNOWN', '`dashcalib run drives`'),
+    (['rnu', 'x'], 'E-COMMAND-UNKNOWN', '`dashcalib run`'),
+    (['exprot'], 'E-COMMAND-UNKNOWN', '`dashcalib export`'),
+    # no drive, and like no command
+    (['camera.yaml'], 'E-COMMAND-UNKNOWN', 'run, turns, demo, compare, export, check, batch'),
+    (['run', 'x', '--fsp', '10'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
+    (['run', 'x', '--thread=2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --threads?'),
+    (['run', 'x', '-fps', '2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
+    (['compare', 'a', 'b', '--qqqq'], 'E-ARGUMENT-UNKNOWN', 'dashcalib compare --help')])
+def test_a_slip_gets_the_nearest_name(here, tmp_path, monkeypatch, args, code, hint):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'drives').mkdir()
+    done = here(*args)
+    assert_one_line_error(done, code)
+    assert hint in done.stderr
+
+
+def test_json_is_the_same_flag_of_each_command():
+    flags = {name: [argument for argument in command.arguments if argument[0] == '--json']
+             for name, command in COMMANDS.items()}
+    # what export prints is a file already
+    assert flags.pop('export') == [] and all(found == [JSON] for found in flags.values())
+
+
+def test_the_names_that_help_has_are_those_of_the_tables():
+    assert tuple(DEMOS) == LENSES and tuple(EXPORTS) == KINDS
+    assert (AUTO, *(model.model for model in calibrated_models())) == MODELS
 
 
 def test_help_imports_nothing_heavy():
@@ -116,23 +155,22 @@ def test_the_shell_completes(tmp_path, line, expected):
 
 def test_version():
     done = dashcalib('--version')
-    assert done.returncode == 0 and done.stdout.startswith('dashcalib ')
+    assert (done.returncode, done.stdout) == (0, f'dashcalib {dashcalib_ros.__version__}\n')
+    assert dashcalib('-V').stdout == done.stdout
 
 
 @pytest.mark.parametrize(('args', 'complaint'), [
     ([], 'COMMAND'),
-    (['calibrate'], "invalid choice: 'calibrate'"),
     (['run'], 'INPUT'),
     (['run', 'x', '--fps', '0'], 'positive number'),
     (['run', 'x', '--fps', 'nan'], 'positive number'),
     (['run', 'x', '--turns', 'many'], '--turns'),
-    (['run', 'x', '--thread', '2'], 'unrecognized'),
-    (['run', 'x', '--out', '-'], '--json -'),
-    (['run', 'x', '--json', 'file'], 'invalid choice'),
+    (['run', 'x', '--out', '-'], '--json'),
     (['run', 'x', '--start', '-1'], '0 or more seconds'),
     (['turns', 'x', '--duration', '0'], 'positive number'),
-    (['demo', '--out', '-'], 'give a folder'),
-    (['export', 'a', '--to', 'ros', '--out', '-'], 'leave --out away'),
+    (['demo', '--out', '-'], '--out'),
+    (['demo', '--lens', 'fishy'], 'windscreen'),
+    (['export', 'a', '--to', 'ros', '--out', '-'], '--out'),
     (['compare', 'a'], 'B'),
     (['export', 'a'], '--to'),
     (['export', 'a', '--to', 'ros', '--size', '640'], '1280x720'),
@@ -141,7 +179,7 @@ def test_version():
 ])
 def test_bad_usage_is_one_line(here, args, complaint):
     done = here(*args)
-    assert_one_line_error(done)
+    assert_one_line_error(done, 'E-USAGE')
     assert complaint in done.stderr and '--help' in done.stderr
 
 
@@ -149,7 +187,8 @@ def test_compare_shows_the_difference(results):
     done = dashcalib('compare', results / 'a', results / 'truth.json')
     assert (done.returncode, done.stderr) == (0, '')
     assert re.search(r'fx +721.54 px +714.54 px +\+7.0000 +\+0.980 % +2.0\n', done.stdout)
-    assert 'matters: yes' in done.stdout
+    # without a covariance, pixels decide
+    assert 'answer: differs' in done.stdout and 'good enough for detection' in done.stdout
     assert '\x1b' not in done.stdout
 
 
@@ -176,14 +215,22 @@ def test_export_prints_or_writes_a_camera_file(here, results):
     # an .npz is not for a terminal
     rays = here('export', results / 'a', '--to', 'rays', '--size', '414x125')
     assert_one_line_error(rays)
-    assert '--out rays.npz' in rays.stderr
+    assert '--out rays.npz' in rays.stderr and '[E-OUT-NEEDED]' in rays.stderr
+    picture = results / 'm.png'
+    maps = here('export', results / 'a', '--to', 'maps', '--out', picture)
+    assert_one_line_error(maps)
+    assert '[E-EXPORT-SUFFIX]' in maps.stderr and 'm.npz' in maps.stderr
+    assert not picture.exists()
     here('export', results / 'a', '--to', 'rays', '--out', results / 'rays.npz')
     assert here('compare', results / 'a', results / 'rays.npz').returncode == 0
 
 
 def test_export_tells_where_the_field_over_the_picture_goes(here, results, tmp_path):
     data = json.loads((results / 'a/result.json').read_text())
-    data['field'] = {'used': True, 'coefficients': np.zeros((2, len(FIELD_TERMS))).tolist()}
+    coefficients = np.zeros((2, len(FIELD_TERMS)))
+    # 0.3 px everywhere to the right, and 0.4 px down
+    coefficients[:, 0] = 0.3, 0.4
+    data['field'] = {'used': True, 'coefficients': coefficients.tolist()}
     path = tmp_path / 'result.json'
     path.write_text(json.dumps(data))
     splined = here('export', path, '--to', 'mrcal')
@@ -191,8 +238,10 @@ def test_export_tells_where_the_field_over_the_picture_goes(here, results, tmp_p
     assert 'LENSMODEL_SPLINED_STEREOGRAPHIC_order=3' in splined.stdout
     without = here('export', path, '--to', 'ros')
     assert without.returncode == 0
-    assert 'has a field over the picture, for which ros has no place' in without.stderr
-    assert_one_line_error(here('export', path, '--to', 'mrcal', '--crop', '0,0,640,375'))
+    assert '0.50 px RMS and 0.50 px at the worst' in without.stderr
+    part = here('export', path, '--to', 'mrcal', '--crop', '0,0,640,375')
+    assert_one_line_error(part)
+    assert '[E-FIELD-OF-PART]' in part.stderr
 
 
 def test_a_lens_profile_has_the_readout_time_of_its_rows(here, results, tmp_path):
@@ -244,8 +293,7 @@ def test_a_terminal_that_knows_ascii_only_still_gets_the_numbers(results):
 
 # -- standard streams that take nothing --------------------------------------------------------
 
-CLOSED = 'stdout is closed; give it a terminal, a file or a pipe'
-FULL = 'cannot write to stdout: No space left on device; send the output to another place'
+CLOSED, FULL = 'E-STDOUT-CLOSED', 'E-STDOUT-UNWRITABLE'
 
 
 def redirected(redirection, *args):
@@ -268,18 +316,19 @@ def commands(results):
             'error': ['compare', results / 'a', results / 'missing']}
 
 
-@pytest.mark.parametrize(('redirection', 'words'), [('>&-', CLOSED), ('>/dev/full', FULL)])
+@pytest.mark.parametrize(('redirection', 'code'), [('>&-', CLOSED), ('>/dev/full', FULL)])
 @pytest.mark.parametrize('name', ['help', 'version', 'compare', 'turns'])
-def test_a_result_that_cannot_be_shown_is_one_line(commands, name, redirection, words):
-    done = redirected(redirection, *commands[name])
-    assert (done.returncode, done.stderr) == (2, f'dashcalib: error: {words}\n')
+def test_a_result_that_cannot_be_shown_is_one_line(commands, name, redirection, code):
+    assert_one_line_error(redirected(redirection, *commands[name]), code)
 
 
-@pytest.mark.parametrize(('redirection', 'words'), [('>&-', CLOSED), ('>/dev/full', FULL)])
+@pytest.mark.parametrize(('redirection', 'word'), [
+    ('>&-', 'closed'), ('>/dev/full', 'No space left on device')])
 def test_a_run_whose_files_are_written_ends_with_its_verdict(commands, results, redirection,
-                                                             words):
+                                                             word):
     done = redirected(redirection, *commands['run'])
-    assert (done.returncode, done.stderr) == (3, f'dashcalib: warning: {words}\n')
+    assert done.returncode == 3 and done.stderr.startswith('dashcalib: warning: ')
+    assert word in done.stderr and done.stderr.count('\n') == 1
     assert json.loads((results / 'out' / 'result.json').read_text())['verdict'] == 'refused'
 
 

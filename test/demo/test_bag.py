@@ -14,12 +14,15 @@ from dashcalib_ros.input.inputs import open_frames
 def rendered():
     found = create_autospec(Drive, instance=True)
     found.frames.return_value = drive()
+    found.__len__.return_value = 20
     return found
 
 
 def test_the_bag_has_the_frames_of_the_drive(rendered, tmp_path):
     path = tmp_path / 'new' / 'bag'
-    render_to_bag(rendered, path)
+    told = []
+    render_to_bag(rendered, path, told.append)
+    assert told == [n / 20 for n in range(1, 21)]
     assert sorted(file.name for file in path.parent.rglob('*')) == [
         'bag', 'bag.mcap', 'metadata.yaml']
     source = open_frames(path)

@@ -7,8 +7,20 @@ import cv2
 import numpy as np
 import pytest
 
-from dashcalib_ros.demo import Drive, DriveSpec, Glass, Lens, Stop, Turn, demo_drive
+from dashcalib_ros.camera import calibrated_models
+from dashcalib_ros.demo import (
+    DEMOS,
+    Drive,
+    DriveSpec,
+    FisheyeLens,
+    Glass,
+    Lens,
+    Stop,
+    Turn,
+    demo_drive,
+)
 from dashcalib_ros.demo.atlas import pack
+from dashcalib_ros.demo.fisheye import WholeRaycaster
 from dashcalib_ros.demo.quads import Quads
 from dashcalib_ros.demo.raycast import Raycaster
 from dashcalib_ros.errors import ConfigError
@@ -42,8 +54,9 @@ def test_lens_inverts_exactly():
 
 
 def test_lens_that_folds_is_refused():
-    with pytest.raises(ConfigError, match='folds over'):
+    with pytest.raises(ConfigError) as error:
         Lens.of(640, 360, 110.0, -0.45, 0.0)
+    assert error.value.code == 'E-LENS-FOLDS'
     Lens.of(1392, 512, 80.0, -0.363, 0.151)
 
 
@@ -183,6 +196,22 @@ def test_standard_demo():
     assert drive.stamp_ns(10) - drive.stamp_ns(0) == 10**9
 
 
+def test_each_demo_has_what_it_says():
+    drives = {name: demo_drive(0, name) for name in DEMOS}
+    names = {model.model: model.names() for model in calibrated_models()}
+    for name, drive in drives.items():
+        assert drive.lens.size == (960, 540)
+        assert tuple(drive.truth) == names[drive.lens.model]
+        assert drive.lens.model == (name if name in names else 'radial')
+    assert drives['windscreen'].lens.glass is not None
+    assert drives['shutter'].spec.rolling_shutter_ms == 25.0
+    assert np.abs(drives['stabilised'].crop_px).max() == pytest.approx(48.0)
+    assert np.ptp(drives['straight'].yaw) < 1e-9
+    with pytest.raises(ConfigError) as error:
+        demo_drive(0, 'mirror')
+    assert error.value.code == 'E-DEMO-UNKNOWN'
+
+
 # -- pictures ---------------------------------------------------------------------------------
 
 def test_frames_are_reproducible(drive):
@@ -289,10 +318,11 @@ def test_compression_loses_little(drive):
 
 @pytest.mark.parametrize('wrong', [
     {'rate': 0.0}, {'noise': -1.0}, {'exposure_ms': 300.0}, {'vignetting': 2.0},
-    {'turns': (Turn(200.0),)}, {'stops': (Stop(7, 1.0),)}])
+    {'turns': (Turn(200.0),)}, {'stops': (Stop(7, 1.0),)}, {'stabilised': 0.3}])
 def test_impossible_drives_are_refused(wrong):
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError) as error:
         DriveSpec(**wrong)
+    assert error.value.code == 'E-DRIVE-RANGE'
 
 
 def test_a_lens_with_all_coefficients_is_opencvs_plumb_bob():
@@ -314,3 +344,53 @@ def test_glass_moves_the_picture_by_what_it_says_and_no_lens_does_that(look):
     np.testing.assert_allclose(lens.project(rays), pixels, atol=1e-6)
     plain = dataclasses.replace(lens, glass=None)
     np.testing.assert_allclose(plain.project(rays), pixels - moved, atol=1e-6)
+
+
+# -- fisheyes and stabilisers ------------------------------------------------------------------
+
+FISHEYE = FisheyeLens.of(640, 360, 150.0, (-0.02, 0.006, -0.003, 0.0005), (9.0, -7.0), 1.002)
+
+
+def test_a_fisheye_is_opencvs_and_inverts_exactly():
+    pixels = np.random.default_rng(0).uniform((-0.5, -0.5), (639.5, 359.5), (500, 2))
+    rays = FISHEYE.rays(pixels)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0)
+    np.testing.assert_allclose(FISHEYE.project(rays), pixels, atol=1e-6)
+    ahead = rays[rays[:, 2] > 0.1]
+    matrix = np.array([[FISHEYE.fx, 0.0, FISHEYE.cx], [0.0, FISHEYE.fy, FISHEYE.cy], [0, 0, 1.0]])
+    expected, _ = cv2.fisheye.projectPoints(ahead[:, None], np.zeros(3), np.zeros(3), matrix,
+                                            np.array(FISHEYE.k))
+    np.testing.assert_allclose(FISHEYE.project(ahead), expected[:, 0], atol=1e-8)
+    with pytest.raises(ConfigError) as error:
+        FisheyeLens.of(640, 360, 150.0, (-0.2, 0.0, 0.0, 0.0))
+    assert error.value.code == 'E-LENS-FOLDS'
+
+
+def test_a_fisheye_shows_world_points_where_it_projects_them(drive):
+    wide = Drive(FISHEYE, drive.spec)
+    wide.__dict__['town'] = drive.town
+    frame = drive.turn_centers[0]
+    quads, points, textures = dots_in_front(drive, frame)
+    rotations, positions = wide.row_poses(frame)
+    image = WholeRaycaster(FISHEYE, pack(textures)).render(quads, rotations, positions)
+    # those of the near wall: it hides some of the far one; the outermost dots touch each other
+    pixels = FISHEYE.project((points[:40] - positions[0]) @ rotations[0])
+    found = [(pixel, centroid(image, pixel, 4)) for pixel in pixels]
+    errors = np.array([seen - pixel for pixel, seen in found if seen is not None])
+    assert len(errors) > 25
+    assert np.linalg.norm(np.median(errors, axis=0)) < 0.02
+    assert np.percentile(np.linalg.norm(errors, axis=1), 80) < 0.1
+
+
+def test_a_stabiliser_moves_its_crop_against_the_turn():
+    lens = Lens.of(320, 180, 75.0, -0.1)
+    spec = DriveSpec(turns=(Turn(80.0),), seed=3, noise=0.0, flicker=0.0, vibration_deg=0.0)
+    plain, steady = Drive(lens, spec), Drive(lens, dataclasses.replace(spec, stabilised=0.05))
+    steady.__dict__['town'] = plain.town
+    index = int(np.argmax(steady.crop_px))
+    assert steady.crop_px[index] == pytest.approx(16.0) and steady.crop_px.min() > -0.1
+    for frame, expected in ((index, steady.crop_px[index]), (3, 0.0)):
+        one, other = (each.frame(frame).image.astype(float) for each in (plain, steady))
+        (moved, down), _ = cv2.phaseCorrelate(one, other, cv2.createHanningWindow((320, 180),
+                                                                                cv2.CV_64F))
+        assert (moved, down) == pytest.approx((-expected, 0.0), abs=0.3)

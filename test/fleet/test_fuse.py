@@ -29,8 +29,8 @@ def fused():
 def test_what_contradicts_is_named_and_left_out(fused):
     shares = fused.shares
     assert shares['again.mp4'].left_out == 'has the same content as 0.mp4'
-    assert '640x480, most of this camera are 800x450' in shares['small.mp4'].left_out
-    assert shares['zoomed.mp4'].left_out.startswith('fits another camera')
+    assert all(size in shares['small.mp4'].left_out for size in ('640x480', '800x450'))
+    assert shares['zoomed.mp4'].left_out.startswith('shows another camera')
     assert [shares[f'{n}.mp4'].used for n in range(4)] == [1, 1, 1, 1]
     assert not shares['straight.mp4'].left_out
     warnings = '; '.join(fused.calibration.warnings)
@@ -45,7 +45,7 @@ def test_one_clip_with_many_turns_does_not_decide_the_size():
     many = clip_of(yaws=YAWS, world=50, tracks=60, keyframes=7)
     clips = {'many.npz': replace(many, origin=Origin((640, 450))), **first_two()}
     shares = fuse('cam', 'acme', clips, CONFIG).shares
-    assert '640x450, most of this camera are 800x450' in shares['many.npz'].left_out
+    assert shares['many.npz'].left_out.startswith('is 640x450')
 
 
 def test_the_others_give_one_camera(fused):

@@ -55,7 +55,7 @@ def test_a_clip_of_two_cameras_is_not_used(shared_drive, tmp_path):
     both = [Frame(n, 0, image[:, ::-1] if n % 2 else image)
             for n, image in enumerate([*images, *images[::-1]])]
     result = gathered(write_folder(tmp_path / 'images', both), tmp_path / 'out', 20.0)
-    assert result.problem.startswith('the images are of two cameras: ') and not result.file
+    assert result.problem.endswith('[E-TWO-CAMERAS]') and not result.file
     assert not list((tmp_path / 'out').rglob('*.npz'))
 
 
@@ -90,7 +90,7 @@ def test_what_changes_while_it_is_read_is_not_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(clips, 'gather', swapped)
     result = gathered(folder, tmp_path / 'out')
-    assert 'changed while it was read' in result.problem and not result.file
+    assert result.problem.endswith('[E-CLIP-CHANGED]') and not result.file
     assert not list((tmp_path / 'out').rglob('*.npz'))
     monkeypatch.undo()
     assert gathered(folder, tmp_path / 'out').frames == 3

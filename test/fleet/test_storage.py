@@ -29,7 +29,7 @@ def test_files_are_written_read_and_removed(place):
     storage.write(file, b'other')
     assert storage.read(file) == b'other'
     assert [name.rpartition('/')[2] for name in storage.listed(f'{place}/a')] == ['b.txt']
-    with pytest.raises(InputError, match=r'(more|larger) than'):
+    with pytest.raises(InputError, match=r'b\.txt'):
         storage.read(file, limit=3)
     before = storage.stamp(file)
     storage.write(file, b'longer than that')
@@ -46,9 +46,10 @@ def test_a_clip_is_copied_to_scratch_and_the_copy_removed(place):
     assert path.exists() != storage.is_url(place)
     if storage.is_url(place):
         assert not path.parent.exists()
-        with (pytest.raises(InputError, match=r'cannot copy .*gone'),
+        with (pytest.raises(InputError, match=r'gone\.mp4') as caught,
               storage.local_copy(f'{place}/gone.mp4')):
             pass
+        assert caught.value.code == 'E-ADDRESS-UNREADABLE'
 
 
 def test_names_are_relative_to_their_folder():
@@ -66,22 +67,25 @@ def test_a_full_disk_leaves_nothing_half_written(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, 'No space left on device')
 
     monkeypatch.setattr('os.fsync', full)
-    with pytest.raises(OutputError, match='No space left on device; free some space'):
+    with pytest.raises(OutputError, match='No space left on device') as caught:
         storage.write(file, b'after')
+    assert caught.value.code == 'E-DISK-FULL'
     assert [path.name for path in tmp_path.iterdir()] == ['a.txt']
     assert storage.read(file) == b'before'
 
 
 def test_an_output_that_is_no_folder(tmp_path):
     (tmp_path / 'file').write_bytes(b'')
-    with pytest.raises(OutputError, match='choose an output folder'):
+    with pytest.raises(OutputError, match=r'file.a\.txt') as caught:
         storage.write(str(tmp_path / 'file' / 'a.txt'), b'')
+    assert caught.value.code == 'E-OUTPUT-NOT-WRITABLE'
 
 
 def test_addresses_say_which_extra_they_need(monkeypatch):
     monkeypatch.setitem(sys.modules, 'fsspec', None)
-    with pytest.raises(ConfigError, match=r's3:// addresses need fsspec: .*\[fleet\]'):
+    with pytest.raises(ConfigError, match=r's3://.* fsspec: .*\[fleet\]') as caught:
         storage.stamp('s3://bucket/clip.mp4')
+    assert caught.value.code == 'E-EXTRA-NOT-INSTALLED'
 
 
 def test_a_stamp_is_of_all_files_of_a_folder(place):
@@ -103,8 +107,9 @@ def test_what_is_no_regular_file_is_not_read(tmp_path):
         with pytest.raises(InputError, match='no regular file'):
             read_manifest(str(tmp_path / place))
     pytest.importorskip('fsspec')
-    with pytest.raises(InputError, match='give its path'):
+    with pytest.raises(InputError) as caught:
         storage.read('file:///dev/zero', 10)
+    assert caught.value.code == 'E-ADDRESS-OF-LOCAL-FILE'
 
 
 def test_a_pattern_ends_where_links_lead_upwards(tmp_path):
@@ -123,8 +128,9 @@ def test_a_pattern_ends_where_links_lead_upwards(tmp_path):
 
 def test_an_unknown_kind_of_address():
     pytest.importorskip('fsspec')
-    with pytest.raises(InputError, match='cannot use nosuch://'):
+    with pytest.raises(InputError, match='nosuch://') as caught:
         storage.stamp('nosuch://bucket/clip.mp4')
+    assert caught.value.code == 'E-ADDRESS-UNKNOWN'
 
 
 def test_what_a_killed_process_left_of_a_file_goes_with_the_next(tmp_path):

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from page_reader import Page
 from dashcalib_ros.fleet import tables
 from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.overview import overview_html
+from dashcalib_ros.fleet.overview import duration, overview_html
 from dashcalib_ros.fleet.solved import ClipShare
 from dashcalib_ros.fleet.tables import (
     CAMERA_COLUMNS,
@@ -59,7 +60,7 @@ def test_a_row_that_cannot_be_read_does_not_take_the_place_of_another():
     rows = clip_rows('cam', '', [(bad, ClipResult('fps')), (good, read), (again, read)],
                      {'a.mp4': ClipShare(1)})
     assert [row['status'] for row in rows] == ['unreadable', 'used', 'left out']
-    assert 'row 2 again' in rows[2]['reason']
+    assert rows[2]['reason'].endswith('row 2')
 
 
 def test_texts_that_are_no_unicode_and_numbers_that_are_none(tmp_path, monkeypatch):
@@ -118,11 +119,39 @@ def test_nothing_of_the_overview_is_cut_in_a_browser(tmp_path, width):
     assert not any(found.values()), found
 
 
+def test_every_dot_of_the_overview_has_a_colour():
+    """A dot whose class has no stroke in the style is there, but nobody sees it."""
+    page = drawn_fleet()
+    style, drawn = page.split('<body>')
+    kinds = re.findall(r'<g class="(\w*)"><path class="dot (\w+)"', drawn)
+    # fx by model (two and one verdicts), sigma by turns, and the clips of the camera that drifts
+    assert len(kinds) == 2 + 1 + 2 + 1
+    for verdict, kind in kinds:
+        assert f'.dot.{kind} {{ stroke: var(--accent); }}' in style
+        assert f'.{verdict} {{ --accent:' in style
+
+
+def test_clips_without_a_turn_are_listed():
+    still = ClipResult(file='x.npz', seconds=10.0)
+    clips = [(Row(n, f'{n}.mp4', f'/{n}.mp4', 'cam'), still) for n in range(12)]
+    page = overview_html([], clip_rows('cam', '', clips, {}))
+    assert all(f'{n}.mp4' in page for n in range(10)) and '11.mp4' not in page
+    assert 'and 2 more' in page
+
+
+@pytest.mark.parametrize(('seconds', 'text'), [
+    (30.0, '30 s'), (240.0, '4 min'), (7000.0, '117 min'), (7200.0, '2.0 h')])
+def test_short_totals_are_not_hours(seconds, text):
+    assert duration(seconds) == text
+    still = [{**row, 'seconds': seconds} for row in rows_at([START_S], [1000.0])]
+    assert f'{text} of video' in overview_html([], still)
+
+
 def test_the_overview_draws_the_fleet():
     page = drawn_fleet()
     assert Page(page).tags.count('svg') == 3
     # fx and sigma of three cameras, five clips, and the line of the one that drifts
     assert page.count('class="all-turns"') == 1 and page.count('h0') == 3 + 3 + 5
-    for name in ('cameras', 'fx', 'sigma %', '% per year'):
+    for name in ('cameras', 'fx, px', 'sigma fx %', 'fx, % per year'):
         assert f'<button>{name}</button>' in page
     assert '<b>three' not in page and 'http' not in page.split('<body>')[1]

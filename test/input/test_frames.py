@@ -28,11 +28,11 @@ from made_drives import (
 )
 from refused import refused
 
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import open_frames
+from dashcalib_ros.pipeline import Calibrator
 
 SUFFIXES = ['.mcap', '.db3', '.bag', '.mp4', '.avi', '.mcap.zstd', '.db3.zstd']
 

@@ -16,7 +16,7 @@ from made_drives import TIMES, fails, number, numbered, write_timed
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.input.inputs import open_frames
-from dashcalib_ros.recorded import calibrate, with_source
+from dashcalib_ros.session import calibrate, with_source
 
 
 def cut_at(path, target, start_s):

@@ -8,19 +8,39 @@ from made_lines import made_lines
 from synthetic import LENS, SIZE
 
 from dashcalib_ros import Config
+from dashcalib_ros.detect import Bend
 from dashcalib_ros.judge import Check, with_lines
+from dashcalib_ros.judge.check import _lines_text
+from dashcalib_ros.judge.verdict import lines_contradict
 
 
 @pytest.mark.parametrize(('answer', 'off', 'expected'), [
     ('right', 0.0, 'right'), ('wrong', 0.0, 'wrong'), ('right', 0.1, 'cannot tell'),
-    ('cannot tell', 0.1, 'cannot tell'), ('wrong', 0.1, 'wrong')])
-def test_lines_take_back_a_right_and_nothing_else(answer, off, expected):
+    ('cannot tell', 0.1, 'cannot tell'), ('wrong', 0.1, 'wrong'), ('differs', 0.0, 'differs'),
+    # more than detection allows; and less: the lines confirm that it differs
+    ('differs', 0.1, 'cannot tell'), ('differs', 0.02, 'differs'), ('right', 0.02, 'cannot tell')])
+def test_lines_take_back_a_good_answer_and_nothing_else(answer, off, expected):
     given = replace(LENS, k1=LENS.k1 + off)
-    found = with_lines(Check(answer, ('the turns say so',)), given,
-                       made_lines(LENS, noise_px=0.05), SIZE, Config())
+    found = with_lines(
+        Check(answer, ('the turns say so',), limits_px={'detection': 5.0}), given,
+        made_lines(LENS, noise_px=0.05), SIZE, Config())
     assert found.answer == expected and found.reasons[0] == 'the turns say so'
     assert found.straight_lines.k1 == pytest.approx(-off, abs=0.02)
-    assert ('do not contradict' in found.reasons[1]) == (off == 0.0)
+    assert ('they agree' in found.reasons[1]) == (off == 0.0)
+
+
+@pytest.mark.parametrize(('k1', 'words'), [
+    (0.019, 'they agree'), (0.033, 'they lean against'), (0.041, 'they contradict'),
+    (-0.041, 'they contradict')])
+def test_three_sigmas_are_no_agreement(k1, words):
+    said = Bend(lines=1000, groups=4, bend_px=0.2, k1=k1, sigma=0.01, camera_sigma=None,
+                picture_px=7.0)
+    config = Config().verdict
+    text = _lines_text(said, lines_contradict(said, 1242, config), config.max_line_sigmas)
+    assert words in text and f'{said.sigmas:.1f} sigma, limit 4.0' in text
+    # so small a k1 moves no picture
+    small = replace(said, k1=0.1, picture_px=0.5)
+    assert 'too few pixels' in _lines_text(small, lines_contradict(small, 1242, config), 4.0)
 
 
 def test_without_enough_lines_or_for_another_size_nothing_is_added():

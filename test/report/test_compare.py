@@ -221,31 +221,37 @@ def test_a_truth_may_name_its_model(tmp_path, model, expected):
         **TRUTH.named, **({'k3': 0.0, 'k4': 0.0} if expected == 'fisheye' else {})}
 
 
-@pytest.mark.parametrize(('change', 'complaint'), [
-    ({'model': 'mirror'}, "the camera model 'mirror'; there are radial, brown, fisheye"),
-    ({'model': ['fisheye']}, 'there are radial'),
-    ({'k4': 0.01}, 'add "model": "fisheye"'),
-    ({'model': 'plumb_bob', 'k4': 0.01}, 'has k1, k2, k4, and a plumb_bob model here has no k4'),
-    ({'skew': 0.5}, 'has no skew'),
-    ({'model': 'fisheye', 'p1': 0.01}, 'an? equidistant model here has no p1')])
-def test_a_truth_of_no_model_here_is_refused(tmp_path, change, complaint):
+@pytest.mark.parametrize(('change', 'code', 'value'), [
+    ({'model': 'mirror'}, 'E-CAMERA-MODEL', "'mirror'; use one of radial, brown, fisheye"),
+    ({'model': ['fisheye']}, 'E-CAMERA-MODEL', 'radial'),
+    ({'k4': 0.01}, 'E-LENS-AMBIGUOUS', '"model": "fisheye"'),
+    ({'model': 'plumb_bob', 'k4': 0.01}, 'E-LENS-COEFFICIENTS', 'plumb_bob model has no k4'),
+    ({'skew': 0.5}, 'E-LENS-COEFFICIENTS', 'has no skew'),
+    ({'model': 'fisheye', 'p1': 0.01}, 'E-LENS-COEFFICIENTS', 'equidistant model has no p1')])
+def test_a_truth_of_no_model_here_is_refused(tmp_path, change, code, value):
     data = {**TRUTH.named, 'width': 1242, 'height': 375, **change}
     (tmp_path / 'truth.json').write_text(json.dumps(data))
-    with pytest.raises(InputError, match=complaint):
+    with pytest.raises(InputError) as raised:
         load_camera(tmp_path / 'truth.json')
+    assert raised.value.code == code and value in str(raised.value)
 
 
 def test_a_result_of_no_model_here_is_refused(tmp_path):
     data = json.loads(result_json(make_calibration())) | {'camera_model': 'x' * 1000}
     (tmp_path / 'result.json').write_text(json.dumps(data))
-    with pytest.raises(InputError, match='there are radial, brown, fisheye') as caught:
+    with pytest.raises(InputError) as caught:
         load_camera(tmp_path)
+    assert caught.value.code == 'E-CAMERA-MODEL'
     assert len(str(caught.value)) < 400
 
 
 def test_different_image_sizes_are_an_error():
-    with pytest.raises(InputError, match=r'1242 x 375.*621 x 187'):
-        compare(REFERENCE, NamedCamera('half', dataclasses.replace(TRUTH, image_size=(621, 187))))
+    for size, cure in (((621, 187), "export 'my truth' --to ros --size 621x187 --out "),
+                       ((640, 480), '--crop')):
+        with pytest.raises(InputError, match='1242x375.*{}x{}'.format(*size)) as raised:
+            compare(dataclasses.replace(REFERENCE, name='my truth'),
+                    NamedCamera('other', dataclasses.replace(TRUTH, image_size=size)))
+        assert raised.value.code == 'E-COMPARE-SIZE' and cure in str(raised.value)
 
 
 @pytest.mark.parametrize('number', ['7' * 400, '-' + '7' * 400, '1e999'])
@@ -259,7 +265,7 @@ def test_a_truth_has_numbers_that_a_computer_can_hold(tmp_path, number):
 
 
 @pytest.mark.parametrize(('change', 'complaint'), [
-    ({'k1': 1e300}, 'k1 = 1e.300, which no lens has'), ({'k2': -1e300}, 'k2 = -1e'),
+    ({'k1': 1e300}, 'k1 = 1e.300'), ({'k2': -1e300}, 'k2 = -1e'),
     ({'fx': 1e300}, 'fx = 1e'), ({'cy': -1e9}, 'cy = -1e'), ({'fx': 1e-300}, 'sees no ray'),
     ({'cx': 1e6, 'k1': -1}, 'sees no ray'), ({'width': 60_000, 'height': 60_000}, 'million')])
 def test_numbers_that_no_lens_has_are_one_line(tmp_path, change, complaint):

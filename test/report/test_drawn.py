@@ -28,10 +28,10 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.agreement import focal_alone, sigma_by_count
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.recorded import with_source
 from dashcalib_ros.report import NamedCamera, report_html, write_results
 from dashcalib_ros.report.lens import undistorted
 from dashcalib_ros.report.wording import field_of_view
+from dashcalib_ros.session import with_source
 
 
 @pytest.fixture(scope='module')

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +20,14 @@ from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, OutputError
 from dashcalib_ros.report import NamedCamera, compare, load_camera, write_text
-from dashcalib_ros.report.export import EXPORTS, cropped, exported, resized
+from dashcalib_ros.report.export import (
+    EXPORTS,
+    SUFFIXES,
+    check_suffix,
+    cropped,
+    exported,
+    resized,
+)
 
 POINTS = np.array([[0.1, -0.05, 1.0], [-0.5, 0.1, 1.0], [0.6, 0.12, 1.0], [0.0, 0.0, 1.0]])
 
@@ -78,16 +86,18 @@ def written(lens, kind, folder):
 
 @pytest.mark.parametrize(('kind', 'model'), CANNOT)
 def test_a_lens_that_a_program_has_not_is_refused(kind, model):
-    with pytest.raises(ConfigError, match=LACKS[kind][model]):
+    with pytest.raises(ConfigError, match=LACKS[kind][model]) as raised:
         exported(EACH_MODEL[model], kind)
+    assert raised.value.code == 'E-EXPORT-LENS'
 
 
 @lenses(*EXPORTS)
 def test_each_export_is_read_back(lens, kind, tmp_path):
     path = written(lens, kind, tmp_path)
     if (kind, lens.model) == ('mrcal', 'fisheye'):
-        with pytest.raises(InputError, match=r'SPLINED.* none of the models here'):
+        with pytest.raises(InputError, match='SPLINED') as raised:
             load_camera(path)
+        assert raised.value.code == 'E-LENS-MODEL'
         return
     read = load_camera(path)
     assert read.sigma is None and read.verdict is None
@@ -118,8 +128,9 @@ def test_a_lens_profile_has_what_gyroflow_needs(lens, kind, readout_ms, tmp_path
 
 def test_a_fisheye_without_coefficients_is_a_pinhole_to_gyroflow():
     ideal = replace(EACH_MODEL['fisheye'], k1=0.0, k2=0.0, k3=0.0, k4=0.0)
-    with pytest.raises(ConfigError, match='for a pinhole'):
+    with pytest.raises(ConfigError) as raised:
         exported(ideal, 'gyroflow')
+    assert raised.value.code == 'E-EXPORT-FISHEYE-ZERO'
 
 
 @lenses('rays')
@@ -223,8 +234,9 @@ def test_mrcal_itself_sees_the_field(bent, tmp_path):
 
 
 def test_a_field_that_no_spline_has_is_refused():
-    with pytest.raises(OutputError, match=r'to 0.001 px, but to .* export to rays'):
+    with pytest.raises(OutputError, match=r'0\.001 px') as raised:
         exported(TRUTH.resized(1 / 3, (414, 125)), 'mrcal', a_field((414, 125), 5.0))
+    assert raised.value.code == 'E-EXPORT-SPLINE'
 
 
 @lenses('kalibr')
@@ -265,14 +277,16 @@ def test_a_resized_picture_s_camera(lens):
     x, y = small.image_size[0] / width, small.image_size[1] / height
     seen = (lens.project(POINTS) + 0.5) * (x, y) - 0.5
     np.testing.assert_allclose(small.project(POINTS), seen, atol=1e-9)
-    with pytest.raises(ConfigError, match='--crop'):
+    with pytest.raises(ConfigError, match='--crop') as raised:
         resized(lens, (640, 480))
+    assert raised.value.code == 'E-SIZE-SHAPE'
 
 
 @pytest.mark.parametrize('size', [(0, 0), (0, 10), (10, 0), (10**9, 10**9)])
 def test_a_size_that_is_none(lens, size):
-    with pytest.raises(DashcalibError, match=r'no size of a picture|million pixels'):
+    with pytest.raises(DashcalibError) as raised:
         resized(lens, size)
+    assert min(size) > 0 or raised.value.code == 'E-SIZE-NOT-POSITIVE'
 
 
 def test_a_part_s_camera(lens):
@@ -283,10 +297,23 @@ def test_a_part_s_camera(lens):
 
 @pytest.mark.parametrize('crop', [(-1, 0, 10, 10), (0, 0, 0, 10), (1200, 0, 100, 10)])
 def test_a_part_that_is_none(lens, crop):
-    with pytest.raises(ConfigError, match='no part'):
+    with pytest.raises(ConfigError) as raised:
         cropped(lens, *crop)
+    assert raised.value.code == 'E-CROP-OUTSIDE'
 
 
 def test_a_kind_that_there_is_not(lens):
-    with pytest.raises(ConfigError, match=', '.join(EXPORTS)):
+    with pytest.raises(ConfigError, match=', '.join(EXPORTS)) as raised:
         exported(lens, 'matlab')
+    assert raised.value.code == 'E-EXPORT-KIND'
+
+
+@pytest.mark.parametrize('kind', EXPORTS)
+def test_a_file_s_name_says_what_it_has(kind):
+    known = SUFFIXES[kind]
+    for suffix in known:
+        check_suffix(Path(f'a/camera{suffix.upper()}'), kind)
+    for name in ('m.png', 'camera.v2', 'a.npz' if '.npz' not in known else 'a.txt'):
+        with pytest.raises(ConfigError, match=Path(name).stem + re.escape(known[0])) as raised:
+            check_suffix(Path(name), kind)
+        assert raised.value.code == 'E-EXPORT-SUFFIX'

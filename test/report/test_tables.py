@@ -103,7 +103,7 @@ def test_comparisons_show_sigmas_only_where_known():
     a, b = NamedCamera('mine', moved, SIGMA, 'weak'), NamedCamera('truth', TRUTH)
     text = terminal(comparison(compare(a, b)))
     assert re.search(r'fx\s+728\.54 px\s+721\.54 px\s+\+7\.0000\s+\+0\.970 %\s+2\.0', text)
-    assert 'A: mine (weak)' in text and re.search(r'apart: \d+\.\d\d px over', text)
+    assert 'A: mine (weak)' in text and re.search(r'differs by \d+\.\d\d px RMS', text)
     assert 'sigmas' not in terminal(comparison(compare(b, b)))
 
 
@@ -118,7 +118,7 @@ def test_what_one_of_two_models_cannot_see_is_told():
     wide = Fisheye((1280, 720), 390.0, 391.0, 630.0, 365.0)
     pinhole = NamedCamera('pinhole', Radial((1280, 720), 390.0, 391.0, 630.0, 365.0))
     text = terminal(comparison(compare(pinhole, NamedCamera('truth', wide))))
-    assert re.search(r'removed, without the\s\d+\s% of the picture that the\sradial\smodel\s'
+    assert re.search(r'removed; without the\s\d+\s% of the picture that the\sradial\smodel\s'
                      r'cannot', text)
     assert 'k1' not in text and 'cy' in text
     assert 'without' not in terminal(comparison(compare(NamedCamera('truth', wide), pinhole)))
@@ -134,4 +134,4 @@ def test_small_coefficients_differ_visibly():
 def test_an_unknown_mapping_error_is_said_to_be_unknown():
     folding = NamedCamera('f', dataclasses.replace(TRUTH, fx=300, fy=300, k1=-0.6, k2=0))
     text = terminal(comparison(compare(NamedCamera('a', TRUTH), folding)))
-    assert 'apart: unknown' in text and 'matters: yes' in text
+    assert 'answer: wrong' in text and 'not comparable' in text

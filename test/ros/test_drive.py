@@ -185,7 +185,7 @@ def test_the_latched_calibration_reaches_late_subscribers(driven, ros_context):
 def test_the_driver_was_given_the_calibration(driven):
     assert len(driven.committed) == 1
     assert driven.committed[0].k.tolist() == driven.bench.infos[0].k.tolist()
-    driven.node.wait_for('set_camera_info took the calibration')
+    driven.node.wait_for('set_camera_info accepted the calibration')
 
 
 def test_the_turning_magnitude_was_published(driven):

@@ -127,19 +127,25 @@ def test_parameters_that_may_not_change_say_so(node_and_bench):
 
     whole = ParameterType.PARAMETER_INTEGER
     refused = set_to('turns.at_most', type=whole, integer_value=3)
-    assert not refused.successful and 'turns.at_most is read-only while' in refused.reason
-    assert 'it is read at the start; start the node with -p turns.at_most' in refused.reason
+    assert not refused.successful and '-p turns.at_most:=VALUE' in refused.reason
+    assert refused.reason.endswith('[E-PARAMETER-READ-ONLY]')
+    # the same as at the start
+    for name, near in (('turns.wnted', 'turns.wanted'), ('of_another_node', '/**')):
+        refused = set_to(name, type=whole, integer_value=3)
+        assert not refused.successful and name in refused.reason and near in refused.reason
+        assert refused.reason.endswith('[E-PARAMETER-UNKNOWN]')
     refused = set_to('queue_size', type=whole, integer_value=3)
-    assert not refused.successful and 'queue_size is read-only while' in refused.reason
+    assert not refused.successful and '-p queue_size:=VALUE' in refused.reason
     refused = set_to('turns.wanted', type=whole, integer_value=11)
-    assert not refused.successful and '10 at the most while the node runs' in refused.reason
+    assert not refused.successful and '-p turns.wanted:=11' in refused.reason
+    assert refused.reason.endswith('[E-TURNS-ABOVE-CAPACITY]')
     for value in (3, 5):
         assert set_to('turns.wanted', type=whole, integer_value=value).successful
         bench.until(lambda value=value: bench.count('turns wanted') == value, node=node)
     text = ParameterType.PARAMETER_STRING
     for name, value in (('model', 'fisheye'), ('model', 'mirror'), ('rectified', 'crop')):
         refused = set_to(name, type=text, string_value=value)
-        assert not refused.successful and 'read-only' in refused.reason
+        assert not refused.successful and '[E-PARAMETER-READ-ONLY]' in refused.reason
         assert '\n' not in refused.reason
     refused = set_to('commit', type=whole, integer_value=3)
     assert not refused.successful and 'commit must be bool' in refused.reason

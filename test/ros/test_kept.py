@@ -76,21 +76,22 @@ def test_what_is_kept_comes_back_whole_and_says_whose_it_is(store, model):
     assert other.text != kept.text and not again.edited and again.contradictions == 2
 
 
-@pytest.mark.parametrize(('whose', 'words'), [
-    (Whose('front', '/rear/image_raw'), 'images on /front/image_raw'),
-    (Whose('rear', '/front/image_raw'), 'of the camera front')])
-def test_the_file_of_another_camera_is_neither_used_nor_lost(store, whose, words):
+@pytest.mark.parametrize(('whose', 'code', 'value'), [
+    (Whose('front', '/rear/image_raw'), 'E-KEPT-OF-OTHER-TOPIC', '/front/image_raw'),
+    (Whose('rear', '/front/image_raw'), 'E-KEPT-OF-OTHER-CAMERA', 'camera front')])
+def test_the_file_of_another_camera_is_neither_used_nor_lost(store, whose, code, value):
     first = store()
     first.save(kept_of())
     first.close()
     text = first.path.read_text()
     other = store(whose)
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=value) as raised:
         other.load()
+    assert raised.value.code == code
     assert first.path.read_text() == text
     said = other.save(kept_of(whose=whose))
     moved = first.path.with_name('camera.previous.yaml')
-    assert said.endswith(f'what another program wrote there is now {moved}')
+    assert said.endswith(f' {moved}')
     assert moved.read_text() == text
 
 
@@ -100,8 +101,9 @@ def test_an_older_file_without_a_topic_is_of_the_plain_topic_only(store):
     edit(first.path, 'dashcalib', 'topic')
     edit(first.path, 'dashcalib', 'checksum')
     first.close()
-    with pytest.raises(InputError, match='says no topic'):
+    with pytest.raises(InputError) as raised:
         store(dataclasses.replace(FRONT, plain=False)).load()
+    assert raised.value.code == 'E-KEPT-OF-OTHER-TOPIC'
 
 
 def test_an_older_file_goes_on_for_the_plain_topic(store):
@@ -117,11 +119,12 @@ def test_two_nodes_never_have_one_file(store, tmp_path):
     first = store()
     first.save(kept_of())
     second = store()
-    with pytest.raises(InputError, match='another node uses'):
+    with pytest.raises(InputError) as read:
         second.load()
-    with pytest.raises(OutputError, match='set camera_name or camera_info_url'):
+    with pytest.raises(OutputError) as written:
         second.save(kept_of('brown'))
-    assert 'another node uses' in second.retire()
+    assert read.value.code == written.value.code == 'E-KEPT-IN-USE'
+    assert second.retire() == second.taken != ''
     assert first.load() is not None
     second.update(kept_of('brown'))
     assert first.load().camera.camera == LENSES['radial']
@@ -146,18 +149,18 @@ def test_what_no_lens_has_is_set_aside(store, keys, value, sealed):
     edit(mine.path, *keys, value=value)
     if not sealed:
         edit(mine.path, 'dashcalib', 'checksum')
-    with pytest.raises(InputError, match=r'is not used: .*camera\.previous\.yaml'):
+    with pytest.raises(InputError, match=r'camera\.previous\.yaml') as raised:
         mine.load()
+    assert raised.value.code == 'E-KEPT-IMPLAUSIBLE'
     assert not mine.path.exists() and mine.path.with_name('camera.previous.yaml').exists()
     assert mine.load() is None
 
 
-@pytest.mark.parametrize(('text', 'words'), [
-    ('{{{ no yaml', 'camera.yaml is ignored: .* write it anew'), ('', 'is no camera calibration')])
-def test_a_file_that_is_none_is_ignored_and_stays(store, text, words):
+@pytest.mark.parametrize('text', ['{{{ no yaml', ''])
+def test_a_file_that_is_none_is_ignored_and_stays(store, text):
     mine = store()
     mine.path.write_text(text)
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=r'camera\.yaml is ignored: '):
         mine.load()
     assert mine.path.read_text() == text
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from fakes import image_message, stands_in_for
 
-from dashcalib_ros.calibrator import Calibrator, Status
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.judge.calibration import StoredTurnSummary
+from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.questions import Questions
 from dashcalib_ros.report import NamedCamera
 from dashcalib_ros.ros import background as room
@@ -84,7 +84,7 @@ class Core:
         while not self.hold.wait(0.01):
             self.on_wait()
             if self.closed.is_set():
-                raise WorkerError('the calibrator was closed while it calibrated')
+                raise WorkerError('E-CALIBRATOR-CLOSED', 'closed while it calibrated')
         if Core.failures:
             raise Core.failures.pop()
         turns = tuple(TurnSummary(turn.number, turn.number, turn.number, 0.0, 0.1, 1, 1,
@@ -108,7 +108,7 @@ class Scenes:
     def want(self, turns, more=0):
         self.core.wanted = turns + more
 
-    def reject(self, reasons):
+    def exclude(self, reasons, keep_files=False):
         self.core.ready = tuple(turn for turn in self.core.ready if turn not in reasons)
 
     def clear_store(self):
@@ -277,18 +277,18 @@ def test_a_request_needs_turns_and_only_one_runs(desk):
     core.hold.clear()
     until(lambda: desk.learner.request() == '')
     until(lambda: desk.learner.activity.calibrating)
-    assert 'running already' in desk.learner.request()
+    assert 'already running' in desk.learner.request()
     core.hold.set()
     until(lambda: desk.results)
     assert not desk.learner.activity.calibrating
 
 
 def test_a_failed_calibration_is_told_and_tried_again(desk):
-    Core.failures = [RuntimeError('odd'), WorkerError('the process died')]
+    Core.failures = [RuntimeError('odd'), WorkerError('E-WORKER-DIED', 'exit code 7')]
     Core.made[0].ready = at(10, 20)
     until(lambda: len(desk.results) == 1)
     assert [kind for kind, _ in desk.troubles] == ['failed_calibrations'] * 2
-    assert 'the process died' in desk.troubles[0][1] and 'in 2 s' in desk.troubles[0][1]
+    assert 'exit code 7 [E-WORKER-DIED]' in desk.troubles[0][1] and 'in 2 s' in desk.troubles[0][1]
     assert 'RuntimeError: odd' in desk.troubles[1][1] and 'in 4 s' in desk.troubles[1][1]
     assert len(Core.made) == 1  # the turns are kept
 
@@ -374,7 +374,7 @@ def test_sensors_that_cannot_be_used_are_told_at_the_next_calibration(desk):
 
 def test_a_failing_core_ends_no_thread(desk, monkeypatch):
     core = Core.made[0]
-    failures = ['status', 'reject']
+    failures = ['status', 'exclude']
 
     def status():
         if 'status' in failures:
@@ -382,12 +382,12 @@ def test_a_failing_core_ends_no_thread(desk, monkeypatch):
             raise RuntimeError('status')
         return Core.status(core)
 
-    def reject(reasons):
-        if 'reject' in failures:
-            failures.remove('reject')
-            raise RuntimeError('reject')
+    def exclude(reasons):
+        if 'exclude' in failures:
+            failures.remove('exclude')
+            raise RuntimeError('exclude')
     core.ready = at(10, 20)
-    core.status, core.scenes.reject = status, reject
+    core.status, core.scenes.exclude = status, exclude
     until(lambda: desk.results)
     assert failures == []
     # the first look at the turns may come before status is replaced, never after two results
@@ -452,13 +452,13 @@ def test_a_camera_that_is_moved_on_a_straight_road_is_told_once(desk):
 def test_turns_that_could_not_be_compared_are_told_and_tried_with_the_next(desk):
     desk.learner.goal = None
     desk.learner.watched = CAMERA
-    Core.failures = [WorkerError('the process died')]
+    Core.failures = [WorkerError('E-WORKER-DIED', 'exit code 7')]
     core = Core.made[0]
     core.ready = at(10)
     until(lambda: desk.troubles)
     time.sleep(2 * room.LOOK_S)
     (kind, text), = desk.troubles
-    assert kind == 'failed_watches' and 'the process died' in text and len(core.watched) == 1
+    assert kind == 'failed_watches' and '[E-WORKER-DIED]' in text and len(core.watched) == 1
     core.ready = at(10, 20)
     until(lambda: desk.watched)
     assert core.watched[-1][1] == at(10, 20) and len(desk.troubles) == 1

@@ -106,7 +106,7 @@ def test_a_kept_fisheye_is_published_with_the_view_that_is_wanted_now(start_node
     camera.until(lambda: camera.values.get('camera model') == 'fisheye', node=node)
     assert 'k4 0.000200 ± 0.001000' in camera.values['published']
     # the file keeps its own until it is asked for
-    node.wait_for('is not that of rectified: all')
+    node.wait_for('does not belong to rectified: all')
     assert path.read_text() == FISHEYE_FILE + OUR_FISHEYE
     assert camera.call('save', node).success
     saved = yaml.safe_load(path.read_text())
@@ -122,8 +122,8 @@ def test_a_kept_fisheye_is_published_with_the_view_that_is_wanted_now(start_node
 
 @pytest.mark.parametrize(('text', 'words'), [
     ('{{{ no yaml', 'dashcam.yaml is ignored'),
-    ('', 'is no camera calibration'),
-    (CAMERA_FILE.format(width=320), 'no accepted calibration of this node'),
+    ('', 'dashcam.yaml is ignored'),
+    (CAMERA_FILE.format(width=320), '[E-KEPT-NOT-ACCEPTED]'),
     (CAMERA_FILE.format(width=640) + OURS, 'it is for 640x240'),
     ((CAMERA_FILE.format(width=320) + OURS).replace('frame_id: camera', 'frame_id: rear'),
      "in frame 'rear'"),
@@ -159,7 +159,8 @@ def test_another_cameras_calibration_is_not_published(start_node, make_bench, tm
     camera.connect(node)
     stream(camera, 3)
     camera.counted('received', 3, node)
-    node.wait_for('is ignored: it is of the images on /a/image, this node has /a/image_raw')
+    node.wait_for('[E-KEPT-OF-OTHER-TOPIC]')
+    assert 'on /a/image, and this node uses /a/image_raw' in node.text
     assert camera.infos == [] and camera.status.hardware_id == 'a'
 
 
@@ -237,6 +238,30 @@ def test_odd_stamps_are_counted_and_the_node_lives(start_node, make_bench):
     assert node.stop() == 0 and 'Traceback' not in node.text
 
 
+@pytest.mark.parametrize(('reliable', 'compressed', 'options', 'cures'), [
+    (True, False, {}, ()),
+    (True, False, {'reliability': 'best_effort'}, ('to auto', 'publish compressed', '.xml')),
+    (False, False, {}, ('publish reliable', 'publish compressed', '.xml')),
+    (False, True, {'image_transport': 'compressed'}, ('publish reliable',))])
+def test_lost_images_name_only_cures_that_are_not_in_use(start_node, make_bench, reliable,
+                                                         compressed, options, cures):
+    node = start_node(**options)
+    kind = {'topic': 'image_raw/compressed', 'image_type': CompressedImage} if compressed else {}
+    camera = make_bench(reliable=reliable, **kind)
+    make = compressed_message if compressed else image_message
+    camera.until(lambda: camera.images.get_subscription_count(), node=node)
+    camera.spin(1.0)
+    stream(camera, 20, make=make)
+    camera.publish(make(noise(0), START + 5 * SECOND))
+    node.wait_for('images are lost')
+    line, = [line for line in node.text.splitlines() if 'images are lost' in line]
+    found = [each for each in ('to auto', 'publish reliable', 'publish compressed', '.xml')
+             if each in line]
+    assert found == list(cures), line
+    # the driver itself may be the cause
+    assert 'driver skips images' in line
+
+
 def test_a_driver_that_never_stamps_is_learned_from_all_the_same(start_node, make_bench):
     node, camera = start_node(), make_bench()
     camera.connect(node)
@@ -258,7 +283,7 @@ def test_two_publishers_of_different_sizes_do_not_reset_it(start_node, make_benc
         camera.until(lambda n=n: len(camera.infos) == n + 1, node=node)
     camera.counted('strays', 15, node)
     assert {info.width for info in camera.infos} == {320}
-    node.wait_for('is there a second publisher?')
+    node.wait_for('check for a second publisher')
 
 
 def test_two_publishers_get_nothing_until_one_is_left(start_node, make_bench, tmp_path):
@@ -296,7 +321,7 @@ def test_a_change_of_size_or_frame_resets_it_loudly(start_node, make_bench, tmp_
     stream(camera, 20, 5, **change)
     camera.counted('received', 25, node)
     camera.until(lambda: camera.values['state'] == 'collecting', node=node)
-    assert '[ERROR]' in node.text and 'the camera changes from 320x240' in node.text
+    assert '[ERROR]' in node.text and 'the camera changed from 320x240' in node.text
     assert all(info.width == 320 and info.header.frame_id == 'camera' for info in camera.infos)
     camera.until(lambda: camera.latched[-1].k[0] == 0, node=node)
     # back again: the file fits once more
@@ -326,8 +351,7 @@ def test_another_publisher_of_camera_info_is_reported(plain):
     node, camera = plain
     assert camera.values['warnings'] == ''
     other = camera.node.create_publisher(CameraInfo, 'camera_info', 1)
-    camera.until(lambda: 'another node publishes /plain/camera_info' in camera.values['warnings'],
-                 node=node)
+    camera.until(lambda: '/plain/camera_info' in camera.values['warnings'], node=node)
     camera.node.destroy_publisher(other)
     camera.until(lambda: camera.values['warnings'] == '', node=node)
 
@@ -362,32 +386,35 @@ def test_a_paused_simulation_does_not_silence_the_diagnostics(start_node, make_b
 
 def test_services_say_why_not(plain):
     node, camera = plain
-    for name, why in (('calibrate', 'no turn was found'), ('save', 'no accepted calibration')):
+    for name, why in (('calibrate', 'no turn'), ('save', 'no accepted calibration')):
         answer = camera.call(name, node)
         assert not answer.success and why in answer.message
 
 
-@pytest.mark.parametrize(('parameters', 'words'), [
-    ({'turns__half_width': 99.0}, 'out of range'),
-    ({'turns__wanted': 2.5}, 'must be int'),
-    ({'model': 'mirror'}, 'there are auto, radial, brown, fisheye'),
-    ({'model': 3.5}, 'model must be str'),
-    ({'rectified': 'whole'}, 'must be one of same, crop, all'),
-    ({'reliability': 'perfect'}, 'must be one of'),
-    ({'camera_name': 'narrow_stereo'}, 'belongs to image_pipeline'),
-    ({'imu_topic': "'a b'"}, "imu_topic 'a b' is no name of a topic"),
-    ({'fix_topic': '/'}, "fix_topic '/' is no name of a topic"),
-    ({'mask_file': 'missing.png'}, 'cannot read the mask'),
-    ({'mask_file': '~nobody-of-this-name/mask.png'}, 'cannot read the mask'),
-    ({'mask__segmentation': '~nobody-of-this-name/m.onnx'}, 'there is no segmentation model'),
-    ({'camera_info_url': '~nobody-of-this-name/camera.yaml'}, 'set camera_info_url'),
-    ({'turns__half_widht': 3}, 'did you mean turns.half_width?'),
-    ({'of_another_node': 3}, 'name that node in the file'),
+# codes are of this room; those of the core are tested there
+@pytest.mark.parametrize(('parameters', 'words', 'code'), [
+    ({'turns__half_width': 99.0}, 'Max: 10.0', 'E-PARAMETER-VALUE-INVALID'),
+    ({'turns__wanted': 2.5}, 'must be int', ''),
+    ({'model': 'mirror'}, 'auto, radial, brown, fisheye', ''),
+    ({'model': 3.5}, 'model must be str', ''),
+    ({'rectified': 'whole'}, 'same, crop, all', ''),
+    ({'reliability': 'perfect'}, 'auto, best_effort, reliable', ''),
+    ({'camera_name': 'narrow_stereo'}, 'image_pipeline', ''),
+    ({'imu_topic': "'a b'"}, "imu_topic 'a b'", 'E-TOPIC-NAME-INVALID'),
+    ({'fix_topic': '/'}, "fix_topic '/'", 'E-TOPIC-NAME-INVALID'),
+    ({'mask_file': 'missing.png'}, 'missing.png', ''),
+    ({'mask_file': '~nobody-of-this-name/mask.png'}, 'mask.png', ''),
+    ({'mask__segmentation': '~nobody-of-this-name/m.onnx'}, 'm.onnx', ''),
+    ({'camera_info_url': '~nobody-of-this-name/camera.yaml'}, 'set camera_info_url',
+     'E-HOME-UNKNOWN'),
+    ({'turns__half_widht': 3}, 'turns.half_width', 'E-PARAMETER-UNKNOWN'),
+    ({'of_another_node': 3}, '/**', 'E-PARAMETER-UNKNOWN'),
 ])
-def test_a_bad_parameter_ends_it_with_one_line(start_node, parameters, words):
+def test_a_bad_parameter_ends_it_with_one_line(start_node, parameters, words, code):
     node = start_node(**parameters)
     assert node.process.wait(SOON) == 2
     assert words in node.text and len(node.text.splitlines()) == 1, node.text
+    assert code in node.text
 
 
 def test_a_mask_of_another_size_ends_it_at_the_first_image(start_node, make_bench, tmp_path):
@@ -396,9 +423,8 @@ def test_a_mask_of_another_size_ends_it_at_the_first_image(start_node, make_benc
     camera.connect(node)
     camera.publish(image_message(noise(0), START))
     assert node.process.wait(SOON) == 2
-    assert node.text.splitlines()[-1] == (
-        'calibrator: error: the mask is 64x48 and the images are 320x240; '
-        'make the mask as large as the images')
+    line = node.text.splitlines()[-1]
+    assert line.startswith('calibrator: error: ') and '64x48' in line and '320x240' in line
 
 
 def test_a_mask_that_fits_is_taken(start_node, make_bench, tmp_path):
@@ -493,7 +519,7 @@ def test_a_callback_at_work_while_the_node_is_stopped_is_no_failure(
         camera.connect(node)
         stream(camera, 1)
         assert node.process.wait(SOON) == 0
-        assert 'Traceback' not in node.text and 'goes on' not in node.text
+        assert 'Traceback' not in node.text and 'the node continues' not in node.text
     finally:
         node.kill()
 
@@ -531,3 +557,4 @@ def test_without_rclpy_one_line_says_how_to_install_it(tmp_path):
                           timeout=SOON, env={**os.environ, **ros_environment(tmp_path)})
     assert done.returncode == 2
     assert 'pip install' in done.stderr and len(done.stderr.splitlines()) == 1
+    assert done.stderr.endswith('[E-ROS-NOT-INSTALLED]\n')

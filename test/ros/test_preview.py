@@ -19,8 +19,8 @@ from ros_bench import image_message
 from ros_desk import STAMPS
 from sensor_msgs.msg import CompressedImage
 
-from dashcalib_ros.calibrator import Calibrator
 from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.ros import preview as room
 from dashcalib_ros.ros.preview import TRACK, Picture, overlay, rectified
 

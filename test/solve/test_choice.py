@@ -84,7 +84,8 @@ def test_a_model_that_was_asked_for_is_weak_where_the_turns_choose_one_far_from_
     reasons = judge(found, CONFIG.verdict).reasons
     far = [reason for reason in reasons if 'a lens of the model' in reason]
     assert len(far) == 1 and 'ask for a lens of the model brown, not fisheye' in far[0]
-    own = tuple(replace(each, apart_px=None) if each.chosen else each for each in found.tried)
+    assert f'{found.px * tried["fisheye"].apart_px:.1f} px' in far[0] and '0.0 px' not in far[0]
+    own = tuple(each if each.chosen else replace(each, apart_px=None) for each in found.tried)
     assert 'far away' in ' '.join(judge(replace(found, tried=own), CONFIG.verdict).reasons)
 
 

@@ -11,7 +11,7 @@ from synthetic import LENS, SyntheticTurn, synthetic_turn
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.judge.agreement import earlier_of_another_camera
+from dashcalib_ros.judge.agreement import OTHER_CAMERA, turns_of_earlier_cameras
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve import solve
@@ -63,8 +63,8 @@ def test_a_lens_exchanged_since_is_left_out_or_in_sigma(own, by):
     assert any(turn.of_this_drive for turn in used)
     off = abs(solution.camera.fx - LENS.fx)
     assert off < 2.5 * solution.sigma[0]
-    left_out = earlier_of_another_camera(scenes, solution)
-    assert left_out == {scene.turn for scene in scenes} - {*used} - {*solution.misfits}
+    left_out = turns_of_earlier_cameras(scenes, solution)
+    assert set(left_out) == {scene.turn for scene in scenes} - {*used} - {*solution.misfits}
     if off > 0.02 * LENS.fx:
         assert judge(solution, CONFIG.verdict).level != 'accepted'
 
@@ -82,9 +82,9 @@ def test_a_camera_that_hangs_upside_down_now_is_another_one():
                                          translations=structure.translations @ turned))
 
     both = [*map(upside_down, scenes[:2]), *scenes[2:]]
-    assert not earlier_of_another_camera(scenes, solved(scenes))
-    assert earlier_of_another_camera(both, solved(both)) == {
-        scene.turn for scene in scenes[2:]}
+    assert not turns_of_earlier_cameras(scenes, solved(scenes))
+    assert turns_of_earlier_cameras(both, solved(both)) == {
+        scene.turn: OTHER_CAMERA for scene in scenes[2:]}
 
 
 def on_a_road(world: int, yaw: float) -> Scene:

@@ -40,7 +40,7 @@ from dashcalib_ros.reconstruct.scene import (
     truncated_cost,
 )
 from dashcalib_ros.solve import joint, solve, start
-from dashcalib_ros.solve.optimise import with_points_settled
+from dashcalib_ros.solve.optimise import Estimate, with_points_settled
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.start import misfits, profile_around, retriangulate, summed
 
@@ -82,6 +82,22 @@ def test_equations_that_nothing_solves_give_no_solution(monkeypatch):
     scenes = scenes_of(2)
     monkeypatch.setattr(joint, '_with_all_tracks', singular)
     assert solve(scenes, CONFIG) is None
+
+
+def test_turns_that_all_lose_their_points_give_no_solution(monkeypatch, no_profile):
+    retriangulated, calls, limit = Estimate.retriangulated, [], 100
+
+    def without_turns(self, least_px=0.0):
+        calls.append(least_px)
+        found = retriangulated(self, least_px)
+        return found if len(calls) < limit else replace(found, scenes=())
+    monkeypatch.setattr(Estimate, 'retriangulated', without_turns)
+    scenes = scenes_of(2, tracks=90, keyframes=8)
+    assert solve(scenes, CONFIG) is not None
+    # wherever in the solution that happens
+    for limit in range(1, len(calls) + 1):
+        calls.clear()
+        assert solve(scenes, CONFIG) is None and len(calls) >= limit
 
 
 def test_three_turns_give_all_six_within_three_sigma(good):

@@ -144,8 +144,9 @@ def test_where_no_child_can_live_the_pictures_are_not_blamed(pool, monkeypatch):
     monkeypatch.setattr(pool_module, 'ATTEMPTS', 2)
     monkeypatch.setattr(child_module, 'START', 'import sys; sys.exit(7)')
     pool.submit(turn(10), None)
-    with pytest.raises(WorkerError, match=r'no reconstruction process .*exit code 7'):
+    with pytest.raises(WorkerError, match='exit code 7') as caught:
         wait_until_built(pool)
+    assert caught.value.code == 'E-WORKER-CANNOT-LOAD'
     monkeypatch.undo()
     use(monkeypatch, child_tasks.build)
     wait_until_built(pool)
@@ -155,8 +156,9 @@ def test_where_no_child_can_live_the_pictures_are_not_blamed(pool, monkeypatch):
 def test_an_error_is_told_once_and_the_turn_tried_again(pool, monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build_fails_at_first)
     pool.submit(turn(10, tmp_path / 'flag'), None)
-    with pytest.raises(WorkerError, match='frame 10 failed: MemoryError: no room'):
+    with pytest.raises(WorkerError, match=r'frame 10 .*MemoryError: no room') as caught:
         wait_until_built(pool)
+    assert caught.value.code == 'E-TURN-FAILED'
     assert len(pool.unbuilt()) == 1
     wait_until_built(pool)
     assert pool.scenes() == {at(10): 'scene of 10'}
@@ -335,8 +337,9 @@ def test_inline_it_is_all_the_same(monkeypatch):
     assert pool.scenes() == {at(center): f'scene of {center}' for center in (10, 50, 90)}
     assert pool.run(child_tasks.pid) == os.getpid() and pool.pids() == []
     pool.close()
-    with pytest.raises(WorkerDiedError, match='closed'):
+    with pytest.raises(WorkerDiedError) as caught:
         pool.run(child_tasks.pid)
+    assert caught.value.code == 'E-CALIBRATOR-CLOSED'
 
 
 @pytest.mark.parametrize('kept', [True, False])
@@ -399,8 +402,9 @@ def test_who_waits_may_do_other_things_meanwhile(monkeypatch, tmp_path):
 
 def test_run_tries_a_child_that_dies_again(pool, tmp_path):
     assert pool.run(child_tasks.die_at_first, str(tmp_path / 'flag')) == 'second time'
-    with pytest.raises(WorkerDiedError, match='exit code 7'):
+    with pytest.raises(WorkerDiedError, match='exit code 7') as caught:
         pool.run(child_tasks.die, 7)
+    assert caught.value.code == 'E-WORKER-DIED'
     assert pool.run(child_tasks.add, 1, 2) == 3
 
 
@@ -441,6 +445,7 @@ def test_close_while_others_wait(pool, monkeypatch, tmp_path):
     assert not any(is_running(pid) for pid in pids) and pool.pids() == []
     # nothing starts again
     pool.submit(turn(200), None)
-    with pytest.raises(WorkerDiedError, match='closed'):
+    with pytest.raises(WorkerDiedError) as caught:
         pool.run(child_tasks.add, 1, 2)
+    assert caught.value.code == 'E-CALIBRATOR-CLOSED'
     assert pool.pids() == []

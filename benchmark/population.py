@@ -1,0 +1,349 @@
+#!/usr/bin/env python3
+"""Random dashcams: lens, shutter, glass, picture and drive of each are drawn from a seed.
+
+    python benchmark/population.py --seeds 1000-1059 --out DIR [--workers N]
+                                   [--stage scenes|all] [--again] [--summary]
+
+DIR/SEED.scenes.pkl has what `solve` gets: the reconstructed turns, and the truth (dashcams.py).
+DIR/SEED.json has what the result is off by. What is there is not made again; --again: results are,
+from the same scenes. The tables are printed, and written to DIR/population.md.
+"""
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from dashcams import Case, load_case, reconstructed, save_case
+from mapping import UNSEEN_PX, WIDEST_DEG
+from measure import (
+    ALL_KEYS,
+    commit,
+    complain,
+    done,
+    errors,
+    isolated,
+    load,
+    processor_s,
+    save,
+    table,
+)
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from dashcalib_ros import Calibration
+from dashcalib_ros.judge.agreement import contradicting_turns
+from dashcalib_ros.judge.conclude import conclude
+from dashcalib_ros.solve import solve
+from dashcalib_ros.workers.worker import THREAD_VARIABLES
+
+Floats = npt.NDArray[np.float64]
+
+# px of glass, and ms of a readout, of which a result must not be silent, nor speak without
+TOLD_GLASS_PX, TOLD_READOUT_MS = 0.5, 5.0
+# of fx: an accepted result may not be off by more
+FX_PERCENT, FX_SIGMAS = 1.0, 3.0
+
+
+def calibrated(case: Case) -> Calibration:
+    """Return what the command makes of a case: with more turns, where the first ones are weak."""
+    evidence, scenes = case.evidence, case.scenes
+    while True:
+        solution = solve(scenes, case.config) if scenes else None
+        if scenes:
+            evidence = replace(evidence, left_out={
+                **evidence.left_out,
+                **contradicting_turns(scenes, solution, case.config.verdict)})
+        found = conclude(solution, evidence, case.config)
+        if found.verdict.level != 'weak' or scenes is case.more or not case.more:
+            return found
+        case = replace(case, more=tuple(
+            scene for scene in case.more if scene.turn not in evidence.left_out))
+        scenes = case.more
+
+
+def measured(path: Path) -> dict[str, Any]:
+    """Return what is wrong with the result of a case."""
+    cv2.setNumThreads(1)
+    case, before = load_case(path), processor_s()
+    found = calibrated(case)
+    row: dict[str, Any] = {
+        'verdict': found.verdict.level, 'reasons': list(found.verdict.reasons),
+        'warnings': list(found.warnings), 'turns': len(case.spec.turn_list),
+        'turns_used': found.turns_used, 'size': case.size, 'rate': case.spec.rate,
+        'truth_model': case.lens['model'], 'glass_px': case.glass.rms_px if case.glass else 0.0,
+        'look': case.glass.look if case.glass else '', 'readout_ms': case.readout_ms,
+        'truth': dict(case.lens), 'named': named(found), 'cpu_s': processor_s() - before,
+        'scenes_cpu_s': case.cpu_s}
+    if found.camera is None or found.sigma_px is None:
+        return row
+    model = found.camera.model
+    shutter = found.rolling_shutter
+    row |= {'model': model, 'sigma_px': found.sigma_px.rms,
+            'rays_px': off(found.project, case, model),
+            'camera_px': off(found.camera.project, case, model),
+            'shutter_ms': shutter.readout_ms if shutter else 0.0,
+            'shutter_sigma_ms': shutter.sigma_ms if shutter else None}
+    if model in case.closest:
+        row |= errors({**found.camera.named, 'model': model},
+                      {**case.closest[model], 'model': model}, found.sigma)
+    return row
+
+
+def named(found: Calibration) -> list[str]:
+    """Return which effects the result names."""
+    text = ' '.join((*found.verdict.reasons, *found.warnings))
+    return [name for name, is_named in (
+        ('zoom', 'the zoom changes' in text),
+        ('stabilised', found.stabiliser is not None or 'stabil' in text),
+        ('bent', 'bent' in text),
+        ('shutter', found.rolling_shutter is not None)) if is_named]
+
+
+def off(project: Callable[[Floats], Floats], case: Case, model: str) -> float:
+    """Return the RMS px between where the true rays are seen, the best rotation removed."""
+    near = (np.ones(len(case.rays), bool) if model == 'fisheye'
+            else case.rays[:, 2] > math.cos(math.radians(WIDEST_DEG)))
+    rays, pixels = case.rays[near], case.pixels[near]
+
+    def residual(turn: Floats) -> Floats:
+        rest = project(Rotation.from_rotvec(turn).apply(rays)) - pixels
+        return np.nan_to_num(rest, nan=UNSEEN_PX).ravel()
+
+    rest = least_squares(residual, np.zeros(3)).fun.reshape(-1, 2)
+    return float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
+
+
+Row = Mapping[str, Any]
+GROUPS: dict[str, Callable[[Row], bool]] = {
+    'all': lambda row: True,
+    'no glass': lambda row: not row['glass_px'],
+    'behind glass': lambda row: row['glass_px'] > 0,
+    'glass and shutter': lambda row: row['glass_px'] > 0 and row['readout_ms'] > 0,
+    'fisheye': lambda row: row['truth_model'] == 'fisheye',
+    'rolling shutter': lambda row: row['readout_ms'] > 0,
+}
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """Return the tables: bars, verdicts, error over sigma, shutters, names, and each camera."""
+    failed = [row for row in rows if row['verdict'] == 'failed']
+    rows = [row for row in rows if row['verdict'] != 'failed']
+    return '\n\n'.join([
+        *(f'Failed: seed {row["seed"]}: {row["reasons"][0]}' for row in failed),
+        _bars(rows), _groups(rows), _sigmas(rows), _shutters(rows), _names(rows), _cameras(rows)])
+
+
+def _groups(rows: Sequence[Row]) -> str:
+    lines = []
+    for name, belongs in GROUPS.items():
+        mine = [row for row in rows if belongs(row)]
+        accepted = [row for row in mine if row['verdict'] == 'accepted']
+        lines.append([
+            name, str(len(mine)),
+            *(str(sum(row['verdict'] == level for row in mine))
+              for level in ('accepted', 'weak', 'refused')),
+            *_spread([row['rays_px'] for row in accepted]),
+            *_spread([row['camera_px'] for row in accepted]),
+            _median([row['camera_px'] / row['sigma_px'] for row in accepted]),
+            _median([abs(row['percent']['fx']) for row in accepted if 'percent' in row], '.3f')])
+    return 'Rays with the field, camera alone, over the picture; of those accepted.\n\n' + table(
+        ['cameras', 'of them', 'accepted', 'weak', 'refused', 'rays off, px: median', '95 %',
+         'camera off, px: median', '95 %', 'camera off / sigma_px', 'fx off, %'], lines)
+
+
+def _sigmas(rows: Sequence[Row]) -> str:
+    lines = []
+    for level in ('accepted', 'weak'):
+        found = [row['z'] for row in rows if row['verdict'] == level and 'z' in row]
+        each = {key: [abs(z[key]) for z in found if key in z] for key in ALL_KEYS}
+        for name, values in (('all', [*chain.from_iterable(each.values())]), *each.items()):
+            if values:
+                lines.append([level, name, str(len(values)), *(
+                    f'{sum(value <= limit for value in values) / len(values):.0%}'
+                    for limit in (1, 2, 3)), _median(values), f'{max(values):.1f}'])
+        shares = [row['camera_px'] / row['sigma_px'] for row in rows
+                  if row['verdict'] == level and row.get('sigma_px')]
+        lines.append([level, 'picture', str(len(shares)), '', '', '', _median(shares),
+                      f'{max(shares, default=math.nan):.1f}'])
+    return 'Error over sigma.\n\n' + table(
+        ['verdict', '', 'n', 'within 1', '2', '3 sigma', 'median', 'worst'], lines)
+
+
+def _shutters(rows: Sequence[Row]) -> str:
+    lines = []
+    for name, belongs in GROUPS.items():
+        mine = [row for row in rows if belongs(row) and 'shutter_ms' in row
+                and row['readout_ms'] >= TOLD_READOUT_MS]
+        told = [row for row in mine if row['shutter_sigma_ms']]
+        if not mine:
+            continue
+        off_ms = [row['shutter_ms'] - row['readout_ms'] for row in told]
+        z = [abs(each) / row['shutter_sigma_ms'] for each, row in zip(off_ms, told, strict=True)]
+        lines.append([
+            name, f'{len(told)} of {len(mine)}',
+            _median([100 * each / row['readout_ms'] for each, row in
+                     zip(off_ms, told, strict=True)], '+.1f'),
+            _median([100 * abs(each) / row['readout_ms'] for each, row in
+                     zip(off_ms, told, strict=True)], '.1f'),
+            f'{sum(value <= 2 for value in z)} of {len(z)}', _median(z)])
+    return f'Readouts of {TOLD_READOUT_MS:g} ms and more.\n\n' + table(
+        ['cameras', 'found', 'off, %: median', 'absolute', 'within 2 sigma', 'in sigmas'], lines)
+
+
+def _names(rows: Sequence[Row]) -> str:
+    has: dict[str, Callable[[Row], bool | None]] = {
+        'zoom': lambda row: False, 'stabilised': lambda row: False,
+        'bent': lambda row: _told(row['glass_px'], TOLD_GLASS_PX),
+        'shutter': lambda row: _told(row['readout_ms'], TOLD_READOUT_MS)}
+    lines = []
+    for name, true in has.items():
+        wrong = [row for row in rows if name in row['named'] and true(row) is False]
+        right = [row for row in rows if true(row) and row['verdict'] != 'refused']
+        lines.append([name, f'{sum(name in row["named"] for row in right)} of {len(right)}',
+                      f'{len(wrong)} of {sum(true(row) is False for row in rows)}',
+                      ', '.join(f'{row["seed"]} ({row["verdict"]})' for row in wrong)])
+    return 'Named findings; what is small may be named or not.\n\n' + table(
+        ['', 'named where it is', 'named where it is not', 'which'], lines)
+
+
+def _told(size: float, limit: float) -> bool | None:
+    """Return whether an effect must be named; None where it is too small to matter."""
+    return False if size == 0.0 else True if size >= limit else None
+
+
+def _bars(rows: Sequence[Row]) -> str:
+    """Return what the population must show, and what it shows."""
+    accepted = [row for row in rows if row['verdict'] == 'accepted']
+    z = [abs(value) for row in accepted for value in row.get('z', {}).values()]
+    rays = [row['rays_px'] for row in accepted]
+    told = [row for row in rows if row['readout_ms'] >= TOLD_READOUT_MS and 'shutter_ms' in row]
+    short = [abs(row['shutter_ms'] / row['readout_ms'] - 1) for row in told]
+    within = [abs(row['shutter_ms'] - row['readout_ms']) <= 2 * row['shutter_sigma_ms']
+              if row['shutter_sigma_ms'] else False for row in told]
+    false = [row for row in accepted if 'z' in row and (
+        abs(row['z']['fx']) > FX_SIGMAS or row['percent']['fx'] > FX_PERCENT)]
+    lines: list[tuple[str, float, str, float, float]] = [
+        ('sound lenses accepted', _share(rows, lambda row: not row['glass_px']), '.0%', 0.97, 1),
+        ('behind glass accepted', _share(rows, lambda row: row['glass_px'] > 0), '.0%', 0.9, 1),
+        ('rays off, px: median', _quantile(rays, 0.5), '.2f', 0, 0.25),
+        ('rays off, px: 95 %', _quantile(rays, 0.95), '.2f', 0, 0.8),
+        *((f'parameters within {limit} sigma', _mean([value <= limit for value in z]), '.1%',
+           *bars) for limit, bars in ((1, (0.6, 0.8)), (2, (0.93, 0.99)), (3, (0.99, 1)))),
+        ('camera off over sigma_px: median', _quantile(
+            [row['camera_px'] / row['sigma_px'] for row in accepted], 0.5), '.2f', 0.7, 1.2),
+        (f'fx more than {FX_SIGMAS:g} sigma, or {FX_PERCENT:g} %, off', len(false), 'd', 0, 0),
+        ('readout off: median', _quantile(short, 0.5), '.1%', 0, 0.015),
+        ('readout within 2 sigma', _mean(within), '.0%', 0.93, 1)]
+    return 'Of those accepted; readouts of all that have a camera.\n\n' + table(
+        ['', 'measured', 'at least', 'at most', ''],
+        [[name, format(value, form), format(least, form), format(most, form),
+          'met' if least <= value <= most else 'missed']
+         for name, value, form, least, most in lines if not math.isnan(value)])
+
+
+def _share(rows: Sequence[Row], belongs: Callable[[Row], bool]) -> float:
+    return _mean([row['verdict'] == 'accepted' for row in rows if belongs(row)])
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else math.nan
+
+
+def _quantile(values: Sequence[float], share: float) -> float:
+    return float(np.quantile(values, share)) if values else math.nan
+
+
+def _cameras(rows: Iterable[Row]) -> str:
+    lines = []
+    for row in rows:
+        z = row.get('z', {})
+        worst = max(z, key=lambda key: abs(z[key]), default='')
+        lines.append([
+            str(row['seed']), '{}x{}'.format(*row['size']), f'{row["rate"]:g}',
+            row['truth_model'], f'{row["glass_px"]:.1f}', row['verdict'], row.get('model', ''),
+            *(f'{row[key]:.2f}' if key in row else '' for key in (
+                'rays_px', 'camera_px', 'sigma_px')),
+            f'{row["readout_ms"]:.1f}',
+            f'{row["shutter_ms"]:.1f} ± {row["shutter_sigma_ms"]:.1f}'
+            if row.get('shutter_sigma_ms') else '',
+            f'{100 * row["error"]["fx"] / row["truth"]["fx"]:+.2f}' if 'error' in row else '',
+            f'{z["fx"]:+.1f}' if 'fx' in z else '', f'{worst} {z[worst]:+.1f}' if worst else '',
+            ', '.join(row['named']), '; '.join(row['reasons'])[:90]])
+    return table(['seed', 'size', 'Hz', 'lens', 'glass px', 'verdict', 'model', 'rays off px',
+                  'camera off px', 'sigma_px', 'readout ms', 'found', 'fx off %', 'in sigmas',
+                  'worst', 'named', 'reasons'], lines)
+
+
+def _spread(values: Sequence[float]) -> list[str]:
+    return [f'{_quantile(values, share):.2f}' if values else '' for share in (0.5, 0.95)]
+
+
+def _median(values: Sequence[float], form: str = '.2f') -> str:
+    return format(_quantile(values, 0.5), form) if values else ''
+
+
+def run(seed: int, out: Path, stage: str, again: bool) -> None:
+    """Make what is missing of a seed."""
+    scenes, result = out / f'{seed}.scenes.pkl', out / f'{seed}.json'
+    if not scenes.exists():
+        outcome = isolated(_write_case, seed, scenes)
+        complain(f'{seed}: {outcome.failure or outcome.value}, {outcome.seconds:.0f} s, '
+                 f'{outcome.peak_mb:.0f} MB')
+        if outcome.failure:
+            save(result, {'seed': seed, 'verdict': 'failed', 'reasons': [outcome.failure]})
+            return
+    if stage == 'all' and (again or not done(load(result) or None)):
+        outcome = isolated(measured, scenes)
+        row = outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure]}
+        save(result, {'seed': seed, 'commit': commit(), 'seconds': outcome.seconds, **row})
+        complain(f'{seed}: {row["verdict"]}, {outcome.seconds:.0f} s')
+
+
+def _write_case(seed: int, path: Path) -> str:
+    case = reconstructed(seed)
+    save_case(case, path)
+    return f'{len(case.scenes)} scenes of {len(case.spec.turn_list)} turns, {case.cpu_s:.0f} CPU s'
+
+
+def _seeds(text: str) -> range:
+    first, _, last = text.partition('-')
+    return range(int(first), int(last or first) + 1)
+
+
+def main() -> None:
+    """Measure."""
+    # processes that start from here inherit it: an inline calibrator needs one thread, and what
+    # COLMAP and Ceres warn of is not shown by a calibrator's children either
+    os.environ.update({**dict.fromkeys(THREAD_VARIABLES, '1'), 'GLOG_minloglevel': '2'})
+    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n')[0])
+    parser.add_argument('--seeds', type=_seeds, required=True, help='a seed, or the first-last')
+    parser.add_argument('--out', type=Path, required=True)
+    parser.add_argument('--workers', type=int, default=1, help='drives at a time')
+    parser.add_argument('--stage', choices=('scenes', 'all'), default='all')
+    parser.add_argument('--again', action='store_true', help='results that are there, too')
+    parser.add_argument('--summary', action='store_true', help='of the results there are, and end')
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    if not given.summary:
+        with ThreadPoolExecutor(given.workers) as pool:
+            list(pool.map(lambda seed: run(seed, given.out, given.stage, given.again),
+                          given.seeds))
+    rows = [row for seed in given.seeds if (row := load(given.out / f'{seed}.json'))]
+    if rows:
+        text = summary(rows)
+        print(text)
+        (given.out / 'population.md').write_text(text + '\n')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,235 @@
+"""The whole story: frames -> turns -> scenes -> one camera -> verdict."""
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from types import TracebackType
+
+from dashcalib_ros.arrays import Mask
+from dashcalib_ros.camera import searched
+from dashcalib_ros.config import Config
+from dashcalib_ros.detect import Turn, TurnId
+from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.input import Frame
+from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
+from dashcalib_ros.judge.conclude import (
+    Evidence,
+    conclude,
+    evidence_of_detection,
+    turns_that_stood,
+)
+from dashcalib_ros.judge.witnesses import Asked, ask_sensors
+from dashcalib_ros.reconstruct.repeated import without_repeated
+from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.selection import SceneSelection
+from dashcalib_ros.solve import solve
+from dashcalib_ros.solve.solution import Solution
+from dashcalib_ros.workers.child import ChildWorker
+from dashcalib_ros.workers.pool import ScenePool
+from dashcalib_ros.workers.worker import InlineWorker, Progress, Worker
+
+
+@dataclass(frozen=True)
+class Status:
+    """The calibrator's state after a frame.
+
+    frames: pushed so far. turns: in the bank and stored. built: how many scenes a calibration
+    would use now; ready: their turns; yaw_deg: the sum of their yaw. stored: how many turns are of
+    earlier drives. magnitude: the newest filtered turning magnitude, of the image width.
+    yaws_deg: of the turns in ready, in their order. reconstructed: the turns that watch() has
+    scenes of, chosen or not. two_cameras: what the newest images show, if they are of two.
+    """
+
+    frames: int
+    turns: int
+    built: int
+    yaw_deg: float
+    magnitude: float
+    standing: bool
+    ready: tuple[TurnId, ...] = ()
+    stored: int = 0
+    yaws_deg: tuple[float, ...] = ()
+    reconstructed: tuple[TurnId, ...] = ()
+    two_cameras: str = ''
+
+
+class Calibrator:
+    """Learns a camera from the turns of a drive.
+
+    push() the frames as they come; calibrate() when enough turns have gathered, or at the end.
+    close() ends the child processes; a Calibrator is also a context manager. questions.py asks
+    its turns about other cameras. All methods are for one thread, but close(), which is for any.
+
+    detection: what was found in the frames so far: turns, tracked points, the ego vehicle. scenes:
+    which turns are reconstructed, and which of them count. workers: where every stage after the
+    detection runs. solution: what the last calibrate() judged, in the resized pictures' pixels;
+    None before, and where there is none.
+    """
+
+    def __init__(self, config: Config | None = None, mask: Mask | None = None,
+                 verbose: bool = False, live: bool = False, use_stored: bool = True,
+                 warn: Callable[[str], None] = lambda text: None, inline: bool = False,
+                 on_trouble: Callable[[str], None] = lambda text: None,
+                 on_wait: Callable[[], bool] | None = None) -> None:
+        """mask: (h, w), False where the ego vehicle is.
+
+        live: children run at low priority, and push() never waits for them; offline it does, so
+        that few turns are in memory at a time. use_stored: False does not load the turns in
+        turns.store, but adds to them. warn: called with one line for each problem with
+        turns.store; the result's warnings have them, too. inline: everything runs in this process,
+        with equal results; numpy must have one thread, else WorkerError says how; close() then
+        does not end what runs. on_trouble: called with one line for each child that died or hangs,
+        and for each turn that is tried again after that, from any thread. on_wait: called again
+        and again while a worker is waited for; it may push() a frame, so that a live drive goes
+        on, and returns whether it did something. Raises ConfigError for an unknown model.
+        """
+        config = config or Config()
+        searched(config.model)
+        self.solution: Solution | None = None
+        self._live = live
+        self._motion: SensorStream | None = None
+        self._detect_s = 0.0
+        self._started = time.monotonic()
+
+        def child() -> Worker:
+            return ChildWorker(live, verbose, config.threads, on_trouble)
+
+        def lost(text: str) -> None:
+            self.scenes.warnings.append(text)
+            on_trouble(text)
+
+        self.detection = Detection(config, mask, beside=not live)
+        self.workers = ScenePool(config, InlineWorker if inline else child,
+                                 queue=config.turns.wanted if live else None, on_lost=lost,
+                                 on_trouble=on_trouble, keep_pictures=not live, on_wait=on_wait)
+        self.scenes = SceneSelection(config, self.detection, self.workers, live, use_stored, warn)
+
+    def push(self, frame: Frame) -> Status:
+        """Take the next frame; raises InputError when its size differs from the first one's."""
+        started = time.monotonic()
+        new_turns = self.detection.push(frame)  # frames -> turns
+        if self.detection.frames == 1:
+            self.scenes.load(frame.frame_id)
+        if new_turns:
+            self.scenes.submit(more_to_come=True)  # turns -> scenes, in the background
+        self._detect_s += time.monotonic() - started
+        self.scenes.make_room()
+        return self.status()
+
+    def sense(self, motion: SensorStream) -> None:
+        """Take what the car's sensors say of the drive so far, in the place of what came before.
+
+        The next calibrate() uses it; its stamps count from the first image.
+        """
+        self._motion = motion
+
+    def calibrate(self, progress: Progress | None = None, final: bool = True) -> Calibration:
+        """Adjust the best turns' scenes together and judge the result.
+
+        final: the drive is over, and its last turn may end here; no push() may follow.
+        progress: called with the stage's name and the share done.
+        """
+        progress = progress or (lambda stage, done: None)
+        started = time.monotonic()
+        if final:
+            self.detection.finish()
+        found = self._calibrate(progress, final, started)
+        if found.verdict.level == 'weak' and self.scenes.widen():
+            found = self._calibrate(progress, final, started)  # with more turns
+        return found
+
+    def close(self) -> None:
+        """End threads and child processes; a calibrate() elsewhere raises WorkerError."""
+        self.detection.close()
+        self.workers.close()
+
+    def _calibrate(self, progress: Progress, final: bool, started: float) -> Calibration:
+        scenes, solution = self._solve(progress, final)  # scenes -> one camera
+        asked = self._ask_sensors(solution, progress)
+        solution, limits = asked.solution, self.scenes.config.verdict
+        # these do not count in the next calibration; files of another camera's turns stay
+        self.scenes.exclude(turns_of_earlier_cameras(scenes, solution), keep_files=True)
+        self.scenes.exclude(contradicting_turns(scenes, solution, limits))
+        self.solution = solution
+        return self._judge(asked, started)  # one camera -> verdict
+
+    def _solve(self, progress: Progress, final: bool) -> tuple[list[Scene], Solution | None]:
+        """Return the scenes that count, and the camera that explains them; None without any."""
+        config = self.scenes.config
+        while scenes := self.scenes.wanted(progress, final):
+            stood = turns_that_stood(scenes, self._motion, self.detection.start_s)
+            if stood:
+                self.scenes.exclude(stood)
+                continue
+            # the search for repeated pictures takes a second and hardly ever finds some
+            search = self.workers.begin(without_repeated, scenes, config.scene.min_images)
+            solving = self.workers.begin(solve, scenes, config, tells=True)
+            kept, repeated = self.workers.result(search)
+            if repeated:
+                self.workers.drop(solving)
+                self.scenes.exclude_repeated(repeated)
+                continue
+            if any(len(one.tracks.frames) < len(other.tracks.frames)
+                   for one, other in zip(kept, scenes, strict=True)):
+                self.workers.drop(solving)
+                solving = self.workers.begin(solve, kept, config, tells=True)
+            return kept, self.workers.result(solving, progress)
+        return [], None
+
+    def _ask_sensors(self, solution: Solution | None, progress: Progress) -> Asked:
+        if solution is None or self._motion is None:
+            return Asked(solution)
+        progress('evaluating the motion sensors', 0.0)
+        asked: Asked = self.workers.run(ask_sensors, solution, self._motion,
+                                        self.detection.start_s, self.scenes.config)
+        return asked
+
+    def _judge(self, asked: Asked, started: float) -> Calibration:
+        # the solution itself is judged
+        evidence = self._evidence(started, replace(asked, solution=None))
+        if not self._live or self.solution is None:
+            return conclude(self.solution, evidence, self.scenes.config)
+        # it takes a second or two, and a live drive goes on meanwhile
+        found: Calibration = self.workers.run(conclude, self.solution, evidence,
+                                              self.scenes.config)
+        return found
+
+    def _evidence(self, started: float, asked: Asked) -> Evidence:
+        now = time.monotonic()
+        timing = {'detect': self._detect_s, 'calibrate': now - started,
+                  'total': now - self._started}
+        seen = evidence_of_detection(self.detection, self.scenes.built())
+        return replace(
+            seen, timing=timing, warnings=(*seen.warnings, *self.scenes.warnings),
+            stored=self.scenes.stored_before, left_out=self.scenes.left_out(),
+            pictures=None if self._live else self.workers.pictures(), motion=self._motion,
+            asked=asked)
+
+    def turns(self) -> tuple[Turn, ...]:
+        """Return the bank's turns, the most prominent first."""
+        return self.detection.turns()
+
+    def status(self) -> Status:
+        """Return the present state; scenes that are new are written to turns.store.
+
+        Those of a drive of two cameras are not.
+        """
+        found = self.detection
+        self.scenes.store_new()
+        chosen, stored = self.scenes.chosen(), len(self.scenes.stored())
+        return Status(found.frames, len(found.turns()) + stored, len(chosen),
+                      sum(scene.yaw_deg for scene in chosen), found.magnitude,
+                      found.standing, tuple(scene.turn for scene in chosen), stored,
+                      tuple(scene.yaw_deg for scene in chosen),
+                      tuple(self.scenes.all_scenes()),
+                      str(found.other_camera) if found.mixed else '')
+
+    def __enter__(self) -> Calibrator:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self.close()

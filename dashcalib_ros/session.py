@@ -1,0 +1,308 @@
+"""A recorded drive in, a result out: the one wiring of the command, Python and the fleet."""
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Generator, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dashcalib_ros.arrays import Mask
+from dashcalib_ros.config import Config
+from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.input import Frame, FrameSource
+from dashcalib_ros.input.decode import check_mask, read_mask
+from dashcalib_ros.input.inputs import Paths, as_list, fits_bag, open_frames
+from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.input.motion_files import bag_motion, read_motion
+from dashcalib_ros.input.source import by
+from dashcalib_ros.judge import Calibration, Check, Odometry, Poses, track_poses
+from dashcalib_ros.pipeline import Calibrator
+from dashcalib_ros.questions import Questions
+from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report.camera_file import Given, given_camera
+from dashcalib_ros.workers.worker import Progress
+
+MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
+MotionOrPath = str | os.PathLike[str] | SensorStream | None
+# s between two looks whether an image has been read
+READING_S = 0.01
+
+
+class Observer:
+    """Sees the progress of a drive; this one does nothing with it."""
+
+    def show(self, stage: str, share: float | None = None, note: str = '') -> None:
+        """Take the stage's name, the share done, 0 to 1 (None: unknown), and a note."""
+
+    def closing(self) -> AbstractContextManager[None]:
+        """Return what surrounds the end of the child processes."""
+        return nullcontext()
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recorded drive: its frames, where they are not to be used, and the car's sensors."""
+
+    source: FrameSource
+    mask: Mask | None = None
+    motion: SensorStream | None = None
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a drive says of a given camera.
+
+    changes: of the camera during the drive, in words. odometry: the motion in the turns beside
+    true poses; None without poses.
+    """
+
+    check: Check
+    calibration: Calibration
+    changes: tuple[str, ...] = ()
+    odometry: Odometry | None = None
+
+
+def open_drive(path: Paths, topic: str | None = None, fps: float | None = None,
+               start_s: float = 0.0, duration_s: float | None = None, mask: MaskOrPath = None,
+               motion: MotionOrPath = None,
+               sensor_topics: Mapping[str, str | None] = MappingProxyType({})) -> Recording:
+    """Open a recorded drive; the parameters are those of calibrate().
+
+    sensor_topics: of a bag, by imu, gps and odom. Raises InputError.
+    """
+    valid, paths = _valid(mask), as_list(path)
+    source = open_frames(paths, topic, fps, start_s, duration_s)
+    sensors = motion if isinstance(motion, SensorStream) else drive_motion(
+        paths, motion, sensor_topics, start_s, topic)
+    return Recording(source, valid, sensors)
+
+
+def calibrate_drive(drive: Recording, config: Config | None = None,
+                    observer: Observer | None = None, verbose: bool = False) -> Calibration:
+    """Calibrate a recorded drive; the input's name and warnings are in the result."""
+    observer = observer or Observer()
+    with _learned(drive, config, observer, verbose) as calibrator:
+        return with_source(calibrator.calibrate(observer.show), drive.source)
+
+
+def check_drive(drive: Recording, named: NamedCamera, config: Config | None = None,
+                observer: Observer | None = None, poses: Poses | None = None,
+                track: SensorStream | None = None, verbose: bool = False) -> Checked:
+    """Calibrate a recorded drive, and compare a given camera with what its turns show.
+
+    named: the given camera, of the pictures as they are stored. poses: true ones of the drive;
+    track: GPS positions, from which poses are made. Raises InputError as Questions.odometry().
+    """
+    observer = observer or Observer()
+    given = drive.source.shown(named.camera)
+    with _learned(drive, config, observer, verbose) as calibrator:
+        calibration, questions = calibrator.calibrate(observer.show), Questions(calibrator)
+        check = questions.check(given, calibration, observer.show, named.name)
+        if given.image_size != calibration.image_size:
+            return Checked(check, calibration)  # it explains no motion either
+        changes = tuple(str(change) for change in questions.watch(given).changes)
+        if track is not None:
+            track = track.since(calibration.start_s)
+            assert track.position is not None
+            poses = track_poses(track.position, calibration.start_s)
+        odometry = None if poses is None else questions.odometry(given, calibration, poses,
+                                                                 observer.show)
+    return Checked(check, calibration, changes, odometry)
+
+
+@contextmanager
+def _learned(drive: Recording, config: Config | None, observer: Observer, verbose: bool
+             ) -> Iterator[Calibrator]:
+    """Give a calibrator that has taken every frame and what the sensors say."""
+    calibrator = Calibrator(config, drive.mask, verbose)
+    try:
+        if drive.motion is not None:
+            calibrator.sense(drive.motion)
+        feed(calibrator, drive, observer)
+        yield calibrator
+    finally:
+        with observer.closing():
+            calibrator.close()
+
+
+def feed(taker: Calibrator | Detection, drive: Recording, observer: Observer) -> int:
+    """Push every frame of the drive, and return how many there were.
+
+    Raises InputError for a mask of another size.
+    """
+    number, count = 0, drive.source.count
+    observer.show('reading', None)
+    for number, frame in enumerate(_read_ahead(drive.source), 1):
+        if number == 1:
+            check_mask(drive.mask, frame.size)
+        taker.push(frame)
+        observer.show('reading', min(number / count, 1.0) if count else None,
+                      f'frame {number}, {counted(len(taker.turns()), "turn")}')
+    return number
+
+
+def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
+                 chosen: Mapping[str, str | None] = MappingProxyType({}),
+                 start_s: float = 0.0, topic: str | None = None) -> SensorStream | None:
+    """Return the sensors' data of the file motion, else of the bags; None if there is none.
+
+    start_s: where the used part of the drive starts; a CSV counts from the drive's first image.
+    chosen: the bag's topics by imu, gps and odom; topic: its image topic. Raises InputError for a
+    file of another kind, and for a topic that does not exist.
+    """
+    wanted = {name: topic for name, topic in chosen.items() if topic is not None}
+    if motion is not None:
+        if wanted:
+            raise InputError('E-MOTION-TWICE', '--imu, --gps and --odom choose topics of a bag: '
+                                               'omit them or --motion')
+        found = read_motion(Path(motion))
+        return found if found.absolute else found.shifted(-start_s)
+    try:
+        bags = [each for each in map(Path, as_list(path)) if each.exists() and fits_bag(each)]
+        return bag_motion(bags, wanted, topic) if bags else None
+    except (InputError, OSError, ValueError):
+        if wanted:
+            raise
+        return None  # reading the pictures will report what is wrong with the bag
+
+
+def _read_ahead(source: FrameSource) -> Iterator[Frame]:
+    """Yield every frame of the drive, while a thread decodes the next one."""
+    frames, reader = iter(source), ThreadPoolExecutor(1)
+    try:
+        coming = reader.submit(next, frames, None)
+        while (frame := coming.result()) is not None:
+            coming = reader.submit(next, frames, None)
+            yield frame
+    finally:
+        # Ctrl-C in the middle of a lock's own code leaves it locked: the thread is not waited for
+        reader.shutdown(wait=False)
+        _close(frames)
+
+
+def _close(frames: Generator[Frame, None, None]) -> None:
+    """End the reading of a drive, which removes temporary files, after the read under way."""
+    while True:
+        try:
+            frames.close()
+        except ValueError:  # it is running
+            time.sleep(READING_S)
+        else:
+            return
+
+
+def _valid(mask: MaskOrPath) -> Mask | None:
+    if mask is None or isinstance(mask, (str, os.PathLike)):
+        return None if mask is None else read_mask(Path(mask))
+    if mask.ndim != 2:
+        raise InputError('E-MASK-SHAPE', f'the mask has the shape {mask.shape}: pass an array of '
+                                         f'shape (height, width)')
+    return np.asarray(mask) > 0
+
+
+def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
+    """Return the calibration with its input's name and warnings, its pictures in colour.
+
+    What the input contradicts is the first reason of one that is not accepted: it may be why.
+    """
+    verdict, material = calibration.verdict, calibration.material
+    doubts = source.contradictions if verdict.level != 'accepted' else ()
+    new = tuple(line for line in source.warnings
+                if line not in (*doubts, *calibration.warnings))
+    if doubts:
+        cures = (line.rpartition(': ')[2] for line in doubts)
+        verdict = replace(verdict, reasons=(*doubts, *verdict.reasons),
+                          cures=(*cures, *verdict.cures))
+    if material is not None:
+        shown = material.pictures
+        images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})
+        material = replace(material, pictures={
+            turn: each.coloured(images[each.frame]) if each.frame in images else each
+            for turn, each in shown.items()})
+    stored = calibration.camera and source.stored(calibration.camera)
+    if stored:
+        values = ', '.join(f'{name} {value:.2f}' for name, value in zip(
+            ('fx', 'fy', 'cx', 'cy'), stored.params, strict=False))
+        new += (f'for the pictures as they are stored ({by(stored.image_size)}): {values}, and '
+                f'the same distortion',)
+    return replace(calibration, verdict=verdict, material=material,
+                   input_name=calibration.input_name or source.name,
+                   warnings=(*new, *calibration.warnings))
+
+
+# for Python ---------------------------------------------------------------------------------
+
+
+class _Progress(Observer):
+    """Calls a function with each stage."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress = progress
+
+    def show(self, stage: str, share: float | None = None, note: str = '') -> None:
+        if self._progress is not None:
+            self._progress(stage, share or 0.0)
+
+
+def calibrate(path: Paths, fps: float | None = None,
+              config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
+              duration_s: float | None = None, mask: MaskOrPath = None,
+              progress: Progress | None = None, motion: MotionOrPath = None) -> Calibration:
+    """Calibrate a recorded drive.
+
+    path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
+    of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
+    fps: images per second of a folder (default 10), or to override the rate of a video.
+    config: the settings; None: Config().
+    topic: the image topic of a bag; needed only when it has several.
+    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
+    mask: the part of the pictures that is not used (bonnet, burnt-in text): the path of a picture
+    that is black there, or an array (height, width) that is 0 or False there; it is added to the
+    automatic mask.
+    progress: called with the name of the stage and the fraction done, 0 to 1.
+    motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
+    a stream. None: the topics of the bag, if path is one.
+
+    Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and its camera is
+    None if it is refused; accepted() returns it, or raises. Raises InputError for input that
+    cannot be read, ConfigError for a bad setting, WorkerError if a child process cannot run.
+    """
+    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
+    return calibrate_drive(drive, config, _Progress(progress))
+
+
+def check(given: Given, path: Paths, fps: float | None = None,
+          config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
+          duration_s: float | None = None, mask: MaskOrPath = None,
+          progress: Progress | None = None, motion: MotionOrPath = None) -> Check:
+    """Check whether a calibration fits a recorded drive.
+
+    given: the calibration: a Calibration, what load_camera() returns, the path of a file that it
+    reads, or a Radial, Brown, Rational or Fisheye of the drive's pictures.
+    path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
+    of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
+    fps: images per second of a folder (default 10), or to override the rate of a video.
+    config: the settings; None: Config().
+    topic: the image topic of a bag; needed only when it has several.
+    start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
+    mask: the part of the pictures that is not used: the path of a picture that is black there, or
+    an array (height, width) that is 0 or False there.
+    progress: called with the name of the stage and the fraction done, 0 to 1.
+    motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
+    a stream. None: the topics of the bag, if path is one.
+
+    Returns a Check: its answer is 'right', 'differs' (good enough for the uses in its good_for),
+    'wrong' or 'cannot tell', with reasons. Raises InputError for what cannot be read, ConfigError
+    for a bad setting, WorkerError where a child process cannot run.
+    """
+    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
+    return check_drive(drive, given_camera(given), config, _Progress(progress)).check
