@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
 from dashcalib_ros.errors import ConfigError
@@ -117,18 +118,33 @@ class TracksConfig:
         0.0, 1.0)
 
 
-# of the setting reconstruct.engine; auto: pycolmap where it is installed, else opencv
-AUTO_ENGINE = 'auto'
-ENGINES = (AUTO_ENGINE, 'pycolmap', 'opencv')
+# engines of reconstruct.engine
+COLMAP, OPENCV = 'pycolmap', 'opencv'
 
 
 @dataclass(frozen=True)
 class ReconstructConfig:
-    """What reconstructs a turn."""
+    """What a turn is reconstructed with."""
 
     engine: str = expert(
-        AUTO_ENGINE, 'library that estimates poses; auto: pycolmap where it is installed',
-        choices=ENGINES)
+        'auto', 'library that estimates poses; auto: pycolmap where it is installed, else opencv',
+        choices=('auto', COLMAP, OPENCV))
+
+    def __post_init__(self) -> None:
+        if self.engine == COLMAP and not self._has_colmap:
+            raise ConfigError('E-ENGINE-MISSING', 'reconstruct.engine is pycolmap, which is not '
+                              'installed: pip install pycolmap, or use auto or opencv')
+
+    @property
+    def used(self) -> str:
+        """Return the engine that is used on this computer, COLMAP or OPENCV; loads none."""
+        if self.engine == 'auto':
+            return COLMAP if self._has_colmap else OPENCV
+        return self.engine
+
+    @property
+    def _has_colmap(self) -> bool:
+        return find_spec(COLMAP) is not None
 
 
 @dataclass(frozen=True)

@@ -152,8 +152,8 @@ class _Seen:
         return 0.5 * loss_px**2 * float(np.log1p(squares / loss_px**2).sum())
 
 
-def adjusted(turns: Sequence[Observed], lens: Lens, loss_px: float, iterations: int, tolerance: float
-             ) -> tuple[list[Observed], Lens]:
+def adjusted(turns: Sequence[Observed], lens: Lens, loss_px: float, iterations: int,
+             tolerance: float) -> tuple[list[Observed], Lens]:
     """Return turns and lens after steps that lower the robust cost.
 
     loss_px: scale of the Cauchy loss. tolerance: of the cost; a step that changes it by a smaller
@@ -269,7 +269,8 @@ def _reduced(linear: _Linear, radius: float) -> _Reduced:
     turn, more = linear.turn, linear.point_right.shape[1]
     count = len(turn.rotations)
     size = POSE * count
-    inverse = np.linalg.inv(_damped(linear.points, _damping(linear.points, radius)))
+    inverse = np.asarray(np.linalg.inv(
+        _damped(linear.points, _damping(linear.points, radius))), np.float64)
     root = np.linalg.cholesky(inverse).transpose(2, 1, 0)
     whole, each = np.zeros((size + more, size + more)), np.arange(count)
     whole[:size, :size].reshape(count, POSE, count, POSE)[each, :, each] = _damped(
@@ -304,9 +305,9 @@ def _step(linear: Sequence[_Linear], radius: float
     damping = _damping(of_lens[:, :-1], radius)
     left = np.column_stack([np.diag(damping), np.zeros(len(damping))])
     reduced, solved = [_reduced(each, radius) for each in linear], []
-    for each in reduced:
-        solved.append(np.linalg.solve(each.poses, each.right))
-        left = left + each.lens - each.right[:, :-1].T @ solved[-1]
+    for less in reduced:
+        solved.append(np.linalg.solve(less.poses, less.right))
+        left = left + less.lens - less.right[:, :-1].T @ solved[-1]
     step = np.linalg.solve(left[:, :-1], left[:, -1])
     # half of what the score gives, and of what the damping holds back
     gain, moves = float(step @ (of_lens[:, -1] + damping * step)), []

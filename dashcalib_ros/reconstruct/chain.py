@@ -10,7 +10,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.config import AUTO_ENGINE, Config
+from dashcalib_ros.config import Config, ReconstructConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.geometry import Engine, engine_named
 from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure, rays_of, triangulate
@@ -25,18 +25,19 @@ MIN_SHARE = 0.3
 
 
 def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
-          seed: int = 0, engine: str = AUTO_ENGINE) -> Structure | None:
+          seed: int = 0, engine: Engine | None = None) -> Structure | None:
     """Return a first structure, or None where no pair of images starts one.
 
     error_px: largest reprojection error; generous, as the camera is only a guess.
-    min_angle_deg: smaller triangulation angles give no point. engine: setting reconstruct.engine.
+    min_angle_deg: smaller triangulation angles give no point. engine: of poses, None for the
+    default.
     """
-    poses = engine_named(engine)
+    engine = engine or engine_named(ReconstructConfig().used)
     rays = rays_of(tracks, camera)
     # where the distortion folds over, pixels have no ray
     seen = np.isfinite(rays[:, :, 0])
     error_rad = error_px / camera.fx
-    start = _initial_pair(rays, error_rad, seed, poses)
+    start = _initial_pair(rays, error_rad, seed, engine)
     if start is None:
         return None
     first, second, rotation, translation = start
@@ -62,7 +63,7 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
         if support[nearest] < MIN_RESECTION:
             return Structure(rotations, translations, points, registered, used)
         common = known & seen[nearest]
-        found = poses.absolute_pose(rays[nearest, common], points[common], error_rad, seed)
+        found = engine.absolute_pose(rays[nearest, common], points[common], error_rad, seed)
         if found is None or found[1] < max(MIN_INLIERS, MIN_SHARE * common.sum()):
             failed[nearest] = True
             continue
@@ -78,13 +79,13 @@ def chain_scene(tracks: Tracks, turn: TurnId, camera: Camera, profile: Profile,
     limits = config.scene
     generous = max(limits.error_px, limits.chain_error * tracks.image_size[0])
     structure = chain(tracks, camera, generous, limits.min_angle_deg, config.seed,
-                      config.reconstruct.engine)
+                      engine_named(config.reconstruct.used))
     if structure is None:
         return None
     return Scene(turn, tracks, structure, camera, profile)
 
 
-def _initial_pair(rays: Floats, error_rad: float, seed: int, poses: Engine
+def _initial_pair(rays: Floats, error_rad: float, seed: int, engine: Engine
                   ) -> tuple[int, int, Floats, Floats] | None:
     """Return the image pair with the best parallax among those that share many points.
 
@@ -103,7 +104,7 @@ def _initial_pair(rays: Floats, error_rad: float, seed: int, poses: Engine
                 candidates.append((float(both.sum()) * min(high - low, 0.2), first, first + gap))
     for _, first, second in sorted(candidates, reverse=True)[:5]:
         both = seen[first] & seen[second]
-        found = poses.relative_pose(rays[first, both], rays[second, both], error_rad / 2, seed)
+        found = engine.relative_pose(rays[first, both], rays[second, both], error_rad / 2, seed)
         if found is not None and found[1] >= 0.5 * both.sum():
             return first, second, *found[0]
     return None

@@ -31,7 +31,7 @@ REFINEMENTS = 5
 
 def relative_pose(before: Floats, after: Floats, error_rad: float, seed: int
                   ) -> tuple[Pose, int] | None:
-    """Return the relative pose of two images; see geometry.Engine."""
+    """Return the relative pose of two images; see Engine."""
     found = pycolmap.estimate_essential_matrix(
         _pixels(before), _pixels(after), _all_around(), _all_around(),
         _ransac(error_rad, seed, RELATIVE_TRIALS))
@@ -42,7 +42,7 @@ def relative_pose(before: Floats, after: Floats, error_rad: float, seed: int
 
 def absolute_pose(rays: Floats, points: Floats, error_rad: float, seed: int
                   ) -> tuple[Pose, int] | None:
-    """Return the pose of an image that sees points; see geometry.Engine."""
+    """Return the pose of an image that sees points; see Engine."""
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac = _ransac(error_rad, seed, ABSOLUTE_TRIALS)
     pixels = _pixels(rays)

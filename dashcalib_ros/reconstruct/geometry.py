@@ -5,55 +5,35 @@ is not installed, OpenCV's minimal solvers and NumPy take its place.
 """
 from __future__ import annotations
 
-from importlib.util import find_spec
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.config import AUTO_ENGINE, ENGINES
-from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.config import COLMAP
 from dashcalib_ros.reconstruct.scene import Pose
 
-_, COLMAP, OPENCV = ENGINES
+# of unit rays (n, 3), others or points (n, 3), the largest error in rad of a ray that agrees, and
+# a seed; returns how many rays agree, too, or None for no pose
+Estimator = Callable[[Floats, Floats, float, int], tuple[Pose, int] | None]
 
 
-class Engine(Protocol):
-    """Robust poses from unit rays (n, 3); both return how many rays agree, None for no pose.
+@dataclass(frozen=True)
+class Engine:
+    """Robust estimators of poses. The same seed gives the same result.
 
-    error_rad: largest error of a ray that agrees. The same seed gives the same result.
+    relative_pose: of rays of the same points in two images, the pose that takes points from the
+    first one's frame to the second one's, with a unit translation. absolute_pose: of rays of an
+    image and the points (n, 3) along them, the pose of the image, world to camera.
     """
 
-    @staticmethod
-    def relative_pose(before: Floats, after: Floats, error_rad: float, seed: int
-                      ) -> tuple[Pose, int] | None:
-        """Return the pose that takes points from the first image's frame to the second one's.
-
-        before, after: rays of the same points. The translation is a unit vector.
-        """
-
-    @staticmethod
-    def absolute_pose(rays: Floats, points: Floats, error_rad: float, seed: int
-                      ) -> tuple[Pose, int] | None:
-        """Return the pose, world to camera, of an image that sees points (n, 3) along rays."""
+    relative_pose: Estimator
+    absolute_pose: Estimator
 
 
-def engine_name(wanted: str) -> str:
-    """Return the engine that the setting reconstruct.engine selects here; loads none.
-
-    Raises ConfigError where pycolmap is wanted, but not installed.
-    """
-    installed = find_spec('pycolmap') is not None
-    if wanted == COLMAP and not installed:
-        raise ConfigError('E-ENGINE-MISSING', 'reconstruct.engine is pycolmap, which is not '
-                          'installed: pip install pycolmap, or set it to opencv or auto')
-    if wanted == AUTO_ENGINE:
-        return COLMAP if installed else OPENCV
-    return wanted
-
-
-def engine_named(wanted: str) -> Engine:
-    """Return the engine that the setting reconstruct.engine selects here."""
-    if engine_name(wanted) == COLMAP:
+def engine_named(name: str) -> Engine:
+    """Return an engine, COLMAP or OPENCV of config."""
+    if name == COLMAP:
         from dashcalib_ros.reconstruct import colmap
-        return colmap
+        return Engine(colmap.relative_pose, colmap.absolute_pose)
     from dashcalib_ros.reconstruct import ransac
-    return ransac
+    return Engine(ransac.relative_pose, ransac.absolute_pose)

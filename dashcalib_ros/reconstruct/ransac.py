@@ -11,7 +11,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera.rotation import rotation_matrices
 from dashcalib_ros.reconstruct.scene import Pose
 
@@ -32,17 +32,16 @@ NO_DISTORTION = np.zeros(4)
 
 def relative_pose(before: Floats, after: Floats, error_rad: float, seed: int
                   ) -> tuple[Pose, int] | None:
-    """Return the relative pose of two images; see geometry.Engine."""
-    def solve(some: Floats) -> list[Pose]:
-        turns = [_to_front(rays[some]) for rays in (before, after)]
-        if any(turn is None for turn in turns):
+    """Return the relative pose of two images; see Engine."""
+    def solve(some: Ints) -> list[Floats]:
+        one, other = _to_front(before[some]), _to_front(after[some])
+        if one is None or other is None:
             return []
-        first, second = (_pixels(rays[some] @ turn.T)
-                         for rays, turn in zip((before, after), turns, strict=True))
-        found, _ = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.99, 1e-3)
-        if found is None:
-            return []
-        return [turns[1].T @ each @ turns[0] for each in found.reshape(-1, 3, 3)]
+        # of five points, all solutions
+        found, _ = cv2.findEssentialMat(_pixels(before[some] @ one.T),
+                                        _pixels(after[some] @ other.T), np.eye(3))
+        return [] if found is None else [
+            other.T @ each @ one for each in found.reshape(-1, 3, 3)]
 
     def errors(essentials: Floats) -> Floats:
         along, back = before @ essentials.transpose(0, 2, 1), after @ essentials
@@ -64,8 +63,8 @@ def relative_pose(before: Floats, after: Floats, error_rad: float, seed: int
 
 def absolute_pose(rays: Floats, points: Floats, error_rad: float, seed: int
                   ) -> tuple[Pose, int] | None:
-    """Return the pose of an image that sees points; see geometry.Engine."""
-    def solve(some: Floats) -> list[Floats]:
+    """Return the pose of an image that sees points; see Engine."""
+    def solve(some: Ints) -> list[Floats]:
         turn = _to_front(rays[some])
         if turn is None:
             return []
@@ -89,13 +88,13 @@ def absolute_pose(rays: Floats, points: Floats, error_rad: float, seed: int
     return (pose[:, :3], pose[:, 3]), int(good.sum())
 
 
-def _ransac(count: int, sample: int, solve: Callable[[Floats], list[Floats]],
+def _ransac(count: int, sample: int, solve: Callable[[Ints], list[Floats]],
             errors: Callable[[Floats], Floats], refine: Callable[[Floats, Mask], Floats],
             error_rad: float, seed: int, trials: tuple[int, int]) -> tuple[Floats, Mask] | None:
     """Return the model with the least truncated error, refined, and which of count rays agree.
 
-    solve: indices (sample,) -> models; errors: models (m, ...) -> squared errors (m, count), rad^2.
-    refine: a model, and which rays agree -> a better one.
+    solve: indices (sample,) -> models. errors: models (m, ...) -> their squared errors (m, count),
+    rad^2. refine: a model, and which rays agree -> a better one.
     """
     if count < sample:
         return None
@@ -155,16 +154,18 @@ def _directions(points: Floats) -> Floats:
 def _in_front(essential: Floats, before: Floats, after: Floats) -> Pose:
     """Return the one of an essential matrix' four poses with most points along both rays."""
     first, second, move = cv2.decomposeEssentialMat(essential)
-    found = []
-    for rotation in (first, second):
+    poses = [(np.asarray(rotation, np.float64), np.asarray(sign * move[:, 0], np.float64))
+             for rotation in (first, second) for sign in (1.0, -1.0)]
+
+    def ahead(pose: Pose) -> int:
+        rotation, translation = pose
         turned = before @ rotation.T
         cosine = np.einsum('nc,nc->n', turned, after)
-        for translation in (move[:, 0], -move[:, 0]):
-            a, b = after @ translation, turned @ translation
-            # the signs of the two depths
-            ahead = (cosine * a > b) & (a > cosine * b)
-            found.append((int(ahead.sum()), len(found), (rotation, translation)))
-    return max(found)[2]
+        a, b = after @ translation, turned @ translation
+        # the signs of the two depths
+        return int(((cosine * a > b) & (a > cosine * b)).sum())
+
+    return max(poses, key=ahead)
 
 
 def _refined_relative(rotation: Floats, translation: Floats, before: Floats, after: Floats
@@ -194,7 +195,8 @@ def _refined_absolute(pose: Floats, rays: Floats, points: Floats) -> Floats:
     ahead = local / distance[:, None]
     off = ahead - rays
     weight = 1 / np.sqrt(1 + np.einsum('nc,nc->n', off, off) / LOSS_RAD**2)
-    by_local = (np.eye(3) - ahead[:, :, None] * ahead[:, None]) * (weight / distance)[:, None, None]
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None]
+    by_local = across * (weight / distance)[:, None, None]
     by_turn = np.cross(turned[:, None], by_local)
     step = _solved(np.concatenate([by_turn, by_local], axis=2).reshape(-1, 6),
                    (off * weight[:, None]).ravel())
