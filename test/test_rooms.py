@@ -28,7 +28,8 @@ ALLOWED: dict[str, set[str]] = {
 }
 # rooms that nobody but these may import
 BORDERS = {'ros': set(), 'cli': set(), 'demo': {'cli'}, 'fleet': {'cli'}}
-HOMES = {'pycolmap': {'reconstruct'}, 'rclpy': {'ros'}, 'onnxruntime': {'detect'}, 'pyarrow': {'fleet'}}
+HOMES = {'pycolmap': {'reconstruct'}, 'rclpy': {'ros'}, 'onnxruntime': {'detect'},
+         'pyarrow': {'fleet'}}
 # what geometry has no use for
 MACHINERY = ('threading', 'multiprocessing', 'subprocess', 'concurrent', 'queue', 'signal', 'os',
              'pathlib', 'shutil', 'tempfile', 'io')

@@ -105,7 +105,8 @@ def test_a_point_behind_the_camera_moves_nothing_and_is_no_crash():
     turn = observed(camera)
     points = turn.points.copy()
     points[0] = [0.0, 0.0, -1e3]
-    [found], moved = adjusted([replace(turn, points=points)], free(camera, 4, 5), LOSS_PX, 20, 1e-9)
+    behind = replace(turn, points=points)
+    [found], moved = adjusted([behind], free(camera, 4, 5), LOSS_PX, 20, 1e-9)
     assert np.isfinite(found.points).all() and np.isfinite(moved.camera.params).all()
     np.testing.assert_array_equal(found.points[0], points[0])
     without = turn.point != 0

@@ -110,7 +110,8 @@ def test_a_chain_finds_every_image(engine):
 
 def test_the_engine_is_colmap_where_it_is_installed(monkeypatch):
     for installed, used in ((True, COLMAP), (False, OPENCV)):
-        monkeypatch.setattr(config_module, 'find_spec', lambda name, found=installed: found or None)
+        spec = find_spec('numpy') if installed else None
+        monkeypatch.setattr(config_module, 'find_spec', lambda name, spec=spec: spec)
         assert ReconstructConfig().used == used
         assert ReconstructConfig(OPENCV).used == OPENCV
     # a Config that exists is valid
