@@ -221,7 +221,8 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
     if doubts:
         cures = (line.rpartition(': ')[2] for line in doubts)
         verdict = replace(verdict, reasons=(*doubts, *verdict.reasons),
-                          cures=(*cures, *verdict.cures))
+                          cures=(*cures, *verdict.cures),
+                          codes=(*['E-INPUT-CONTRADICTED'] * len(doubts), *verdict.codes))
     if material is not None:
         shown = material.pictures
         images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})

@@ -191,7 +191,8 @@ def _verdict(own: Calibration, make: str, camera: Camera, covariance: Floats, pr
         f'{100 * share:.0f} % of the information about fx comes from the prior of the camera '
         f'model {make} ({prior.units} other cameras), the rest from its own turns; sigma of fx '
         f'with it: {sigma:.1f} %',
-        *(f'without the prior: {reason}' for reason in own.verdict.reasons)))
+        *(f'without the prior: {reason}' for reason in own.verdict.reasons)),
+        codes=('E-PRIOR-USED', *own.verdict.codes))
 
 
 def _picture_sigma(camera: Camera, covariance: Floats, alone: PictureSigma) -> PictureSigma:

@@ -1,4 +1,4 @@
-"""Whether the turns agree on one camera, and what each of them, and one more, tells of fx."""
+"""Whether the turns agree on one camera, and what each of them, and one more, knows of fx."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -109,19 +109,19 @@ def sigma_by_count(solution: Solution) -> list[float]:
 
 
 # of fx; a larger sigma helps nobody to decide
-TOLD = 0.2
+SHOWN = 0.2
 
 
 def next_turn(solution: Solution) -> str:
-    """Return what one more turn would bring, in words; '' where nobody can tell."""
-    # how much two turns differ is chance; so a single one is told what two more bring
+    """Return what one more turn would bring, in words; '' where that is not known."""
+    # how much two turns differ is chance; so for a single one it is what two more bring
     more = 1 if len(solution.scenes) > 1 else 2
     sigma = with_right_angles(solution, more)
-    if not sigma < TOLD:
+    if not sigma < SHOWN:
         return ''
     # one digit is all that is known
-    return (f'{("one more right angle", "two more right angles")[more - 1]}: fx to about '
-            f'{float(f"{100 * sigma:.1g}"):g} %')
+    turns = ('one more right-angle turn', 'two more right-angle turns')[more - 1]
+    return f'{turns}: fx known to about {float(f"{100 * sigma:.1g}"):g} %'
 
 
 def with_right_angles(solution: Solution, more: int) -> float:

@@ -25,8 +25,6 @@ from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.solve.solution import LeftOut, Solution
 from dashcalib_ros.solve.spread import PictureSigma, sigma_over
 
-UNKNOWN_COVARIANCE = ('this calibration does not know how its parameters are correlated: '
-                      'calibrate the drive again')
 # after the point, in one line of text
 MOST_DIGITS = 9
 # an optical frame that looks ahead (z ahead, x to the right, y downwards) to the car's (REP-103)
@@ -38,12 +36,14 @@ Level = Literal['accepted', 'weak', 'refused']
 class Verdict:
     """accepted: use it. weak: look at the sigmas before using it. refused: there is no result.
 
-    reasons: one line each, what is wrong: what to do. cures: what to do, the gravest first.
+    reasons: one line each, what is wrong: what to do. cures: what to do, the likeliest to help
+    first. codes: of the reasons, in their order; a code stays when its text is reworded.
     """
 
     level: Level
     reasons: tuple[str, ...] = ()
     cures: tuple[str, ...] = ()
+    codes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,9 +105,9 @@ class Stabiliser:
 
 @dataclass(frozen=True)
 class Witness:
-    """What a sensor says of the focal length, from the angles of the turns.
+    """The focal length by a sensor, from the angles of the turns.
 
-    time_offset_s: what must be taken off the sensor's stamps; positive: its messages are late.
+    time_offset_s: to subtract from the sensor's stamps; positive: its messages are late.
     None where it is not known. scale: the sensor's angles over the camera's. fx_percent: by how
     much fx would have to change to agree with the sensor, of fx; fx_sigma_percent: with what the
     sensor's own scale may be off. agrees: no contradiction beyond 3 sigmas of both.
@@ -131,7 +131,7 @@ class Witness:
 
 @dataclass(frozen=True)
 class Witnesses:
-    """The sensors that were asked; each None where it has nothing to say."""
+    """The sensors that were compared; each None where it is not used."""
 
     gyro: Witness | None = None
     gps: Witness | None = None
@@ -152,6 +152,14 @@ class LensField:
     worst_px: float
     sigma_px: float
 
+    @property
+    def text(self) -> str:
+        """Return the clause that stands beside the camera's parameters, without a verb."""
+        side = 'below' if self.rms_px < self.sigma_px else 'above'
+        digits = 1 if self.rms_px >= 0.1 else 2
+        return (f'a smooth field of {self.rms_px:.{digits}f} px, {side} its sigma of '
+                f'{self.sigma_px:.{digits}f} px')
+
 
 # of a mounting, and what its sigmas are named by
 ANGLES = ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg')
@@ -164,7 +172,7 @@ class Mount:
     """How the camera sits on the car, relative to the direction of travel and to the road.
 
     yaw_left_deg, pitch_up_deg: where the optical axis points; roll_right_deg: by how much the
-    camera is turned clockwise, as seen from behind; None where nothing tells it. height_m: above
+    camera is turned clockwise, as seen from behind; None where it is not known. height_m: above
     the road; None where the speed is not known. sigma: by these four names. travel_px: the pixel
     (u, v) in which the car travels, with its sigma: less than that of the angles, which have the
     centre's, too. straight_m: of straight driving. moved_s: stamp after which the camera was
@@ -231,6 +239,11 @@ class Material:
     pictures: Mapping[TurnId, TurnPicture] = default(default_factory=dict)
 
 
+def _unknown_covariance() -> InputError:
+    return InputError('E-UNKNOWN-COVARIANCE', 'this calibration does not contain the correlations '
+                      'of its parameters: calibrate the drive again')
+
+
 def _with_sigma(value: float, sigma: float) -> str:
     """Return a value and its sigma, both to the second digit of the sigma."""
     if not (math.isfinite(sigma) and sigma > 0):
@@ -250,12 +263,12 @@ class Calibration:
     mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
     rolling_shutter: the one that was found, and whose effect was removed; None for a global one.
     stabiliser: the one that was found, and whose effect was removed; None for a fixed picture.
-    mount: how the camera sits on the car; None where nothing tells it.
-    field: what the camera leaves over; None: nothing speaks for one. camera is the best without.
-    sigma_px: how far the whole camera may be off over the picture. held_out: what each turn says
-    of the calibration without it, in the full-size images' pixels; () for fewer than three turns.
-    straight_lines: what upright lines of the world say of the distortion; None: too few of them.
-    witnesses: what the car's own sensors say of the focal length.
+    mount: how the camera sits on the car; None where it is not known.
+    field: what the camera's model leaves over; None: no evidence for one. camera is without it.
+    sigma_px: how far the whole camera may be off over the picture. held_out: how each turn
+    fits the calibration without it, full-size images' px; () for fewer than three turns.
+    straight_lines: the distortion by upright lines of the world; None: too few of them.
+    witnesses: the focal length by the car's own sensors.
     start_s: stamp of the first image. material: what the report draws, None in a live drive.
     """
 
@@ -302,7 +315,9 @@ class Calibration:
         sigma = self.sigma or {}
         found = [f'{name} {_with_sigma(value, sigma.get(name, math.nan))}'
                  for name, value in self.camera.named.items()]
-        text = f'{self.verdict.level}, {self.camera.model}, {", ".join(found)}'
+        field = self._used_field and self.field
+        text = (f'{self.verdict.level}, {self.camera.model}, {", ".join(found)}'
+                + (f', and {field.text}' if field else ''))
         return f'Calibration({"; ".join(part for part in (text, self.caveat) if part)})'
 
     def accepted(self) -> AcceptedCalibration:
@@ -346,7 +361,7 @@ class Calibration:
         names = self._camera.names()
         correlation = np.array(self.details.get('correlation', ()), np.float64)
         if self.sigma is None or correlation.shape != (len(names), len(names)):
-            raise InputError(UNKNOWN_COVARIANCE)
+            raise _unknown_covariance()
         sigma = np.array([self.sigma[name] for name in names])
         return np.asarray(correlation * np.outer(sigma, sigma))
 
@@ -381,7 +396,7 @@ class Calibration:
         camera = self._camera.widened()
         covariance = np.array(self.details.get('picture_covariance', ()), np.float64)
         if covariance.shape != (len(camera.params),) * 2:
-            raise InputError(UNKNOWN_COVARIANCE)
+            raise _unknown_covariance()
         return camera, covariance
 
     def rays(self, pixels: npt.ArrayLike) -> Floats:
@@ -416,8 +431,10 @@ class Calibration:
         import cv2
         camera = self._camera
         if image.shape[1::-1] != camera.image_size:
-            raise InputError(f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
-                             f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}')
+            raise InputError('E-OTHER-IMAGE-SIZE',
+                             f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
+                             f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}: '
+                             f'resize the image, or use `dashcalib export --size`')
         if self._used_field is not None:
             y, x = np.indices(image.shape[:2])
             ahead = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy,
@@ -431,7 +448,8 @@ class Calibration:
     @property
     def _camera(self) -> Camera:
         if self.camera is None:
-            raise InputError(f'the calibration was refused: {"; ".join(self.verdict.reasons)}')
+            raise InputError('E-CALIBRATION-REFUSED', 'the calibration was refused: '
+                             f'{"; ".join(self.verdict.reasons)}')
         return self.camera
 
     @property

@@ -36,7 +36,7 @@ class Check:
     answer: right: the given camera and the drive's own are the same within what the drive can
     determine, and near enough for the uses in good_for. differs: the difference is more than
     chance, and small enough for the uses in good_for. wrong: it is more than chance, and too large
-    for every use. cannot tell: neither is shown.
+    for every use. cannot tell: the error may be too large, and nothing shows whether it is.
     rms_px, worst_px: over the picture, between the given camera and the drive's own, the best
     common rotation removed; None where they cannot be compared. sigma_px: of the drive's own.
     told_apart: whether distance exceeds limit. distance: between the given camera and the drive's

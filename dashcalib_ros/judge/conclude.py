@@ -19,6 +19,7 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
+from dashcalib_ros.errors import counted
 from dashcalib_ros.input.motion import SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
@@ -50,12 +51,12 @@ from dashcalib_ros.solve.solution import Solution, cross_validation
 
 # why turns are not used
 NOT_NEEDED = 'more prominent turns were enough'
-STOOD = 'the car stood, its speed says: what turned were others, or the camera alone'
+STOOD = ('according to its speed the car stood: other things turned, or the camera alone')
 
 # result.json has their versions: a result's last digits depend on them
 PACKAGES = (
     'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap')
-# px RMS; a warning tells of a field that no lens model has, if it is larger
+# px RMS; a warning names a field that no lens model has, if it is larger
 TOLD_FIELD_PX = 0.5
 
 
@@ -64,7 +65,7 @@ class Evidence:
     """What a calibration needs beside the solution.
 
     image_size: of the input; scale: how it was resized for the scenes. built: scenes by their
-    turn. stored: the turns of earlier drives that were available. left_out: why turns were taken
+    turn. stored: the turns of earlier drives that were available. left_out: why turns were left
     out, in words. pictures: of turns whose images are gone; None: the report is not wanted.
     start_s: stamp of the first image. lines: upright ones, in the resized images; None where they
     were not looked for. straights: pairs of images of straight driving, likewise. motion: of the
@@ -176,21 +177,21 @@ def _warnings(found: Calibration, solution: Solution) -> tuple[str, ...]:
     warnings = []
     if level != 'accepted' and asked_for != AUTO:
         warnings.append(
-            f'the lens model {asked_for} was asked for and may be why the result is {level}: '
-            f'--model {AUTO} takes the one that the turns prove')
+            f'the lens model {asked_for} was chosen by hand and may be why the result is {level}: '
+            f'--model {AUTO} uses the one that fits the turns')
     if field is not None and field.rms_px >= max(TOLD_FIELD_PX, field.sigma_px):
         warnings.append(
             f'the picture is bent by {field.rms_px:.1f} px (up to {field.worst_px:.1f} px), as by '
-            f'a windscreen or a rectification: camera_info cannot say that, and sigma over the '
-            f'picture allows for it; `dashcalib export --to rays` has it')
+            f'a windscreen or a rectification: camera_info cannot describe this, and sigma over '
+            f'the picture includes it; `dashcalib export --to rays` keeps it')
     if found.mount is not None and found.mount.moved_s is not None:
         warnings.append(
             f'the camera was moved on the car {found.mount.moved_s - found.start_s:.0f} s into '
-            f'the drive: how it sits is told from there on')
+            f'the drive: the mounting is that from there on')
     if found.stabiliser is not None and STEADY not in found.verdict.cures:
         warnings.append(
             f'the picture seems to move by up to {found.stabiliser.largest_px:.0f} px against the '
-            f'lens, no more than the lens is uncertain; that was taken out: {STEADY}')
+            f'lens, which is within the uncertainty of the lens, and was removed: {STEADY}')
     return tuple(warnings)
 
 
@@ -251,23 +252,28 @@ def _field(solution: Solution, image_size: tuple[int, int]) -> LensField | None:
 
 def _verdict_without_solution(evidence: Evidence) -> Verdict:
     """Return the verdict on a drive that gave no scene."""
+    turns = len(evidence.turns)
     if evidence.frames < 2:
-        what, cure = f'there is only {evidence.frames} image', 'record a drive with turns'
-    elif not evidence.turns:
-        what = ('no turn was found: the car stood or drove straight on, or the pictures show too '
-                'little')
-        cure = 'record a drive with turns at crossings, in daylight'
+        found = Finding('E-FEW-IMAGES', 'refused',
+                        f'the drive has only {counted(evidence.frames, "image")}',
+                        'record a drive with turns')
+    elif not turns:
+        found = Finding('E-NO-TURN', 'refused',
+                        'no turn was found: the car stood or drove straight on, or the pictures '
+                        'show too little', 'record a drive with turns at crossings, in daylight')
     elif evidence.left_out and set(evidence.left_out.values()) == {STOOD}:
-        what = (f'the car stood during all that look like turns ({len(evidence.turns)}), its '
-                f'speed says')
-        cure = 'drive through turns, or leave a speed away that is wrong'
+        found = Finding('E-CAR-STOOD', 'refused',
+                        f'the car stood during all turns that were found ({turns}), according to '
+                        f'its speed',
+                        'drive through turns, or omit the speed if it is wrong')
     else:
-        what = (f'none of the {len(evidence.turns)} turns could be reconstructed: the pictures '
-                f'are too dark or blurred, or the camera turned without moving')
-        cure = 'drive through turns at town speed, in daylight'
-    found = [Finding('refused', what, cure)]
-    return verdict_of([two_cameras(evidence.other_camera), *found] if evidence.other_camera
-                      else found)
+        found = Finding('E-NO-SCENE', 'refused',
+                        f'{counted(turns, "turn")} {"was" if turns == 1 else "were"} found, but '
+                        f'none could be reconstructed: the pictures are too dark or blurred, or '
+                        f'the camera turned without moving',
+                        'drive through turns at town speed, in daylight')
+    other = evidence.other_camera
+    return verdict_of([two_cameras(other), found] if other else [found])
 
 
 def _summary(turn: Turn, scene: Scene | None, evidence: Evidence, solution: Solution | None

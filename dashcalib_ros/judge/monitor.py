@@ -102,7 +102,7 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
 
 
 def readings_of(scenes: Iterable[Scene], camera: Camera, config: Config) -> tuple[Reading, ...]:
-    """Return what each turn says of a camera in use; camera: of the scenes' pictures."""
+    """Return how each turn fits a camera in use; camera: of the scenes' pictures."""
     return tuple(reading_of(scene, camera, config) for scene in scenes)
 
 
@@ -114,7 +114,7 @@ class Change:
     wrong. mount: the camera points elsewhere in the car; the calibration stays right.
     zoom: by how much fx has grown, of fx; shift: (2,) of the centre, of the picture's width: what
     explains the turns best if nothing else has changed; both NaN where the camera in use explains
-    the turns so badly that they cannot be told. looks_like: in words, what explains the turns as
+    the turns so badly that they are not known. looks_like: in words, what explains the turns as
     well as any other camera does; each of the texts does so alone, () where none does.
     turned_deg: (2,) the yaw and pitch of the mounting. turns: how many show it; one is a
     suspicion.
@@ -138,10 +138,11 @@ class Change:
         if self.kind == 'mount':
             return moved_text(since, self.turned_deg)
         if not self.looks_like:
-            return (f'the calibration does not explain the pictures {since}: is it another '
-                    f'camera, or another part of its picture?')
+            return (f'the calibration does not explain the pictures {since}: check whether it is '
+                    f'another camera, or another part of its picture')
         return (f'the calibration does not fit {since}, as if {", or ".join(self.looks_like)}; '
-                f'was the camera zoomed, focused anew or exchanged, or its picture cropped?')
+                f'check whether the camera was zoomed, refocused or exchanged, or its picture '
+                f'cropped')
 
 
 def moved_text(than: str, turned_deg: Sequence[float] | Floats) -> str:
@@ -339,7 +340,7 @@ class Monitor:
             'focal length': f'its focal length were {least:.1f} to {most:.1f} % too '
                             f'{"short" if zoom > 0 else "long"}',
             'centre': f'its centre were up to {shift:.1f} % of the width off',
-            'distortion': 'its distortion were another'}
+            'distortion': 'its distortion were different'}
         return ' and '.join(texts[way] for way in ways)
 
     def _mount(self) -> Change | None:

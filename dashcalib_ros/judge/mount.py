@@ -77,7 +77,7 @@ class _Pairs:
 
 def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str,
              speed: Speed | None) -> Mount | None:
-    """Return how the camera sits on the car; None where nothing tells.
+    """Return how the camera sits on the car; None where that is not known.
 
     straights, lines: in the scenes' pixels. level: the lens's verdict; the mount's is never
     better. speed: m/s (n,) at stamps (n,), s.
@@ -145,13 +145,12 @@ def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[str
     """Return why a mount is weak. sigma, own: (2,) all of it, and what the lens's centre adds."""
     found = []
     if level != 'accepted':
-        found.append(f'the lens is {level}, and where the camera points is no better known: see '
-                     f'the reasons of the lens')
+        found.append(f'the lens is {level}')
     if max(sigma) > ACCEPTED_DEG:
-        cure = ('drive more turns, the centre of the picture is not known better'
+        cure = ('drive more turns, to know the centre of the picture better'
                 if max(own) > ACCEPTED_DEG else 'drive straight on for longer')
-        found.append(f'yaw and pitch are known to {max(sigma):.2f} degrees after {metres:.0f} m '
-                     f'of straight driving, {ACCEPTED_DEG:g} or better needed: {cure}')
+        found.append(f'yaw and pitch are known only to {max(sigma):.2f}° after {metres:.0f} m of '
+                     f'straight driving, {ACCEPTED_DEG:g}° or better is needed: {cure}')
     return tuple(found)
 
 
@@ -326,7 +325,7 @@ def _averaged(values: Floats, sigmas: Floats, floor: float) -> tuple[float, floa
 def _roll(scenes: Sequence[Scene], lines: Lines | None, camera: Camera
           ) -> tuple[float, float] | None:
     """Return the roll to the right and its sigma, degrees; None where nothing tells it."""
-    found = [each for scene in scenes if (each := _roll_of_path(scene)) is not None]
+    found = [each for scene in scenes if (each := roll_of_path(scene)) is not None]
     if lines is not None and len(lines) >= LEAST_LINES:
         found.append(_roll_of_lines(lines, camera))
     if not found:
@@ -337,7 +336,7 @@ def _roll(scenes: Sequence[Scene], lines: Lines | None, camera: Camera
     return roll, float(np.hypot(sigma, CROWN_DEG))
 
 
-def _roll_of_path(scene: Scene) -> float | None:
+def roll_of_path(scene: Scene) -> float | None:
     """Return the roll against the plane of a turn's path, where it does not bend, degrees."""
     if abs(scene.yaw_deg) < LEAST_YAW_DEG:
         return None

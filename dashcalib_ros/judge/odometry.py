@@ -110,8 +110,9 @@ def odometry(scenes: Sequence[Scene], cameras: Mapping[str, Camera], poses: Pose
     found = [turn for scene in scenes
              if (turn := _turn(scene, cameras, poses, config)) is not None]
     if not found:
-        raise InputError('none of the turns has poses: do their stamps fit those of the drive? '
-                         "KITTI's format has one line for each frame, and needs no stamps")
+        raise InputError('E-NO-POSES-OF-TURNS',
+                         'none of the turns has poses: use poses with the time stamps of the '
+                         "drive, or KITTI's format with one line for each frame and no stamps")
     return Odometry(tuple(cameras), tuple(found))
 
 
@@ -222,7 +223,8 @@ def read_poses(path: Path) -> Poses:
                 heads = line
                 continue
             if len(cells) in POSE_COLUMNS:
-                raise InputError(f'{path} has a line that is not all numbers: {error}') from error
+                raise InputError('E-POSES-NUMBERS', f'{path} has a line that is not all numbers: '
+                                 f'{error}; remove or correct it') from error
             raise _no_poses(path) from error
         columns = columns or len(row)
         if columns not in POSE_COLUMNS or len(row) != columns:
@@ -232,7 +234,8 @@ def read_poses(path: Path) -> Poses:
         raise _no_poses(path)
     table = np.array(values).reshape(-1, columns)
     if not np.isfinite(table).all():
-        raise InputError(f'{path} has numbers that are not finite; leave these poses out')
+        raise InputError('E-POSES-NOT-FINITE',
+                         f'{path} has numbers that are not finite; remove these poses')
     if columns in (KITTI, KITTI_TIMED):
         return _kitti(table[:, -KITTI:], path)
     if columns == EUROC or REAL_FIRST.search(heads):
@@ -241,9 +244,10 @@ def read_poses(path: Path) -> Poses:
 
 
 def _no_poses(path: Path) -> InputError:
-    return InputError(f"{path} has no poses in KITTI's format (12 numbers a line, one line for "
-                      f"each frame), in TUM's (t x y z qx qy qz qw) nor in EuRoC's, and no line "
-                      f"that names stamp_s, latitude and longitude")
+    return InputError('E-POSES-FORMAT',
+                      f"{path} has no poses in KITTI's format (12 numbers a line, one line for "
+                      f"each frame), in TUM's (t x y z qx qy qz qw) or in EuRoC's, and no header "
+                      f"with stamp_s, latitude and longitude: use one of these")
 
 
 def track_poses(position: Samples, start_s: float) -> Poses:
@@ -257,13 +261,15 @@ def track_poses(position: Samples, start_s: float) -> Poses:
     stamps = position.stamps_s
     inside = stamps[(stamps >= stamps[0] + COURSE_S) & (stamps <= stamps[-1] - COURSE_S)]
     if len(inside) < 2:
-        raise InputError('the GPS track is too short for headings: record it during the drive')
+        raise InputError('E-GPS-TOO-SHORT',
+                         'the GPS track is too short for headings: record it during the drive')
     way = position.at(inside + COURSE_S) - position.at(inside - COURSE_S)
     heading = np.arctan2(way[:, 1], way[:, 0])
     # one that stands has no heading: it keeps the one before
     moves = np.linalg.norm(way[:, :2], axis=1) > STANDING_M
     if not moves.any():
-        raise InputError('the GPS track does not move: record it during the drive')
+        raise InputError('E-GPS-STANDS',
+                         'the GPS track does not move: record it during the drive')
     last = np.maximum.accumulate(np.where(moves, np.arange(len(moves)), int(np.argmax(moves))))
     # to the world (east, north, up), from axes as a camera's
     turned = Rotation.from_rotvec(heading[last][:, None] * [0.0, 0.0, 1.0]).as_matrix() @ OPTICAL
@@ -278,14 +284,16 @@ def _kitti(table: Floats, path: Path) -> Poses:
         off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
     # NaN is none, either
     if not off <= NOT_A_ROTATION or (np.linalg.det(rotations) < 0).any():
-        raise InputError(f'{path} has matrices that are no rotations: are they 3x4, row by row?')
+        raise InputError('E-POSES-ROTATION', f'{path} has matrices that are not rotations: write '
+                         f'each as 3x4, row by row')
     return Poses(rotations, _places(poses[:, :, 3], path))
 
 
 def _places(positions: Floats, path: Path) -> Floats:
     farthest = np.abs(positions).max()
     if farthest > FARTHEST_M:
-        raise InputError(f'{path} has a position {farthest:.4g} m away; write metres')
+        raise InputError('E-POSES-UNIT',
+                         f'{path} has a position {farthest:.4g} m away; write metres')
     return positions
 
 
@@ -293,12 +301,13 @@ def _tum(table: Floats, path: Path) -> Poses:
     from scipy.spatial.transform import Rotation
     (stamps, warnings), quaternions = in_seconds(table[:, 0], str(path)), table[:, 4:]
     if not (np.diff(stamps) > 0).all():
-        raise InputError(f'{path}: the stamps of the poses do not ascend; sort them')
+        raise InputError('E-POSES-ORDER',
+                         f'{path}: the time stamps of the poses do not increase; sort them')
     with np.errstate(all='ignore'):
         lengths = np.linalg.norm(quaternions, axis=1)
     if (np.abs(lengths - 1) > 0.5).any():
-        raise InputError(f'{path} has quaternions that are no rotations: is the order t x y z qx '
-                         f'qy qz qw?')
+        raise InputError('E-POSES-QUATERNION', f'{path} has quaternions that are not rotations: '
+                         f'write t x y z qx qy qz qw')
     return Poses(Rotation.from_quat(quaternions).as_matrix(), _places(table[:, 1:4], path), stamps,
                  warnings)
 

@@ -26,13 +26,14 @@ from dashcalib_ros.judge.agreement import (
     turns_of_another_camera,
 )
 from dashcalib_ros.judge.calibration import Verdict, Witnesses
+from dashcalib_ros.judge.mount import roll_of_path
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.solve.evidence import LEAST_GAIN, FixedCameraTest, largest_crop
 from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Solution
 
 # of the range between its bounds; a parameter nearer to one of them counts as lying on it
 ON_BOUND = 0.01
-STEADY = 'switch the stabiliser off, and fix the zoom'
+STEADY = 'switch off the stabiliser and fix the zoom, then record another drive'
 # of the sigma of fx by pictures alone; a gyro that knows as much as these leaves 0.71
 CONFIRMED = 0.71
 # relative rise of the error; less is refused
@@ -43,8 +44,17 @@ REFUSED_SIGMA = 0.1
 MAX_READOUT_MS = 50.0
 # of the width; only if that k1 moves the picture by more: less does no harm
 MAX_LINE_MOVE = 0.001
-# over the picture; a model asked for, but farther from what turns choose, is weak
+# over the picture; a model that was chosen by hand, but farther from what turns choose, is weak
 MAX_MODEL_SIGMAS = 2.0
+# where the road is in turned pictures, by quarters of a turn, and ffmpeg's filter against it
+TURNED = {1: ('right side', 'transpose=1'), -1: ('left side', 'transpose=2'),
+          2: ('top', 'hflip,vflip'), -2: ('top', 'hflip,vflip'), 0: ('bottom', 'rotate=RADIANS')}
+# degrees; the plane of a path of upright pictures is tilted by less, also on a slope
+LEAST_PATH_ROLL_DEG = 45.0
+CORNERS = 'drive where there are things to see up to the corners of the picture'
+MORE_TURNS = 'drive more and sharper turns, as at crossings, in daylight'
+# for what no camera_info holds
+RAYS = 'use `dashcalib export --to rays`'
 # over the picture; kinds of lenses that differ by less may be mistaken
 MAX_KIND_SIGMAS = 10.0
 
@@ -53,10 +63,13 @@ MAX_KIND_SIGMAS = 10.0
 class Finding:
     """A rule's objection to a solution: the verdict it leads to, what is wrong, and what to do.
 
-    Both are in the words of the driver, with the figures; docs/troubleshooting.md explains each.
-    cause: whether the other findings may come from it; then it is the first one.
+    code: names what is wrong; it stays when the texts are reworded. Both texts are in the words of
+    the driver, with the figures; docs/troubleshooting.md explains each. cure: the likeliest first,
+    and only what can help here. cause: whether the other findings may come from it; then it is the
+    first one.
     """
 
+    code: str
     level: Literal['weak', 'refused']
     what: str
     cure: str
@@ -68,9 +81,9 @@ def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
           other_camera: OtherCamera | None = None) -> Verdict:
     """Return the verdict on a solution, its reasons sorted: causes, then those that refuse it.
 
-    lines: what straight lines say of it, if there are enough of them. outlook: to tell what one
-    more turn would bring, where only knowledge is missing. witnesses: what sensors say of it.
-    other_camera: that is in the stream, too.
+    lines: what straight lines say of it, if there are enough of them. outlook: whether to predict
+    what one more turn would bring, where only knowledge is missing. witnesses: what sensors say of
+    it. other_camera: a second one in the same stream.
     """
     of_lines: tuple[Rule, ...] = () if lines is None else (partial(_lines_disagree, lines),)
     if witnesses is not None:
@@ -81,8 +94,9 @@ def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
                 if (found := rule(solution, config)) is not None]
     findings.sort(key=lambda found: (not found.cause, found.level != 'refused'))
     if findings and outlook and lacks_knowledge_only(solution, config, of_lines):
-        more = next_turn(solution)
-        findings[0] = replace(findings[0], cure=findings[0].cure + (more and f' ({more})'))
+        first, more = findings[0].cure, next_turn(solution)
+        findings = [replace(found, cure=first + (more and f' ({more})')) if found.cure == first
+                    else found for found in findings]
     return verdict_of(findings)
 
 
@@ -93,7 +107,8 @@ def verdict_of(findings: Sequence[Finding]) -> Verdict:
     refused = any(found.level == 'refused' for found in findings)
     return Verdict('refused' if refused else 'weak',
                    tuple(f'{found.what}: {found.cure}' for found in findings),
-                   tuple(dict.fromkeys(found.cure for found in findings)))
+                   tuple(dict.fromkeys(found.cure for found in findings)),
+                   tuple(found.code for found in findings))
 
 
 def lacks_knowledge_only(solution: Solution, config: VerdictConfig,
@@ -109,14 +124,15 @@ def lacks_knowledge_only(solution: Solution, config: VerdictConfig,
 
 def _too_few_turns(solution: Solution, config: VerdictConfig) -> Finding | None:
     count = len(solution.scenes)
-    if count >= config.min_turns or _gyro_confirms(solution):
+    if count >= config.min_turns or gyro_confirms(solution):
         return None
-    lone = ', so that nothing confirms the numbers and their sigma' if count == 1 else ''
-    return Finding('weak', f'only {count} of at least {config.min_turns} turns could be used'
-                           f'{lone}', 'drive more turns, as at crossings')
+    lone = ', and nothing confirms its numbers and their sigma' if count == 1 else ''
+    return Finding('E-FEW-TURNS', 'weak',
+                   f'only {count} of at least {config.min_turns} turns could be used{lone}',
+                   MORE_TURNS)
 
 
-def _gyro_confirms(solution: Solution) -> bool:
+def gyro_confirms(solution: Solution) -> bool:
     """Return whether a gyro that agrees knows fx as well as the turns do, or better."""
     alone = solution.alone
     return alone is not None and bool(solution.sigma[0] <= CONFIRMED * alone.sigma[0])
@@ -125,9 +141,9 @@ def _gyro_confirms(solution: Solution) -> bool:
 def _too_little_yaw(solution: Solution, config: VerdictConfig) -> Finding | None:
     yaw = sum(scene.yaw_deg for scene in solution.scenes)
     return _graded(
-        yaw < config.refused_yaw_deg, yaw < config.min_yaw_deg,
-        f'{yaw:.0f}° of yaw in all turns; at least {config.min_yaw_deg:.0f}° needed',
-        'drive sharper turns, as at crossings')
+        'E-LITTLE-YAW', yaw < config.refused_yaw_deg, yaw < config.min_yaw_deg,
+        f'the turns have {yaw:.0f}° of yaw in all, at least {config.min_yaw_deg:.0f}° are needed',
+        MORE_TURNS)
 
 
 def flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -135,10 +151,10 @@ def flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
     contrast = profile_contrast(solution)
     return _graded(
         # written with not: a contrast of NaN is refused, too
-        not contrast >= REFUSED_CONTRAST, contrast < config.min_contrast,
+        'E-FLAT-PROFILE', not contrast >= REFUSED_CONTRAST, contrast < config.min_contrast,
         f'a focal length 20 % off would explain the pictures almost as well (the error rises by '
-        f'{100 * max(contrast, 0.0):.1f} %; at least {100 * config.min_contrast:.0f} % needed)',
-        'drive sharper turns, in daylight')
+        f'{100 * max(contrast, 0.0):.1f} %, at least {100 * config.min_contrast:.0f} % is needed)',
+        MORE_TURNS)
 
 
 def profile_contrast(solution: Solution) -> float:
@@ -152,31 +168,34 @@ def _far_from_profile(solution: Solution, config: VerdictConfig) -> Finding | No
     best = solution.around.best * solution.camera.image_size[0]
     if np.isclose(best, solution.camera.fx):
         return None
-    return Finding('refused', f'two ways to find the focal length contradict each other, with '
-                              f'{solution.px * solution.camera.fx:.0f} px and about '
-                              f'{solution.px * best:.0f} px, so that neither can be trusted',
+    return Finding('E-TWO-FOCAL-LENGTHS', 'refused',
+                   f'two ways to find the focal length contradict each other: '
+                   f'{solution.px * solution.camera.fx:.0f} px and about '
+                   f'{solution.px * best:.0f} px; neither can be trusted',
                    'record another drive, with sharper turns and less traffic')
 
 
 def sigma_too_large(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """Fx must be known well enough; a sigma that is not known is none."""
+    """Fx must be known well enough; an unknown sigma is refused, too."""
     relative = float(solution.sigma[0] / solution.camera.fx)
-    known = f'to {100 * relative:.1f} % only' if np.isfinite(relative) else 'not at all'
+    known = f'only to {100 * relative:.1f} %' if np.isfinite(relative) else 'not at all'
     return _graded(
+        'E-LARGE-SIGMA',
         not np.isfinite(relative) or relative > REFUSED_SIGMA, relative > config.max_sigma,
-        f'the focal length is known {known}; {100 * config.max_sigma:.1f} % or better needed',
-        'drive more turns, or sharper ones')
+        f'the focal length is known {known}, {100 * config.max_sigma:.1f} % or better is needed',
+        MORE_TURNS)
 
 
 def one_turn_dominates(solution: Solution, config: VerdictConfig) -> Finding | None:
     """If one turn gives nearly all information about fx, the others cannot confirm it."""
     shares = leverages(solution)
     turn = max(shares, key=lambda turn: shares[turn])
-    if len(shares) < 2 or shares[turn] <= config.max_leverage or _gyro_confirms(solution):
+    if len(shares) < 2 or shares[turn] <= config.max_leverage or gyro_confirms(solution):
         return None
-    return Finding('weak', f'no other turn confirms {_turns([turn])}, which gives '
-                           f'{100 * min(shares[turn], 1.0):.0f} % of what is known about the '
-                           f'focal length', 'drive another turn that is as sharp')
+    return Finding('E-ONE-TURN-DOMINATES', 'weak',
+                   f'no other turn confirms {_turns([turn])}, which gives '
+                   f'{100 * min(shares[turn], 1.0):.0f} % of the information about the focal '
+                   f'length', 'drive another turn that is as sharp')
 
 
 def turns_disagree(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -184,20 +203,23 @@ def turns_disagree(solution: Solution, config: VerdictConfig) -> Finding | None:
     spread = focal_disagreement(solution)
     if spread <= config.max_disagreement:
         return None
-    return Finding('weak', f'the turns disagree about the focal length by {100 * spread:.1f} %; '
-                           f'at most {100 * config.max_disagreement:.0f} % is usual',
-                   'check that nobody moved or zoomed the camera, and avoid heavy traffic')
+    return Finding('E-TURNS-DISAGREE', 'weak',
+                   f'the turns disagree about the focal length by {100 * spread:.1f} %, at most '
+                   f'{100 * config.max_disagreement:.0f} % is usual',
+                   'record another drive with little traffic, and make sure that nobody zooms or '
+                   'moves the camera')
 
 
 def other_camera(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """No turn may ask for a camera of its own."""
+    """No turn may fit a camera of its own far better than the common one."""
     turns = sorted(turns_of_another_camera(solution.misfits, config))
     if not turns:
         return None
     fit = f'{_turns(turns)} fit{"s" * (len(turns) == 1)}'
-    return Finding('weak', f'{fit} another camera far better than the one of the other turns, as '
-                           f'if it was zoomed, exchanged or cropped in between',
-                   'calibrate what was recorded before and after that apart')
+    return Finding('E-ANOTHER-CAMERA', 'weak',
+                   f'{fit} another camera far better than that of the other turns, as if the '
+                   f'camera was zoomed, exchanged or cropped in between',
+                   'calibrate the parts before and after that change separately')
 
 
 def _turns(turns: list[TurnId]) -> str:
@@ -230,18 +252,22 @@ def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
     if clear[0].kind == 'shift':
         return _moving('about', clear[0].size, solution)
     if clear[0].kind == 'bend':
-        return Finding('weak', f'the picture is bent in places, as no lens of the model '
-                               f'{solution.camera.model} bends it',
-                       'take away the windscreen or cover that does so, or try another --model')
-    return Finding('weak', _zoomed(clear[0]), 'fix the zoom and the focus')
+        return Finding('E-PICTURE-BENT', 'weak',
+                       f'the picture is bent in places, in a way that the lens model '
+                       f'{solution.camera.model} cannot describe',
+                       f'{RAYS}, which includes the smooth part of it'
+                       if solution.field is not None else
+                       'clean the lens and the glass in front of it, then record another drive')
+    return Finding('E-ZOOM-CHANGES', 'weak', _zoomed(clear[0]),
+                   'fix the zoom and the focus, then record another drive')
 
 
 def _moving(how: str, px: float, solution: Solution) -> Finding:
     share = 100 * px / solution.camera.image_size[0]
-    return Finding('weak', f'the picture moves against the lens by {how} {share:.1f} % of its '
-                           f'width, as in a stabilised video or while the zoom changes: no '
-                           f'camera_info holds for all pictures', STEADY,
-                   cause=True)
+    return Finding('E-PICTURE-MOVES', 'weak',
+                   f'the picture moves against the lens by {how} {share:.1f} % of its width, as '
+                   f'in a stabilised video or while the zoom changes, so no single camera_info is '
+                   f'right for all pictures', STEADY, cause=True)
 
 
 def _zoomed(test: FixedCameraTest) -> str:
@@ -255,14 +281,26 @@ def _zoomed(test: FixedCameraTest) -> str:
 
 
 def _turned_pictures(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """A car turns about the vertical, and the road is below it."""
-    turned = abs(roll_deg(solution.scenes))
-    if turned <= config.max_roll_deg:
+    """A car turns about the vertical, and the road is below it.
+
+    Only a turn of enough yaw shows that axis: in others bumps and the lean of a two-wheeler turn
+    the camera as much. The plane of the path of such turns must agree.
+    """
+    paths = [abs(roll) for scene in solution.scenes if (roll := roll_of_path(scene)) is not None]
+    if not paths:
         return None
-    return Finding('weak', f'the pictures are turned by about {90 * round(turned / 90)}°, as the '
-                           f'axis about which the car turns and the road under it say',
-                   'mend what the video says of it (ffmpeg -display_rotation 0 -i IN -c copy '
-                   'OUT.mp4), or --set verdict.max_roll_deg=180 for a camera mounted so',
+    roll = roll_deg(solution.scenes)
+    quarters = round(roll / 90)
+    # the plane of a path has no upper side: of pictures upside down it says 0
+    agrees = abs(quarters) != 1 or np.median(paths) > LEAST_PATH_ROLL_DEG
+    if abs(roll) <= config.max_roll_deg or not agrees:
+        return None
+    where, turn = TURNED[quarters]
+    return Finding('E-TURNED-PICTURES', 'weak',
+                   f'the pictures are turned by about {abs(roll):.0f}°: the road is at their '
+                   f'{where}',
+                   f'turn them upright (a video: ffmpeg -i IN -vf {turn} OUT.mp4), or use --set '
+                   f'verdict.max_roll_deg=180 for a camera that is mounted this way',
                    cause=True)
 
 
@@ -271,20 +309,21 @@ def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None
     aspect = solution.camera.fy / solution.camera.fx
     if abs(aspect - 1) <= config.max_aspect:
         return None
-    return Finding('weak', f'the pixels seem to be out of square (fy is {100 * (aspect - 1):+.1f} '
-                           f'% off fx), as a stretched picture, a decentred lens or a strong '
-                           f'rolling shutter makes them look',
-                   'unstretch the pictures, check the stamps (--fps), which a rolling shutter '
-                   'is found by, or try --model brown')
+    brown = '' if solution.camera.model != 'radial' else ', or try --model brown'
+    return Finding('E-PIXEL-ASPECT', 'weak',
+                   f'fy is {100 * (aspect - 1):+.1f} % off fx, as with stretched pictures, a '
+                   f'decentred lens or a strong rolling shutter',
+                   f'check the time stamps (--fps), by which a rolling shutter is found, and undo '
+                   f'any stretching of the pictures{brown}')
 
 
 def _strange_shutter(solution: Solution, config: VerdictConfig) -> Finding | None:
     readout_ms = 1e3 * abs(solution.readout_s)
     if not solution.rolling or readout_ms <= MAX_READOUT_MS:
         return None
-    return Finding('weak', f'the rows of a picture seem to be exposed over {readout_ms:.0f} ms, '
-                           f'longer than rolling shutters take',
-                   'check that the stamps, or --fps, are right')
+    return Finding('E-LONG-READOUT', 'weak',
+                   f'reading out the rows of a picture seems to take {readout_ms:.0f} ms, longer '
+                   f'than rolling shutters take', 'check the time stamps, or --fps')
 
 
 def _on_bound(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -294,22 +333,24 @@ def _on_bound(solution: Solution, config: VerdictConfig) -> Finding | None:
              if not ON_BOUND < value < 1 - ON_BOUND]
     if not names:
         return None
-    return Finding('weak', f'the search for {", ".join(names)} ended at the limit of what lenses '
-                           f'have', 'give the whole picture, or record another drive; mirrors '
-                                    'and lenses of more than 190° cannot be calibrated')
+    return Finding('E-PARAMETER-LIMIT', 'weak',
+                   f'the search for {", ".join(names)} ended at the limit of real lenses',
+                   'use the whole picture, not a part of it, or record another drive; mirrors and '
+                   'lenses wider than 190° cannot be calibrated')
 
 
 def _folds_over(solution: Solution, config: VerdictConfig) -> Finding | None:
     if solution.camera.covers_picture():
         return None
-    return Finding('weak', 'the distortion near the corners of the picture is no real one (it '
-                           'folds over), as nothing was seen there',
-                   'drive where there is something to see up to the corners, or try --model '
-                   'fisheye for a wide lens')
+    fisheye = '' if solution.camera.family != PINHOLE else (
+        ', or try --model fisheye for a wide lens')
+    return Finding('E-FOLDS-OVER', 'weak',
+                   'the distortion folds over near the corners of the picture, which no real lens '
+                   'does: no point was seen there', f'{CORNERS}{fisheye}')
 
 
 def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """Compare a model that was asked for with what the turns would have chosen."""
+    """Compare a model that was chosen by hand with what the turns would have chosen."""
     asked, px = solution.camera, solution.px
     chosen = next((each for each in solution.tried if each.chosen), None)
     if chosen is not None and MODELS[chosen.model].family != asked.family:
@@ -320,9 +361,10 @@ def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
         chosen, far = None, f'{px * solution.written.apart_px:.1f} px'
     else:
         return None
-    other = chosen.model if chosen else 'with more coefficients'
-    return Finding('weak', f'the turns ask for a lens of the model {other}, not '
-                           f'{asked.model}, and that one is {far} away', 'leave --model away')
+    other = f'the lens model {chosen.model}' if chosen else 'a lens model with more coefficients'
+    return Finding('E-ANOTHER-MODEL', 'weak',
+                   f'{other} fits the turns better than {asked.model} does, and the two are {far} '
+                   f'apart', 'omit --model')
 
 
 def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
@@ -339,9 +381,9 @@ def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
         alike_px = MAX_KIND_SIGMAS * solution.picture.rms
         far = each.apart_px is None or each.apart_px > alike_px
         if far and each.cost_ratio < CLEAR_KIND_RATIO:
-            return Finding('weak', f'the turns do not tell whether the lens is {camera.model} or '
-                                   f'{each.model}, and near the corners these differ',
-                           'drive where there is something to see up to the corners')
+            return Finding('E-LENS-AMBIGUOUS', 'weak',
+                           f'the turns do not show whether the lens is {camera.model} or '
+                           f'{each.model}, and these differ near the corners', CORNERS)
     return None
 
 
@@ -349,16 +391,16 @@ def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> F
     """Poles and the edges of houses must be straight: nothing of this comes from motion."""
     if not lines_contradict(lines, solution.camera.image_size[0], config):
         return None
-    return Finding('weak', f'poles and the edges of houses are not straight with this distortion '
-                           f'({lines.lines} upright lines ask for k1 {lines.k1:+.3f}, '
-                           f'{lines.sigmas:.0f} times what both may be off)',
-                   'look for a curved windscreen or cover before the lens, try another --model, '
-                   'or drive more turns')
+    glass = '' if solution.field is None else f', or {RAYS} if a curved windscreen bends them'
+    return Finding('E-LINES-BENT', 'weak',
+                   f'poles and the edges of houses are not straight with this distortion '
+                   f'({lines.lines} upright lines indicate k1 {lines.k1:+.3f}, {lines.sigmas:.0f} '
+                   f'times the sigma of the difference)', f'{MORE_TURNS}{glass}')
 
 
 def two_cameras(found: OtherCamera) -> Finding:
-    """Refuse a stream of two cameras: a calibration of one would be given to both."""
-    return Finding('refused', str(found), APART, cause=True)
+    """Refuse a stream of two cameras: a calibration of one would be used for both."""
+    return Finding('E-TWO-CAMERAS', 'refused', str(found), APART, cause=True)
 
 
 def _sensors_disagree(witnesses: Witnesses, solution: Solution, config: VerdictConfig
@@ -367,12 +409,13 @@ def _sensors_disagree(witnesses: Witnesses, solution: Solution, config: VerdictC
     for name, said in (('the gyro', witnesses.gyro), ('GPS', witnesses.gps)):
         if said is not None and not said.agrees:
             own = 100 * float(solution.sigma[0]) / solution.camera.fx
-            return Finding('weak', f'the pictures and {name} contradict each other: by {name} the '
-                                   f'focal length is {said.fx_percent:+.1f} ± '
-                                   f'{said.fx_sigma_percent:.1f} % off, which the pictures '
-                                   f'know to {own:.1f} %',
-                           'check its scale, its clock and that it is of this drive, and leave '
-                           'it away if it is wrong; else drive more turns')
+            return Finding('E-SENSOR-CONTRADICTS', 'weak',
+                           f'the pictures and {name} contradict each other: according to {name} '
+                           f'the focal length is off by {said.fx_percent:+.1f} ± '
+                           f'{said.fx_sigma_percent:.1f} %, and the pictures know it to '
+                           f'{own:.1f} %',
+                           'check the scale and the clock of the sensor and that it belongs to '
+                           'this drive; omit it if it is wrong, otherwise drive more turns')
     return None
 
 
@@ -382,11 +425,11 @@ def lines_contradict(lines: Bend, width: int, config: VerdictConfig) -> bool:
             and lines.picture_px / width > MAX_LINE_MOVE)
 
 
-def _graded(refused: bool, weak: bool, what: str, cure: str) -> Finding | None:
+def _graded(code: str, refused: bool, weak: bool, what: str, cure: str) -> Finding | None:
     """Return a finding of the graver condition that holds, None if neither does."""
     if refused:
-        return Finding('refused', what, cure)
-    return Finding('weak', what, cure) if weak else None
+        return Finding(code, 'refused', what, cure)
+    return Finding(code, 'weak', what, cure) if weak else None
 
 
 Rule = Callable[[Solution, VerdictConfig], Finding | None]

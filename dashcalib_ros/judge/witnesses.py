@@ -1,4 +1,4 @@
-"""What a gyro and GPS say of a solution: they know the angles of the turns without any picture.
+"""What a gyro and GPS know of a solution: the angles of the turns, without any picture.
 
 A turn's angle by the pictures depends on the focal length; by a gyro it does not. The model: from
 keyframe to keyframe the camera turned by phi, in its own axes; the sensor by theta, in its axes,
@@ -165,8 +165,8 @@ def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnSca
     scale, sigma = found
     if abs(scale - 1) > CONTRADICTED * np.hypot(sigma, prior):
         return _OwnScale(scale, sigma, found, (
-            f'the gyro is {scale:.4f} ± {sigma:.4f} times what GPS headings say, and that is '
-            f'used: set motion.gyro_scale_sigma, {prior:g}, higher'))
+            f'the angles of the gyro are {scale:.4f} ± {sigma:.4f} times those of GPS headings, '
+            f'and this scale is used: set motion.gyro_scale_sigma, {prior:g}, higher'))
     share = prior**2 / (prior**2 + sigma**2)
     return _OwnScale(1 + share * (scale - 1), sigma * float(np.sqrt(share)), found)
 
@@ -186,8 +186,8 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
         return None, ''
     apart = abs(1 - fit.gyro.inverse_scale) / float(np.sqrt(own + known))
     if len(solution.scenes) == 1 and apart > DOUBTED:
-        return None, (f'the gyro does not confirm the only turn, it is {apart:.1f} sigma off: '
-                      f'check its scale, its clock and that it is of this drive')
+        return None, (f'the gyro does not confirm the only turn, it is {apart:.1f} sigmas off: '
+                      f'check its scale, its clock and that it belongs to this drive')
     moved = with_measurement(solution, fit.by_camera @ solution.written.by_solution,
                              1 - fit.gyro.inverse_scale, known)
     scenes = [scene_with(moved.camera, scene, config) for scene in solution.scenes]
@@ -201,20 +201,22 @@ def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness 
     """Return what the gyro says, or why it says nothing."""
     if fit is None:
         return None, ('the gyro is not used: it has no samples during the turns, within 0.5 s of '
-                      'their stamps')
+                      'their time stamps: check its clock')
     gyro = fit.gyro
     if abs(gyro.offset_s) >= LARGEST_OFFSET_S or not fit.explained >= LEAST_EXPLAINED:
         return None, (f'the gyro is not used: it does not turn as the pictures do (it explains '
-                      f'{100 * max(fit.explained, 0.0):.0f} % of that): check that it is of this '
-                      f'drive, and that its stamps are within 0.5 s of those of the pictures')
+                      f'{100 * max(fit.explained, 0.0):.0f} % of their turning): check that it '
+                      f'belongs to this drive, and that its time stamps are within 0.5 s of those '
+                      f'of the pictures')
     if not SCALES[0] < fit.scale < SCALES[1]:
-        cure = ('write rad/s, not degrees a second' if DEGREES[0] < fit.scale < DEGREES[1] else
+        cure = ('write rad/s, not degrees per second' if DEGREES[0] < fit.scale < DEGREES[1] else
                 'check its unit')
         return None, (f'the gyro is not used: its angles are {fit.scale:.3g} times those of the '
                       f'pictures: {cure}')
     if fit.out_of_pace:
-        return None, (f'the gyro is not used: its stamps and those of the pictures do not keep '
-                      f'pace ({fit.out_of_pace}): check --fps, and that no images are missing')
+        return None, (f'the gyro is not used: its time stamps and those of the pictures do not '
+                      f'keep pace ({fit.out_of_pace}): check --fps, and whether images are '
+                      f'missing')
     sigmas = np.sqrt(np.diag(fit.covariance))
     said = _witness(gyro.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
     return replace(
@@ -595,8 +597,8 @@ def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
     each = camera / gps
     kappa = float(np.average(each, weights=weights))
     if not 1 / SCALES[1] < kappa < 1 / SCALES[0]:
-        return None, ('GPS is not used: it does not turn as the pictures do: check that it is of '
-                      'this drive, and its stamps')
+        return None, ('GPS is not used: it does not turn as the pictures do: check its time '
+                      'stamps, and that it belongs to this drive')
     variance = 1 / float(weights.sum()) + _between_turns(each - kappa, 1 / weights, kappa)
     by_camera = np.average(np.array(follow) / gps[:, None], axis=0, weights=weights)
     return _witness(kappa, float(np.sqrt(variance)), 0.0, by_camera, solution), ''

@@ -74,7 +74,7 @@ def save(calibration: Calibration, folder: str | os.PathLike[str] = 'calibration
     """Write what `dashcalib run` writes into a folder, and return the files' paths.
 
     These are result.json, report.html and calibration.yaml (calibration.weak.yaml where it is
-    weak, none where it is refused). Raises OutputError, which tells what to do.
+    weak, none where it is refused). Raises OutputError, which names the cure.
     """
     return write_results(calibration, folder).files
 
@@ -105,7 +105,8 @@ def set_aside(path: Path) -> Path | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        raise OutputError(f'{path} could not be moved aside: {error.strerror or error}; move it '
+        raise OutputError('E-FILE-NOT-MOVED',
+                          f'{path} could not be moved aside: {error.strerror or error}; move it '
                           f'yourself, or allow writing to {path.parent}') from error
     sync(path.parent)
     return target
@@ -165,15 +166,16 @@ def _output_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OutputError(f'cannot write to {folder}: {error.strerror or error}; '
-                          f'{_cure(error)}') from error
+        raise _cannot_write(folder, error) from error
 
 
-def _cure(error: OSError) -> str:
+def _cannot_write(folder: Path, error: OSError) -> OutputError:
+    what = f'cannot write to {folder}: {error.strerror or error}; '
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return 'free some space or choose another output folder'
+        return OutputError('E-DISK-FULL', what + 'free some space or choose another output folder')
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return 'choose an output folder you may write to'
+        return OutputError('E-NOT-WRITABLE', what + 'choose an output folder you may write to')
     if error.errno in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR):
-        return 'something else has that name: move it or choose another output folder'
-    return 'choose another output folder'
+        return OutputError('E-NAME-TAKEN', what + 'something else has that name: rename it or '
+                           'choose another output folder')
+    return OutputError('E-CANNOT-WRITE', what + 'choose another output folder')

@@ -10,7 +10,7 @@ from dashcalib_ros.arrays import Floats, Ints, Pixels
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera_info import WIDEST, rectified_matrix
 from dashcalib_ros.judge import Calibration
-from dashcalib_ros.judge.agreement import sigma_by_count
+from dashcalib_ros.judge.agreement import focal_alone, sigma_by_count
 from dashcalib_ros.judge.calibration import Material, Mount
 from dashcalib_ros.reconstruct.scene import Profile, Scene, residuals_px
 from dashcalib_ros.report.charts import (
@@ -29,6 +29,7 @@ from dashcalib_ros.report.charts import (
     ticks,
 )
 from dashcalib_ros.report.turns import focal_by_turn
+from dashcalib_ros.report.wording import angle_text
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import SigmaMap
 
@@ -38,13 +39,17 @@ FEWEST = 4  # observations of a cell whose mean residual is drawn
 GRID_LINES = 12  # over the picture's width
 # from little to much, BGR
 RAMP = np.array([(250, 243, 236), (238, 205, 160), (206, 148, 78), (142, 86, 34), (72, 38, 16)])
-BY_TURN = ('Each turn alone, one sigma. Last, and as a band: all together, with how much the '
-           'turns differ.')
+BY_TURN = ('fx by each turn alone, with one sigma. Last, and as a band: all turns together, '
+           'including how much they differ.')
+# times the sigma of the best turn; where all together know less, that needs no explanation
+MUCH_BETTER = 0.5
+WHY_TOGETHER = (' One turn alone cannot separate fx from the other parameters of the lens; turns '
+                'that differ can, so together they know fx far better than each alone.')
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A drawing with its title, and what it tells."""
+    """A drawing with its title, and a sentence about it."""
 
     title: str
     svg: str
@@ -73,8 +78,8 @@ def uncertainty_of(c: Calibration) -> Drawing | None:
         return None
     return Drawing(
         'Uncertainty over the picture', sigma_svg(found, c.image_size, c.material.px),
-        f'By how many pixels this camera may be off, one sigma: {c.sigma_px.rms:.2f} px over '
-        f'the picture (RMS), {c.sigma_px.worst:.2f} px at the worst.')
+        f'How many pixels this camera may be off, one sigma: {c.sigma_px.rms:.2f} px over the '
+        f'picture (RMS), {c.sigma_px.worst:.2f} px at the worst place.')
 
 
 def slider_of(c: Calibration) -> Slider | None:
@@ -90,7 +95,7 @@ def slider_of(c: Calibration) -> Slider | None:
     straight, bent_grid, straight_grid, moved = undistorted(image, camera, c.config.rectified)
     moved *= c.image_size[0] / width
     return Slider(data_uri(image), data_uri(straight), bent_grid, straight_grid, width,
-                  height, f'The orange grid is of the same rays on both sides. The lens moves '
+                  height, f'The orange grid shows the same rays on both sides. The lens moves '
                           f'points by up to {moved:.0f} px.')
 
 
@@ -105,7 +110,9 @@ def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
     if solution is not None and c.camera is not None and c.sigma is not None:
         drawings += _growth(c, solution, material.px)
         if by_turn := focal_by_turn(c):
-            drawings.append(Drawing('What each turn says of fx', by_turn, BY_TURN))
+            best = material.px * min(turn.sigma for turn in focal_alone(solution).values())
+            why = WHY_TOGETHER if c.sigma['fx'] < MUCH_BETTER * best else ''
+            drawings.append(Drawing('fx by turn', by_turn, BY_TURN + why))
     camera = None if solution is None else solution.camera
     xy, residual = observations_of(scenes, camera)
     if len(xy):
@@ -144,8 +151,8 @@ def _profile(c: Calibration, material: Material, scenes: list[Scene]) -> Drawing
         content += line(x, axes.top, x, axes.height - axes.bottom, 'joint')
     return Drawing(
         'Focal profile', svg(WIDTH, axes.height, 'focal profile', content),
-        'Each turn (thin) and all together (thick) were explained with the focal length held '
-        'fixed. A clear minimum means that the turns know it; a flat line means that they do not.')
+        'The error of each turn (thin) and of all together (thick) at fixed focal lengths. A '
+        'clear minimum: the turns determine the focal length. A flat line: they do not.')
 
 
 def _growth(c: Calibration, solution: Solution, px: float) -> list[Drawing]:
@@ -163,13 +170,13 @@ def _growth(c: Calibration, solution: Solution, px: float) -> list[Drawing]:
     if count > 2:
         # one turn does not show how much turns differ
         content += strokes([where[1:]], 'all-turns')
-    content += (strokes(where[:1, None], 'dot other') + strokes(where[1:, None], 'dot own')
+    content += (strokes(where[:1, None], 'dot other') + strokes(where[1:, None], 'dot all')
                 + ''.join(text(x, y - 9, f'{value:.2g}', 'mid strong halo')
                           for (x, y), value in zip(where, percent, strict=True)))
     return [Drawing('Uncertainty against number of turns',
                     svg(WIDTH, axes.height, 'sigma of fx over the number of turns', content),
                     'The most prominent turn first. One turn (grey) does not show how much turns '
-                    'differ; that comes in with the second, and few turns know it badly.')]
+                    'differ; two do, and more do so better. So sigma may rise at the second.')]
 
 
 def _residuals(xy: Floats, residual: Floats, size: tuple[int, int], px: float) -> Drawing:
@@ -198,9 +205,9 @@ def _residuals(xy: Floats, residual: Floats, size: tuple[int, int], px: float) -
     return Drawing('Residuals over the picture',
                    svg(WIDTH, height, 'residuals over the picture', content, 'plot map'),
                    f'Half of the {len(residual):,} are below {half:.2f} px. Arrows: mean residual '
-                   f'of a cell, {magnified} times as long as it is; tint: how much residuals '
-                   'scatter there. Arrows that point the same way over a large part of the '
-                   'picture mean that the lens model does not fit there.')
+                   f'of a cell, magnified {magnified} times. Tint: how much residuals scatter '
+                   'there. Where neighbouring arrows point the same way over a large part of the '
+                   'picture, the lens model does not fit.')
 
 
 def _coverage(xy: Floats, size: tuple[int, int], mask_id: str | None) -> Drawing:
@@ -211,7 +218,7 @@ def _coverage(xy: Floats, size: tuple[int, int], mask_id: str | None) -> Drawing
     shown = np.sqrt(count.astype(np.float64) / max(int(count.max()), 1))
     content = (_heat(np.where(count > 0, shown, np.nan), WIDTH, height)
                + mask_over(mask_id, WIDTH, height))
-    masked = '; what is tinted moves with the car and is not used' if mask_id else ''
+    masked = '; the tinted part moves with the car and is not used' if mask_id else ''
     return Drawing('Coverage',
                    svg(WIDTH, height, 'observations over the picture', content, 'plot map'),
                    f'Where points were observed. {100 * float(np.mean(count == 0)):.0f} % of the '
@@ -338,15 +345,18 @@ def mounting_of(c: Calibration) -> list[Drawing]:
     """Return the car from the side and from above, and the horizon in a picture."""
     if c.mount is None or c.camera is None:
         return []
-    mount, sigma = c.mount, c.mount.sigma
+    mount = c.mount
     drawings = [
         Drawing('From the side', _car(SIDE, CAMERA_SIDE, -mount.pitch_up_deg, 'from the side'),
-                f'Pitch {mount.pitch_up_deg:+.2f} ± {sigma["pitch_up_deg"]:.2f}° upwards, drawn '
-                f'{ENLARGED:.0f} times as large.'),
+                _angle('pitch_up_deg', mount)),
         Drawing('From above', _car(ABOVE, CAMERA_ABOVE, -mount.yaw_left_deg, 'from above'),
-                f'Yaw {mount.yaw_left_deg:+.2f} ± {sigma["yaw_left_deg"]:.2f}° to the left, drawn '
-                f'{ENLARGED:.0f} times as large.')]
+                _angle('yaw_left_deg', mount))]
     return [*drawings, _horizon(c, mount, c.camera)]
+
+
+def _angle(name: str, mount: Mount) -> str:
+    text = angle_text(name, getattr(mount, name), mount.sigma[name])
+    return f'{text[0].upper()}{text[1:]}, drawn {ENLARGED:.0f} times as large.'
 
 
 def field_of(c: Calibration) -> list[Drawing]:
@@ -363,8 +373,9 @@ def field_of(c: Calibration) -> list[Drawing]:
     drawn = arrows(pixels * small, moves * small * cell / longest, 'arrow')
     return [Drawing(
         'The field', svg(WIDTH, height * small, 'displacements over the picture', drawn, 'map'),
-        f'What the lens model leaves over, as a windscreen does: {c.field.rms_px:.2f} px RMS, '
-        f'{c.field.worst_px:.2f} px at the worst. The longest arrow is {longest:.2f} px.')]
+        f'What the lens model cannot describe, for example the bend of a windscreen: '
+        f'{c.field.text} (RMS), {c.field.worst_px:.2f} px at the worst place. The longest arrow '
+        f'is {longest:.2f} px.')]
 
 
 def _car(side: Floats, camera: tuple[float, float], turned_deg: float, label: str) -> str:
@@ -399,4 +410,4 @@ def _horizon(c: Calibration, mount: Mount, camera: Camera) -> Drawing:
                    svg(WIDTH, height * small, 'horizon and point of travel', below + marks, 'map'),
                    f'The horizon of a flat road, and the pixel towards which the car travels: '
                    f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± '
-                   f'{mount.travel_sigma_px:.1f}.')
+                   f'{mount.travel_sigma_px:.1f} px.')

@@ -58,6 +58,7 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'seed': c.config.seed,
         'versions': c.versions,
         'config': c.config.flat(),
+        'reason_codes': c.verdict.codes,
         'sigma_px': c.sigma_px,
         'camera_model': None if c.camera is None else c.camera.model,
         'stored_turns': [_turn_dict(turn) for turn in c.stored_turns],
@@ -99,20 +100,23 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
         data = parse_json(text, str(place))
         missing = [key for key in ('verdict', 'image_size', 'intrinsics') if key not in data]
         if missing:
-            raise InputError(f'{place} is no result.json of dashcalib: it has no {missing[0]!r}; '
-                             'give the file that dashcalib run wrote')
+            raise InputError('E-NO-RESULT-FILE',
+                             f'{place} is not a result.json of dashcalib: it has no '
+                             f'{missing[0]!r}; use the file that dashcalib run wrote')
     else:
         data = parse_yaml(text, str(place))
         own = data.get('dashcalib') if isinstance(data, Mapping) else None
         if not isinstance(own, Mapping):
-            raise InputError(f'{place} is no calibration of dashcalib; load_camera() reads it')
+            raise InputError('E-OTHER-CALIBRATION', f'{place} is not a calibration of dashcalib; '
+                             f'use load_camera() for it')
         data = {**own, 'image_size': [data.get('image_width'), data.get('image_height')]}
     refused = data.get('verdict') == 'refused'
     camera = None if refused else parse_camera(text, place).camera
     try:
         return calibration_of(data, camera)
     except (KeyError, TypeError, ValueError, AttributeError, DashcalibError) as error:
-        raise InputError(f'{place} is damaged ({one_line(error)}); calibrate again') from error
+        raise InputError('E-CALIBRATION-DAMAGED',
+                         f'{place} is damaged ({one_line(error)}); calibrate again') from error
 
 
 def calibration_of(data: Mapping[str, Any], camera: Camera | None) -> Calibration:
@@ -131,7 +135,8 @@ def calibration_of(data: Mapping[str, Any], camera: Camera | None) -> Calibratio
     field, size = data.get('field'), (data['image_size'][0], data['image_size'][1])
     sigma = data.get('sigma')
     return Calibration(
-        verdict=Verdict(data['verdict'], tuple(data['reasons'])),
+        verdict=Verdict(data['verdict'], tuple(data['reasons']),
+                        codes=tuple(data.get('reason_codes', ()))),
         image_size=size, camera=camera,
         sigma=None if sigma is None else {name: math.nan if value is None else float(value)
                                           for name, value in sigma.items()},
@@ -195,7 +200,7 @@ def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
 
 def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None,
                 mount: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return what a drive says of a given calibration as types of strict JSON.
+    """Return the answer of a drive about a given calibration as types of strict JSON.
 
     changes: of the camera during the drive, in words. motion: the comparison with true poses.
     mount: how far the mounting is from the calibration's.
@@ -267,11 +272,12 @@ def yaml_text(document: Mapping[str, Any]) -> str:
 def check_camera_name(name: str) -> None:
     """Raise ConfigError for a name that camera_info_manager or image_pipeline would not take."""
     if not re.fullmatch(r'[A-Za-z0-9_]+', name):
-        raise ConfigError(f'the camera name {name!r} must be letters, digits and underscores: '
-                          'camera_info_manager takes no others')
+        raise ConfigError('E-CAMERA-NAME',
+                          f'the camera name {name!r} may have only letters, digits and '
+                          'underscores: camera_info_manager refuses others')
     if name == 'narrow_stereo':
-        raise ConfigError('the camera name narrow_stereo belongs to image_pipeline\'s stereo '
-                          'files; choose another')
+        raise ConfigError('E-CAMERA-NAME-TAKEN', 'the camera name narrow_stereo belongs to the '
+                          'stereo files of image_pipeline; choose another one')
 
 
 class _Text(str):
@@ -308,6 +314,7 @@ def _provenance(calibration: Calibration, created: str | None) -> dict[str, Any]
     block: dict[str, Any] = plain_values({
         'verdict': calibration.verdict.level,
         'reasons': calibration.verdict.reasons,
+        'reason_codes': calibration.verdict.codes,
         'camera_model': None if calibration.camera is None else calibration.camera.model,
         'sigma': calibration.sigma,
         'turns_used': calibration.turns_used,

@@ -20,17 +20,18 @@ from dashcalib_ros.report.compare import (
     difference_row,
     unseen_text,
 )
-from dashcalib_ros.report.wording import number, optional, parameter_rows, run_facts
+from dashcalib_ros.report.wording import (
+    cures,
+    number,
+    objections,
+    optional,
+    parameter_rows,
+    run_facts,
+)
 
 # columns between two of a table
 APART = 3
 TURNS = ('at s', 'frames', 'yaw °', 'images', 'error px', 'used')
-# where the reasons do not say it
-NEXT = {
-    'accepted': 'give calibration.yaml to the camera driver; report.html tells more',
-    'weak': 'read report.html before you use calibration.weak.yaml',
-    'refused': 'record a drive with turns at crossings, in daylight',
-}
 COLOURS = {'accepted': 'bold green', 'weak': 'bold yellow', 'refused': 'bold red'}
 
 
@@ -55,9 +56,8 @@ def summary(calibration: Calibration) -> RenderableType:
 def conclusion(verdict: Verdict) -> RenderableType:
     """Return the verdict, coloured, and its reasons."""
     parts: list[RenderableType] = [labelled('verdict', verdict.level, COLOURS[verdict.level])]
-    for reason in verdict.reasons:
-        cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), None)
-        parts.append(Padding.indent(line(reason.removesuffix(f': {cure}')), 2))
+    parts += [Padding.indent(line(f'{what} [{code}]' if code else what), 2)
+              for code, what, _ in objections(verdict)]
     return Group(*parts)
 
 
@@ -66,9 +66,10 @@ def labelled(label: str, word: str, colour: str) -> Text:
     return Text.assemble(f'{label}: ', (word, colour))
 
 
-def next_step(verdict: Verdict) -> Text:
-    """Return what to do next."""
-    return line(f'next: {(verdict.cures or (NEXT[verdict.level],))[0]}')
+def next_step(verdict: Verdict) -> RenderableType:
+    """Return what to do next: all cures, the likeliest to help first."""
+    first, *others = cures(verdict)
+    return Group(line(f'next: {first}'), *(line(f'also: {cure}') for cure in others))
 
 
 def _turn_row(turn: TurnSummary, start_s: float) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What the page shows of each turn: its tracks, a view in space, and what it says of fx."""
+"""What the page shows of each turn: its tracks, a view in space, and its own fx."""
 from __future__ import annotations
 
 import math
@@ -49,8 +49,8 @@ AnySummary = TurnSummary | StoredTurnSummary
 class TurnSection:
     """A turn as the page shows it; SVG texts are '' where there is nothing to draw.
 
-    frame: of the picture; magnified: by how much its residuals are, 0 for none drawn. alone: what
-    it says of fx, in words.
+    frame: of the picture; magnified: by how much its residuals are, 0 for none drawn. alone: its
+    own fx, in words.
     """
 
     name: str
@@ -78,7 +78,7 @@ def turn_sections(c: Calibration, mask_id: str | None) -> list[TurnSection]:
 
 
 def _fx_alone(c: Calibration) -> dict[TurnId, tuple[float, float]]:
-    """Return what each turn alone says of fx, and its sigma, px of the input.
+    """Return fx by each turn alone, and its sigma, px of the input.
 
     Nothing of a refused calibration, which has no numbers.
     """
@@ -124,8 +124,8 @@ def _facts(turn: AnySummary, scene: Scene | None, c: Calibration) -> tuple[str, 
 
 def _said(fx: float, sigma: float, share: float) -> str:
     percent = min(max(100 * share, 0.0), 100.0)
-    return (f'Alone it says fx {with_sigma(fx, sigma)}, and gives '
-            f'{f"{percent:.0f}" if percent >= 1 else "less than 1"} % of what is known of fx.')
+    part = f'{percent:.0f}' if percent >= 1 else 'less than 1'
+    return f'Alone: fx {with_sigma(fx, sigma)}, {part} % of the information about fx.'
 
 
 def turn_rows(c: Calibration) -> list[dict[str, str]]:
@@ -238,7 +238,7 @@ def direction(scene: Scene) -> str:
 
 
 def focal_by_turn(c: Calibration) -> str:
-    """Return what each turn says of fx, beside the result of all; '' where there is nothing."""
+    """Return a plot of fx by each turn, beside that of all; '' where there is nothing."""
     alone = _fx_alone(c)
     if not alone or c.camera is None or c.sigma is None:
         return ''

@@ -57,27 +57,29 @@ def test_tums_poses_are_interpolated_at_the_frames_stamps(tmp_path):
     np.testing.assert_allclose(found[1], rotation(1, np.pi / 8), atol=1e-6)
 
 
-@pytest.mark.parametrize(('text', 'match'), [
-    ('', 'no poses'), ('1 2 3\n4 5 6\n', 'no poses'), ('1 2\n' + '0 ' * 12 + '\n', 'no poses'),
-    (f'{"1 " * 12}\n' * 2, 'no rotations'), (f'{"a " * 12}\n' * 2, 'not all numbers'),
-    (f'{"nan " * 8}\n' * 2, 'not finite'),
-    ('2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n', 'do not ascend'),
-    ('1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 0\n', 'no rotations'),
-    ('1 0 0 0 9 9 9 9\n2 0 0 0 9 9 9 9\n', 'no rotations'),
-    ('1 1e300 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n', 'write metres'),
-    ('5e10 0 0 0 0 0 0 1\n6e10 0 0 0 0 0 0 1\n', 'write seconds'),
-    ('1e300 0 0 0 0 0 0 1\n2e300 0 0 0 0 0 0 1\n', 'write seconds'),
-    ('0 0 0 0 0 0 0 1\n1e300 0 0 0 0 0 0 1\n', 'write seconds'),
-    ('1 0 0 0 1e200 -1e200 0 1\n2 0 0 0 0 0 0 1\n', 'no rotations'),
-    (f'{"1e300 -1e300 " * 6}\n' * 2, 'no rotations'),
-    ('-1e308 0 0 0 0 0 0 1\n1e308 0 0 0 0 0 0 1\n', 'write seconds'),
-    ('t x y z qx qy qz qw\n' * 2, 'not all numbers')])
+@pytest.mark.parametrize(('text', 'code'), [
+    ('', 'E-POSES-FORMAT'), ('1 2 3\n4 5 6\n', 'E-POSES-FORMAT'),
+    ('1 2\n' + '0 ' * 12 + '\n', 'E-POSES-FORMAT'),
+    (f'{"1 " * 12}\n' * 2, 'E-POSES-ROTATION'), (f'{"a " * 12}\n' * 2, 'E-POSES-NUMBERS'),
+    (f'{"nan " * 8}\n' * 2, 'E-POSES-NOT-FINITE'),
+    ('2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n', 'E-POSES-ORDER'),
+    ('1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 0\n', 'E-POSES-QUATERNION'),
+    ('1 0 0 0 9 9 9 9\n2 0 0 0 9 9 9 9\n', 'E-POSES-QUATERNION'),
+    ('1 1e300 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n', 'E-POSES-UNIT'),
+    ('5e10 0 0 0 0 0 0 1\n6e10 0 0 0 0 0 0 1\n', 'E-STAMP-UNIT'),
+    ('1e300 0 0 0 0 0 0 1\n2e300 0 0 0 0 0 0 1\n', 'E-STAMP-UNIT'),
+    ('0 0 0 0 0 0 0 1\n1e300 0 0 0 0 0 0 1\n', 'E-STAMP-UNIT'),
+    ('1 0 0 0 1e200 -1e200 0 1\n2 0 0 0 0 0 0 1\n', 'E-POSES-QUATERNION'),
+    (f'{"1e300 -1e300 " * 6}\n' * 2, 'E-POSES-ROTATION'),
+    ('-1e308 0 0 0 0 0 0 1\n1e308 0 0 0 0 0 0 1\n', 'E-STAMP-UNIT'),
+    ('t x y z qx qy qz qw\n' * 2, 'E-POSES-NUMBERS')])
 @pytest.mark.filterwarnings('error')
-def test_what_is_no_file_of_poses_is_named(tmp_path, text, match):
+def test_what_is_no_file_of_poses_is_named(tmp_path, text, code):
     path = tmp_path / 'poses.txt'
     path.write_text(text)
-    with pytest.raises(InputError, match=match) as caught:
+    with pytest.raises(InputError) as caught:
         read_poses(path)
+    assert caught.value.code == code
     assert str(path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
 
 
@@ -97,7 +99,7 @@ def test_stamps_since_1970_may_be_of_any_unit_which_is_said(tmp_path, unit, digi
 def test_nanoseconds_since_a_computer_was_started_are_no_milliseconds_since_1970(tmp_path):
     path = tmp_path / 'poses.txt'
     path.write_text(''.join(f'{5 * 10**12 + n * 10**8} 0 0 0 0 0 0 1\n' for n in range(5)))
-    with pytest.raises(InputError, match='write seconds'):
+    with pytest.raises(InputError, match=r'poses\.txt'):
         read_poses(path)
 
 
@@ -143,11 +145,12 @@ def test_a_gps_that_comes_once_a_second_has_headings_between():
     assert known.all() and abs(places[0, 0] - 47.5) < 1e-6
 
 
-@pytest.mark.parametrize(('places', 'match'), [
-    (np.zeros((60, 3)), 'does not move'), (np.zeros((3, 3)), 'too short')])
-def test_a_track_without_headings_is_named(places, match):
-    with pytest.raises(InputError, match=match):
+@pytest.mark.parametrize(('places', 'code'), [
+    (np.zeros((60, 3)), 'E-GPS-STANDS'), (np.zeros((3, 3)), 'E-GPS-TOO-SHORT')])
+def test_a_track_without_headings_is_named(places, code):
+    with pytest.raises(InputError) as caught:
         track_poses(Samples(0.2 * np.arange(len(places)), places), 0.0)
+    assert caught.value.code == code
 
 
 MOUNT = rotation(0, 0.3) @ rotation(2, -0.2)
@@ -210,5 +213,6 @@ def test_the_paths_are_plotted_and_written_for_evo(motion):
 def test_poses_of_another_time_are_refused(motion):
     scene = synthetic_turn(keyframes=8, tracks=100).scene(LENS)
     rotations, positions = three()
-    with pytest.raises(InputError, match='none of the turns has poses'):
+    with pytest.raises(InputError) as caught:
         odometry([scene], {'ours': LENS}, Poses(rotations, positions, STAMPS + 1e9), CONFIG)
+    assert caught.value.code == 'E-NO-POSES-OF-TURNS'

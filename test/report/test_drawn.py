@@ -29,8 +29,8 @@ from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.agreement import focal_alone, sigma_by_count
 from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.report import NamedCamera, report_html, write_results
-from dashcalib_ros.report.lens import undistorted
-from dashcalib_ros.report.wording import field_of_view
+from dashcalib_ros.report.lens import WHY_TOGETHER, undistorted
+from dashcalib_ros.report.wording import checks, field_of_view
 from dashcalib_ros.session import with_source
 
 
@@ -55,8 +55,8 @@ def test_each_turn_is_drawn_with_tracks_residuals_path_and_what_it_says_of_fx(dr
         assert text.count(f'<path class="{kind}"') == 3
     assert text.count('aria-label="fx by turn"') == 1  # the turns' plot would be the same
     assert text.count('class="picture"') == 5 + 1  # all five turns, and the slider's second one
-    assert re.search(r'residuals \d+ times as long', page.text)
-    assert page.text.count('Alone it says fx') == 3
+    assert re.search(r'residuals magnified \d+ times', page.text)
+    assert page.text.count('Alone: fx') == 3
     assert len(text) < 3_000_000
     assert all(link.startswith('data:') or f'id="{link[1:]}"' in text for link in page.links)
     assert page.links.count('#turn-by-turn') == 1
@@ -96,6 +96,37 @@ def test_a_turn_that_contradicts_the_others_says_so():
     *_, unexplained, _, untried = drawn_calibration(None).turns
     assert 'no camera' in unexplained.unused_because
     assert 'not reconstructed' in untried.unused_because
+
+
+def test_every_objection_is_a_row_that_failed_and_they_come_first(drawn):
+    # the second reason has no number, the third no code
+    verdict = Verdict('weak', ('the picture is bent: clean', 'sigma is large: drive', 'old'),
+                      ('clean', 'drive'), ('E-PICTURE-BENT', 'E-LARGE-SIGMA'))
+    rows = checks(dataclasses.replace(drawn, verdict=verdict))
+    assert [row.code for row in rows if not row.met] == ['E-PICTURE-BENT', 'E-LARGE-SIGMA', '']
+    assert [row.met for row in rows] == [False] * 3 + [True] * 6
+    assert (rows[0].name, rows[2].name) == ('the picture is bent', 'old')
+    assert rows[1].found == '0.39 %'
+    assert all(row.met for row in checks(drawn))
+    text = report_html(dataclasses.replace(drawn, verdict=verdict))
+    assert text.count('<tr class="objection">') == 3 and '<code>E-PICTURE-BENT</code>' in text
+
+
+def test_with_two_turns_the_growth_of_what_is_known_shows_both():
+    text = report_html(drawn_calibration(only(solution(), range(2))))
+    style = text[text.index('<style>'):text.index('</style>')]
+    plot = text[text.index('aria-label="sigma of fx over the number of turns"'):]
+    dots = re.findall(r'<path class="dot (\w+)" d="([^"]+)"', plot[:plot.index('</svg>')])
+    assert [outline.count('M') for _, outline in dots] == [1, 1]
+    # a dot without a stroke is not seen
+    assert all(re.search(rf'\.dot\.{kind} {{ stroke:', style) for kind, _ in dots)
+
+
+def test_why_all_turns_know_more_than_each_alone_is_said_where_it_is_so(drawn):
+    best = min(turn.sigma for turn in focal_alone(solution()).values())
+    for part, said in ((0.6, False), (0.2, True)):
+        c = dataclasses.replace(drawn, sigma={**drawn.sigma, 'fx': part * best})
+        assert (WHY_TOGETHER in Page(report_html(c)).text) == said
 
 
 def test_where_no_report_is_wanted_nothing_is_kept_for_it():
@@ -142,7 +173,7 @@ def test_a_refused_page_draws_the_evidence_and_has_no_camera(drawn):
     text = report_html(refused)
     page = Page(text)
     assert 'class="track"' in text and 'Focal profile' in page.text
-    assert 'Alone it says' not in page.text and 'Use it' not in page.text
+    assert 'Alone: fx' not in page.text and 'Use it' not in page.text
     assert f'{solution().camera.fx:.1f}' not in page.text and 'Parameters' not in page.text
 
 
@@ -192,10 +223,12 @@ def test_sigma_at_pixels_is_in_those_of_the_input(drawn):
 
 def test_a_calibration_without_its_covariance_has_no_samples(drawn):
     for ask in (lambda c: c.samples(2), lambda c: c.sigma_at((0, 0))):
-        with pytest.raises(InputError, match='refused'):
+        with pytest.raises(InputError) as caught:
             ask(make_calibration('refused'))
-        with pytest.raises(InputError, match='calibrate the drive again'):
+        assert caught.value.code == 'E-CALIBRATION-REFUSED'
+        with pytest.raises(InputError) as caught:
             ask(dataclasses.replace(drawn, details={}))
+        assert caught.value.code == 'E-UNKNOWN-COVARIANCE'
 
 
 # the lines to copy

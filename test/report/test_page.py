@@ -149,7 +149,7 @@ def test_settings_that_were_changed_are_named():
 def test_what_is_missing_is_told_in_numbers(level):
     text = Page(report_html(make_calibration(level, turns=make_calibration().turns[1:]))).text
     assert 'this drive has 0 and 0°' in text
-    assert re.search(r'yaw of these turns together\s+0°\s+at least 60°\s+✗', text)
+    assert re.search(r'yaw of these turns together\s+E-LITTLE-YAW\s+0°\s+at least 60°\s+✗', text)
 
 
 def test_the_mask_s_tint_is_the_mask():

@@ -258,8 +258,10 @@ def test_names_from_outside_cannot_break_the_file():
 
 @pytest.mark.parametrize('name', ['narrow_stereo', '', 'my cam', 'a:b', 'käm'])
 def test_camera_names_that_drivers_refuse_are_refused(name):
-    with pytest.raises(ConfigError, match='camera name'):
+    with pytest.raises(ConfigError) as caught:
         calibration_yaml(make_calibration(), name)
+    assert caught.value.code == (
+        'E-CAMERA-NAME-TAKEN' if name == 'narrow_stereo' else 'E-CAMERA-NAME')
 
 
 def test_a_camera_name_of_digits_stays_text():

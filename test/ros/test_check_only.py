@@ -263,7 +263,7 @@ def test_a_fault_beside_a_right_camera_is_wrong_before_and_after_the_turns(desk,
     heard = answers(desk)
     drive(desk, info_of(r=FAULTS[2][0]['r']), lambda: heard)
     assert heard[-1]['answer'] == 'wrong' and 'R rotates' in heard[-1]['reasons'][0]
-    assert 'is wrong: R turns' in capfd.readouterr().err
+    assert 'is wrong: R rotates' in capfd.readouterr().err
     Core.newest.ready = turns(10, 20)
     desk.until(lambda: 'fx 400' in heard[-1]['reasons'])
     assert heard[-1]['answer'] == 'wrong' and 'R rotates' in heard[-1]['reasons'][0]

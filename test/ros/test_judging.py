@@ -315,11 +315,11 @@ dashcalib:
 def test_a_camera_that_was_moved_since_the_last_calibration_is_told_once(make_desk, capfd):
     desk = make_desk()
     desk.give(mount=MOUNT)
-    desk.until(lambda: 'looks 2.00 ± 0.10 ° to the left' in desk.bench.values['mounting'])
+    desk.until(lambda: 'yaw 2.00 ± 0.10° to the left' in desk.bench.values['mounting'])
     desk.give(mount=dataclasses.replace(MOUNT, yaw_left_deg=2.4))
     assert 'the camera was moved' not in capfd.readouterr().err
     desk.give(mount=dataclasses.replace(MOUNT, yaw_left_deg=-1.0))
-    desk.until(lambda: 'looks 1.00 ± 0.10 ° to the right' in desk.bench.values['mounting'])
+    desk.until(lambda: 'yaw 1.00 ± 0.10° to the right' in desk.bench.values['mounting'])
     logged = capfd.readouterr().err
     assert logged.count('the camera was moved') == 1
     assert desk.show() == 400.0
