@@ -1,7 +1,7 @@
 """Bundle adjustment in NumPy: Levenberg-Marquardt, with points and then poses eliminated (Schur).
 
-Poses and points of turns that share one camera, and some of its parameters. The steps and when
-they end are those of Ceres, so that both give the same.
+Adjusts the poses and points of turns that share one camera, and some of its parameters. The steps
+are chosen, and ended, as Ceres does: from one start both take the same steps.
 """
 from __future__ import annotations
 
@@ -167,10 +167,12 @@ def adjusted(turns: Sequence[Observed], lens: Lens, loss_px: float, iterations: 
         linear = linear or [_linearised(turn, each, lens, loss_px)
                             for turn, each in zip(turns, seen, strict=True)]
         step, moves, expected = _step(linear, radius)
-        after = [turn.moved(*move) for turn, move in zip(turns, moves, strict=True)]
-        other = lens.moved(step)
-        there = [_Seen.of(turn, other.camera) for turn in after]
-        gain = cost - sum(each.cost(loss_px) for each in there)
+        gain = -np.inf
+        if np.isfinite(expected):
+            after = [turn.moved(*move) for turn, move in zip(turns, moves, strict=True)]
+            other = lens.moved(step)
+            there = [_Seen.of(turn, other.camera) for turn in after]
+            gain = cost - sum(each.cost(loss_px) for each in there)
         settled = abs(gain) <= tolerance * cost
         if gain > WORTH * expected:
             turns, lens, seen, cost, linear, failures = after, other, there, cost - gain, [], 0
@@ -300,7 +302,18 @@ def _reduced(linear: _Linear, radius: float) -> _Reduced:
 
 def _step(linear: Sequence[_Linear], radius: float
           ) -> tuple[Floats, list[tuple[Floats, Floats]], float]:
-    """Return the steps of the lens (q,) and of each turn's poses and points, and their gain."""
+    """Return the steps of the lens (q,) and of each turn's poses and points, and their gain.
+
+    The gain is NaN where the equations have no solution.
+    """
+    try:
+        return _solution(linear, radius)
+    except np.linalg.LinAlgError:
+        return np.zeros(0), [], np.nan
+
+
+def _solution(linear: Sequence[_Linear], radius: float
+              ) -> tuple[Floats, list[tuple[Floats, Floats]], float]:
     of_lens = np.sum([each.lens for each in linear], axis=0)
     damping = _damping(of_lens[:, :-1], radius)
     left = np.column_stack([np.diag(damping), np.zeros(len(damping))])

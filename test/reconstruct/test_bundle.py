@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from synthetic import SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Brown, Camera, Fisheye, Radial
-from dashcalib_ros.reconstruct.bundle import Lens, Observed, adjusted
+from dashcalib_ros.reconstruct.bundle import UNSEEN_PX, Lens, Observed, adjusted
 
 LOSS_PX = 0.5
 LENSES = {
@@ -38,6 +38,7 @@ def observed(lens: Camera, count: int = 40) -> Observed:
 def cost(turn: Observed, camera: Camera) -> float:
     local = np.einsum('nij,nj->ni', turn.rotations[turn.image], turn.points[turn.point])
     off = camera.project(local + turn.translations[turn.image]) - turn.observed
+    off = np.nan_to_num(off, nan=UNSEEN_PX)
     return float(0.5 * LOSS_PX**2 * np.log1p(np.sum(off**2, axis=1) / LOSS_PX**2).sum())
 
 
@@ -122,3 +123,27 @@ def test_a_lens_stays_in_its_bounds():
     _, moved = adjusted([observed(camera)], Lens(lens.camera, lens.directions, low, high),
                         LOSS_PX, 30, 1e-9)
     assert moved.camera.k1 == -0.2
+
+
+def test_a_turn_that_determines_nothing_is_no_crash():
+    camera = LENSES['radial']
+    turn = observed(camera)
+    # all images at one place, all points in one direction
+    same = replace(turn, translations=turn.translations * 0,
+                   rotations=np.broadcast_to(np.eye(3), turn.rotations.shape),
+                   points=np.tile([0.0, 0.0, 5.0], (len(turn.points), 1)))
+    for start in (same, replace(same, points=1e12 * same.points)):
+        [found], moved = adjusted([start], free(camera, 4, 5), LOSS_PX, 30, 1e-9)
+        assert np.isfinite(moved.camera.params).all()
+        assert cost(found, moved.camera) <= cost(start, camera)
+
+
+def test_equations_without_a_solution_move_nothing(monkeypatch):
+    def fails(*arguments):
+        raise np.linalg.LinAlgError
+
+    turn, lens = observed(LENSES['radial']), free(LENSES['radial'], 4, 5)
+    monkeypatch.setattr(np.linalg, 'solve', fails)
+    [found], moved = adjusted([turn], lens, LOSS_PX, 30, 1e-9)
+    np.testing.assert_array_equal(found.points, turn.points)
+    assert moved.camera == lens.camera
