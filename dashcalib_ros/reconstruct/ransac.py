@@ -136,10 +136,13 @@ def _to_front(rays: Floats) -> Floats | None:
     length = float(np.linalg.norm(middle))
     if length < 1e-9 or (rays @ middle).min() < IN_FRONT * length:
         return None
-    axis = middle / length
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(axis, across), axis])
+    x, y, z = (middle / length).tolist()
+    # the shortest turn of the middle to the axis, where half a turn comes first if it is behind
+    half = 1.0 if z >= 0 else -1.0
+    y, z = half * y, half * z
+    k = 1 / (1 + z)
+    return np.array([[1 - x * x * k, -x * y * k, -x], [-x * y * k, 1 - y * y * k, -y], [x, y, z]]
+                    ) * [1.0, half, half]
 
 
 def _pixels(rays: Floats) -> Floats:
@@ -172,15 +175,14 @@ def _refined_relative(rotation: Floats, translation: Floats, before: Floats, aft
                       ) -> Floats:
     """Return the essential matrix after one Gauss-Newton step on Sampson's errors."""
     turned = before @ rotation.T
-    normal = np.cross(after, translation)
-    back = normal @ rotation
-    along = np.cross(translation, turned)
+    normal = after @ _cross(translation)
+    back, along = normal @ rotation, turned @ _cross(translation)
     scale = 1 / np.sqrt(np.maximum(np.sum(along**2, axis=1) + np.sum(back**2, axis=1), 1e-30))
     off = scale * np.einsum('nc,nc->n', normal, turned)
     weight = scale / np.sqrt(1 + (off / LOSS_RAD)**2)
     # the translation is a unit vector: it moves in the plane across it
     plane = np.linalg.svd(translation[None])[2][1:]
-    columns = np.column_stack([np.cross(turned, normal), np.cross(turned, after) @ plane.T])
+    columns = np.column_stack([_crossed(turned, normal), _crossed(turned, after) @ plane.T])
     step = _solved(columns * weight[:, None], off / scale * weight)
     rotation = rotation_matrices(-step[None, :3])[0] @ rotation
     translation = translation - step[3:] @ plane
@@ -197,7 +199,7 @@ def _refined_absolute(pose: Floats, rays: Floats, points: Floats) -> Floats:
     weight = 1 / np.sqrt(1 + np.einsum('nc,nc->n', off, off) / LOSS_RAD**2)
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None]
     by_local = across * (weight / distance)[:, None, None]
-    by_turn = np.cross(turned[:, None], by_local)
+    by_turn = _crossed(turned[:, None], by_local)
     step = _solved(np.concatenate([by_turn, by_local], axis=2).reshape(-1, 6),
                    (off * weight[:, None]).ravel())
     return np.column_stack([rotation_matrices(-step[None, :3])[0] @ pose[:, :3],
@@ -209,6 +211,12 @@ def _solved(columns: Floats, values: Floats) -> Floats:
     return np.asarray(np.linalg.solve(
         normal + 1e-12 * max(float(np.trace(normal)), 1e-300) * np.eye(len(normal)),
         columns.T @ values))
+
+
+def _crossed(first: Floats, second: Floats) -> Floats:
+    """Return the cross products of vectors (..., 3); NumPy's own takes five times as long."""
+    (a, b, c), (x, y, z) = np.moveaxis(first, -1, 0), np.moveaxis(second, -1, 0)
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
 
 
 def _cross(vector: Floats) -> Floats:
