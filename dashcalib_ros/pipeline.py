@@ -330,8 +330,9 @@ class Calibrator:
 
 def _load_solving() -> None:
     """Import what a worker needs until the solution, COLMAP too."""
-    import dashcalib_ros.reconstruct.build
     import dashcalib_ros.solve.joint  # noqa: F401
+    from dashcalib_ros.reconstruct import load
+    load()
 
 
 def _load_judging() -> None:

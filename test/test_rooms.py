@@ -28,8 +28,7 @@ ALLOWED: dict[str, set[str]] = {
 }
 # rooms that nobody but these may import
 BORDERS = {'ros': set(), 'cli': set(), 'demo': {'cli'}, 'fleet': {'cli'}}
-HOMES = {'pycolmap': {'reconstruct', 'solve'}, 'pyceres': {'reconstruct', 'solve'},
-         'rclpy': {'ros'}, 'onnxruntime': {'detect'},
+HOMES = {'pycolmap': {'reconstruct'}, 'rclpy': {'ros'}, 'onnxruntime': {'detect'},
          'pyarrow': {'fleet'}}
 # what geometry has no use for
 MACHINERY = ('threading', 'multiprocessing', 'subprocess', 'concurrent', 'queue', 'signal', 'os',
@@ -176,7 +175,7 @@ def test_zlib_comes_before_pycolmap_in_the_one_module_that_imports_it():
     lines = {}
     for name, line in imports(users[0]):
         lines.setdefault(name, line)
-    assert lines['zlib'] < lines['pycolmap'] and lines['zlib'] < lines['pyceres']
+    assert lines['zlib'] < lines['pycolmap']
 
 
 def loaded_by(code: str, *modules: str) -> set[str]:
@@ -194,7 +193,7 @@ def loaded_by(code: str, *modules: str) -> set[str]:
     'dashcalib_ros', 'dashcalib_ros.judge', 'dashcalib_ros.pipeline',
     'dashcalib_ros.workers.pool'])
 def test_colmap_is_loaded_by_the_child_only(module):
-    assert loaded_by(f'import {module}', 'pycolmap', 'pyceres', 'rclpy') == set()
+    assert loaded_by(f'import {module}', 'pycolmap', 'rclpy') == set()
 
 
 def test_the_processes_that_reconstruct_turns_load_no_more_than_they_need():
@@ -229,8 +228,8 @@ result_json(found), report_html(found), report_html(make_calibration(mount=MOUNT
 
 
 def test_colmap_is_loaded_where_it_is_used():
-    code = 'import dashcalib_ros.reconstruct.adjust'
-    assert loaded_by(code, 'pycolmap', 'pyceres') == {'pycolmap', 'pyceres'}
+    code = 'from dashcalib_ros.reconstruct import load\nload()'
+    assert loaded_by(code, 'pycolmap') == {'pycolmap'}
 
 
 def test_a_live_calibrator_loads_nothing_large_while_images_come():
@@ -238,7 +237,7 @@ def test_a_live_calibrator_loads_nothing_large_while_images_come():
     code = 'from dashcalib_ros.pipeline import Calibrator\nCalibrator(live=True).close()'
     wanted = {'scipy.special', 'scipy.spatial.transform', 'scipy.optimize',
               'dashcalib_ros.judge.conclude'}
-    assert loaded_by(code, *wanted, 'pycolmap', 'pyceres') == wanted
+    assert loaded_by(code, *wanted, 'pycolmap') == wanted
 
 
 def test_the_package_alone_loads_no_opencv():

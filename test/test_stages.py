@@ -41,7 +41,6 @@ class OneTerm(Camera):
     model: ClassVar[str] = 'one_term'
     ros_model: ClassVar[str] = 'plumb_bob'
     family: ClassVar[str] = PINHOLE
-    colmap_one_focal: ClassVar[ColmapModel] = ColmapModel('SIMPLE_RADIAL', 4, (0, 0, 1, 2, 3))
     colmap: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4))
     spread: ClassVar[tuple[float, ...]] = (1.0,)
 

@@ -120,9 +120,10 @@ class Version(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, help='print the version and exit')
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        """Print the installed package's version."""
+        """Print the version of the installed package, and the engine that estimates poses."""
         from dashcalib_ros import __version__
-        write_stdout(f'{PROGRAM} {__version__}')
+        from dashcalib_ros.config import ReconstructConfig
+        write_stdout(f'{PROGRAM} {__version__} (poses: {ReconstructConfig().used})')
         parser.exit()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import AUTO
-from dashcalib_ros.config import Config
+from dashcalib_ros.config import Config, ReconstructConfig
 from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
@@ -55,7 +55,7 @@ STOOD = ('according to its speed the car stood: other things turned, or the came
 
 # result.json has their versions: a result's last digits depend on them
 PACKAGES = (
-    'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap', 'pyceres')
+    'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap')
 # px RMS; a warning names a field that no lens model has, if it is larger
 TOLD_FIELD_PX = 0.5
 
@@ -136,7 +136,8 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         turns=tuple(_summary(turn, scenes.get(turn.id), evidence, solution)
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
         frames=evidence.frames, reprojection_error_px=None, timing=evidence.timing,
-        versions=versions(), config=config, warnings=evidence.warnings + evidence.asked.unused,
+        versions=versions(config.reconstruct), config=config,
+        warnings=evidence.warnings + evidence.asked.unused,
         magnitudes=evidence.magnitudes, mask=_of_size(evidence.mask, evidence.image_size),
         stored_turns=tuple(_stored_summary(turn, scenes[turn.scene.turn], evidence, solution)
                            for turn in evidence.stored),
@@ -354,9 +355,9 @@ def _details(solution: Solution) -> dict[str, Any]:
     return details
 
 
-def versions() -> dict[str, str]:
-    """Return those of PACKAGES, and Python's, by name."""
-    found = {'python': platform.python_version()}
+def versions(reconstruct: ReconstructConfig) -> dict[str, str]:
+    """Return those of PACKAGES, and Python's, by name; and the engine that estimates poses."""
+    found = {'python': platform.python_version(), 'engine': reconstruct.used}
     for name in PACKAGES:
         try:
             found[name] = metadata.version(name)

@@ -24,6 +24,7 @@ from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.arguments import COMMANDS, JSON, KINDS, LENSES, MODELS
 from dashcalib_ros.cli.terminal import show, warn
+from dashcalib_ros.config import Config
 from dashcalib_ros.demo import DEMOS
 from dashcalib_ros.formats.export import EXPORTS
 from dashcalib_ros.report import write_results
@@ -155,7 +156,8 @@ def test_the_shell_completes(tmp_path, line, expected):
 
 def test_version():
     done = dashcalib('--version')
-    assert (done.returncode, done.stdout) == (0, f'dashcalib {dashcalib_ros.__version__}\n')
+    assert (done.returncode, done.stdout) == (
+        0, f'dashcalib {dashcalib_ros.__version__} (poses: {Config().reconstruct.used})\n')
     assert dashcalib('-V').stdout == done.stdout
 
 
