@@ -16,11 +16,13 @@ if TYPE_CHECKING:
         OutputError,
         WorkerError,
     )
-    from dashcalib_ros.formats import export, load_camera
+    from dashcalib_ros.formats import load_camera
+    from dashcalib_ros.formats.export import export
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
     from dashcalib_ros.pipeline import Calibrator
-    from dashcalib_ros.report import AcceptedCalibration, Calibration, Verdict, compare
+    from dashcalib_ros.report import AcceptedCalibration, Calibration, Verdict
+    from dashcalib_ros.report.compare import compare
     from dashcalib_ros.session import calibrate, check
 
     __version__: str
