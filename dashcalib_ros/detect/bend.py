@@ -17,6 +17,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.config import LinesConfig
 from dashcalib_ros.detect.edges import Lines
+from dashcalib_ros.robust import cauchy_fit, jackknife, weighted_median
 
 # place of k1 among the parameters, in every model
 K1 = 4
@@ -198,21 +199,19 @@ def _location(wanted: Floats, information: Floats) -> tuple[float, Floats]:
     wanted: (n,) k1 of each line; information: (n,) inverse variances. What is curved in the world
     gives any k1, and hardly counts.
     """
-    order = np.argsort(wanted)
-    share = np.cumsum(np.sqrt(information[order]))
-    place = float(wanted[order][np.searchsorted(share, share[-1] / 2)])
-    for _ in range(WEIGHT_STEPS):
-        weight = information / (1 + information * (wanted - place)**2)
-        place = float(np.average(wanted, weights=weight))
-    return place, np.asarray(weight)
+    sigma = 1 / np.sqrt(information)
+    start = weighted_median(wanted, 1 / sigma)
+    found = cauchy_fit(np.ones((len(wanted), 1)), wanted, sigma, WEIGHT_STEPS, information,
+                       np.array([start]))
+    return float(found.params[0]), found.weights
 
 
 def _sigma(wanted: Floats, information: Floats, group: Ints, groups: int) -> float:
-    """Return the standard deviation by leaving out each group of images in turn (jackknife)."""
-    without = [_location(wanted[keep], information[keep])[0]
-               for keep in (group != left for left in range(groups))]
+    """Return the standard deviation by leaving out each group of images in turn."""
+    sigma = jackknife(lambda kept: np.array(_location(wanted[kept], information[kept])[0]),
+                      group, groups)
     # of few groups it is uncertain itself: the wider t distribution, for as many
-    return float(np.sqrt((groups - 1) * np.var(without) * (groups - 1) / (groups - 3)))
+    return float(sigma * np.sqrt((groups - 1) / (groups - 3)))
 
 
 def _camera_sigma(measured: _Measured, weight: Floats, covariance: Floats | None

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
-from dashcalib_ros.detect.continuity import MIN_POINTS, reweighted
+from dashcalib_ros.detect.continuity import MIN_POINTS, fitted_steps
 from dashcalib_ros.detect.points import Tracking, follow_points
 
 APART = 'record each camera separately, with one topic per camera'
@@ -41,7 +41,7 @@ OFF_WIDTH, OFF_STEP = 0.005, 0.15
 ALIKE = 0.5
 # of the grey values' spread; a darker image, as black ones of a broken driver, shows nothing
 LEAST_CONTRAST = 0.3
-# px², as in reweighted(): while the car turns, its motion explains a shift before a mounting does
+# px², as in fitted_steps(): while the car turns, its motion explains a shift before a mounting does
 SPEED_PRIOR, CAMERA_PRIOR = 1e-3, 1e-4
 
 
@@ -143,6 +143,6 @@ def _off(at: Floats, to_between: Floats, to_after: Floats, half: float) -> Float
     one, none = np.ones(len(at)), np.zeros(len(at))
     design = np.stack([to_after, np.stack([one, none], 1), np.stack([none, one], 1),
                        np.stack([-around[:, 1], around[:, 0]], 1), around], axis=2)
-    params, _ = reweighted(design, to_between, np.zeros(5), np.array(
+    found = fitted_steps(design, to_between, np.zeros(5), np.array(
         [SPEED_PRIOR, *[CAMERA_PRIOR] * 4]))
-    return params[1:] / half
+    return np.asarray(found.params[1:] / half)

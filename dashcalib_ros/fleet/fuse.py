@@ -23,6 +23,7 @@ from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import lacks_knowledge_only
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.robust import weighted_median
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.store.scene_file import Origin, SceneFile, StoredTurn
@@ -208,10 +209,7 @@ def _other_focal(shares: Mapping[str, ClipShare]) -> dict[str, str]:
         return {}
     fx, sigma = (np.array([each[place] for each in known], float) for place in (1, 2))
     tolerance = OTHER_FOCAL_SHARE * fx
-    weight = 1 / (sigma**2 + tolerance**2)
-    order = np.argsort(fx, kind='stable')
-    passed = np.cumsum(weight[order])
-    middle = float(fx[order][np.searchsorted(passed, passed[-1] / 2)])
+    middle = weighted_median(fx, 1 / (sigma**2 + tolerance**2))
     limit = np.maximum(tolerance, OTHER_FOCAL * sigma)
     return {known[n][0]: f'shows another camera: fx from its turns alone is {fx[n]:.0f} px, and '
                          f'{middle:.0f} px from most clips'

@@ -21,8 +21,15 @@ from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.judge.calibration import MOVED_DEG, MOVED_SIGMAS, Mount
 from dashcalib_ros.judge.monitor import HEADING_SIGMA_DEG, PITCH_SIGMA_DEG
-from dashcalib_ros.reconstruct.heading import MAD, heading
+from dashcalib_ros.reconstruct.heading import heading
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.robust import (
+    cauchy_fit,
+    cauchy_weights,
+    jackknife,
+    mad_sigma,
+    weighted_mean,
+)
 from dashcalib_ros.solve.solution import Solution
 
 # of a pair's poses: steps of Gauss-Newton, and the loss in px, narrowing to what tracks need
@@ -61,7 +68,10 @@ ROADWAY, LEAST_SEEN, LEAST_ROAD_POINTS = 1.0, 3, 8
 TURN_SCATTER, HEIGHT_FLOOR = 0.01, 0.01
 # m above the road, and m/s: where speed is unknown, straight_m assumes a camera that high
 USUAL_HEIGHT_M, USUAL_SPEED = 1.4, 10.0
+# of new weights
 ROUNDS = 20
+# a smaller scatter is rounding
+EPSILON = float(np.finfo(float).eps)
 
 Speed = Callable[[Floats], Floats]
 
@@ -179,7 +189,7 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
     for step in range(STEPS):
         errors, slopes, tangents = _epipolar(turned, back, first, second)
         loss = unit * max(LAST_PX, FIRST_PX * NARROWING**step)
-        weights = seen / (1 + (errors / loss)**2)
+        weights = seen * cauchy_weights(errors, loss)
         weighted = (weights[..., None] * slopes).transpose(0, 2, 1)
         hessian = weighted @ slopes + np.finfo(float).eps * np.eye(5)
         change = np.asarray(
@@ -189,8 +199,8 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
         turned = rotation_matrices(change[:, :3]) @ turned
         back = back + np.einsum('nk,nki->ni', change[:, 3:], tangents)
         back /= np.linalg.norm(back, axis=1)[:, None]
-    noise = MAD * np.array([np.median(np.abs(row[valid])) if valid.any() else np.inf
-                            for row, valid in zip(errors, seen, strict=True)])
+    noise = np.array([mad_sigma(row[valid]) if valid.any() else np.inf
+                      for row, valid in zip(errors, seen, strict=True)])
     variance = np.linalg.inv(hessian)[:, [3, 4], [3, 4]].mean(axis=1)
     vector = rotation_vectors(turned)
     ahead = -(rotation_matrices(-vector / 2) @ back[:, :, None])[:, :, 0]
@@ -247,11 +257,9 @@ def _of_pairs(pairs: _Pairs, kept: Mask, roll: float) -> tuple[Floats, Floats]:
     angles, rate = _angles(pairs.ahead[kept], roll), pairs.rate_deg_s[kept]
     weights = 1 / (pairs.sigma_deg[kept]**2 + PAIR_SCATTER_DEG**2)
     blocks = np.arange(len(weights)) * BLOCKS // len(weights)
-    without = np.array([_at_rest(angles[blocks != n], rate[blocks != n], weights[blocks != n])
-                        for n in range(blocks.max() + 1)])
-    count = len(without)
-    return _at_rest(angles, rate, weights), np.sqrt((count - 1) / count * np.sum(
-        (without - without.mean(axis=0))**2, axis=0))
+    return _at_rest(angles, rate, weights), jackknife(
+        lambda some: _at_rest(angles[some], rate[some], weights[some]),
+        blocks, int(blocks.max()) + 1)
 
 
 def _kept(pairs: _Pairs) -> Mask:
@@ -282,18 +290,11 @@ def _moved(pairs: _Pairs, kept: Mask, stamps_s: Floats) -> tuple[float, Floats] 
 
 def _at_rest(angles: Floats, rate: Floats, weights: Floats) -> Floats:
     """Return robust yaw and pitch (2,): a camera ahead of the rear axle moves aside in a bend."""
-    found = []
-    for n, columns in ((0, np.column_stack([np.ones(len(rate)), rate])),
-                       (1, np.ones((len(rate), 1)))):
-        robust = weights
-        for _ in range(ROUNDS):
-            root = np.sqrt(robust)
-            line = np.linalg.lstsq(columns * root[:, None], angles[:, n] * root, rcond=None)[0]
-            errors = angles[:, n] - columns @ line
-            scatter = max(MAD * float(np.median(np.abs(errors))), np.finfo(float).eps)
-            robust = weights / (1 + (errors / (2 * scatter))**2)
-        found.append(float(line[0]))
-    return np.array(found)
+    one = np.ones(len(rate))
+    return np.array([cauchy_fit(
+        np.column_stack(columns), angle, lambda off: 2 * max(mad_sigma(off), EPSILON), ROUNDS,
+        weights).params[0] for columns, angle in (([one, rate], angles[:, 0]),
+                                                  ([one], angles[:, 1]))])
 
 
 def _angles(ahead: Floats, roll: float) -> Floats:
@@ -312,12 +313,9 @@ def _direction(angles: Floats, roll: float) -> Floats:
 
 
 def _averaged(values: Floats, sigmas: Floats, floor: float) -> tuple[float, float]:
-    """Return the weighted mean and its sigma, widened where the values differ by more."""
-    weights = 1 / (sigmas**2 + floor**2)
-    mean = float(weights @ values / weights.sum())
-    freedom = max(len(values) - 1, 1)
-    ratio = max(1.0, float(weights @ (values - mean)**2) / freedom)
-    return mean, float(np.sqrt(ratio / weights.sum()))
+    """Return the mean of sources, none of which is better than floor, and its sigma."""
+    mean = weighted_mean(values, sigmas**2 + floor**2)
+    return mean.value, float(np.sqrt(mean.widened))
 
 
 # -- roll and height ---------------------------------------------------------------------------
@@ -366,14 +364,11 @@ def _roll_of_lines(lines: Lines, camera: Camera) -> float:
     normals = np.cross(rays[:, 0], rays[:, 1])
     lengths = np.linalg.norm(normals, axis=1)
     normals /= lengths[:, None]
-    upright, up = np.minimum(lengths / np.median(lengths), 3.0)**2, np.array([0.0, -1.0, 0.0])
-    for _ in range(ROUNDS):
-        errors = normals @ up
-        loss = min(MAD * float(np.median(np.abs(errors))) + np.finfo(float).eps, LINE_LOSS)
-        weights = upright / (1 + (errors / loss)**2)**2
-        up = np.linalg.eigh(normals.T * weights @ normals)[1][:, 0]
-        up *= -np.sign(up[1])
-    return float(np.degrees(np.arctan2(-up[0], -up[1])))
+    # upwards is (x, -1, z), across all normals
+    found = cauchy_fit(normals[:, [0, 2]], normals[:, 1],
+                       lambda off: min(mad_sigma(off) + EPSILON, LINE_LOSS), ROUNDS,
+                       np.minimum(lengths / np.median(lengths), 3.0)**2, np.zeros(2), power=2)
+    return float(np.degrees(np.arctan2(-found.params[0], 1.0)))
 
 
 def _height(scenes: Sequence[Scene], speed: Speed, down: Floats) -> tuple[float, float] | None:
@@ -419,4 +414,4 @@ def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, fl
         return None
     logs = np.log(depth[road] * unit)
     middle = float(np.median(logs))
-    return middle, MAD * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
+    return middle, mad_sigma(logs - middle) / np.sqrt(len(logs))

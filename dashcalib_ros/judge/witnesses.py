@@ -38,6 +38,7 @@ from dashcalib_ros.judge.gyro_scale import (
     scale_by_gps,
 )
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
+from dashcalib_ros.robust import weighted_mean
 from dashcalib_ros.solve.imaging import lens_alone
 from dashcalib_ros.solve.linear import normal_equations, used_keyframes
 from dashcalib_ros.solve.prior import loss_px_of
@@ -452,12 +453,10 @@ def variance_if_turns_differ(offsets: Floats, variances: Floats, more: float) ->
     """
     logs, found = [], []
     for extra in (0.0, more):
-        weights = 1 / (variances + extra)
-        mean = float(np.average(offsets, weights=weights))
-        squares = weights @ (offsets - mean)**2
-        logs.append(0.5 * float(np.log(weights).sum() - np.log(weights.sum()) - squares))
-        ratio = max(float(squares) / (len(offsets) - 1), 1.0)
-        found.append(ratio / float(weights.sum()) + mean**2)
+        mean = weighted_mean(offsets, variances + extra)
+        logs.append(0.5 * float(np.log(mean.variance) - np.log(variances + extra).sum()
+                                - mean.squares))
+        found.append(mean.widened + mean.value**2)
     share = 1 / (1 + np.exp(min(logs[0] - logs[1], LARGEST_LOG)))
     return float((1 - share) * found[0] + share * found[1])
 

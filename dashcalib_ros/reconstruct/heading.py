@@ -15,13 +15,12 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
+from dashcalib_ros.robust import cauchy_fit, mad_sigma
 
-# rounds of reweighting; ten drives changed by less than 0.01 degrees after the fifth
-ROUNDS = 10
+# rounds of new weights; ten drives changed by less than 0.01 degrees after the fifth
+ROUNDS = 9
 # of the scatter; errors beyond it lose weight (Cauchy)
 LOSS = 2.0
-# of a normal distribution: its standard deviation over its median absolute deviation
-MAD = 1.4826
 # degrees; less scatter than this is rounding
 LEAST_SCATTER = 1e-3
 # of the steps at either end, left out of a mean: bumps and bad poses
@@ -107,13 +106,10 @@ def _open_below(scene: Scene, down: Floats) -> float:
 
 def _at_no_curvature(curvature: Floats, angle: Floats) -> tuple[float, float]:
     """Return the value of a robust line over the curvature at 0, and its standard deviation."""
-    columns = np.column_stack([np.ones(len(curvature)), curvature])
-    weights = np.ones(len(curvature))
-    for _ in range(ROUNDS):
-        information = columns.T * weights @ columns
-        line = np.linalg.lstsq(information, columns.T @ (weights * angle), rcond=None)[0]
-        errors = angle - columns @ line
-        scatter = max(MAD * float(np.median(np.abs(errors))), LEAST_SCATTER)
-        weights = 1 / (1 + (errors / (LOSS * scatter))**2)
-    variance = scatter**2 * np.linalg.pinv(information)[0, 0]
-    return float(line[0]), float(np.sqrt(variance))
+    def scatter(off: Floats) -> float:
+        return max(mad_sigma(off), LEAST_SCATTER)
+
+    line = cauchy_fit(np.column_stack([np.ones(len(curvature)), curvature]), angle,
+                      lambda off: LOSS * scatter(off), ROUNDS)
+    variance = scatter(line.off)**2 * np.linalg.pinv(line.normal)[0, 0]
+    return float(line.params[0]), float(np.sqrt(variance))
