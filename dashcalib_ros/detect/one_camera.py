@@ -41,7 +41,7 @@ OFF_WIDTH, OFF_STEP = 0.005, 0.15
 ALIKE = 0.5
 # of the grey values' spread; a darker image, as black ones of a broken driver, shows nothing
 LEAST_CONTRAST = 0.3
-# px², as in fitted_steps(): while the car turns, its motion explains a shift before a mounting does
+# px², as in fitted_steps(): in a turn the car's motion explains a shift before a mounting does
 SPEED_PRIOR, CAMERA_PRIOR = 1e-3, 1e-4
 
 

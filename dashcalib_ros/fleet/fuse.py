@@ -20,7 +20,7 @@ from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.agreement import focal_of, turns_of_another_camera
 from dashcalib_ros.judge.conclude import Evidence, conclude
-from dashcalib_ros.judge.verdict import lacks_knowledge_only
+from dashcalib_ros.judge.verdict import Grounds, lacks_knowledge_only
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.robust import weighted_median
@@ -92,7 +92,8 @@ def _estimate(solution: Solution | None, origin: Origin, config: Config) -> Esti
         solution.camera.resized(px, origin.image_size), solution.covariance * units,
         solution.carried(solution.posterior.alike.covariance) * units,
         solution.picture.times(px),
-        solution.reprojection_error_px * px, lacks_knowledge_only(solution, config.verdict))
+        solution.reprojection_error_px * px,
+        lacks_knowledge_only(Grounds(solution, config.verdict)))
 
 
 def _same_content(clips: Clips) -> dict[str, str]:
