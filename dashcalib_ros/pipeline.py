@@ -15,8 +15,9 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.input.source import by
-from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Poses, Reading
+from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading
 from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
 from dashcalib_ros.judge.check import CALIBRATION
 from dashcalib_ros.judge.conclude import (

@@ -7,16 +7,8 @@ from dashcalib_ros.judge.calibration import CalibrationData, TurnSummary, Verdic
 from dashcalib_ros.judge.check import Check, check, with_faults, with_lines
 from dashcalib_ros.judge.monitor import Change, Monitor, Reading, moved_text, watch
 from dashcalib_ros.judge.mount import moved
-from dashcalib_ros.judge.odometry import (
-    Odometry,
-    Poses,
-    odometry,
-    path_files,
-    read_poses,
-    track_poses,
-    trivial_guess,
-)
+from dashcalib_ros.judge.odometry import Odometry, odometry, path_files, trivial_guess
 
-__all__ = ['CalibrationData', 'Change', 'Check', 'Monitor', 'Odometry', 'Poses', 'Reading',
-           'TurnSummary', 'Verdict', 'check', 'moved', 'moved_text', 'odometry', 'path_files',
-           'read_poses', 'track_poses', 'trivial_guess', 'watch', 'with_faults', 'with_lines']
+__all__ = ['CalibrationData', 'Change', 'Check', 'Monitor', 'Odometry', 'Reading', 'TurnSummary',
+           'Verdict', 'check', 'moved', 'moved_text', 'odometry', 'path_files', 'trivial_guess',
+           'watch', 'with_faults', 'with_lines']

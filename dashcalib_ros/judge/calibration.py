@@ -15,7 +15,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.camera.remap import rectify
-from dashcalib_ros.camera.rotation import rotation_matrices
+from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
@@ -26,8 +26,6 @@ from dashcalib_ros.solve.spread import PictureSigma, sigma_over
 
 # after the point, in one line of text
 MOST_DIGITS = 9
-# an optical frame that looks ahead (z ahead, x to the right, y downwards) to the car's (REP-103)
-OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 Level = Literal['accepted', 'weak', 'refused']
 
 
