@@ -29,12 +29,6 @@ SHARE_KEPT = 0.6
 MAX_RATIO = 1.7
 # a point agrees when it is this far, px, and this share of its step, from where it should be
 AGREES_PX, AGREES_SHARE = 1.0, 0.15
-# px; a standing car's points move so much by noise, whatever its speed
-STILL_PX = 0.3
-# of new weights; the fit has settled after half of them
-ROUNDS = 10
-# px²; a parameter that no point determines is 0
-LEAST_NORMAL = 1e-6
 
 
 def goes_on(first: Floats32, middle: Floats32, last: Floats32, followed: float, usual: float
@@ -57,6 +51,10 @@ def goes_on(first: Floats32, middle: Floats32, last: Floats32, followed: float, 
             and share > max(MIN_SHARE, SHARE_KEPT * usual))
 
 
+# px; a standing car's points move so much by noise, whatever its speed
+STILL_PX = 0.3
+
+
 def _ratio(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
     """Return how much longer the steps have become, and (n,) how far each point is off, px.
 
@@ -73,6 +71,12 @@ def _ratio(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
     found = fitted_steps(design, wanted, np.array([0.0, *np.median(wanted, axis=0), 0.0]),
                          np.array([STILL_PX ** 2, 0.0, 0.0, 0.0]))
     return 1.0 + float(found.params[0]), found.off
+
+
+# of new weights; the fit has settled after half of them
+ROUNDS = 10
+# px²; a parameter that no point determines is 0
+LEAST_NORMAL = 1e-6
 
 
 def fitted_steps(design: Floats, wanted: Floats, start: Floats, prior: Floats) -> LinearFit:

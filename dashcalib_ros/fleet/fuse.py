@@ -28,12 +28,6 @@ from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.store.scene_file import Origin, SceneFile, StoredTurn
 
-# solutions at the most; each leaves out the clips that contradict the one before
-ROUNDS = 3
-# a clip whose own fx is farther off that of most, in sigmas and in shares of it, is of another
-# camera; on one real drive gentle bends differ by 3 % from the sharp turn
-OTHER_FOCAL, OTHER_FOCAL_SHARE = 4.0, 0.05
-
 Clips = Mapping[str, SceneFile]
 
 
@@ -43,6 +37,10 @@ class ClipTurn:
 
     clip: str
     stored: StoredTurn
+
+
+# solutions at the most; each leaves out the clips that contradict the one before
+ROUNDS = 3
 
 
 def fuse(camera: str, make: str, clips: Clips, config: Config) -> Solved:
@@ -200,6 +198,11 @@ def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn],
     found.update(_other_focal(shares))
     # where half of them differ, nobody knows which are right: the verdict is weak, and says so
     return found if 2 * len(found) < len(used) else {}
+
+
+# a clip whose own fx is farther off that of most, in sigmas and in shares of it, is of another
+# camera; on one real drive gentle bends differ by 3 % from the sharp turn
+OTHER_FOCAL, OTHER_FOCAL_SHARE = 4.0, 0.05
 
 
 def _other_focal(shares: Mapping[str, ClipShare]) -> dict[str, str]:

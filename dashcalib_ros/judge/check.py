@@ -25,9 +25,6 @@ from dashcalib_ros.judge.verdict import lines_contradict
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import PictureSigma
 
-# what messages call the file of a camera whose file they do not know
-CALIBRATION = 'CALIBRATION'
-
 
 @dataclass(frozen=True)
 class Check:
@@ -61,6 +58,10 @@ class Check:
     bound_px: float | None = None
     limits_px: Mapping[Use, float] = default(default_factory=dict)
     good_for: tuple[Use, ...] = ()
+
+
+# what messages call the file of a camera whose file they do not know
+CALIBRATION = 'CALIBRATION'
 
 
 def check(given: Camera, image_size: tuple[int, int], solution: Solution | None, verdict: Verdict,

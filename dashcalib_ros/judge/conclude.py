@@ -55,10 +55,6 @@ from dashcalib_ros.store.scene_file import StoredTurn
 NOT_NEEDED = 'more prominent turns were enough'
 STOOD = ('according to its speed the car stood: other things turned, or the camera alone')
 
-# result.json has their versions: a result's last digits depend on them
-PACKAGES = (
-    'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap')
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -358,6 +354,11 @@ def _details(solution: Solution) -> dict[str, Any]:
         details['pictures_alone'] = {'fx': solution.px * pictures.camera.fx,
                                      'sigma_fx': solution.px * float(pictures.sigma[0])}
     return details
+
+
+# result.json has their versions: a result's last digits depend on them
+PACKAGES = (
+    'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap')
 
 
 def versions(reconstruct: ReconstructConfig) -> dict[str, str]:

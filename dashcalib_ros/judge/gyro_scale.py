@@ -15,34 +15,6 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.input.motion import Samples
 
-# degrees a second, and the seconds over which they are taken; a straight has less
-STRAIGHT_DEG_S, RATE_OVER_S = 2.0, 1.0
-# s and m of a straight at the least; s that are left out at both ends, as clocks differ and
-# receivers filter
-STRAIGHT_S, STRAIGHT_M, ENDS_S = 2.0, 20.0, 0.7
-# fixes of a straight at the least: a line through two of them is always exact
-FIXES = 3
-# degrees; what a heading is not better than: the aerial's place, and cambers
-HEADING_FLOOR_DEG = 0.3
-# degrees; a heading that is known worse says nothing
-HEADING_SIGMA_DEG = 5.0
-# m; fixes of one receiver share errors of this size, which no residual shows
-LEAST_NOISE_M = 0.05
-# of the median distance from a straight; fixes beyond have jumped
-JUMP = 4.0
-# degrees a root of a second: noise of cheap gyros
-GYRO_NOISE_DEG = 0.1
-# s between straights at the most; the bias drifts over more
-APART_S = 60.0
-# straights, and degrees between them in all, at the least
-LEAST_STRAIGHTS, LEAST_TURNED_DEG = 6, 240.0
-# a scale farther off is one of units, or of another drive
-SCALES = (0.7, 1.4)
-# one that is known worse tells less than that a gyro is no worse than 3 %
-LARGEST_SIGMA = 0.05
-# s between samples of a gyro; over more the angle between them is not known
-LONGEST_GAP_S = 0.35
-
 
 @dataclass(frozen=True)
 class Straight:
@@ -88,6 +60,12 @@ class _Stretch:
     piece: int
 
 
+# a scale farther off is one of units, or of another drive
+SCALES = (0.7, 1.4)
+# one that is known worse tells less than that a gyro is no worse than 3 %
+LARGEST_SIGMA = 0.05
+
+
 def scale_by_gps(rate: Samples, position: Samples) -> tuple[float, float] | None:
     """Return a gyro's angles over the true ones, and the sigma; None where too little tells.
 
@@ -100,6 +78,15 @@ def scale_by_gps(rate: Samples, position: Samples) -> tuple[float, float] | None
     # about the wrong way, the headings do not follow
     scale, sigma = max(found, default=(0.0, 0.0))
     return (scale, sigma) if SCALES[0] < scale < SCALES[1] and sigma < LARGEST_SIGMA else None
+
+
+# degrees a second, and the seconds over which they are taken; a straight has less
+STRAIGHT_DEG_S, RATE_OVER_S = 2.0, 1.0
+# s and m of a straight at the least; s that are left out at both ends, as clocks differ and
+# receivers filter
+STRAIGHT_S, STRAIGHT_M, ENDS_S = 2.0, 20.0, 0.7
+# s between samples of a gyro; over more the angle between them is not known
+LONGEST_GAP_S = 0.35
 
 
 def _stretches(stamps_s: Floats, rate: Floats, position: Samples) -> list[_Stretch]:
@@ -122,6 +109,14 @@ def _stretches(stamps_s: Floats, rate: Floats, position: Samples) -> list[_Stret
             stretches.append(_Stretch(found, stamp_s, float(np.interp(stamp_s, stamps_s, yaw)),
                                       int(piece[first])))
     return stretches
+
+
+# fixes of a straight at the least: a line through two of them is always exact
+FIXES = 3
+# m; fixes of one receiver share errors of this size, which no residual shows
+LEAST_NOISE_M = 0.05
+# of the median distance from a straight; fixes beyond have jumped
+JUMP = 4.0
 
 
 def straight_between(begin_s: float, end_s: float, position: Samples, least_m: float,
@@ -158,6 +153,18 @@ def _line_through(when: Floats, where: Floats) -> Straight:
     direction = direction * np.sign(direction @ (where[-1] - where[0]))
     return Straight(when, direction, away @ direction,
                     away @ np.array([-direction[1], direction[0]]))
+
+
+# degrees; what a heading is not better than: the aerial's place, and cambers
+HEADING_FLOOR_DEG = 0.3
+# degrees; a heading that is known worse says nothing
+HEADING_SIGMA_DEG = 5.0
+# degrees a root of a second: noise of cheap gyros
+GYRO_NOISE_DEG = 0.1
+# s between straights at the most; the bias drifts over more
+APART_S = 60.0
+# straights, and degrees between them in all, at the least
+LEAST_STRAIGHTS, LEAST_TURNED_DEG = 6, 240.0
 
 
 def _fitted(stretches: list[_Stretch]) -> tuple[float, float] | None:

@@ -44,56 +44,6 @@ from dashcalib_ros.solve.linear import normal_equations, used_keyframes
 from dashcalib_ros.solve.prior import loss_px_of
 from dashcalib_ros.solve.solution import Solution, with_measurement
 
-# s to either side: clocks of sensors in one car are not farther apart
-LARGEST_OFFSET_S = 0.5
-# s between the offsets that are tried first; a turn takes seconds
-COARSE_S = 0.02
-# s over which a rate is taken, to know how an angle follows the offset
-RATE_S = 0.03
-# keyframes of a turn at the least
-LEAST_KEYFRAMES = 5
-# degrees in all turns; with less there is no angle to compare
-LEAST_TURNED_DEG = 10.0
-# of the squared angles; a sensor that explains less is of another drive, or its clock is
-LEAST_EXPLAINED = 0.9
-# times ours; a scale farther off than SCALES, and in between, is one of units
-DEGREES = (40.0, 80.0)
-# of a turn's angle: what pictures of real drives may be off in one turn, beyond their noise
-TURN_SIGMA = 0.0045
-# of time, one sigma: what a rate that was given with --fps may be off, as the frames of two real
-# drives are; and sigmas beyond which a clock is not used
-PACE, LARGEST_PACE = 0.005, 2.0
-# s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
-LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
-# times what a turn's other steps leave; where an image is missing in a turn of 50 degrees or more
-# one step left 4.7 to 14 times that, and else 4.2 at the most
-LARGEST_JUMP = 4.5
-# ratios of the poses' variance to the gyro's in a second, of which the likeliest is taken
-RATIOS = np.logspace(-4, 3, 22)
-# parameters of a gyro beside a camera
-UNKNOWNS = 9
-# of likelihoods; beyond it the less likely case counts for nothing
-LARGEST_LOG = 100.0
-# steps of the fit, and those at which the noises are weighed anew
-STEPS, WEIGHED = 8, (1, 4)
-# sigmas; where a witness is farther off, it contradicts
-CONTRADICTED = 3.0
-# the same for one turn, which a gyro alone confirms: farther off, it confirms nothing. Of gyros
-# that are 3 % wrong and called calibrated, 2 sigmas let 12 of 80 pass, and these none
-DOUBTED = 1.25
-
-# degrees by which the car may turn on what counts as a straight
-STRAIGHT_DEG = 1.5
-# degrees of a turn at the least, between two headings of GPS
-LEAST_GPS_DEG = 30.0
-# m from the rear axle, which goes where the car points, to the aerial
-LEVER_M = 2.0
-# m of a straight at the least
-STRAIGHT_M = 8.0
-# sigma of a gyro's scale; one that is known worse is a witness only: a gyro that is 3 % off, and
-# does not say so, must not move an accepted camera
-KNOWN_SCALE = 0.015
-
 
 @dataclass(frozen=True)
 class SensorComparison:
@@ -105,6 +55,10 @@ class SensorComparison:
     solution: Solution | None = None
     witnesses: Witnesses = field(default_factory=Witnesses)
     unused: tuple[str, ...] = ()
+
+
+# keyframes of a turn at the least
+LEAST_KEYFRAMES = 5
 
 
 def compare_sensors(solution: Solution | None, stream: SensorStream | None, start_s: float,
@@ -158,6 +112,10 @@ class _OwnScale:
     contradiction: str = ''
 
 
+# sigmas; where a witness is farther off, it contradicts
+CONTRADICTED = 3.0
+
+
 def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnScale:
     """Return what is known of a gyro's scale. prior: its sigma, without GPS."""
     found = None if position is None else scale_by_gps(rate, position)
@@ -170,6 +128,14 @@ def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnSca
             f'and this scale is used: set motion.gyro_scale_sigma, {prior:g}, higher'))
     share = prior**2 / (prior**2 + sigma**2)
     return _OwnScale(1 + share * (scale - 1), sigma * float(np.sqrt(share)), found)
+
+
+# the same for one turn, which a gyro alone confirms: farther off, it confirms nothing. Of gyros
+# that are 3 % wrong and called calibrated, 2 sigmas let 12 of 80 pass, and these none
+DOUBTED = 1.25
+# sigma of a gyro's scale; one that is known worse is a witness only: a gyro that is 3 % off, and
+# does not say so, must not move an accepted camera
+KNOWN_SCALE = 0.015
 
 
 def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
@@ -196,6 +162,14 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
         return None, ''
     return replace(moved, by_pictures=solution, scenes=tuple(
         scene for scene in scenes if scene is not None)), ''
+
+
+# s to either side: clocks of sensors in one car are not farther apart
+LARGEST_OFFSET_S = 0.5
+# of the squared angles; a sensor that explains less is of another drive, or its clock is
+LEAST_EXPLAINED = 0.9
+# times ours; a scale farther off than SCALES, and in between, is one of units
+DEGREES = (40.0, 80.0)
 
 
 def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness | None, str]:
@@ -284,6 +258,16 @@ class Gyro:
                     float(self.pace + step[8]))
 
 
+# of time, one sigma: what a rate that was given with --fps may be off, as the frames of two real
+# drives are; and sigmas beyond which a clock is not used
+PACE, LARGEST_PACE = 0.005, 2.0
+# s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
+LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
+# times what a turn's other steps leave; where an image is missing in a turn of 50 degrees or more
+# one step left 4.7 to 14 times that, and else 4.2 at the most
+LARGEST_JUMP = 4.5
+
+
 @dataclass(frozen=True)
 class Fit:
     """How a gyro and a camera fit together.
@@ -347,6 +331,10 @@ def _turned(rotations: Floats) -> Floats:
         rotations[:-1] @ rotations[1:].transpose(0, 2, 1)).as_rotvec())
 
 
+# s over which a rate is taken, to know how an angle follows the offset
+RATE_S = 0.03
+
+
 def _covered(turn: Steps, stamps_s: Floats, when: Floats) -> Steps | None:
     """Return the part of a turn for which there are samples; None where it is too short.
 
@@ -375,6 +363,16 @@ def fit_to(turns: Sequence[Steps], rate: Samples) -> Fit | None:
         if found is None or not abs(found.gyro.offset_s) < LARGEST_OFFSET_S:
             break
     return found
+
+
+# s between the offsets that are tried first; a turn takes seconds
+COARSE_S = 0.02
+# degrees in all turns; with less there is no angle to compare
+LEAST_TURNED_DEG = 10.0
+# parameters of a gyro beside a camera
+UNKNOWNS = 9
+# steps of the fit, and those at which the noises are weighed anew
+STEPS, WEIGHED = 8, (1, 4)
 
 
 def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
@@ -432,6 +430,10 @@ def _largest(left: Floats) -> float:
     return largest / float(np.sqrt((np.sum(left**2) - largest**2) / (len(left) - 1)))
 
 
+# of a turn's angle: what pictures of real drives may be off in one turn, beyond their noise
+TURN_SIGMA = 0.0045
+
+
 def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:
     """Return the variance of a common value that turns which differ by TURN_SIGMA add to it.
 
@@ -442,6 +444,10 @@ def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:
         return more
     whole = variance_if_turns_differ(offsets, variances, more)
     return float(max(whole - 1 / np.sum(1 / variances), 0.0))
+
+
+# of likelihoods; beyond it the less likely case counts for nothing
+LARGEST_LOG = 100.0
 
 
 def variance_if_turns_differ(offsets: Floats, variances: Floats, more: float) -> float:
@@ -530,6 +536,10 @@ def _by_turn(turns: Sequence[Steps], rows: Floats) -> list[Floats]:
     return np.split(rows, np.cumsum([3 * len(turn.turned) for turn in turns])[:-1])
 
 
+# ratios of the poses' variance to the gyro's in a second, of which the likeliest is taken
+RATIOS = np.logspace(-4, 3, 22)
+
+
 def _likeliest_ratio(turns: Sequence[Steps], rows: Rows) -> float:
     """Return the ratio of the two noises that explains the residuals best."""
     def badness(ratio: float) -> float:
@@ -559,6 +569,10 @@ class _End:
     def off_m(self) -> float:
         """Return the RMS distance of the fixes from the straight."""
         return float(np.sqrt(np.mean(self.straight.left**2)))
+
+
+# degrees of a turn at the least, between two headings of GPS
+LEAST_GPS_DEG = 30.0
 
 
 def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
@@ -600,6 +614,14 @@ def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
     variance = mean.variance + _between_turns(ratios - mean.value, variances, mean.value)
     by_camera = np.average(np.array(follow) / gps[:, None], axis=0, weights=1 / variances)
     return _witness(mean.value, float(np.sqrt(variance)), 0.0, by_camera, solution), ''
+
+
+# degrees by which the car may turn on what counts as a straight
+STRAIGHT_DEG = 1.5
+# m from the rear axle, which goes where the car points, to the aerial
+LEVER_M = 2.0
+# m of a straight at the least
+STRAIGHT_M = 8.0
 
 
 def _ends(turn: Steps, position: Samples) -> tuple[_End, _End] | None:

@@ -17,21 +17,6 @@ from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
 from dashcalib_ros.robust import cauchy_fit, mad_sigma
 
-# rounds of new weights; ten drives changed by less than 0.01 degrees after the fifth
-ROUNDS = 9
-# of the scatter; errors beyond it lose weight (Cauchy)
-LOSS = 2.0
-# degrees; less scatter than this is rounding
-LEAST_SCATTER = 1e-3
-# of the steps at either end, left out of a mean: bumps and bad poses
-TRIMMED = 0.1
-# points near the path; fewer do not tell how high the world is
-LEAST_POINTS = 30
-# of the logarithm; the turns of six upright drives have -4.9 to -0.7
-OPEN = 0.4
-# keyframes; a line needs more steps between them than it has parameters
-LEAST_KEYFRAMES = 6
-
 
 @dataclass(frozen=True)
 class Heading:
@@ -45,6 +30,10 @@ class Heading:
     pitch_deg: float
     yaw_sigma_deg: float
     pitch_sigma_deg: float
+
+
+# keyframes; a line needs more steps between them than it has parameters
+LEAST_KEYFRAMES = 6
 
 
 def heading(scene: Scene) -> Heading | None:
@@ -67,10 +56,18 @@ def heading(scene: Scene) -> Heading | None:
                    float(np.std(pitch) / np.sqrt(len(pitch))))
 
 
+# of the steps at either end, left out of a mean: bumps and bad poses
+TRIMMED = 0.1
+
+
 def _trimmed_mean(values: Floats) -> float:
     """Return the mean without the share TRIMMED at either end; scipy.stats loads for 0.4 s."""
     cut = int(TRIMMED * len(values))
     return float(np.sort(values)[cut:len(values) - cut].mean())
+
+
+# of the logarithm; the turns of six upright drives have -4.9 to -0.7
+OPEN = 0.4
 
 
 def roll_deg(scenes: Sequence[Scene]) -> float:
@@ -83,6 +80,10 @@ def roll_deg(scenes: Sequence[Scene]) -> float:
     if np.median([_open_below(scene, down) for scene in scenes]) > OPEN:
         down = -down
     return float(np.degrees(np.arctan2(down[0], down[1])))
+
+
+# points near the path; fewer do not tell how high the world is
+LEAST_POINTS = 30
 
 
 def _open_below(scene: Scene, down: Floats) -> float:
@@ -102,6 +103,14 @@ def _open_below(scene: Scene, down: Floats) -> float:
     highest, high, deep, deepest = np.percentile(depth, [2, 25, 75, 98])
     tiny = np.finfo(float).tiny
     return float(np.log((deepest - deep + tiny) / (high - highest + tiny)))
+
+
+# rounds of new weights; ten drives changed by less than 0.01 degrees after the fifth
+ROUNDS = 9
+# of the scatter; errors beyond it lose weight (Cauchy)
+LOSS = 2.0
+# degrees; less scatter than this is rounding
+LEAST_SCATTER = 1e-3
 
 
 def _at_no_curvature(curvature: Floats, angle: Floats) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from dashcalib_ros.arrays import Floats, Ints, Pixels
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.remap import WIDEST, rectified_matrix, rectify, seen_at
 from dashcalib_ros.judge import CalibrationData
-from dashcalib_ros.judge.agreement import focal_alone, sigma_by_count
+from dashcalib_ros.judge.agreement import focal_of_turns, sigma_by_count
 from dashcalib_ros.judge.calibration import Material, Mount
 from dashcalib_ros.reconstruct.scene import Profile, Scene, residuals_px
 from dashcalib_ros.report.charts import (
@@ -110,7 +110,7 @@ def evidence_of(c: CalibrationData, mask_id: str | None) -> list[Drawing]:
     if solution is not None and c.camera is not None and c.sigma is not None:
         drawings += _growth(c, solution, material.px)
         if by_turn := focal_by_turn(c):
-            best = material.px * min(turn.sigma for turn in focal_alone(solution).values())
+            best = material.px * min(turn.sigma for turn in focal_of_turns(solution).values())
             why = WHY_TOGETHER if c.sigma['fx'] < MUCH_BETTER * best else ''
             drawings.append(Drawing('fx by turn', by_turn, BY_TURN + why))
     camera = None if solution is None else solution.camera

@@ -11,7 +11,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge import CalibrationData, TurnSummary
-from dashcalib_ros.judge.agreement import focal_alone, leverages, turns_of_another_camera
+from dashcalib_ros.judge.agreement import focal_of_turns, leverages, turns_of_another_camera
 from dashcalib_ros.judge.calibration import Material, StoredTurnSummary
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, residuals_px
 from dashcalib_ros.report.charts import (
@@ -89,7 +89,7 @@ def _fx_alone(c: CalibrationData) -> dict[TurnId, tuple[float, float]]:
     if solution is None:
         return {}
     alone = {turn: (found.fx * c.material.px, found.sigma * c.material.px)
-             for turn, found in focal_alone(solution).items()}
+             for turn, found in focal_of_turns(solution).items()}
     return alone if np.isfinite(list(alone.values())).all() else {}
 
 

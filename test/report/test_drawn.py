@@ -26,7 +26,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.judge.agreement import focal_alone, sigma_by_count
+from dashcalib_ros.judge.agreement import focal_of_turns, sigma_by_count
 from dashcalib_ros.judge.calibration import Condition, Shutter, Stabiliser, StoredTurnSummary
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.report import NamedCamera, report_html, write_results
@@ -147,7 +147,7 @@ def test_with_two_turns_the_growth_of_what_is_known_shows_both():
 
 
 def test_why_all_turns_know_more_than_each_alone_is_said_where_it_is_so(drawn):
-    best = min(turn.sigma for turn in focal_alone(solution()).values())
+    best = min(turn.sigma for turn in focal_of_turns(solution()).values())
     for part, said in ((0.6, False), (0.2, True)):
         c = dataclasses.replace(drawn, sigma={**drawn.sigma, 'fx': part * best})
         assert (WHY_TOGETHER in Page(report_html(c)).text) == said
@@ -180,7 +180,7 @@ def test_times_count_from_the_drive_s_start(drawn, text):
 
 def test_what_turns_say_alone_scatters_about_the_common_result(drawn):
     found = solution()
-    alone = focal_alone(found)
+    alone = focal_of_turns(found)
     assert set(alone) == {scene.turn for scene in found.scenes}
     for each in alone.values():
         assert abs(each.fx - found.camera.fx) < 5 * each.sigma
