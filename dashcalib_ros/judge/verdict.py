@@ -72,6 +72,10 @@ class Finding:
     value: str = ''
     limit: str = ''
 
+    def measured(self, name: str, value: str, limit: str) -> Finding:
+        """Return it with the numbers that say it."""
+        return replace(self, name=name, value=value, limit=limit)
+
     @property
     def objects(self) -> bool:
         """Return whether something is wrong."""
@@ -152,8 +156,9 @@ def turn_count(count: int, config: VerdictConfig, confirmed: bool = False) -> Fi
     lone = ', and nothing confirms its numbers and their sigma' if count == 1 else ''
     return Finding('E-FEW-TURNS', _graded(False, count < config.min_turns and not confirmed),
                    f'only {count} of at least {config.min_turns} turns could be used{lone}',
-                   MORE_TURNS, name='turns used', value=f'{count}',
-                   limit='the gyro confirms them' if confirmed else f'at least {config.min_turns}')
+                   MORE_TURNS).measured(
+        'turns used', f'{count}',
+        'the gyro confirms them' if confirmed else f'at least {config.min_turns}')
 
 
 def _yaw_of_turns(grounds: Grounds) -> Finding:
@@ -162,12 +167,12 @@ def _yaw_of_turns(grounds: Grounds) -> Finding:
 
 def yaw_in_all(yaw_deg: float, config: VerdictConfig) -> Finding:
     """Judge the yaw of all turns together."""
-    least = f'{config.min_yaw_deg:.0f}°'
+    least = config.min_yaw_deg
     return Finding('E-LITTLE-YAW', _graded(yaw_deg < config.refused_yaw_deg,
-                                           yaw_deg < config.min_yaw_deg),
-                   f'the turns have {yaw_deg:.0f}° of yaw in all, at least {least} are needed',
-                   MORE_TURNS, name='yaw of these turns together', value=f'{yaw_deg:.0f}°',
-                   limit=f'at least {least}')
+                                           yaw_deg < least),
+                   f'the turns have {yaw_deg:.0f}° of yaw in all, at least {least:.0f}° are '
+                   f'needed', MORE_TURNS).measured(
+        'yaw of these turns together', f'{yaw_deg:.0f}°', f'at least {least:.0f}°')
 
 
 # relative rise of the error; less is refused
@@ -177,14 +182,14 @@ REFUSED_CONTRAST = 0.01
 def flat_profile(grounds: Grounds) -> Finding:
     """The cost must rise on both sides of its minimum, or the focal length is not observable."""
     contrast, least = profile_contrast(grounds.solution), grounds.config.min_contrast
-    rise, needed = f'{100 * max(contrast, 0.0):.1f} %', f'at least {100 * least:.0f} %'
+    percent = 100 * max(contrast, 0.0)
     return Finding(
         # written with not: a contrast of NaN is refused, too
         'E-FLAT-PROFILE', _graded(not contrast >= REFUSED_CONTRAST, contrast < least),
         f'a focal length 20 % off would explain the pictures almost as well (the error rises by '
-        f'{rise}, {needed} is needed)',
-        MORE_TURNS, name='rise of the error when the focal length is 20 % off', value=rise,
-        limit=needed)
+        f'{percent:.1f} %, at least {100 * least:.0f} % is needed)',
+        MORE_TURNS).measured('rise of the error when the focal length is 20 % off',
+                             f'{percent:.1f} %', f'at least {100 * least:.0f} %')
 
 
 def profile_contrast(solution: Solution) -> float:
@@ -215,9 +220,9 @@ def sigma_too_large(grounds: Grounds) -> Finding:
     known = f'only to {100 * sigma:.1f} %' if np.isfinite(sigma) else 'not at all'
     return Finding(
         'E-LARGE-SIGMA', _graded(not np.isfinite(sigma) or sigma > REFUSED_SIGMA, sigma > most),
-        f'the focal length is known {known}, {100 * most:.1f} % or better is needed', MORE_TURNS,
-        name='uncertainty of fx', value=f'{100 * sigma:.2g} %',
-        limit=f'at most {100 * most:.3g} %')
+        f'the focal length is known {known}, {100 * most:.1f} % or better is needed',
+        MORE_TURNS).measured('uncertainty of fx', f'{100 * sigma:.2g} %',
+                             f'at most {100 * most:.3g} %')
 
 
 def _relative_sigma(solution: Solution) -> float:
@@ -229,13 +234,14 @@ def one_turn_dominates(grounds: Grounds) -> Finding:
     """If one turn gives nearly all information about fx, the others cannot confirm it."""
     shares, most = leverages(grounds.solution), grounds.config.max_leverage
     turn = max(shares, key=lambda turn: shares[turn])
-    share, confirmed = f'{100 * min(shares[turn], 1.0):.0f} %', gyro_confirms(grounds.solution)
+    percent, confirmed = 100 * min(shares[turn], 1.0), gyro_confirms(grounds.solution)
     return Finding('E-ONE-TURN-DOMINATES',
                    _graded(False, len(shares) > 1 and shares[turn] > most and not confirmed),
-                   f'no other turn confirms {_turns([turn])}, which gives {share} of the '
-                   f'information about the focal length', 'drive another turn that is as sharp',
-                   name='largest share of one turn in the information about fx', value=share,
-                   limit='the gyro confirms it' if confirmed else f'at most {100 * most:.0f} %')
+                   f'no other turn confirms {_turns([turn])}, which gives {percent:.0f} % of the '
+                   f'information about the focal length',
+                   'drive another turn that is as sharp').measured(
+        'largest share of one turn in the information about fx', f'{percent:.0f} %',
+        'the gyro confirms it' if confirmed else f'at most {100 * most:.0f} %')
 
 
 def turns_disagree(grounds: Grounds) -> Finding:
@@ -245,8 +251,8 @@ def turns_disagree(grounds: Grounds) -> Finding:
                    f'the turns disagree about the focal length by {100 * spread:.1f} %, at most '
                    f'{100 * most:.0f} % is usual',
                    'record another drive with little traffic, and make sure that nobody zooms or '
-                   'moves the camera', name='scatter of fx between the turns',
-                   value=f'{100 * spread:.2g} %', limit=f'at most {100 * most:.3g} %')
+                   'moves the camera').measured(
+        'scatter of fx between the turns', f'{100 * spread:.2g} %', f'at most {100 * most:.3g} %')
 
 
 def other_camera(grounds: Grounds) -> Finding:
@@ -256,10 +262,11 @@ def other_camera(grounds: Grounds) -> Finding:
     return Finding('E-ANOTHER-CAMERA', _graded(False, bool(turns)),
                    f'{_turns(turns)} fit{"s" * (len(turns) == 1)} another camera far better than '
                    f'that of the other turns, as if the camera was zoomed, exchanged or cropped '
-                   f'in between', 'calibrate the parts before and after that change separately',
-                   name='error of a turn, over that with a camera of its own',
-                   value=f'{max(misfits.values(), default=0.0):.2g} times',
-                   limit=f'at most {grounds.config.max_misfit:.2g} times')
+                   f'in between',
+                   'calibrate the parts before and after that change separately').measured(
+        'error of a turn, over that with a camera of its own',
+        f'{max(misfits.values(), default=0.0):.2g} times',
+        f'at most {grounds.config.max_misfit:.2g} times')
 
 
 def _turns(turns: list[TurnId]) -> str:

@@ -14,8 +14,8 @@ from dashcalib_ros.report.files import write_results
 
 
 @dataclass(frozen=True, repr=False)
-class Calibration(CalibrationData):
-    """The complete result; CalibrationData says what it has."""
+class Calibration(CalibrationData):  # noqa: D101, it is the base's, which has the attributes
+    __doc__ = CalibrationData.__doc__
 
     @staticmethod
     def of(data: CalibrationData) -> Calibration:
