@@ -15,8 +15,9 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import SensorStream
+from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.input.source import by
-from dashcalib_ros.judge import Calibration, Check, Monitor, Odometry, Poses, Reading
+from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading
 from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
 from dashcalib_ros.judge.check import CALIBRATION
 from dashcalib_ros.judge.conclude import (
@@ -26,9 +27,10 @@ from dashcalib_ros.judge.conclude import (
     turns_that_stood,
 )
 from dashcalib_ros.judge.monitor import readings_of
-from dashcalib_ros.judge.witnesses import Asked, ask_sensors
+from dashcalib_ros.judge.witnesses import SensorComparison, compare_sensors
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
@@ -161,13 +163,13 @@ class Calibrator:
 
     def _calibrate(self, progress: Progress, final: bool, started: float) -> Calibration:
         scenes, solution = self._solve(progress, final)  # scenes -> one camera
-        asked = self._ask_sensors(solution, progress)
-        solution, limits = asked.solution, self.scenes.config.verdict
+        sensors = self._compare_sensors(solution, progress)
+        solution, limits = sensors.solution, self.scenes.config.verdict
         # these do not count in the next calibration; files of another camera's turns stay
         self.scenes.exclude(turns_of_earlier_cameras(scenes, solution), keep_files=True)
         self.scenes.exclude(contradicting_turns(scenes, solution, limits))
         self.solution = solution
-        return self._judge(asked, started)  # one camera -> verdict
+        return self._judge(sensors, started)  # one camera -> verdict
 
     def _solve(self, progress: Progress, final: bool) -> tuple[list[Scene], Solution | None]:
         """Return the scenes that count, and the camera that explains them; None without any."""
@@ -192,25 +194,24 @@ class Calibrator:
             return kept, self.workers.result(solving, progress)
         return [], None
 
-    def _ask_sensors(self, solution: Solution | None, progress: Progress) -> Asked:
+    def _compare_sensors(self, solution: Solution | None, progress: Progress
+                         ) -> SensorComparison:
         if solution is None or self._motion is None:
-            return Asked(solution)
+            return SensorComparison(solution)
         progress('evaluating the motion sensors', 0.0)
-        asked: Asked = self.workers.run(ask_sensors, solution, self._motion,
-                                        self.detection.start_s, self.scenes.config)
-        return asked
-
-    def _judge(self, asked: Asked, started: float) -> Calibration:
-        # the solution itself is judged
-        evidence = self._evidence(started, replace(asked, solution=None))
-        if not self._live or self.solution is None:
-            return conclude(self.solution, evidence, self.scenes.config)
-        # it takes a second or two, and a live drive goes on meanwhile
-        found: Calibration = self.workers.run(conclude, self.solution, evidence,
-                                              self.scenes.config)
+        found: SensorComparison = self.workers.run(
+            compare_sensors, solution, self._motion, self.detection.start_s, self.scenes.config)
         return found
 
-    def _evidence(self, started: float, asked: Asked) -> Evidence:
+    def _judge(self, sensors: SensorComparison, started: float) -> Calibration:
+        # the solution itself is judged
+        evidence = self._evidence(started, replace(sensors, solution=None))
+        what = self.solution, evidence, self.scenes.config
+        # it takes a second or two, and a live drive goes on meanwhile
+        return Calibration.of(conclude(*what) if not self._live or self.solution is None
+                              else self.workers.run(conclude, *what))
+
+    def _evidence(self, started: float, sensors: SensorComparison) -> Evidence:
         now = time.monotonic()
         timing = {'detect': self._detect_s, 'calibrate': now - started,
                   'total': now - self._started}
@@ -219,11 +220,11 @@ class Calibrator:
             seen, timing=timing, warnings=(*seen.warnings, *self.scenes.warnings),
             stored=self.scenes.stored_before, left_out=self.scenes.left_out(),
             pictures=None if self._live else self.workers.pictures(), motion=self._motion,
-            asked=asked)
+            sensors=sensors)
 
     # other cameras ----------------------------------------------------------------------------
 
-    def check(self, given: Camera, calibration: Calibration, progress: Progress | None = None,
+    def check(self, given: Camera, calibration: CalibrationData, progress: Progress | None = None,
               name: str = CALIBRATION) -> Check:
         """Say whether a given camera explains the drive.
 

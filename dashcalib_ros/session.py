@@ -24,10 +24,11 @@ from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.input.inputs import Paths, as_list, fits_bag, open_frames
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
+from dashcalib_ros.input.poses import Poses, track_poses
 from dashcalib_ros.input.source import by
-from dashcalib_ros.judge import Calibration, Check, Odometry, Poses, track_poses
+from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.pipeline import Calibrator
-from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.workers.worker import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None

@@ -11,7 +11,8 @@ from std_srvs.srv import Trigger
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
-from dashcalib_ros.judge import Calibration, Verdict
+from dashcalib_ros.judge import Verdict
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros import node as node_module
 from dashcalib_ros.ros.background import Result
 from dashcalib_ros.ros.program import make_node

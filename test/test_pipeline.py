@@ -28,12 +28,12 @@ from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.errors import InputError, WorkerError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import Samples, SensorStream
-from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.agreement import OTHER_CAMERA
 from dashcalib_ros.judge.conclude import STOOD, conclude, evidence_of_detection
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.session import calibrate
 from dashcalib_ros.solve import solve

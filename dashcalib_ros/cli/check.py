@@ -13,14 +13,8 @@ from dashcalib_ros.formats.load import load_with_faults
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, is_motion, read_motion
-from dashcalib_ros.judge import (
-    Check,
-    Odometry,
-    Poses,
-    path_files,
-    read_poses,
-    with_faults,
-)
+from dashcalib_ros.input.poses import Poses, read_poses
+from dashcalib_ros.judge import Check, Odometry, path_files, with_faults
 from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.compare import mount_dict
 from dashcalib_ros.report.tables import TextTable, labelled, line
@@ -80,7 +74,7 @@ def check(args: argparse.Namespace) -> int:
         for name, text in path_files(motion).items():
             write_text(args.out / name, text)
         if not args.json:
-            write_stdout(f'written: {args.out / "paths.svg"}; beside it the paths as TUM files')
+            write_stdout(f'written: {args.out}: the paths as TUM files, which evo compares')
     if args.mounting and EXIT_CODES[found.answer] == ACCEPTED and (
             now is None or before is None or now.moved_from(before)):
         return NOT_ENOUGH if now is None else WRONG

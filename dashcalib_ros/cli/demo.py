@@ -25,8 +25,14 @@ from dashcalib_ros.errors import OutputError
 from dashcalib_ros.formats import calibrated_camera, result_dict
 from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.inputs import open_frames
-from dashcalib_ros.judge import Calibration
-from dashcalib_ros.report import NamedCamera, compare, output_folder, write_results, write_text
+from dashcalib_ros.report import (
+    Calibration,
+    NamedCamera,
+    compare,
+    output_folder,
+    write_results,
+    write_text,
+)
 from dashcalib_ros.report.files import TRUTH
 from dashcalib_ros.report.tables import against_truth, conclusion, line, next_step, summary
 from dashcalib_ros.report.wording import optional

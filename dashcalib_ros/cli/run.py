@@ -18,8 +18,7 @@ from dashcalib_ros.errors import InputError, OutputError, counted
 from dashcalib_ros.formats import result_json
 from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input import FrameSource
-from dashcalib_ros.judge import Calibration
-from dashcalib_ros.report import Written, output_folder, write_results
+from dashcalib_ros.report import Calibration, Written, output_folder, write_results
 from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE
 from dashcalib_ros.report.tables import (
     TextTable,

@@ -21,7 +21,7 @@ from dashcalib_ros.formats.table import FORMATS
 from dashcalib_ros.formats.values import Cameras, Data, numbers_in
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.source import by, os_error
-from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import (
     ARRAY_BYTES,
@@ -41,7 +41,7 @@ IN_FOLDER = ('result.json', 'calibration.yaml', 'cameras.bin', 'cameras.txt',
 KNOWN = ('a result.json (or its folder), a camera_info YAML, a file of OpenCV, Kalibr, COLMAP, '
          'nerfstudio, OpenSfM, mrcal or Gyroflow, a JSON of fx, fy, cx, cy, k1, k2, width and '
          'height, or a bag with camera_info')
-Given = Calibration | NamedCamera | Camera | str | os.PathLike[str]
+Given = CalibrationData | NamedCamera | Camera | str | os.PathLike[str]
 
 
 def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
@@ -201,7 +201,7 @@ def given_camera(given: Given) -> NamedCamera:
     """
     if isinstance(given, NamedCamera):
         return given
-    if isinstance(given, Calibration):
+    if isinstance(given, CalibrationData):
         return calibrated_camera(given)
     if isinstance(given, Camera):
         return NamedCamera(f'the {given.model} camera', given)

@@ -34,9 +34,10 @@ from dashcalib_ros.formats.values import (
     read_size,
     unknown_model,
 )
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import (
     ANGLES,
+    Condition,
     LensField,
     Mount,
     Shutter,
@@ -50,8 +51,11 @@ from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, read_text
 from dashcalib_ros.solve.solution import LeftOut
 from dashcalib_ros.solve.spread import PictureSigma
 
+# arrays of a calibration that stand among the details
+COVARIANCES = ('covariance', 'picture_covariance')
 
-def result_dict(calibration: Calibration) -> dict[str, Any]:
+
+def result_dict(calibration: CalibrationData) -> dict[str, Any]:
     """Return the content of result.json: plain dicts, lists, text, and finite numbers or None."""
     c = calibration
     plain: dict[str, Any] = plain_values({
@@ -84,24 +88,21 @@ def result_dict(calibration: Calibration) -> dict[str, Any]:
         'input': c.input_name,
         'warnings': c.warnings,
         'masked_fraction': None if c.mask is None else 1.0 - float(np.mean(c.mask)),
-        'details': c.details,
+        'details': c.details | {name: getattr(c, name) for name in COVARIANCES
+                                if getattr(c, name) is not None},
+        'conditions': c.verdict.conditions,
     })
     return plain
 
 
-def result_json(calibration: Calibration) -> str:
+def result_json(calibration: CalibrationData) -> str:
     """Return result.json's text; the same calibration gives the same text."""
     return json.dumps(result_dict(calibration), indent=2, allow_nan=False,
                       ensure_ascii=False) + '\n'
 
 
-def load_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Read what save() and `dashcalib run` write: a result.json, its folder, calibration.yaml.
-
-    A result.json has everything but the mask, the turning magnitudes and what the report draws; a
-    calibration.yaml has camera, sigma, verdict and versions. Settings that this version does not
-    know are left out. Raises InputError; load_camera() reads other files.
-    """
+def load_calibration(path: str | os.PathLike[str]) -> CalibrationData:
+    """Read a result: see Calibration.load(). Settings that are unknown here are left out."""
     place = Path(path)
     place = place / 'result.json' if place.is_dir() else place
     text = read_text(place, JSON_BYTES)
@@ -127,7 +128,7 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
                          f'{place} is damaged ({one_line(error)}); calibrate again') from error
 
 
-def calibration_of(data: Data, camera: Camera | None) -> Calibration:
+def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
     """Return the calibration that result_dict() gave these values."""
     def made(kind: type[Any], values: Mapping[str, Any] | None, **more: Any) -> Any:
         return None if values is None else kind(**more, **{
@@ -140,11 +141,17 @@ def calibration_of(data: Data, camera: Camera | None) -> Calibration:
         TurnId.stored(place) if turn['center'] is None else TurnId.at(turn['center']),
         turn['px'], turn['sigma_px'], turn['others_sigma_px'])
         for place, turn in enumerate(data.get('held_out', ()))]
+    details = dict(data.get('details', {}))
+    covariance, of_picture = (
+        None if (rows := details.pop(name, None)) is None else np.array(rows, np.float64)
+        for name in COVARIANCES)
     field, size = data.get('field'), (data['image_size'][0], data['image_size'][1])
     sigma = data.get('sigma')
-    return Calibration(
+    return CalibrationData(
         verdict=Verdict(data['verdict'], tuple(data['reasons']),
-                        codes=tuple(data.get('reason_codes', ()))),
+                        codes=tuple(data.get('reason_codes', ())),
+                        conditions=tuple(Condition(**each)
+                                         for each in data.get('conditions', ()))),
         image_size=size, camera=camera,
         sigma=None if sigma is None else {name: math.nan if value is None else float(value)
                                           for name, value in sigma.items()},
@@ -153,7 +160,7 @@ def calibration_of(data: Data, camera: Camera | None) -> Calibration:
         timing=dict(data.get('timing', {})), versions=dict(data.get('versions', {})),
         config=config.replace({'seed': data.get('seed', config.seed)}),
         input_name=data.get('input', ''), warnings=tuple(data.get('warnings', ())),
-        details=dict(data.get('details', {})), stored_turns=tuple(
+        details=details, covariance=covariance, picture_covariance=of_picture, stored_turns=tuple(
             made(StoredTurnSummary, turn, id=TurnId.stored(place))
             for place, turn in enumerate(data.get('stored_turns', ()))),
         rolling_shutter=made(Shutter, data.get('rolling_shutter')),
@@ -164,7 +171,7 @@ def calibration_of(data: Data, camera: Camera | None) -> Calibration:
             field['rms_px'], field['worst_px'], field['sigma_px']),
         mount=_mount(data.get('mount')),
         held_out=tuple(held_out), straight_lines=made(Bend, data.get('straight_lines')),
-        witnesses=Witnesses(**{name: made(Witness, said) for name, said
+        witnesses=Witnesses(**{name: made(Witness, each) for name, each
                                in (data.get('witnesses') or {}).items()}))
 
 
@@ -206,7 +213,7 @@ def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
             if key != 'id'}
 
 
-def calibration_yaml(calibration: Calibration, camera_name: str = ros.CAMERA_NAME,
+def calibration_yaml(calibration: CalibrationData, camera_name: str = ros.CAMERA_NAME,
                      created: str | None = None) -> str:
     """Return the YAML text of an accepted or weak calibration, at full precision.
 
@@ -221,7 +228,7 @@ def calibration_yaml(calibration: Calibration, camera_name: str = ros.CAMERA_NAM
     return ros.yaml_text({**content, ros.OWN: _provenance(calibration, created)})
 
 
-def _provenance(calibration: Calibration, created: str | None) -> dict[str, Any]:
+def _provenance(calibration: CalibrationData, created: str | None) -> dict[str, Any]:
     block: dict[str, Any] = plain_values({
         'verdict': calibration.verdict.level,
         'reasons': calibration.verdict.reasons,
@@ -292,17 +299,23 @@ def _no_intrinsics(name: str, verdict: Any, reasons: Any) -> InputError:
                       + (f': {known}' if known else '') + '; calibrate a drive with more turns')
 
 
-def calibrated_camera(calibration: Calibration, name: str = 'estimate') -> NamedCamera:
+def calibrated_camera(calibration: CalibrationData, name: str = 'estimate') -> NamedCamera:
     """Return the camera of a calibration. Raises InputError when it was refused."""
     if calibration.camera is None:
         raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.reasons)
     shutter, field = calibration.rolling_shutter, calibration.field
     return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
-                       _covariance(calibration.details, calibration.camera, calibration.sigma),
+                       _of_camera(calibration, len(calibration.camera.params)),
                        calibration.sigma_px,
                        field.field if field is not None and field.used else None,
                        mount=calibration.mount,
                        readout_ms=None if shutter is None else shutter.readout_ms)
+
+
+def _of_camera(calibration: CalibrationData, count: int) -> Floats | None:
+    """Return the covariance of the camera's parameters, as the picture shows them."""
+    found = calibration.picture_covariance
+    return calibration.covariance if found is None else found[:count, :count]
 
 
 def _covariance(details: Any, camera: Camera, sigma: Mapping[str, float] | None
@@ -319,7 +332,8 @@ def _covariance(details: Any, camera: Camera, sigma: Mapping[str, float] | None
             covariance = covariance[:count, :count]
         if 'picture_covariance' not in data and sigma is not None:
             each = [sigma[name] for name in camera.names()]
-            covariance = np.array(data.get('correlation'), np.float64) * np.outer(each, each)
+            covariance = (np.array(data['covariance'], np.float64) if 'covariance' in data else
+                          np.array(data.get('correlation'), np.float64) * np.outer(each, each))
         if covariance.shape == (count, count) and np.isfinite(covariance).all():
             np.linalg.cholesky(covariance)
             return covariance

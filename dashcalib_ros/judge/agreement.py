@@ -9,6 +9,7 @@ import numpy as np
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.robust import weighted_mean
 from dashcalib_ros.solve.solution import Solution
 
 # why turns do not count
@@ -65,16 +66,15 @@ def focal_disagreement(solution: Solution) -> float:
     """Return the weighted scatter between the turns' own fx, relative to fx."""
     if len(solution.scenes) < 2:
         return 0.0
-    alone = list(focal_alone(solution).values())
-    fx, weights = (np.array(each) for each in zip(
-        *((turn.fx, turn.sigma**-2) for turn in alone), strict=True))
-    scatter = np.average((fx - np.average(fx, weights=weights))**2, weights=weights)
-    return float(np.sqrt(scatter) / solution.camera.fx)
+    own = list(focal_of_turns(solution).values())
+    mean = weighted_mean(np.array([turn.fx for turn in own]),
+                         np.array([turn.sigma**2 for turn in own]))
+    return float(np.sqrt(mean.squares * mean.variance) / solution.camera.fx)
 
 
 def leverages(solution: Solution) -> dict[TurnId, float]:
     """Return each turn's share in the information about fx; the shares sum to 1."""
-    known = {turn: found.sigma**-2 for turn, found in focal_alone(solution).items()}
+    known = {turn: found.sigma**-2 for turn, found in focal_of_turns(solution).items()}
     return {turn: own / sum(known.values()) for turn, own in known.items()}
 
 
@@ -86,7 +86,7 @@ class FocalEstimate:
     sigma: float
 
 
-def focal_alone(solution: Solution) -> dict[TurnId, FocalEstimate]:
+def focal_of_turns(solution: Solution) -> dict[TurnId, FocalEstimate]:
     """Return what each turn says of fx alone, linearised at the common result.
 
     Sigma cannot hold how much turns differ: one turn does not show that.

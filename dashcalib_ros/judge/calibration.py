@@ -2,12 +2,10 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from dataclasses import field as default
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -17,20 +15,32 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.camera.remap import rectify
-from dashcalib_ros.camera.rotation import rotation_matrices
+from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import InputError, NotAcceptedError
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.solve.solution import LeftOut, Solution
 from dashcalib_ros.solve.spread import PictureSigma, sigma_over
 
 # after the point, in one line of text
 MOST_DIGITS = 9
-# an optical frame that looks ahead (z ahead, x to the right, y downwards) to the car's (REP-103)
-OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 Level = Literal['accepted', 'weak', 'refused']
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition of the verdict in words, what this drive has, what is needed, and whether met.
+
+    value, limit: '' where two numbers do not say it. code: of the reason where it is not met.
+    """
+
+    code: str
+    name: str
+    value: str
+    limit: str
+    met: bool
 
 
 @dataclass(frozen=True)
@@ -39,12 +49,15 @@ class Verdict:
 
     reasons: one line each, what is wrong: what to do. cures: what to do, the likeliest to help
     first. codes: of the reasons, in their order; a code stays when its text is reworded.
+    conditions: those that are not met, in the order of the reasons, then those that are met and
+    that two numbers say.
     """
 
     level: Level
     reasons: tuple[str, ...] = ()
     cures: tuple[str, ...] = ()
     codes: tuple[str, ...] = ()
+    conditions: tuple[Condition, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -240,11 +253,6 @@ class Material:
     pictures: Mapping[TurnId, TurnPicture] = default(default_factory=dict)
 
 
-def _unknown_covariance() -> InputError:
-    return InputError('E-UNKNOWN-COVARIANCE', 'this calibration does not contain the correlations '
-                      'of its parameters: calibrate the drive again')
-
-
 def _with_sigma(value: float, sigma: float) -> str:
     """Return a value and its sigma, both to the second digit of the sigma."""
     if not (math.isfinite(sigma) and sigma > 0):
@@ -254,10 +262,13 @@ def _with_sigma(value: float, sigma: float) -> str:
 
 
 @dataclass(frozen=True, repr=False)
-class Calibration:
-    """The complete result. camera and sigma are None when the verdict is refused.
+class CalibrationData:
+    """The complete result. camera, sigma and covariance are None when the verdict is refused.
 
-    camera: of the full-size images. sigma: by the parameters' names.
+    camera: of the full-size images. sigma: by the parameters' names. covariance: (n, n) of the n
+    parameters, in the order of camera.named; its diagonal is sigma squared; None where it is not
+    known. picture_covariance: (w, w) of the parameters of the next larger lens model, what the
+    model leaves out of the picture included.
     turns: of this drive; stored_turns: of earlier ones, see config turns.store.
     timing: seconds, keys detect, calibrate, total. versions: package name -> version.
     magnitudes: (n, 2) float64, columns stamp [s] and filtered turning magnitude [of the width].
@@ -299,15 +310,8 @@ class Calibration:
     witnesses: Witnesses = default(default_factory=Witnesses)
     start_s: float = 0.0
     material: Material | None = default(default=None, compare=False)
-
-    if TYPE_CHECKING:
-        # report/, where files are read and written, adds them: see report/__init__.py
-        @staticmethod
-        def load(path: str | os.PathLike[str]) -> Calibration:
-            """Read what save() and `dashcalib run` write."""
-
-        def save(self, folder: str | os.PathLike[str] = 'calibration') -> tuple[Path, ...]:
-            """Write what `dashcalib run` writes."""
+    covariance: Floats | None = default(default=None, compare=False)
+    picture_covariance: Floats | None = default(default=None, compare=False)
 
     def __repr__(self) -> str:
         """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
@@ -320,17 +324,6 @@ class Calibration:
         text = (f'{self.verdict.level}, {self.camera.model}, {", ".join(found)}'
                 + (f', and {field.text}' if field else ''))
         return f'Calibration({"; ".join(part for part in (text, self.caveat) if part)})'
-
-    def accepted(self) -> AcceptedCalibration:
-        """Return the same calibration, whose camera and sigma are known not to be None.
-
-        Raises NotAcceptedError with the reasons if it is weak or refused.
-        """
-        if self.verdict.level != 'accepted':
-            raise NotAcceptedError('E-NOT-ACCEPTED', f'the calibration is {self.verdict.level}: '
-                                                     f'{"; ".join(self.verdict.reasons)}')
-        return AcceptedCalibration(**{each.name: getattr(self, each.name)
-                                      for each in fields(self)})
 
     @property
     def caveat(self) -> str:
@@ -351,20 +344,6 @@ class Calibration:
         Those of a fisheye are for cv2.fisheye.
         """
         return np.array(self._camera.ros_distortion())
-
-    @property
-    def covariance(self) -> Floats:
-        """Return the covariance of the n parameters (n, n), in the order of camera.named.
-
-        Its diagonal is sigma squared. Raises InputError where there is no camera, or where the
-        correlations are not known.
-        """
-        names = self._camera.names()
-        correlation = np.array(self.details.get('correlation', ()), np.float64)
-        if self.sigma is None or correlation.shape != (len(names), len(names)):
-            raise _unknown_covariance()
-        sigma = np.array([self.sigma[name] for name in names])
-        return np.asarray(correlation * np.outer(sigma, sigma))
 
     def sigma_at(self, pixels: npt.ArrayLike) -> Floats:
         """Return (n,) how far the camera may be off at pixels (n, 2), one sigma, px.
@@ -394,10 +373,10 @@ class Calibration:
     @property
     def _posterior(self) -> tuple[Camera, Floats]:
         """Return the camera in the wider model, and the covariance (n, n) of its parameters."""
-        camera = self._camera.widened()
-        covariance = np.array(self.details.get('picture_covariance', ()), np.float64)
-        if covariance.shape != (len(camera.params),) * 2:
-            raise _unknown_covariance()
+        camera, covariance = self._camera.widened(), self.picture_covariance
+        if covariance is None or covariance.shape != (len(camera.params),) * 2:
+            raise InputError('E-UNKNOWN-COVARIANCE', 'this calibration does not contain the '
+                             'correlations of its parameters: calibrate the drive again')
         return camera, covariance
 
     def rays(self, pixels: npt.ArrayLike) -> Floats:
@@ -473,16 +452,3 @@ class Calibration:
     def turns_used(self) -> int:
         """Return how many turns the result is based on, including those of earlier drives."""
         return len(self.used_turns)
-
-
-@dataclass(frozen=True, repr=False)
-class AcceptedCalibration(Calibration):
-    """An accepted calibration, from Calibration.accepted(): camera and sigma are there."""
-
-    camera: Camera
-    sigma: Mapping[str, float]
-
-    @property
-    def intrinsics(self) -> dict[str, float]:
-        """Return the camera's parameters by name."""
-        return self.camera.named

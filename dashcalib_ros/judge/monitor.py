@@ -28,30 +28,6 @@ from dashcalib_ros.solve.prior import loss_px_of
 from dashcalib_ros.solve.quadratic import Quadratic
 
 Kind = Literal['lens', 'mount']
-# least sigma of a coefficient of distortion: good calibrations differ by this much
-LEAST_DISTORTION_SIGMA = 0.002
-# times the least sigmas: the error of a camera of which nothing is known
-UNKNOWN = 100.0
-# times the zoom that is found, between which the true one is: the linear step overshoots by half
-# and more, and noise adds to it
-TRUE_ZOOM = (0.4, 1.3)
-# a zoom that the camera in use explains no longer; of made turns it mostly explains 5 %, not 8 %
-UNEXPLAINED_ZOOM = 0.05
-# of the evidence; parts of the camera that leave less are the explanation: a turn's cost is not
-# exactly quadratic, so that the others gain some evidence from a change they have no part in
-UNEXPLAINED = 0.2
-# by which the turns of one camera vary more than their noise; KITTI 03: up to 5
-SCATTER = 3.0
-# of fx, or of the width: smaller changes are not told
-LEAST_CHANGE = 0.008
-# degrees; a camera that was moved by less is not told
-LEAST_TURNED_DEG = 0.6
-# degrees; the direction of travel varies so much between turns, sideways
-HEADING_SIGMA_DEG = 0.15
-# degrees; the same up and down: roads, brakes and load
-PITCH_SIGMA_DEG = 0.2
-# degrees; a turn that shows the direction of travel worse is not used
-MAX_HEADING_SIGMA_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -151,6 +127,30 @@ def moved_text(than: str, turned_deg: Sequence[float] | Floats) -> str:
     return (f'the camera points elsewhere {than}: by {abs(yaw):.1f} degrees to the '
             f'{"left" if yaw > 0 else "right"} and {abs(pitch):.1f} '
             f'{"up" if pitch > 0 else "down"}; its calibration stays right')
+
+
+# times the least sigmas: the error of a camera of which nothing is known
+UNKNOWN = 100.0
+# times the zoom that is found, between which the true one is: the linear step overshoots by half
+# and more, and noise adds to it
+TRUE_ZOOM = (0.4, 1.3)
+# a zoom that the camera in use explains no longer; of made turns it mostly explains 5 %, not 8 %
+UNEXPLAINED_ZOOM = 0.05
+# of the evidence; parts of the camera that leave less are the explanation: a turn's cost is not
+# exactly quadratic, so that the others gain some evidence from a change they have no part in
+UNEXPLAINED = 0.2
+# by which the turns of one camera vary more than their noise; KITTI 03: up to 5
+SCATTER = 3.0
+# of fx, or of the width: smaller changes are not told
+LEAST_CHANGE = 0.008
+# degrees; a camera that was moved by less is not told
+LEAST_TURNED_DEG = 0.6
+# degrees; the direction of travel varies so much between turns, sideways
+HEADING_SIGMA_DEG = 0.15
+# degrees; the same up and down: roads, brakes and load
+PITCH_SIGMA_DEG = 0.2
+# degrees; a turn that shows the direction of travel worse is not used
+MAX_HEADING_SIGMA_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -384,6 +384,10 @@ def watch(readings: Iterable[Reading], camera: Camera, sigma: Mapping[str, float
     for reading in readings:
         monitor = monitor.after(reading)
     return monitor
+
+
+# least sigma of a coefficient of distortion: good calibrations differ by this much
+LEAST_DISTORTION_SIGMA = 0.002
 
 
 def _covariance(camera: Camera, sigma: Mapping[str, float]) -> Floats:

@@ -1,13 +1,12 @@
 """The output folder and its report.html; comparisons; what a terminal shows: tables.py."""
-from dashcalib_ros.formats import load_calibration
-from dashcalib_ros.judge import AcceptedCalibration, Calibration, Verdict
+from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.difference import NamedCamera
+from dashcalib_ros.report.calibration import AcceptedCalibration, Calibration
 from dashcalib_ros.report.compare import answer_dict, compare
 from dashcalib_ros.report.files import (
     Written,
     check_writable,
     output_folder,
-    save,
     set_aside,
     write_results,
     write_text,
@@ -17,7 +16,3 @@ from dashcalib_ros.report.page import report_html
 __all__ = ['AcceptedCalibration', 'Calibration', 'NamedCamera', 'Verdict', 'Written',
            'answer_dict', 'check_writable', 'compare', 'output_folder', 'report_html', 'set_aside',
            'write_results', 'write_text']
-
-# a result's files are written and read here: judge/, which makes the result, knows no files
-for _name, _function in (('load', staticmethod(load_calibration)), ('save', save)):
-    setattr(Calibration, _name, _function)

@@ -12,7 +12,7 @@ from pathlib import Path
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.formats import calibration_yaml, load_camera, result_json
 from dashcalib_ros.formats.ros import CAMERA_NAME
-from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.whole_files import prepared, remove_leftovers, sync, write_whole
@@ -35,7 +35,7 @@ class Written:
     set_aside: Path | None = None
 
 
-def write_results(calibration: Calibration, out_dir: str | os.PathLike[str],
+def write_results(calibration: CalibrationData, out_dir: str | os.PathLike[str],
                   camera_name: str = CAMERA_NAME,
                   created: str | None = None, truth: NamedCamera | None = None) -> Written:
     """Write the result's files into out_dir, which is made if needed, and return their paths.
@@ -67,16 +67,6 @@ def write_results(calibration: Calibration, out_dir: str | os.PathLike[str],
                 (folder / WEAK).unlink(missing_ok=True)
             sync(folder)
     return Written(tuple(folder / name for name in texts), moved)
-
-
-def save(calibration: Calibration, folder: str | os.PathLike[str] = 'calibration'
-         ) -> tuple[Path, ...]:
-    """Write what `dashcalib run` writes into a folder, and return the files' paths.
-
-    These are result.json, report.html and calibration.yaml (calibration.weak.yaml where it is
-    weak, none where it is refused). Raises OutputError, which names the cure.
-    """
-    return write_results(calibration, folder).files
 
 
 def write_text(path: str | Path, text: str | bytes) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Ints, Pixels
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.remap import WIDEST, rectified_matrix, rectify, seen_at
-from dashcalib_ros.judge import Calibration
-from dashcalib_ros.judge.agreement import focal_alone, sigma_by_count
+from dashcalib_ros.judge import CalibrationData
+from dashcalib_ros.judge.agreement import focal_of_turns, sigma_by_count
 from dashcalib_ros.judge.calibration import Material, Mount
 from dashcalib_ros.reconstruct.scene import Profile, Scene, residuals_px
 from dashcalib_ros.report.charts import (
@@ -69,7 +69,7 @@ class Slider:
     caption: str
 
 
-def uncertainty_of(c: Calibration) -> Drawing | None:
+def uncertainty_of(c: CalibrationData) -> Drawing | None:
     """Return the uncertainty over the picture; None where it is not known."""
     if c.material is None or c.camera is None or c.material.solution is None:
         return None
@@ -82,7 +82,7 @@ def uncertainty_of(c: Calibration) -> Drawing | None:
         f'picture (RMS), {c.sigma_px.worst:.2f} px at the worst place.')
 
 
-def slider_of(c: Calibration) -> Slider | None:
+def slider_of(c: CalibrationData) -> Slider | None:
     """Return the picture of the turn that shows most, of this drive, without distortion."""
     pictures = {} if c.material is None or c.material.solution is None else c.material.pictures
     turns = [turn for turn in c.turns if turn.id in pictures]
@@ -99,7 +99,7 @@ def slider_of(c: Calibration) -> Slider | None:
                           f'points by up to {moved:.0f} px.')
 
 
-def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
+def evidence_of(c: CalibrationData, mask_id: str | None) -> list[Drawing]:
     """Return the plots of the evidence; none where no turn was reconstructed."""
     material = c.material
     if material is None or not material.scenes:
@@ -110,7 +110,7 @@ def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
     if solution is not None and c.camera is not None and c.sigma is not None:
         drawings += _growth(c, solution, material.px)
         if by_turn := focal_by_turn(c):
-            best = material.px * min(turn.sigma for turn in focal_alone(solution).values())
+            best = material.px * min(turn.sigma for turn in focal_of_turns(solution).values())
             why = WHY_TOGETHER if c.sigma['fx'] < MUCH_BETTER * best else ''
             drawings.append(Drawing('fx by turn', by_turn, BY_TURN + why))
     camera = None if solution is None else solution.camera
@@ -121,7 +121,7 @@ def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
     return drawings
 
 
-def _profile(c: Calibration, material: Material, scenes: list[Scene]) -> Drawing:
+def _profile(c: CalibrationData, material: Material, scenes: list[Scene]) -> Drawing:
     """Return the error that is left at each focal length held fixed, by turn and for all."""
     solution, fx = material.solution, None if c.camera is None else c.camera.fx
     each = [scene.profile for scene in scenes]
@@ -155,7 +155,7 @@ def _profile(c: Calibration, material: Material, scenes: list[Scene]) -> Drawing
         'clear minimum: the turns determine the focal length. A flat line: they do not.')
 
 
-def _growth(c: Calibration, solution: Solution, px: float) -> list[Drawing]:
+def _growth(c: CalibrationData, solution: Solution, px: float) -> list[Drawing]:
     """Return the sigma of fx, in %, with the first turn, with two of them, and so on."""
     assert c.camera is not None
     percent = [100 * sigma * px / c.camera.fx for sigma in sigma_by_count(solution)]
@@ -331,7 +331,7 @@ HEIGHT, AXIS = 160, 130.0
 ARROWS = 18
 
 
-def mounting_of(c: Calibration) -> list[Drawing]:
+def mounting_of(c: CalibrationData) -> list[Drawing]:
     """Return the car from the side and from above, and the horizon in a picture."""
     if c.mount is None or c.camera is None:
         return []
@@ -349,7 +349,7 @@ def _angle(name: str, mount: Mount) -> str:
     return f'{text[0].upper()}{text[1:]}, drawn {ENLARGED:.0f} times as large.'
 
 
-def field_of(c: Calibration) -> list[Drawing]:
+def field_of(c: CalibrationData) -> list[Drawing]:
     """Return the field as arrows over the picture; none where none is used."""
     if c.field is None or not c.field.used or c.camera is None:
         return []
@@ -380,7 +380,7 @@ def _car(side: Floats, camera: tuple[float, float], turned_deg: float, label: st
         text(20, HEIGHT - 8, 'dashed: direction of travel')]))
 
 
-def _horizon(c: Calibration, mount: Mount, camera: Camera) -> Drawing:
+def _horizon(c: CalibrationData, mount: Mount, camera: Camera) -> Drawing:
     """Return the horizon, and the pixel that the car travels to, in a picture of the drive."""
     width, height = c.image_size
     level = replace(mount, yaw_left_deg=0.0)

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dashcalib_ros.errors import visible
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.report.compare import (
     Comparison,
     answers,
@@ -43,7 +43,7 @@ def line(text: str) -> Text:
     return Text(visible(text))
 
 
-def summary(calibration: Calibration) -> RenderableType:
+def summary(calibration: CalibrationData) -> RenderableType:
     """Return the estimate with its sigma, the table of turns, and a few facts."""
     c = calibration
     parts: list[RenderableType] = []

@@ -4,15 +4,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import zip_longest
-from typing import NamedTuple
 
 import numpy as np
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
-from dashcalib_ros.judge.agreement import focal_disagreement, leverages
-from dashcalib_ros.judge.calibration import Mount, Witnesses
-from dashcalib_ros.judge.verdict import gyro_confirms, profile_contrast
+from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
+from dashcalib_ros.judge.calibration import Condition, Mount, Witnesses
 
 ADVICE = {
     'accepted': 'Good to use.',
@@ -30,20 +27,20 @@ NEXT = {
 PIXELS = ('fx', 'fy', 'cx', 'cy')
 
 
-def parameter_rows(calibration: Calibration) -> list[tuple[str, str, str, str]]:
+def parameter_rows(calibration: CalibrationData) -> list[tuple[str, str, str, str]]:
     """Return each parameter's name, value, sigma and sigma in percent, as text."""
     rows = []
     for name, value in ({} if calibration.camera is None else calibration.camera.named).items():
         sigma = (calibration.sigma or {}).get(name, math.inf)
-        said, relative = '± ' + number(name, sigma), ''
+        absolute, relative = '± ' + number(name, sigma), ''
         if not math.isfinite(sigma):
-            said = 'unknown'
+            absolute = 'unknown'
         elif value:
             share = 100 * sigma / abs(value)
             # one as large as its value has no sensible digits
             relative = ('over 100 %' if share > 100 else
                         f'{share:.0f} %' if share >= 10 else f'{share:.2f} %')
-        rows.append((name, number(name, value), said, relative))
+        rows.append((name, number(name, value), absolute, relative))
     return rows
 
 
@@ -99,26 +96,26 @@ def mount_text(mount: Mount) -> str:
 def witness_texts(witnesses: Witnesses) -> list[str]:
     """Return a line for each sensor that knows something of the focal length."""
     lines = []
-    for name, said in (('gyro', witnesses.gyro), ('GPS', witnesses.gps)):
-        if said is None:
+    for name, each in (('gyro', witnesses.gyro), ('GPS', witnesses.gps)):
+        if each is None:
             continue
-        text = (f'the {name} {"agrees" if said.agrees else "contradicts"}: fx off by '
-                f'{said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} %')
-        if said.time_offset_s is not None and said.time_sigma_s is not None:
-            text += (f', its time stamps late by {1e3 * said.time_offset_s:.0f} ± '
-                     f'{max(1e3 * said.time_sigma_s, 0.1):.1f} ms')
-        if said.scale_by_gps is not None:
-            text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*said.scale_by_gps)
+        text = (f'the {name} {"agrees" if each.agrees else "contradicts"}: fx off by '
+                f'{each.fx_percent:+.2f} ± {each.fx_sigma_percent:.2f} %')
+        if each.time_offset_s is not None and each.time_sigma_s is not None:
+            text += (f', its time stamps late by {1e3 * each.time_offset_s:.0f} ± '
+                     f'{max(1e3 * each.time_sigma_s, 0.1):.1f} ms')
+        if each.scale_by_gps is not None:
+            text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*each.scale_by_gps)
         lines.append(text)
     return lines
 
 
-def since_start(turn: TurnSummary, calibration: Calibration) -> str:
+def since_start(turn: TurnSummary, calibration: CalibrationData) -> str:
     """Return when a turn was, in s since the start of the drive, as on the plot's axis."""
     return f'{turn.stamp_s - calibration.start_s:.1f}'
 
 
-def key_figures(c: Calibration) -> list[tuple[str, str, str]]:
+def key_figures(c: CalibrationData) -> list[tuple[str, str, str]]:
     """Return the figures that matter most: a name, a value, and what belongs to it."""
     yaw = c.yaw_deg
     found = [('turns used', f'{c.turns_used}',
@@ -169,7 +166,7 @@ def objections(verdict: Verdict) -> Iterator[tuple[str, str, str]]:
         yield code, reason.removesuffix(f': {cure}'), cure
 
 
-def next_steps(c: Calibration) -> list[str]:
+def next_steps(c: CalibrationData) -> list[str]:
     """Return what to do next, most useful first."""
     needed = c.config.verdict
     together = ('Short drives add up: with `--set turns.store=FOLDER`, each run uses the turns of '
@@ -200,7 +197,7 @@ def next_steps(c: Calibration) -> list[str]:
     return steps
 
 
-def run_facts(c: Calibration) -> list[tuple[str, str]]:
+def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
     """Return what else is known of the run: a name, and a text."""
     facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
     for name, turns in (('turns', c.turns), ('turns of earlier drives', c.stored_turns)):
@@ -241,61 +238,7 @@ def optional(value: float | None, digits: int, unit: str = '') -> str:
     return '-' if value is None or not math.isfinite(value) else f'{value:.{digits}f}{unit}'
 
 
-class Condition(NamedTuple):
-    """A condition of the verdict in words, what this drive has, what is needed, and whether met.
-
-    found, needed: '' where two numbers do not say it. code: of the reason where it is not met.
-    """
-
-    code: str
-    name: str
-    found: str
-    needed: str
-    met: bool
-
-
-def checks(c: Calibration) -> list[Condition]:
-    """Return the conditions of the verdict: its reasons in their order, then what is met.
-
-    What can be put in a number is there also where it is met.
-    """
-    rows = {row.code: row for row in _measured(c)}
-    failed = [rows.pop(code)._replace(met=False) if code in rows
-              else Condition(code, what, '', '', False)
-              for code, what, _ in objections(c.verdict)]
-    return [*failed, *sorted(rows.values(), key=lambda row: row.met)]
-
-
-def _measured(c: Calibration) -> list[Condition]:
-    """Return the conditions that can be put in a number.
-
-    Only the first two are judged here, for a drive without a solution: the verdict has the others.
-    """
-    needed, count, yaw = c.config.verdict, c.turns_used, c.yaw_deg
-    solution = None if c.material is None else c.material.solution
-    alone = solution is not None and gyro_confirms(solution)
-    found = [Condition(*row) for row in (
-        ('E-FEW-TURNS', 'turns used', f'{count}',
-         'the gyro confirms them' if alone else f'at least {needed.min_turns}',
-         alone or count >= needed.min_turns),
-        ('E-LITTLE-YAW', 'yaw of these turns together', f'{yaw:.0f}°',
-         f'at least {needed.min_yaw_deg:.0f}°', yaw >= needed.min_yaw_deg))]
-    if solution is None:
-        return found
-    share = max(leverages(solution).values(), default=1.0)
-    return found + [Condition(code, name, value, limit, True) for code, name, value, limit in (
-        ('E-FLAT-PROFILE', 'rise of the error when the focal length is 20 % off',
-         f'{100 * max(profile_contrast(solution), 0.0):.1f} %',
-         f'at least {100 * needed.min_contrast:.0f} %'),
-        ('E-LARGE-SIGMA', 'uncertainty of fx',
-         f'{100 * float(solution.sigma[0] / solution.camera.fx):.2g} %',
-         f'at most {100 * needed.max_sigma:.3g} %'),
-        ('E-TURNS-DISAGREE', 'scatter of fx between the turns',
-         f'{100 * focal_disagreement(solution):.2g} %',
-         f'at most {100 * needed.max_disagreement:.3g} %'),
-        ('E-ONE-TURN-DOMINATES', 'largest share of one turn in the information about fx',
-         f'{100 * min(share, 1.0):.0f} %',
-         'the gyro confirms it' if alone else f'at most {100 * needed.max_leverage:.0f} %'),
-        ('E-ANOTHER-CAMERA', 'error of a turn, over that with a camera of its own',
-         f'{max(solution.misfits.values(), default=0.0):.2g} times',
-         f'at most {needed.max_misfit:.2g} times'))]
+def conditions(verdict: Verdict) -> tuple[Condition, ...]:
+    """Return the conditions of a verdict; of one without any, its reasons."""
+    return verdict.conditions or tuple(Condition(code, what, '', '', False)
+                                       for code, what, _ in objections(verdict))

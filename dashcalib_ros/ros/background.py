@@ -17,10 +17,10 @@ from dashcalib_ros.errors import DashcalibError, InputError, coded, counted, one
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.motion import SensorBuffer
-from dashcalib_ros.judge import Calibration, Check, Monitor, moved_text
+from dashcalib_ros.judge import Check, Monitor, moved_text
 from dashcalib_ros.judge.agreement import CONTRADICTS, outdated, turns_of_another_camera
 from dashcalib_ros.pipeline import Calibrator, Status
-from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.workers.memory import mapped_copy
 
 # s between two checks whether enough turns are built: scenes are finished without a push

@@ -14,9 +14,8 @@ from std_msgs.msg import Header
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError, coded
-from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import Mount
-from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.report.wording import mount_text, mounts_text
 from dashcalib_ros.ros.background import Result, Watched
 from dashcalib_ros.ros.car import Mounting

@@ -22,10 +22,9 @@ from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.formats import calibrated_camera, calibration_yaml
 from dashcalib_ros.formats.load import parse_camera
 from dashcalib_ros.formats.ros import matrix_block, yaml_text
-from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
-from dashcalib_ros.report import NamedCamera, set_aside, write_text
+from dashcalib_ros.report import Calibration, NamedCamera, set_aside, write_text
 from dashcalib_ros.whole_files import remove_leftovers
 
 # camera_info_manager's

@@ -356,7 +356,7 @@ def test_result_json_keeps_the_covariance_of_the_picture(tmp_path):
     covariance = np.diag([0.4, 0.4, 0.3, 0.3, 1e-3, 1e-3])**2
     calibration = dataclasses.replace(
         make_calibration(), sigma_px=PictureSigma(0.3, 0.9),
-        details={'picture_covariance': covariance.tolist()})
+        picture_covariance=covariance)
     (tmp_path / 'result.json').write_text(result_json(calibration))
     for camera in (load_camera(tmp_path), calibrated_camera(calibration)):
         np.testing.assert_array_equal(camera.covariance, covariance)

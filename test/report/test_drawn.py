@@ -18,7 +18,7 @@ import yaml
 from drawn import START_S, drawn_calibration, solution
 from made_calibration import EACH_MODEL, calibration_of, make_calibration
 from page_reader import Page
-from solving import only
+from solving import CONFIG, only
 
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect import TurnId
@@ -26,11 +26,12 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.judge.agreement import focal_alone, sigma_by_count
-from dashcalib_ros.judge.calibration import Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.judge.agreement import focal_of_turns, sigma_by_count
+from dashcalib_ros.judge.calibration import Condition, Shutter, Stabiliser, StoredTurnSummary
+from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.report import NamedCamera, report_html, write_results
 from dashcalib_ros.report.lens import WHY_TOGETHER, undistorted
-from dashcalib_ros.report.wording import checks, field_of_view
+from dashcalib_ros.report.wording import conditions, field_of_view
 from dashcalib_ros.session import with_source
 
 
@@ -99,17 +100,40 @@ def test_a_turn_that_contradicts_the_others_says_so():
 
 
 def test_every_objection_is_a_row_that_failed_and_they_come_first(drawn):
-    # the second reason has no number, the third no code
-    verdict = Verdict('weak', ('the picture is bent: clean', 'sigma is large: drive', 'old'),
-                      ('clean', 'drive'), ('E-PICTURE-BENT', 'E-LARGE-SIGMA'))
-    rows = checks(dataclasses.replace(drawn, verdict=verdict))
-    assert [row.code for row in rows if not row.met] == ['E-PICTURE-BENT', 'E-LARGE-SIGMA', '']
-    assert [row.met for row in rows] == [False] * 3 + [True] * 6
-    assert (rows[0].name, rows[2].name) == ('the picture is bent', 'old')
-    assert rows[1].found == '0.39 %'
-    assert all(row.met for row in checks(drawn))
+    rows = drawn.verdict.conditions
+    assert len(rows) == 7 and all(row.met and row.value and row.limit for row in rows)
+    # the first objection has no number
+    long = dataclasses.replace(solution(), readout_s=0.09, readout_sigma_s=0.001)
+    limits = dataclasses.replace(CONFIG.verdict, max_sigma=0.001, min_turns=4)
+    verdict = judge(long, limits)
+    assert verdict.codes == ('E-FEW-TURNS', 'E-LARGE-SIGMA', 'E-LONG-READOUT')
+    rows = verdict.conditions
+    assert [row.met for row in rows] == [False] * 3 + [True] * 5
+    assert tuple(row.code for row in rows[:3]) == verdict.codes
+    assert [(row.value, row.limit) for row in rows[:3]] == [
+        ('3', 'at least 4'), ('0.39 %', 'at most 0.1 %'), ('', '')]
+    assert verdict.reasons[2].startswith(rows[2].name)
     text = report_html(dataclasses.replace(drawn, verdict=verdict))
-    assert text.count('<tr class="objection">') == 3 and '<code>E-PICTURE-BENT</code>' in text
+    assert text.count('<tr class="objection">') == 3 and '<code>E-LONG-READOUT</code>' in text
+    assert text.index('<code>E-LONG-READOUT</code>') < text.index('rise of the error when')
+
+
+def test_a_verdict_of_another_origin_has_its_reasons_as_rows(drawn):
+    # the second reason has no code
+    verdict = Verdict('weak', ('the picture is bent: clean', 'old'), ('clean',),
+                      ('E-PICTURE-BENT',))
+    assert conditions(verdict) == (
+        Condition('E-PICTURE-BENT', 'the picture is bent', '', '', False),
+        Condition('', 'old', '', '', False))
+    text = report_html(dataclasses.replace(drawn, verdict=verdict))
+    assert text.count('<tr class="objection">') == 2 and '<code>E-PICTURE-BENT</code>' in text
+
+
+def test_a_drive_without_turns_shows_what_it_lacks():
+    verdict = drawn_calibration(None).verdict
+    assert [row.code for row in verdict.conditions] == [
+        verdict.codes[0], 'E-FEW-TURNS', 'E-LITTLE-YAW']
+    assert not any(row.met for row in verdict.conditions) and len(verdict.codes) == 1
 
 
 def test_with_two_turns_the_growth_of_what_is_known_shows_both():
@@ -123,7 +147,7 @@ def test_with_two_turns_the_growth_of_what_is_known_shows_both():
 
 
 def test_why_all_turns_know_more_than_each_alone_is_said_where_it_is_so(drawn):
-    best = min(turn.sigma for turn in focal_alone(solution()).values())
+    best = min(turn.sigma for turn in focal_of_turns(solution()).values())
     for part, said in ((0.6, False), (0.2, True)):
         c = dataclasses.replace(drawn, sigma={**drawn.sigma, 'fx': part * best})
         assert (WHY_TOGETHER in Page(report_html(c)).text) == said
@@ -156,7 +180,7 @@ def test_times_count_from_the_drive_s_start(drawn, text):
 
 def test_what_turns_say_alone_scatters_about_the_common_result(drawn):
     found = solution()
-    alone = focal_alone(found)
+    alone = focal_of_turns(found)
     assert set(alone) == {scene.turn for scene in found.scenes}
     for each in alone.values():
         assert abs(each.fx - found.camera.fx) < 5 * each.sigma
@@ -227,7 +251,7 @@ def test_a_calibration_without_its_covariance_has_no_samples(drawn):
             ask(make_calibration('refused'))
         assert caught.value.code == 'E-CALIBRATION-REFUSED'
         with pytest.raises(InputError) as caught:
-            ask(dataclasses.replace(drawn, details={}))
+            ask(dataclasses.replace(drawn, picture_covariance=None))
         assert caught.value.code == 'E-UNKNOWN-COVARIANCE'
 
 

@@ -25,8 +25,9 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.formats.ros import camera_of_message
-from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
+from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.pipeline import Calibrator, Status
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros import background, node
 from dashcalib_ros.ros.calibrator_node import camera_info
 from dashcalib_ros.ros.check_node import NOT_YET

@@ -28,8 +28,9 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.input.scale import Scale
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Mount
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros.background import Moved, Result
 from dashcalib_ros.ros.store import Store, Whose
 from dashcalib_ros.store.turn_store import Origin, StoredTurn, TurnStore

@@ -15,10 +15,10 @@ from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
+from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.judge.calibration import StoredTurnSummary
 from dashcalib_ros.pipeline import Calibrator, Status
-from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.ros import background as room
 from dashcalib_ros.ros.background import (
     Learner,

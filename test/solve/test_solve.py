@@ -30,7 +30,7 @@ from dashcalib_ros.judge.agreement import (
     turns_of_another_camera,
 )
 from dashcalib_ros.judge.conclude import Evidence, conclude
-from dashcalib_ros.judge.verdict import judge, profile_contrast, sigma_too_large
+from dashcalib_ros.judge.verdict import Grounds, judge, profile_contrast, sigma_too_large
 from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import (
     Profile,
@@ -310,9 +310,10 @@ def test_another_focal_length_that_explains_more(good):
 def test_sigma_too_large(good, relative, level):
     wide = good.covariance.copy()
     wide[0, 0] = (relative * good.camera.fx)**2
-    found = sigma_too_large(with_covariance(good, wide), CONFIG.verdict)
-    assert (found.level if found else 'accepted') == level
-    assert found is None or found.code == 'E-LARGE-SIGMA'
+    found = sigma_too_large(Grounds(with_covariance(good, wide), CONFIG.verdict))
+    assert (found.level, found.code) == (level, 'E-LARGE-SIGMA')
+    assert found.condition.met == (level == 'accepted')
+    assert found.limit == f'at most {100 * CONFIG.verdict.max_sigma:.3g} %'
 
 
 @pytest.mark.parametrize(('rise', 'asked'), [(0.5, [20, 20, 20]), (0.02, [20] * 3 + [80] * 3)])
