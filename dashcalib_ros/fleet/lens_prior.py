@@ -27,6 +27,9 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import FleetConfig
 from dashcalib_ros.input.source import by
 
+# sigmas; a camera farther from the fx of its model uses another mode of the sensor
+OTHER_MODE = 3.0
+
 
 @dataclass(frozen=True)
 class Unit:
@@ -106,7 +109,7 @@ def _of_make(unit: Unit, prior: LensPrior | None, others: int, config: FleetConf
     if prior is None:
         return OfMake(None, f'its model has {others} other usable cameras; a prior needs '
                             f'{config.least_units} that agree')
-    if off_by(unit, prior) > config.other_mode:
+    if off_by(unit, prior) > OTHER_MODE:
         percent = 100 * (focal_length(unit.lens[0]) / focal_length(prior.mean[0]) - 1)
         return OfMake(None, f'its fx differs by {percent:+.1f} % from the prior of its model, or '
                             f'its distortion differs: another mode of the sensor, or another '
@@ -148,7 +151,7 @@ def lens_prior(units: Sequence[Unit], config: FleetConfig) -> LensPrior | None:
     agree = _densest(focal, np.array([unit.covariance[0, 0] for unit in units]), config)
     prior = _fitted([unit for unit, kept in zip(units, agree, strict=True) if kept], config)
     for _ in range(ROUNDS):
-        now = np.array([off_by(unit, prior) <= config.other_mode for unit in units])
+        now = np.array([off_by(unit, prior) <= OTHER_MODE for unit in units])
         if now.sum() < config.least_units:
             return None
         if np.array_equal(now, agree):
@@ -174,9 +177,9 @@ def _densest(focal: Floats, variance: Floats, config: FleetConfig) -> Mask:
     weight = spread / total
     # the candidates are the best known units
     best = np.argsort(-weight, kind='stable')[:CANDIDATES]
-    near = np.abs(focal[best, None] - focal) < config.other_mode / 2 * np.sqrt(total)
+    near = np.abs(focal[best, None] - focal) < OTHER_MODE / 2 * np.sqrt(total)
     middle = focal[best[int(np.argmax(near @ weight))]]
-    return np.asarray(np.abs(focal - middle) < config.other_mode * np.sqrt(total))
+    return np.asarray(np.abs(focal - middle) < OTHER_MODE * np.sqrt(total))
 
 
 # of the change of B; EM has ended

@@ -203,7 +203,7 @@ def _straight_lines(solution: Solution | None, evidence: Evidence, config: Confi
     if field is not None:
         ideal = field.ideal(lines.points.astype(np.float64))
         lines = replace(lines, points=ideal.astype(np.float32))
-    return bend(lines, solution.camera, config.lines, solution.covariance)
+    return bend(lines, solution.camera, covariance=solution.covariance)
 
 
 def _mount(solution: Solution, evidence: Evidence, level: str, config: Config) -> Mount | None:

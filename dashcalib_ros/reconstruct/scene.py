@@ -25,6 +25,9 @@ PICTURE_WIDTH = 720
 # world to camera: rotation (3, 3), translation (3,)
 Pose = tuple[Floats, Floats]
 
+# of a turn at the least; with fewer it is not reconstructed
+MIN_KEYFRAMES = 6
+
 
 @dataclass(frozen=True)
 class Structure:

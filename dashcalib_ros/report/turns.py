@@ -117,7 +117,7 @@ def _facts(turn: AnySummary, scene: Scene | None, c: CalibrationData) -> tuple[s
     if turn.yaw_deg is not None:
         way = '' if scene is None else ' ' + direction(scene)
         facts.append(f'{turn.yaw_deg:.0f}°{way}')
-    if turns_of_another_camera({turn.id: turn.misfit or 0.0}, c.config.verdict):
+    if turns_of_another_camera({turn.id: turn.misfit or 0.0}):
         facts.append(f'fits another camera: {turn.misfit:.1f} times the error of its own')
     return tuple(facts)
 
