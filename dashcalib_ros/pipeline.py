@@ -16,7 +16,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.poses import Poses
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading
 from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
 from dashcalib_ros.judge.check import CALIBRATION
@@ -297,7 +297,8 @@ class Calibrator:
         if camera.image_size != size:
             raise InputError('E-CALIBRATION-SIZE',
                              f'the given camera is for pictures of another size: '
-                             f'{by(camera.image_size)}; resize it with dashcalib export --size')
+                             f'{size_text(camera.image_size)}; resize it with dashcalib export '
+                             f'--size')
         return camera.resized(1 / scale.px, scale.size(size))
 
     # what is known so far ---------------------------------------------------------------------

@@ -225,7 +225,7 @@ MOTION: tuple[Argument, ...] = (
 # what the shell may complete: argcomplete looks for it
 COMPLETED = {'--model': MODELS, '--to': KINDS}
 # a command takes only one of these
-ALONE = ('--size', '--crop', '--workers', '--address', '--shard')
+EXCLUSIVE = ('--size', '--crop', '--workers', '--address', '--shard')
 
 
 def out_folder(default: str, cure: str = '') -> Argument:
@@ -366,9 +366,9 @@ def make_parser() -> Parser:
             name, help=command.summary, description=command.description,
             epilog=f'example: {command.example}\n{command.exit_codes}')
         alone = (own.add_mutually_exclusive_group()
-                 if any(flag in ALONE for flag, _ in command.arguments) else own)
+                 if any(flag in EXCLUSIVE for flag, _ in command.arguments) else own)
         for flag, options in command.arguments:
-            action = (alone if flag in ALONE else own).add_argument(flag, **options)
+            action = (alone if flag in EXCLUSIVE else own).add_argument(flag, **options)
             if flag in COMPLETED:
                 names = COMPLETED[flag]
                 action.completer = lambda n=names, **_: n  # type: ignore[attr-defined]

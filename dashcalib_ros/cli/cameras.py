@@ -13,7 +13,7 @@ from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.formats import export as exported
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
 from dashcalib_ros.report import compare as compare_cameras
 from dashcalib_ros.report import write_text
 from dashcalib_ros.report.page import difference_html
@@ -59,7 +59,7 @@ def export(args: argparse.Namespace) -> int:
         others = ', '.join(kind for kind, form in EXPORTS.items() if 'field' in form.keeps)
         warn([f'{found.name} has a field over the picture, for which {args.to} has no place: '
               f'without it pixels are off by {np.sqrt(np.mean(lost**2)):.2f} px RMS and '
-              f'{lost.max():.2f} px at the worst (of {by(found.image_size)}); export to '
+              f'{lost.max():.2f} px at the worst (of {size_text(found.image_size)}); export to '
               f'{others} to keep it'])
     unseen = rayless_share(camera)
     if unseen:

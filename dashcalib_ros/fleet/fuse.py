@@ -16,7 +16,7 @@ from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import counted
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.agreement import focal_of, turns_of_another_camera
 from dashcalib_ros.judge.conclude import Evidence, conclude
@@ -113,8 +113,8 @@ def _other_origins(clips: Clips) -> dict[str, str]:
         return sum(map(bool, turns)), sum(turns), len(turns), str(origin)
 
     main = max({clip.origin for clip in clips.values()}, key=weight, default=Origin((0, 0)))
-    return {name: f'is {by(clip.origin.image_size)}, and most clips of this camera are '
-                  f'{by(main.image_size)}'
+    return {name: f'is {size_text(clip.origin.image_size)}, and most clips of this camera are '
+                  f'{size_text(main.image_size)}'
             if clip.origin.image_size != main.image_size else
             'was gathered with another max_width or min_width than most clips of this camera'
             for name, clip in clips.items() if clip.origin != main}

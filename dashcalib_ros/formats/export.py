@@ -8,7 +8,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.formats.load import Given, given_camera
 from dashcalib_ros.formats.table import FORMATS
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge.check import same_shape
 from dashcalib_ros.limits import check_pixels
 
@@ -51,11 +51,13 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     """
     if min(size) < 1:
         raise ConfigError('E-SIZE-NOT-POSITIVE',
-                          f'{by(size)} is no size of a picture; write its width and height in px')
+                          f'{size_text(size)} is no size of a picture; write its width and '
+                          f'height in px')
     check_pixels(*size, 'the resized picture')
     if not same_shape(camera.image_size, size):
         raise ConfigError('E-SIZE-SHAPE',
-                          f'{by(size)} has another shape than the {by(camera.image_size)} of the '
+                          f'{size_text(size)} has another shape than the '
+                          f'{size_text(camera.image_size)} of the '
                           f'calibration; if the picture was cropped, use --crop')
     x, y = (new / old for new, old in zip(size, camera.image_size, strict=True))
     return camera.resized(x, size, y)
@@ -67,6 +69,6 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
             or top + height > camera.image_size[1]):
         raise ConfigError('E-CROP-OUTSIDE',
                           f'{left},{top},{width},{height} is no part of a picture of '
-                          f'{by(camera.image_size)}; write X,Y,W,H in px: the top left corner of '
-                          f'the part, and its size')
+                          f'{size_text(camera.image_size)}; write X,Y,W,H in px: the top left '
+                          f'corner of the part, and its size')
     return replace(camera, image_size=(width, height), cx=camera.cx - left, cy=camera.cy - top)
