@@ -1,9 +1,9 @@
-"""python -m dashcalib_ros.ros [checker] ...: a node, without the installed commands."""
+"""python -m dashcalib_ros.ros [calibrator | checker] ...: without the installed commands."""
 import sys
 
 from dashcalib_ros.ros import main
-from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER
+from dashcalib_ros.ros.interface import CALIBRATOR, PROGRAMS
 
 arguments = sys.argv[1:]
-checks = arguments[:1] == [CHECKER]
-sys.exit(main(CHECKER if checks else CALIBRATOR, arguments[checks:]))
+named = arguments[0] if arguments[:1] and arguments[0] in PROGRAMS else ''
+sys.exit(main(named or CALIBRATOR, arguments[bool(named):]))

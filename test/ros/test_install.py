@@ -168,7 +168,12 @@ def test_the_page_of_the_interface_is_that_of_a_running_node(start_node, make_be
     assert {name: said[name] for name in set(said) - of_rclpy} == expected(PUBLISHED)
     heard.pop('/parameter_events', None)
     assert heard == expected(SUBSCRIBED)
-    assert {name for name in found('service')} == {
+    names = set(ask(bench, node, ListParameters, f'/{program}/list_parameters',
+                    ListParameters.Request(depth=0)).result.names)
+    for kind, topics in (('publisher', expected(PUBLISHED)), ('subscription', heard)):
+        for topic in topics:
+            assert f'qos_overrides.{topic}.{kind}.depth' in names
+    assert set(found('service')) == {
         full(each.name) for each in SERVICES if program in each.programs} | {
         full(name) for name in OF_RCLPY['services']}
 
@@ -209,7 +214,8 @@ def test_parameters_that_may_not_change_say_so(node_and_bench):
 
 
 def ask(bench, node, kind, name, request):
-    client = bench.node.create_client(kind, f'calibrator/{name}')
+    client = bench.node.create_client(
+        kind, name if name.startswith('/') else f'calibrator/{name}')
     bench.until(client.service_is_ready, what=name, node=node)
     future = client.call_async(request)
     bench.until(future.done, what=name, node=node)
