@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
@@ -25,14 +26,21 @@ from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, Settings, specs, 
 RELIABILITIES = ('best_effort', 'reliable')
 
 
-def given_parameters(node_name: str) -> dict[str, Any]:
-    """Return the parameters that a node of this name is given at the start, known or not."""
-    probe = Node(node_name, enable_rosout=False, start_parameter_services=False,
-                 automatically_declare_parameters_from_overrides=True)
+def given_parameters(program: str) -> dict[str, Any]:
+    """Return the parameters that a program's node is given at the start, known or not."""
+    make = functools.partial(Node, program, enable_rosout=False, start_parameter_services=False)
     try:
-        return {name: probe.get_parameter(name).value for name in declared_names(probe)}
+        probe = make(automatically_declare_parameters_from_overrides=True)
+    except ValueError:
+        # an empty list, maybe of another node, has no type: rclpy then takes none of them
+        probe = make()
+        for name in specs(program):
+            probe.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True))
+    try:
+        given = {name: probe.get_parameter(name).value for name in declared_names(probe)}
     finally:
         probe.destroy_node()
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def declare(node: Node, program: str, given: Mapping[str, Any]) -> Settings:

@@ -91,6 +91,11 @@ def test_a_file_may_have_full_names_or_sections(tmp_path, ros_context):
         {'turns.wanted': 3, 'motion.rate': 8.0, 'turns.at_most': 4})
 
 
+def test_an_empty_list_of_another_node_is_left_alone(ros_context):
+    settings, _ = read(['-p', 'filters:=[]', '-p', 'turns.wanted:=3', '-p', 'mount_x:=1'])
+    assert settings.core.turns.wanted == 3 and settings.own.mount_x == 1.0
+
+
 def test_a_file_of_all_nodes_may_have_their_parameters(tmp_path, start_node):
     path = tmp_path / 'parameters.yaml'
     path.write_text('/**:\n  ros__parameters:\n    turns.wanted: 3\n    max_speed: 8.0\n'
