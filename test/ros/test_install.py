@@ -113,14 +113,14 @@ def test_the_node_takes_the_shipped_parameters(node_and_bench):
 
 
 def test_parameters_are_declared_with_type_reason_and_range(start_node, make_bench):
-    node, bench = start_node(scene__loss_px=0.6, mount_x=1), make_bench()
+    node, bench = start_node('-r', '__node:=typed', scene__loss_px=0.6, mount_x=1), make_bench()
     request = ListParameters.Request(depth=0)
-    names = list(ask(bench, node, ListParameters, 'list_parameters', request).result.names)
+    names = list(ask(bench, node, ListParameters, '/typed/list_parameters', request).result.names)
     users = {name for name, spec in specs().items() if not spec.metadata['expert']}
     assert users < set(names)
     request = DescribeParameters.Request(names=names)
     about = {each.name: each for each in ask(
-        bench, node, DescribeParameters, 'describe_parameters', request).descriptors}
+        bench, node, DescribeParameters, '/typed/describe_parameters', request).descriptors}
     kinds = {bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,
              float: ParameterType.PARAMETER_DOUBLE, str: ParameterType.PARAMETER_STRING}
     for name in users:
