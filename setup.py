@@ -41,8 +41,9 @@ setup(
         'numpy>=1.26',
         'scipy>=1.11',
         'opencv-python-headless>=4.10',
-        'pycolmap>=4.2',
-        'pyceres>=2.6',
+        # estimates poses; OpenCV does where it has no wheels
+        'pycolmap>=4.2; platform_machine == "x86_64" or platform_machine == "AMD64" '
+        'or (platform_machine == "arm64" and sys_platform == "darwin")',
         'rosbags>=0.11.9',
         'apsw',
         'mcap>=1.2',

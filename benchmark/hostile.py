@@ -68,6 +68,8 @@ from dashcalib_ros import Calibrator
 from dashcalib_ros.camera import Radial, ros_camera
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.formats.ros import camera_of_message
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion_files import read_motion
 from dashcalib_ros.report import load_camera
@@ -795,7 +797,7 @@ def old_stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
 
     from fleet_made import YAWS, clip_of
 
-    from dashcalib_ros.reconstruct.scene_file import SceneFile, encoded
+    from dashcalib_ros.store.scene_file import SceneFile, encoded
     pictures = two_turns(folder / 'pictures')
     true = Lens.of(640, 360, 75.0, -0.30, 0.10, offset=(9.0, -6.0), aspect=1.003)
     lens = Radial((640, 360), *(getattr(true, name) for name in (

@@ -23,11 +23,11 @@ from dashcalib_ros import Calibrator, Config
 from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import DashcalibError
+from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input import Frame
-from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.solve import solve
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ScenePool
@@ -187,7 +187,7 @@ class Stopwatch:
         self._stage, self._since = stage, now
 
 
-def calibrate(frames: Iterable[Frame], config: Config) -> tuple[Calibration, dict[str, float]]:
+def calibrate(frames: Iterable[Frame], config: Config) -> tuple[CalibrationData, dict[str, float]]:
     """Return the calibration, and the seconds of each stage.
 
     decode: getting the frames; push: all of detection, with waiting for scenes; then whatever
@@ -220,7 +220,7 @@ def reconstructed(detection: Detection, turns: Sequence[Turn], config: Config) -
 
 
 def solved(detection: Detection, scenes: Sequence[Scene], config: Config,
-           tell: Progress = lambda stage, share: None) -> Calibration:
+           tell: Progress = lambda stage, share: None) -> CalibrationData:
     """Return what these scenes say together; tell: is called as each stage begins."""
     worker = ChildWorker()
     try:
@@ -256,7 +256,7 @@ def errors(estimate: Mapping[str, Any], truth: Mapping[str, Any],
     return found
 
 
-def summarised(result: Calibration, truth: Mapping[str, Any],
+def summarised(result: CalibrationData, truth: Mapping[str, Any],
                known: Sequence[str] = ALL_KEYS) -> dict[str, Any]:
     """Return a calibration as a row of results; known: see errors()."""
     row: dict[str, Any] = {

@@ -30,7 +30,7 @@ from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import Samples, SensorStream, local_metres
 from dashcalib_ros.judge.gyro_scale import scale_by_gps
 from dashcalib_ros.judge.verdict import judge
-from dashcalib_ros.judge.witnesses import Asked, ask_sensors
+from dashcalib_ros.judge.witnesses import SensorComparison, compare_sensors
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.start import scene_with
@@ -103,10 +103,10 @@ def solved(frames: Iterable[Frame]) -> tuple[Solution, float, str]:
 
 
 def asked(drive: Driven, stream: SensorStream, solution: Solution | None = None,
-          scale_sigma: float = CALIBRATED) -> Asked:
+          scale_sigma: float = CALIBRATED) -> SensorComparison:
     """Ask the sensors of a drive, of its own solution or another one."""
     config = Config().replace({'motion.gyro_scale_sigma': scale_sigma})
-    return ask_sensors(solution or drive.solution, stream, drive.start_s, config)
+    return compare_sensors(solution or drive.solution, stream, drive.start_s, config)
 
 
 def scaled(stream: SensorStream, scale: float) -> SensorStream:

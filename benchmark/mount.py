@@ -42,9 +42,9 @@ from dashcalib_ros import Calibrator, Config, open_frames
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.demo import Drive
 from dashcalib_ros.demo.vehicle import MARGIN_S
+from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.motion import Samples, SensorStream
-from dashcalib_ros.judge import read_poses
-from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.input.poses import read_poses
 
 LENSES = {'demo': DEMO, 'KITTI raw': KITTI_RAW, '48 deg': NARROW, 'no distortion': PINHOLE,
           'off-centre': SHIFTED, '640x480': VGA, '115 deg': WIDE}

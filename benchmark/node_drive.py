@@ -144,7 +144,7 @@ def against(text: str | None, reference: dict[str, float]) -> None:
     if text is None:
         print('no calibration')
         return
-    from dashcalib_ros.report.camera_file import parse_camera
+    from dashcalib_ros.formats.load import parse_camera
     camera = parse_camera(text, 'the node')
     for name, value in reference.items():
         mine = camera.camera.named[name]

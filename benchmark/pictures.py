@@ -28,7 +28,7 @@ from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.demo import demo_drive
 from dashcalib_ros.detect.detection import detect
 from dashcalib_ros.detect.epipoles import epipoles_of
-from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.reconstruct import reconstruct
 from dashcalib_ros.reconstruct.scene import Scene
@@ -67,7 +67,7 @@ class Measured:
     epipoles: Floats
     scenes: list[Scene]
     solution: Solution
-    calibration: Calibration
+    calibration: CalibrationData
 
 
 def measure() -> Measured:

@@ -28,14 +28,15 @@ from measure import commit, complain, load, save, table
 from dashcalib_ros import Calibrator, Config, open_frames
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect import Turn, TurnId
+from dashcalib_ros.formats import load_camera
 from dashcalib_ros.input import Frame
-from dashcalib_ros.judge import Poses, read_poses, trivial_guess
-from dashcalib_ros.judge.odometry import COLOURS, angle_deg, length, odometry, path_files
+from dashcalib_ros.input.poses import Poses, read_poses
+from dashcalib_ros.judge import trivial_guess
 from dashcalib_ros.judge.odometry import TurnPath as TruePath
+from dashcalib_ros.judge.odometry import angle_deg, length, odometry, path_files
 from dashcalib_ros.reconstruct.chain import chain_scene
 from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure
 from dashcalib_ros.reconstruct.tracks import Tracks, track_turn
-from dashcalib_ros.report import load_camera
 from dashcalib_ros.solve.start import scene_with
 
 # frames of a window, from one to the next, and between two keyframes
@@ -141,6 +142,9 @@ def chained(known: Mapping[str, Any], poses: Poses, names: Sequence[str]
             'scale_spread_percent': 100 * float(np.std(np.log(scales_found))),
             'places': places}
     return found
+
+
+COLOURS = ('#d62728', '#1f77b4', '#7f7f7f', '#2ca02c', '#9467bd')
 
 
 def drive_svg(found: Mapping[str, Mapping[str, Any]], true: np.ndarray) -> str:

@@ -36,11 +36,11 @@ from dashcalib_ros import Config, open_frames
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect.detection import detect
-from dashcalib_ros.judge import Poses, read_poses
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.input.poses import Poses, read_poses
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.judge.odometry import Odometry, angle_deg, odometry
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.report import load_camera
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 

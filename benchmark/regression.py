@@ -23,8 +23,8 @@ from measure import Outcome, calibrate, commit, isolated, load, save
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.demo import demo_drive
+from dashcalib_ros.formats import result_dict
 from dashcalib_ros.input import Frame
-from dashcalib_ros.report import result_dict
 
 SETTINGS = ('rolling shutter 20 ms', 'dashcam: bonnet, text', 'one turn', 'turning on the spot')
 COMPARED = ('verdict', 'reasons', 'intrinsics', 'sigma', 'turns', 'frames',

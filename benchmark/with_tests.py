@@ -5,4 +5,4 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / 'test'), str(ROOT)]
 # two modules of tests are used, too: their damaged files, their made pairs of images
-sys.path += [str(ROOT / 'test' / room) for room in ('judge', 'reconstruct')]
+sys.path += [str(ROOT / 'test' / room) for room in ('judge', 'store')]

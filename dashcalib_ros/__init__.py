@@ -16,17 +16,13 @@ if TYPE_CHECKING:
         OutputError,
         WorkerError,
     )
+    from dashcalib_ros.formats import load_camera
+    from dashcalib_ros.formats.export import export
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
     from dashcalib_ros.pipeline import Calibrator
-    from dashcalib_ros.report import (
-        AcceptedCalibration,
-        Calibration,
-        Verdict,
-        compare,
-        load_camera,
-    )
-    from dashcalib_ros.report.export import export
+    from dashcalib_ros.report import AcceptedCalibration, Calibration, Verdict
+    from dashcalib_ros.report.compare import compare
     from dashcalib_ros.session import calibrate, check
 
     __version__: str
@@ -42,10 +38,9 @@ __all__ = ['AcceptedCalibration', 'Brown', 'Calibration', 'Calibrator', 'Camera'
            'calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames']
 
 _HOMES = {'Calibrator': 'pipeline', 'Config': 'config', 'Frame': 'input',
-          'calibrate': 'session', 'check': 'session', 'export': 'report.export',
-          'open_frames': 'input.inputs',
-          **dict.fromkeys(('AcceptedCalibration', 'Calibration', 'Verdict', 'compare',
-                           'load_camera'), 'report'),
+          'calibrate': 'session', 'check': 'session', 'export': 'formats',
+          'load_camera': 'formats', 'open_frames': 'input.inputs',
+          **dict.fromkeys(('AcceptedCalibration', 'Calibration', 'Verdict', 'compare'), 'report'),
           **dict.fromkeys(('Brown', 'Camera', 'Fisheye', 'Radial', 'Rational'), 'camera'),
           **dict.fromkeys(('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError',
                            'OutputError', 'WorkerError'), 'errors')}

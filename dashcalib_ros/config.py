@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
 from dashcalib_ros.errors import ConfigError
@@ -115,6 +116,35 @@ class TracksConfig:
     keyframe_motion: float = expert(
         0.03, 'fraction of the image width; motion of the median point between keyframes',
         0.0, 1.0)
+
+
+# engines of reconstruct.engine
+COLMAP, OPENCV = 'pycolmap', 'opencv'
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """What a turn is reconstructed with."""
+
+    engine: str = expert(
+        'auto', 'library that estimates poses; auto: pycolmap where it is installed, else opencv',
+        choices=('auto', COLMAP, OPENCV))
+
+    def __post_init__(self) -> None:
+        if self.engine == COLMAP and not self._has_colmap:
+            raise ConfigError('E-ENGINE-MISSING', 'reconstruct.engine is pycolmap, which is not '
+                              'installed: pip install pycolmap, or use auto or opencv')
+
+    @property
+    def used(self) -> str:
+        """Return the engine that is used on this computer, COLMAP or OPENCV; loads none."""
+        if self.engine == 'auto':
+            return COLMAP if self._has_colmap else OPENCV
+        return self.engine
+
+    @property
+    def _has_colmap(self) -> bool:
+        return find_spec(COLMAP) is not None
 
 
 @dataclass(frozen=True)
@@ -291,6 +321,7 @@ class Config:
     mask: MaskConfig = field(default_factory=MaskConfig)
     turns: TurnsConfig = field(default_factory=TurnsConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
     lines: LinesConfig = field(default_factory=LinesConfig)

@@ -43,10 +43,9 @@ class DashcalibError(Exception):
     it in scripts. text: one line with the problem and its cure; str(error) is the text alone.
     """
 
-    def __init__(self, code: str, text: str = '') -> None:
-        # a text alone is an error whose code is not chosen yet
-        self.code, self.text = (code, text) if text else ('', code)
-        super().__init__(*((code, text) if text else (code,)))
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(code, text)
+        self.code, self.text = code, text
 
     def __str__(self) -> str:
         return self.text

@@ -2,28 +2,35 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import TracebackType
 
-from dashcalib_ros.arrays import Mask
-from dashcalib_ros.camera import searched
+from dashcalib_ros import judge
+from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import SensorStream
-from dashcalib_ros.judge import Calibration
+from dashcalib_ros.input.poses import Poses
+from dashcalib_ros.input.source import by
+from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading
 from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
+from dashcalib_ros.judge.check import CALIBRATION
 from dashcalib_ros.judge.conclude import (
     Evidence,
     conclude,
     evidence_of_detection,
     turns_that_stood,
 )
-from dashcalib_ros.judge.witnesses import Asked, ask_sensors
+from dashcalib_ros.judge.monitor import readings_of
+from dashcalib_ros.judge.witnesses import SensorComparison, compare_sensors
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
@@ -60,8 +67,9 @@ class Calibrator:
     """Learns a camera from the turns of a drive.
 
     push() the frames as they come; calibrate() when enough turns have gathered, or at the end.
-    close() ends the child processes; a Calibrator is also a context manager. questions.py asks
-    its turns about other cameras. All methods are for one thread, but close(), which is for any.
+    close() ends the child processes; a Calibrator is also a context manager. check(), odometry(),
+    watch() and moved() ask the turns about other cameras than their own, of full-size pictures.
+    All methods are for one thread, but close(), which is for any.
 
     detection: what was found in the frames so far: turns, tracked points, the ego vehicle. scenes:
     which turns are reconstructed, and which of them count. workers: where every stage after the
@@ -93,6 +101,9 @@ class Calibrator:
         self._motion: SensorStream | None = None
         self._detect_s = 0.0
         self._started = time.monotonic()
+        # what turns say of the camera that watch() was asked about last, resized
+        self._watched: Camera | None = None
+        self._readings: dict[TurnId, Reading] = {}
 
         def child() -> Worker:
             return ChildWorker(live, verbose, config.threads, on_trouble)
@@ -101,8 +112,12 @@ class Calibrator:
             self.scenes.warnings.append(text)
             on_trouble(text)
 
+        if live:
+            # nothing else runs during an import: while images come, some would be lost
+            _load_judging()
         self.detection = Detection(config, mask, beside=not live)
         self.workers = ScenePool(config, InlineWorker if inline else child,
+                                 _load_all if live else _load_solving,
                                  queue=config.turns.wanted if live else None, on_lost=lost,
                                  on_trouble=on_trouble, keep_pictures=not live, on_wait=on_wait)
         self.scenes = SceneSelection(config, self.detection, self.workers, live, use_stored, warn)
@@ -148,13 +163,13 @@ class Calibrator:
 
     def _calibrate(self, progress: Progress, final: bool, started: float) -> Calibration:
         scenes, solution = self._solve(progress, final)  # scenes -> one camera
-        asked = self._ask_sensors(solution, progress)
-        solution, limits = asked.solution, self.scenes.config.verdict
+        sensors = self._compare_sensors(solution, progress)
+        solution, limits = sensors.solution, self.scenes.config.verdict
         # these do not count in the next calibration; files of another camera's turns stay
         self.scenes.exclude(turns_of_earlier_cameras(scenes, solution), keep_files=True)
         self.scenes.exclude(contradicting_turns(scenes, solution, limits))
         self.solution = solution
-        return self._judge(asked, started)  # one camera -> verdict
+        return self._judge(sensors, started)  # one camera -> verdict
 
     def _solve(self, progress: Progress, final: bool) -> tuple[list[Scene], Solution | None]:
         """Return the scenes that count, and the camera that explains them; None without any."""
@@ -166,7 +181,7 @@ class Calibrator:
                 continue
             # the search for repeated pictures takes a second and hardly ever finds some
             search = self.workers.begin(without_repeated, scenes, config.scene.min_images)
-            solving = self.workers.begin(solve, scenes, config, tells=True)
+            solving = self.workers.begin(solve, scenes, config, reports=True)
             kept, repeated = self.workers.result(search)
             if repeated:
                 self.workers.drop(solving)
@@ -175,29 +190,28 @@ class Calibrator:
             if any(len(one.tracks.frames) < len(other.tracks.frames)
                    for one, other in zip(kept, scenes, strict=True)):
                 self.workers.drop(solving)
-                solving = self.workers.begin(solve, kept, config, tells=True)
+                solving = self.workers.begin(solve, kept, config, reports=True)
             return kept, self.workers.result(solving, progress)
         return [], None
 
-    def _ask_sensors(self, solution: Solution | None, progress: Progress) -> Asked:
+    def _compare_sensors(self, solution: Solution | None, progress: Progress
+                         ) -> SensorComparison:
         if solution is None or self._motion is None:
-            return Asked(solution)
+            return SensorComparison(solution)
         progress('evaluating the motion sensors', 0.0)
-        asked: Asked = self.workers.run(ask_sensors, solution, self._motion,
-                                        self.detection.start_s, self.scenes.config)
-        return asked
-
-    def _judge(self, asked: Asked, started: float) -> Calibration:
-        # the solution itself is judged
-        evidence = self._evidence(started, replace(asked, solution=None))
-        if not self._live or self.solution is None:
-            return conclude(self.solution, evidence, self.scenes.config)
-        # it takes a second or two, and a live drive goes on meanwhile
-        found: Calibration = self.workers.run(conclude, self.solution, evidence,
-                                              self.scenes.config)
+        found: SensorComparison = self.workers.run(
+            compare_sensors, solution, self._motion, self.detection.start_s, self.scenes.config)
         return found
 
-    def _evidence(self, started: float, asked: Asked) -> Evidence:
+    def _judge(self, sensors: SensorComparison, started: float) -> Calibration:
+        # the solution itself is judged
+        evidence = self._evidence(started, replace(sensors, solution=None))
+        what = self.solution, evidence, self.scenes.config
+        # it takes a second or two, and a live drive goes on meanwhile
+        return Calibration.of(conclude(*what) if not self._live or self.solution is None
+                              else self.workers.run(conclude, *what))
+
+    def _evidence(self, started: float, sensors: SensorComparison) -> Evidence:
         now = time.monotonic()
         timing = {'detect': self._detect_s, 'calibrate': now - started,
                   'total': now - self._started}
@@ -206,7 +220,87 @@ class Calibrator:
             seen, timing=timing, warnings=(*seen.warnings, *self.scenes.warnings),
             stored=self.scenes.stored_before, left_out=self.scenes.left_out(),
             pictures=None if self._live else self.workers.pictures(), motion=self._motion,
-            asked=asked)
+            sensors=sensors)
+
+    # other cameras ----------------------------------------------------------------------------
+
+    def check(self, given: Camera, calibration: CalibrationData, progress: Progress | None = None,
+              name: str = CALIBRATION) -> Check:
+        """Say whether a given camera explains the drive.
+
+        calibration: what the last calibrate() returned. progress: as for calibrate(). name: of
+        the given camera's file, for the command that a message offers.
+        """
+        if progress is not None:
+            progress('the turns with the given camera', 0.0)
+        config, size = self.scenes.config, calibration.image_size
+        found: Check = self.workers.run(judge.check, given, size, self.solution,
+                                        calibration.verdict, config, name)
+        return judge.with_lines(found, given, self.detection.lines(), size, config)
+
+    def odometry(self, given: Camera, poses: Poses, progress: Progress | None = None
+                 ) -> Odometry | None:
+        """Compare the motion that cameras find in the turns with true poses.
+
+        The cameras: given, the drive's own, and a trivial guess. Returns None where the last
+        calibrate() found no camera. Raises InputError where given is for pictures of another size,
+        or no turn has poses.
+        """
+        if self.solution is None:
+            return None
+        if progress is not None:
+            progress('the turns beside the poses', 0.0)
+        own = self.solution.camera
+        cameras = {'given': self._resized(given), 'ours': own,
+                   'guess': judge.trivial_guess(own.image_size)}
+        found: Odometry = self.workers.run(judge.odometry, self.solution.scenes, cameras, poses,
+                                           self.scenes.config)
+        return found
+
+    def watch(self, camera: Camera, sigma: Mapping[str, float] | None = None) -> Monitor:
+        """Return whether the turns so far show that a camera in use has changed.
+
+        sigma: of its parameters; None for a camera that is not known to have fitted any turns
+        before these: then only turns behind one that it explains can show a change. Turns that
+        were read with the same camera before are not read again. Raises InputError where the
+        camera is for pictures of another size.
+        """
+        small, config, scenes = self._resized(camera), self.scenes.config, self.scenes.all_scenes()
+        if self._watched != small:
+            self._watched, self._readings = small, {}
+        new = [scene for turn, scene in scenes.items() if turn not in self._readings]
+        if new:
+            readings: tuple[Reading, ...] = self.workers.run(readings_of, new, small, config)
+            self._readings |= {reading.turn: reading for reading in readings}
+        units = dict(zip(small.names(), small.units(self.detection.scale.px).tolist(),
+                         strict=True))
+        scaled = None if sigma is None else {
+            name: value / units.get(name, 1.0) for name, value in sigma.items()}
+        # a stored turn that was driven again counts once
+        return judge.watch((reading for turn, reading in sorted(self._readings.items())
+                            if turn.of_this_drive or turn in scenes), small, scaled,
+                           config.monitor)
+
+    def moved(self, camera: Camera, newest: int) -> tuple[float, Floats] | None:
+        """Return when and by how much the camera was moved on the car; None where it was not.
+
+        That is s before the newest image, and (2,) degrees to the left and upwards. newest: pairs
+        of images of straight driving that are asked. Raises InputError as watch() does.
+        """
+        straights = self.detection.straights(newest)
+        found = self.workers.run(judge.moved, straights, self._resized(camera))
+        return found and (float(straights.stamps_s[-1] - found[0]), found[1])
+
+    def _resized(self, camera: Camera) -> Camera:
+        """Return a camera of the resized pictures."""
+        size, scale = self.detection.size, self.detection.scale
+        if camera.image_size != size:
+            raise InputError('E-CALIBRATION-SIZE',
+                             f'the given camera is for pictures of another size: '
+                             f'{by(camera.image_size)}; resize it with dashcalib export --size')
+        return camera.resized(1 / scale.px, scale.size(size))
+
+    # what is known so far ---------------------------------------------------------------------
 
     def turns(self) -> tuple[Turn, ...]:
         """Return the bank's turns, the most prominent first."""
@@ -233,3 +327,24 @@ class Calibrator:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self.close()
+
+
+def _load_solving() -> None:
+    """Import what a worker needs until the solution, COLMAP too."""
+    import dashcalib_ros.solve.joint  # noqa: F401
+    from dashcalib_ros.reconstruct import load
+    load()
+
+
+def _load_judging() -> None:
+    """Import what judges a result, and what that may need: it takes half a second."""
+    from scipy import optimize, special  # noqa: F401
+    from scipy.spatial import transform  # noqa: F401
+
+    import dashcalib_ros.judge.conclude  # noqa: F401
+
+
+def _load_all() -> None:
+    """Import what a worker of a live drive needs until the result."""
+    _load_judging()
+    _load_solving()

@@ -10,8 +10,8 @@ from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.reconstruct.scene_file import Origin, StoredTurn
-from dashcalib_ros.turn_store import TurnStore
+from dashcalib_ros.store.scene_file import Origin, StoredTurn
+from dashcalib_ros.store.turn_store import TurnStore
 from dashcalib_ros.workers.memory import in_a_file
 from dashcalib_ros.workers.pool import ScenePool
 from dashcalib_ros.workers.worker import Progress
@@ -54,11 +54,6 @@ class SceneSelection:
         self._valid: dict[TurnId, Mask | None] = {}
         # the turns whose pictures are in files
         self._in_a_file: set[TurnId] = set()
-        # whether the workers import already what they need
-        self._loading = False
-        if live:
-            # nothing else runs during an import: while images come, some would be lost
-            _load_judging()
         turns = config.turns
         self._store = TurnStore(turns.store, max(turns.capacity, turns.wanted), turns.half_width,
                                 self._store_failed)
@@ -166,10 +161,8 @@ class SceneSelection:
                 ready.append(turn)
             if not (replace_failed and key in built and built[key] is None):
                 places -= 1
-        if ready and not self._loading:
-            self._loading = True
-            for _ in range(self.config.threads):
-                self._workers.begin(_load_all if self._live else _load_solving)
+        if ready:
+            self._workers.start()
         waiting = WAITING if more_to_come and not self._live else 0
         due = ready[:max(len(ready) - waiting, 0)]
         for turn in due:
@@ -271,26 +264,6 @@ class SceneSelection:
     def _store_failed(self, text: str) -> None:
         self.warnings.append(text)
         self._warn(text)
-
-
-def _load_solving() -> None:
-    """Import what a child needs until the solution, COLMAP too."""
-    import dashcalib_ros.reconstruct.build
-    import dashcalib_ros.solve.joint  # noqa: F401
-
-
-def _load_judging() -> None:
-    """Import what judges a result, and what that may need: it takes half a second."""
-    from scipy import optimize, special  # noqa: F401
-    from scipy.spatial import transform  # noqa: F401
-
-    import dashcalib_ros.judge.conclude  # noqa: F401
-
-
-def _load_all() -> None:
-    """Import what a child of a live drive may need until the result."""
-    _load_judging()
-    _load_solving()
 
 
 def _repeated_text(turn: TurnId, other: TurnId) -> str:

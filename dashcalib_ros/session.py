@@ -18,17 +18,17 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.formats import Given, given_camera
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.input.inputs import Paths, as_list, fits_bag, open_frames
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
+from dashcalib_ros.input.poses import Poses, track_poses
 from dashcalib_ros.input.source import by
-from dashcalib_ros.judge import Calibration, Check, Odometry, Poses, track_poses
+from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.pipeline import Calibrator
-from dashcalib_ros.questions import Questions
-from dashcalib_ros.report import NamedCamera
-from dashcalib_ros.report.camera_file import Given, given_camera
+from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.workers.worker import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
@@ -100,22 +100,21 @@ def check_drive(drive: Recording, named: NamedCamera, config: Config | None = No
     """Calibrate a recorded drive, and compare a given camera with what its turns show.
 
     named: the given camera, of the pictures as they are stored. poses: true ones of the drive;
-    track: GPS positions, from which poses are made. Raises InputError as Questions.odometry().
+    track: GPS positions, from which poses are made. Raises InputError as Calibrator.odometry().
     """
     observer = observer or Observer()
     given = drive.source.shown(named.camera)
     with _learned(drive, config, observer, verbose) as calibrator:
-        calibration, questions = calibrator.calibrate(observer.show), Questions(calibrator)
-        check = questions.check(given, calibration, observer.show, named.name)
+        calibration = calibrator.calibrate(observer.show)
+        check = calibrator.check(given, calibration, observer.show, named.name)
         if given.image_size != calibration.image_size:
             return Checked(check, calibration)  # it explains no motion either
-        changes = tuple(str(change) for change in questions.watch(given).changes)
+        changes = tuple(str(change) for change in calibrator.watch(given).changes)
         if track is not None:
             track = track.since(calibration.start_s)
             assert track.position is not None
             poses = track_poses(track.position, calibration.start_s)
-        odometry = None if poses is None else questions.odometry(given, calibration, poses,
-                                                                 observer.show)
+        odometry = None if poses is None else calibrator.odometry(given, poses, observer.show)
     return Checked(check, calibration, changes, odometry)
 
 
@@ -221,7 +220,8 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
     if doubts:
         cures = (line.rpartition(': ')[2] for line in doubts)
         verdict = replace(verdict, reasons=(*doubts, *verdict.reasons),
-                          cures=(*cures, *verdict.cures))
+                          cures=(*cures, *verdict.cures),
+                          codes=(*['E-INPUT-CONTRADICTED'] * len(doubts), *verdict.codes))
     if material is not None:
         shown = material.pictures
         images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})

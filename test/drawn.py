@@ -10,8 +10,8 @@ from synthetic import SIZE
 from dashcalib_ros.detect import Turn
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.scale import FULL_SIZE
-from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.conclude import Evidence, conclude
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.solve.solution import Solution
 
 START_S = 1.7e9
@@ -45,4 +45,4 @@ def drawn_calibration(found: Solution | None, **changes) -> Calibration:
         'image_size': SIZE, 'frames': 500, 'turns': turns(), 'scale': FULL_SIZE, 'timing': {},
         'built': {scene.turn: scene for scene in solution().scenes}, 'magnitudes': magnitudes,
         'mask': mask, 'start_s': START_S, 'left_out': {turns()[3].id: 'it was too dark'}}
-    return conclude(found, Evidence(**evidence | changes), CONFIG)
+    return Calibration.of(conclude(found, Evidence(**evidence | changes), CONFIG))

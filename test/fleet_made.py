@@ -11,7 +11,7 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.config import Config
-from dashcalib_ros.reconstruct.scene_file import Origin, SceneFile, StoredTurn, encoded
+from dashcalib_ros.store.scene_file import Origin, SceneFile, StoredTurn, encoded
 
 CONFIG = Config().replace({'intrinsics.profile_tracks': 60})
 FEW = {'tracks': 110, 'keyframes': 9, 'noise_px': 0.25}

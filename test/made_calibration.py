@@ -7,8 +7,9 @@ import numpy as np
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
 from dashcalib_ros.config import Config
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Mount
+from dashcalib_ros.report import Calibration
 
 SIZE = (1242, 375)
 TRUTH = Radial(SIZE, 721.5377, 724.25, 609.5593, 172.854, -0.363, 0.151)

@@ -133,8 +133,8 @@ def node_arguments(words):
 def made():
     """Return an accepted calibration for pictures of SIZE."""
     return calibration_of(CAMERA, image_size=SIZE, mask=None,
-                          details={'correlation': np.eye(len(CAMERA.params)).tolist(),
-                                   'picture_covariance': np.eye(len(CAMERA.widened().params))})
+                          covariance=np.eye(len(CAMERA.params)),
+                          picture_covariance=np.eye(len(CAMERA.widened().params)))
 
 
 @pytest.fixture(scope='module')

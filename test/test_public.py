@@ -20,7 +20,6 @@ from dashcalib_ros import Calibrator, calibrate, check, compare, export, open_fr
 from dashcalib_ros.errors import DashcalibError, InputError, NotAcceptedError
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.judge import Check
-from dashcalib_ros.questions import Questions
 
 FUNCTIONS = ('calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames')
 ERRORS = ('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError', 'OutputError',
@@ -71,6 +70,14 @@ class FakeCalibrator:
         progress('solving', 1.0)
         return make_calibration()
 
+    def check(self, given, calibration, progress=None, name=''):
+        type(self).given = given
+        progress('checking', 1.0)
+        return Check('right', (), 0.0, 1.0)
+
+    def watch(self, camera, sigma=None):
+        return types.SimpleNamespace(changes=())
+
     def turns(self):
         return ()
 
@@ -78,26 +85,9 @@ class FakeCalibrator:
         pass
 
 
-@stands_in_for(Questions)
-class FakeQuestions:
-    """Asks nothing."""
-
-    def __init__(self, calibrator):
-        pass
-
-    def check(self, given, calibration, progress=None, name=''):
-        type(self).given = given
-        progress('checking', 1.0)
-        return Check('right', (), 0.0, 1.0)
-
-    def watch(self, camera, sigma=None, progress=None):
-        return types.SimpleNamespace(changes=())
-
-
 @pytest.fixture
 def drive(tmp_path, monkeypatch):
     monkeypatch.setattr(session, 'Calibrator', FakeCalibrator)
-    monkeypatch.setattr(session, 'Questions', FakeQuestions)
     (tmp_path / 'drive').mkdir()
     for n in range(4):
         cv2.imwrite(str(tmp_path / 'drive' / f'{n}.png'), np.full((48, 64), 60 + n, np.uint8))
@@ -153,7 +143,7 @@ def test_a_calibration_is_given_in_any_form(drive, tmp_path):
     named = dashcalib_ros.load_camera(tmp_path / 'a')
     for given in (result, TRUTH, named, tmp_path / 'a', str(tmp_path / 'a/calibration.yaml')):
         check(given, drive)
-        assert FakeQuestions.given == TRUTH
+        assert FakeCalibrator.given == TRUTH
         assert compare(given, result).mapping_px == pytest.approx(0.0, abs=1e-6)
         assert json.loads(export(given, 'nerfstudio'))['fl_x'] == TRUTH.fx
     for use in (lambda given: check(given, drive), lambda given: compare(given, TRUTH),

@@ -23,9 +23,9 @@ from dashcalib_ros.camera.camera import ColmapModel
 from dashcalib_ros.demo import Lens
 from dashcalib_ros.detect.detection import Detection, detect
 from dashcalib_ros.errors import ConfigError
+from dashcalib_ros.formats import calibration_yaml, load_camera, result_dict
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
 from dashcalib_ros.reconstruct import reconstruct
-from dashcalib_ros.report import calibration_yaml, load_camera, result_dict
 from dashcalib_ros.solve import solve
 
 # one term is all that this lens has
@@ -41,7 +41,6 @@ class OneTerm(Camera):
     model: ClassVar[str] = 'one_term'
     ros_model: ClassVar[str] = 'plumb_bob'
     family: ClassVar[str] = PINHOLE
-    colmap_one_focal: ClassVar[ColmapModel] = ColmapModel('SIMPLE_RADIAL', 4, (0, 0, 1, 2, 3))
     colmap: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4))
     spread: ClassVar[tuple[float, ...]] = (1.0,)
 

@@ -1,6 +1,6 @@
 """The camera models: projection, viewing rays, derivatives, limits; COLMAP's names and ROS's."""
 from dashcalib_ros.camera.camera import FISHEYE, PINHOLE, Camera
-from dashcalib_ros.camera.camera_info import RECTIFIED, ros_camera, ros_faults
+from dashcalib_ros.camera.camera_info import ros_camera, ros_faults
 from dashcalib_ros.camera.fisheye import Fisheye
 from dashcalib_ros.camera.models import (
     AUTO,
@@ -14,6 +14,7 @@ from dashcalib_ros.camera.models import (
     searched,
 )
 from dashcalib_ros.camera.pinhole import Brown, Radial, Rational
+from dashcalib_ros.camera.remap import RECTIFIED
 
 __all__ = ['AUTO', 'FISHEYE', 'MODELS', 'NO_DISTORTION', 'PINHOLE', 'RECTIFIED', 'Brown', 'Camera',
            'Fisheye', 'Radial', 'Rational', 'calibrated_models', 'camera_from_ros', 'camera_of',

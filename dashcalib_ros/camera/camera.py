@@ -36,32 +36,19 @@ class ColmapModel:
     """How COLMAP writes a camera.
 
     name: of COLMAP's model; size: how many parameters it has. places: the index of each of our
-    parameters among them; two may share one (a single focal length). COLMAP's other parameters
-    are fixed at 0.
+    parameters among them. COLMAP's other parameters are 0.
     """
 
     name: str
     size: int
     places: tuple[int, ...]
 
-    @property
-    def fixed(self) -> list[int]:
-        """Return the indices of COLMAP's parameters that are fixed at 0."""
-        return sorted(set(range(self.size)) - set(self.places))
-
     def values(self, params: npt.ArrayLike) -> Floats:
         """Return COLMAP's parameters (size,) for ours."""
         values = np.zeros(self.size)
-        # of two parameters that share a place, the first one counts
-        values[list(reversed(self.places))] = np.asarray(params)[::-1]
+        values[list(self.places)] = np.asarray(params)
         values[list(self.places[2:4])] += HALF_PIXEL
         return values
-
-    def params(self, values: npt.ArrayLike) -> Floats:
-        """Return our parameters for COLMAP's (size,)."""
-        params = np.asarray(values, np.float64)[list(self.places)]
-        params[2:4] -= HALF_PIXEL
-        return params
 
 
 @dataclass(frozen=True)
@@ -71,8 +58,7 @@ class Camera(ABC):
     model: its name in result.json and --model. ros_model: CameraInfo's distortion_model.
     family: PINHOLE or FISHEYE; within one, a coefficient has one meaning. given_only:
     whether no turns can determine its coefficients: then it may only be read from files.
-    colmap_one_focal, colmap: how COLMAP adjusts it with one focal length and the centre fixed, and
-    with all parameters (paper, 3.2). spread: prior standard deviation of each distortion
+    colmap: how COLMAP writes it. spread: prior standard deviation of each distortion
     coefficient, around 0. focal_ratios: focal lengths over the image width that the search for a
     start tries.
     sees_behind: whether it projects rays beyond 90 degrees from its axis.
@@ -88,7 +74,6 @@ class Camera(ABC):
     ros_model: ClassVar[str]
     family: ClassVar[str]
     given_only: ClassVar[bool] = False
-    colmap_one_focal: ClassVar[ColmapModel]
     colmap: ClassVar[ColmapModel]
     spread: ClassVar[tuple[float, ...]]
     # 126 to 29 degrees across, without distortion

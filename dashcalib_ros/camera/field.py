@@ -29,7 +29,8 @@ BEYOND = 1.1
 STEPS = 8
 
 
-@dataclass(frozen=True)
+# fields are compared by identity, as arrays cannot be: source_map() keeps the last one's map
+@dataclass(frozen=True, eq=False)
 class Field:
     """Where a pixel is observed, less where the camera's model alone would see it.
 

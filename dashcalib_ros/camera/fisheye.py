@@ -40,7 +40,6 @@ class Fisheye(Camera):
     model: ClassVar[str] = 'fisheye'
     ros_model: ClassVar[str] = 'equidistant'
     family: ClassVar[str] = FISHEYE
-    colmap_one_focal: ClassVar[ColmapModel] = ColmapModel('RADIAL_FISHEYE', 5, (0, 0, 1, 2, 3, 4))
     colmap: ClassVar[ColmapModel] = ColmapModel('OPENCV_FISHEYE', 8, (0, 1, 2, 3, 4, 5, 6, 7))
     spread: ClassVar[tuple[float, ...]] = (0.2, 0.1, 0.05, 0.02)
     # 250 to 82 degrees across, without distortion

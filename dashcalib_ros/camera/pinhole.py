@@ -40,7 +40,6 @@ class Radial(Camera):
     model: ClassVar[str] = 'radial'
     ros_model: ClassVar[str] = 'plumb_bob'
     family: ClassVar[str] = PINHOLE
-    colmap_one_focal: ClassVar[ColmapModel] = ColmapModel('RADIAL', 5, (0, 0, 1, 2, 3, 4))
     colmap: ClassVar[ColmapModel] = ColmapModel('OPENCV', 8, (0, 1, 2, 3, 4, 5))
     spread: ClassVar[tuple[float, ...]] = (1.0, 1.0)
 
@@ -75,17 +74,34 @@ class Radial(Camera):
 
     def derivatives(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the derivatives of the pixels of points (m, 3); see Camera."""
-        if len(points) == 0:
-            return np.zeros((0, 2, len(self.names()))), np.zeros((0, 2, 3)), np.zeros((0, 2))
-        # the stubs have wrong types for this function
-        project: Any = cv2.projectPoints
-        origin = np.zeros(3)
-        pixels, jacobian = project(np.ascontiguousarray(points, np.float64), origin, origin,
-                                   self.matrix, np.array(self.ros_distortion()))
-        jacobian = jacobian.reshape(len(points), 2, -1)
-        # OpenCV's columns: rotation, translation (the point's own), fx fy, cx cy, then D
-        return (jacobian[:, :, 6:6 + len(self.names())], jacobian[:, :, 3:6],
-                pixels.reshape(-1, 2))
+        # a tenth of the time of cv2.projectPoints
+        inverse = 1 / points[:, 2]
+        x, y = points[:, 0] * inverse, points[:, 1] * inverse
+        k1, k2, p1, p2, k3 = self.ros_distortion()
+        square = x * x + y * y
+        scale = self._stretch(square)
+        # of the scale by x over x, and by y over y
+        slope = 2 * (k1 + square * (2 * k2 + 3 * k3 * square))
+        across, sideways, downwards = 2 * x * y, square + 2 * x * x, square + 2 * y * y
+        by_params = np.zeros((len(points), 2, len(self.names())))
+        by_params[:, 0, 0] = x * scale + p1 * across + p2 * sideways
+        by_params[:, 1, 1] = y * scale + p1 * downwards + p2 * across
+        by_params[:, 0, 2] = by_params[:, 1, 3] = 1.0
+        pixels = by_params[:, [0, 1], [0, 1]] * [self.fx, self.fy] + [self.cx, self.cy]
+        radial = np.stack([self.fx * x, self.fy * y], axis=1) * square[:, None]
+        by_params[:, :, 4], by_params[:, :, 5] = radial, radial * square[:, None]
+        if len(self.names()) > 6:
+            by_params[:, 0, 6], by_params[:, 0, 7] = self.fx * across, self.fx * sideways
+            by_params[:, 1, 6], by_params[:, 1, 7] = self.fy * downwards, self.fy * across
+            by_params[:, :, 8] = radial * (square * square)[:, None]
+        both = across * slope / 2 + 2 * (p1 * x + p2 * y)
+        by_point = np.empty((len(points), 2, 3))
+        by_point[:, 0, 0] = scale + x * x * slope + 2 * p1 * y + 6 * p2 * x
+        by_point[:, 1, 1] = scale + y * y * slope + 6 * p1 * y + 2 * p2 * x
+        by_point[:, 0, 1] = by_point[:, 1, 0] = both
+        by_point[:, :, 2] = -(by_point[:, :, 0] * x[:, None] + by_point[:, :, 1] * y[:, None])
+        by_point *= inverse[:, None, None] * np.array([[self.fx], [self.fy]])
+        return by_params, by_point, pixels
 
     def rays(self, pixels: Floats) -> Floats:
         """Return unit viewing rays (..., 3): Newton's method on the radius."""
@@ -172,6 +188,20 @@ class Rational(Brown):
     def ros_distortion(self) -> list[float]:
         """Return k1, k2, p1, p2, k3, k4, k5, k6, the order of ROS and OpenCV."""
         return [float(value) for value in self.params[4:]]
+
+    def derivatives(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the derivatives of the pixels of points (m, 3); see Camera."""
+        if len(points) == 0:
+            return np.zeros((0, 2, len(self.names()))), np.zeros((0, 2, 3)), np.zeros((0, 2))
+        # the stubs have wrong types for this function
+        project: Any = cv2.projectPoints
+        origin = np.zeros(3)
+        pixels, jacobian = project(np.ascontiguousarray(points, np.float64), origin, origin,
+                                   self.matrix, np.array(self.ros_distortion()))
+        jacobian = jacobian.reshape(len(points), 2, -1)
+        # OpenCV's columns: rotation, translation (the point's own), fx fy, cx cy, then D
+        return (jacobian[:, :, 6:6 + len(self.names())], jacobian[:, :, 3:6],
+                pixels.reshape(-1, 2))
 
     def _stretch(self, square: Floats) -> Floats:
         above, below = self._polynomials

@@ -6,6 +6,9 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 
+# an optical frame that looks ahead (z ahead, x to the right, y downwards) to the car's (REP-103)
+OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
 
 def rotation_matrices(vectors: Floats) -> Floats:
     """Return the (n, 3, 3) matrices of rotation vectors (n, 3), rad."""

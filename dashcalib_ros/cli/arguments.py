@@ -37,8 +37,8 @@ BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera was refused;
                    'not be read or a camera was refused; 2 bad manifest or usage')
 # names of models, exports and demos; to take them from their tables would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
-KINDS = ('opencv', 'colmap', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'ros', 'foxglove',
-         'gyroflow', 'rays', 'maps')
+KINDS = ('colmap', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove', 'ros',
+         'opencv', 'rays', 'maps')
 LENSES = ('radial', 'brown', 'fisheye', 'windscreen', 'shutter', 'stabilised', 'straight')
 # files that no command takes as a drive
 NO_DRIVES = ('.yaml', '.yml', '.json', '.xml', '.txt', '.csv', '.npz')
@@ -120,9 +120,10 @@ class Version(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, help='print the version and exit')
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        """Print the installed package's version."""
+        """Print the version of the installed package, and the engine that estimates poses."""
         from dashcalib_ros import __version__
-        write_stdout(f'{PROGRAM} {__version__}')
+        from dashcalib_ros.config import ReconstructConfig
+        write_stdout(f'{PROGRAM} {__version__} (poses: {ReconstructConfig().used})')
         parser.exit()
 
 

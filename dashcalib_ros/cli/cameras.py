@@ -3,23 +3,19 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 
 import numpy as np
 
 from dashcalib_ros.camera.mapping import rayless_share
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
 from dashcalib_ros.cli.terminal import show, warn
+from dashcalib_ros.formats import export as exported
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
 from dashcalib_ros.input.source import by
 from dashcalib_ros.report import compare as compare_cameras
-from dashcalib_ros.report import load_camera, write_text
-from dashcalib_ros.report.export import (
-    WITH_FIELD,
-    WITH_READOUT,
-    check_suffix,
-    cropped,
-    exported,
-    resized,
-)
+from dashcalib_ros.report import write_text
 from dashcalib_ros.report.page import difference_html
 from dashcalib_ros.report.tables import comparison
 from dashcalib_ros.standard_streams import write_stdout
@@ -48,21 +44,23 @@ def export(args: argparse.Namespace) -> int:
     if args.crop is not None:
         whole, camera = camera, cropped(camera, *args.crop)
         readout_ms = readout_ms and readout_ms * camera.image_size[1] / whole.image_size[1]
-    if found.field is not None and args.to in WITH_FIELD and camera is not found.camera:
+    keeps = EXPORTS[args.to].keeps if args.to in EXPORTS else ()
+    if found.field is not None and 'field' in keeps and camera is not found.camera:
         raise UsageError('E-FIELD-OF-PART', 'the field over the picture is known for the whole '
                          'picture only; omit --size and --crop')
     if args.out is not None:
         check_suffix(args.out, args.to)
-    text = exported(camera, args.to, found.field, readout_ms)
-    if readout_ms is None and args.to in WITH_READOUT:
+    content = exported(replace(found, camera=camera, readout_ms=readout_ms), args.to)
+    if readout_ms is None and 'readout_ms' in keeps:
         warn([f'{found.name} has no readout time of a rolling shutter: set it in {args.to}, '
               f'unless the shutter is global'])
-    if found.field is not None and args.to not in WITH_FIELD:
+    if found.field is not None and 'field' not in keeps:
         lost = found.field.over(found.camera)
+        others = ', '.join(kind for kind, form in EXPORTS.items() if 'field' in form.keeps)
         warn([f'{found.name} has a field over the picture, for which {args.to} has no place: '
               f'without it pixels are off by {np.sqrt(np.mean(lost**2)):.2f} px RMS and '
               f'{lost.max():.2f} px at the worst (of {by(found.image_size)}); export to '
-              f'{", ".join(WITH_FIELD)} to keep it'])
+              f'{others} to keep it'])
     unseen = rayless_share(camera)
     if unseen:
         warn([f'{found.name} has no ray for {100 * unseen:.0f} % of the picture: there its model '
@@ -70,10 +68,10 @@ def export(args: argparse.Namespace) -> int:
     if found.verdict == 'weak':
         warn([f'{found.name} is weak: look at its standard deviations (sigma) before you use it'])
     if args.out is not None:
-        write_text(args.out, text)
-    elif isinstance(text, bytes):
+        write_text(args.out, content)
+    elif isinstance(content, bytes):
         raise UsageError('E-OUT-NEEDED',
                          f'--to {args.to} writes a binary file; add --out {args.to}.npz')
     else:
-        write_stdout(text.rstrip('\n'))
+        write_stdout(content.rstrip('\n'))
     return ACCEPTED

@@ -9,27 +9,19 @@ from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH, WRONG, UsageError
 from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Stages, show, warn
 from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.formats.load import load_with_faults
 from dashcalib_ros.input.inputs import fits_bag
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, is_motion, read_motion
-from dashcalib_ros.judge import (
-    Check,
-    Odometry,
-    Poses,
-    path_files,
-    read_poses,
-    with_faults,
-)
+from dashcalib_ros.input.poses import Poses, read_poses
+from dashcalib_ros.judge import Check, Odometry, path_files, with_faults
 from dashcalib_ros.report import answer_dict, check_writable, write_text
-from dashcalib_ros.report.camera_file import load_with_faults
 from dashcalib_ros.report.compare import mount_dict
 from dashcalib_ros.report.tables import TextTable, labelled, line
 from dashcalib_ros.report.wording import mounts_text
 from dashcalib_ros.session import check_drive
 from dashcalib_ros.standard_streams import write_stdout
 
-COLOURS = {'right': 'bold green', 'differs': 'bold cyan', 'wrong': 'bold red',
-           'cannot tell': 'bold yellow'}
 EXIT_CODES = {'right': ACCEPTED, 'differs': ACCEPTED, 'wrong': WRONG, 'cannot tell': NOT_ENOUGH}
 # what the poses show, by its name in the JSON
 MEASURED = {'rotation_deg': ('rotation error, degrees', 1.0),
@@ -82,7 +74,7 @@ def check(args: argparse.Namespace) -> int:
         for name, text in path_files(motion).items():
             write_text(args.out / name, text)
         if not args.json:
-            write_stdout(f'written: {args.out / "paths.svg"}; beside it the paths as TUM files')
+            write_stdout(f'written: {args.out}: the paths as TUM files, which evo compares')
     if args.mounting and EXIT_CODES[found.answer] == ACCEPTED and (
             now is None or before is None or now.moved_from(before)):
         return NOT_ENOUGH if now is None else WRONG
@@ -107,7 +99,7 @@ def _poses(args: argparse.Namespace) -> tuple[Poses | None, SensorStream | None]
 
 
 def _show(found: Check, motion: Odometry | None, changes: Sequence[str]) -> None:
-    show(labelled('answer', found.answer, COLOURS[found.answer]))
+    show(labelled('answer', found.answer))
     for reason in (*found.reasons, *changes):
         show(line(f'- {reason}'))
     if motion is None:

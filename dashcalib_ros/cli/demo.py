@@ -22,19 +22,18 @@ from dashcalib_ros.cli.run import files_line, now, warn_of
 from dashcalib_ros.cli.terminal import Screen, Stages
 from dashcalib_ros.demo import DEMOS, Drive, demo_drive, render_to_bag
 from dashcalib_ros.errors import OutputError
+from dashcalib_ros.formats import calibrated_camera, result_dict
+from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.inputs import open_frames
-from dashcalib_ros.judge import Calibration
 from dashcalib_ros.report import (
+    Calibration,
     NamedCamera,
-    calibrated_camera,
     compare,
     output_folder,
-    result_dict,
     write_results,
     write_text,
 )
 from dashcalib_ros.report.files import TRUTH
-from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.tables import against_truth, conclusion, line, next_step, summary
 from dashcalib_ros.report.wording import optional
 from dashcalib_ros.session import Recording, calibrate_drive

@@ -15,16 +15,11 @@ from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, OutputError, counted
+from dashcalib_ros.formats import result_json
+from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input import FrameSource
-from dashcalib_ros.judge import Calibration
-from dashcalib_ros.report import (
-    Written,
-    output_folder,
-    result_json,
-    write_results,
-)
+from dashcalib_ros.report import Calibration, Written, output_folder, write_results
 from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE
-from dashcalib_ros.report.result import plain_values
 from dashcalib_ros.report.tables import (
     TextTable,
     conclusion,
@@ -32,6 +27,7 @@ from dashcalib_ros.report.tables import (
     next_step,
     summary,
 )
+from dashcalib_ros.report.wording import NEXT
 from dashcalib_ros.session import calibrate_drive, feed
 from dashcalib_ros.standard_streams import write_stdout
 
@@ -144,4 +140,4 @@ def _conclusion(found: int, wanted: int, frames: int) -> tuple[str, str]:
     return (f'{counted(found, "turn")} found in {counted(frames, "frame")}; a calibration uses '
             f'the best {wanted}',
             'next: dashcalib run with the same INPUT' if found else
-            'next: record a drive with turns at crossings, in daylight')
+            f'next: {NEXT["refused"]}')

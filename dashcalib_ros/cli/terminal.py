@@ -17,11 +17,13 @@ from rich.progress import (
     BarColumn,
     Progress,
     SpinnerColumn,
+    Task,
     TaskID,
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.progress_bar import ProgressBar
 
 from dashcalib_ros.cli.program import handling
 from dashcalib_ros.errors import OutputError, visible
@@ -31,6 +33,7 @@ from dashcalib_ros.standard_streams import write_stderr, write_stdout
 PIPE_WIDTH = 80  # columns where there is no terminal
 EVERY_S = 10.0  # between two lines of progress, where there is no terminal
 STEPS = 1000  # a stage's fraction is shown in thousandths
+STILL_S = 2.0  # a bar that stands longer pulses
 
 
 def show(renderable: RenderableType, to_stderr: bool = False) -> None:
@@ -72,6 +75,19 @@ def warn(lines: Iterable[str]) -> None:
         write_stderr(f'dashcalib: warning: {" ".join(line.split())}')
 
 
+class MovingBar(BarColumn):
+    """A bar that pulses while its stage works and cannot say how far it is.
+
+    Its tasks have a field since: when their fraction changed, by the clock of the progress, s.
+    """
+
+    def render(self, task: Task) -> ProgressBar:
+        """Return the task's bar."""
+        bar = super().render(task)
+        bar.pulse = bar.pulse or task.get_time() - task.fields['since'] > STILL_S
+        return bar
+
+
 class Stages(Observer):
     """The progress of one command, a stage at a time.
 
@@ -84,10 +100,11 @@ class Stages(Observer):
         self._told = time.monotonic()
         # as wide as it may become, it fits 80 columns
         self._progress = Progress(
-            SpinnerColumn(), TextColumn('{task.description}', markup=False), BarColumn(16),
+            SpinnerColumn(), TextColumn('{task.description}', markup=False), MovingBar(16),
             TaskProgressColumn(), TimeElapsedColumn(), console=console, transient=True,
             disable=quiet or not console.is_terminal)
         self._stage = ''
+        self._done: float | None = None
         self._task: TaskID | None = None
 
     def __enter__(self) -> Stages:
@@ -110,8 +127,11 @@ class Stages(Observer):
         if stage != self._stage or self._task is None:
             if self._task is not None:
                 self._progress.remove_task(self._task)
-            self._task = self._progress.add_task(stage, total=None)
+            self._task = self._progress.add_task(stage, total=None, since=time.monotonic())
             self._stage = stage
+        if done != self._done:
+            self._done = done
+            self._progress.update(self._task, since=time.monotonic())
         self._progress.update(self._task, description=text, total=None if done is None else STEPS,
                               completed=0 if done is None else STEPS * done)
 

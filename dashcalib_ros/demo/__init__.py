@@ -1,7 +1,6 @@
 """Rendered drives with exact truth: the embedded default input, and the tests' fixture."""
-from dashcalib_ros.demo.bag import render_to_bag
 from dashcalib_ros.demo.demos import DEMOS, demo_drive
-from dashcalib_ros.demo.drive import Drive, render
+from dashcalib_ros.demo.drive import Drive, render, render_to_bag
 from dashcalib_ros.demo.fisheye import FisheyeLens
 from dashcalib_ros.demo.glass import Glass
 from dashcalib_ros.demo.lens import Lens

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -11,7 +12,6 @@ import numpy.typing as npt
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage
 from dashcalib_ros.demo.paint import finish, noise
 from dashcalib_ros.demo.path import Course
-from dashcalib_ros.demo.street import Street
 
 Texture = GreyImage
 
@@ -21,6 +21,29 @@ ROAD_M = 11.0
 PAVEMENT_M = 15.5
 AROUND_M = 25.0
 SHIFT = 4
+
+
+@dataclass(frozen=True)
+class Street:
+    """A street's axis. start: (2,) m; heading rad; length m."""
+
+    start: Floats
+    heading: float
+    length: float
+
+    @property
+    def ahead(self) -> Floats:
+        """Return the direction, (2,)."""
+        return np.array([math.cos(self.heading), math.sin(self.heading)])
+
+    @property
+    def left(self) -> Floats:
+        """Return the direction to its left, (2,)."""
+        return np.array([-math.sin(self.heading), math.cos(self.heading)])
+
+    def at(self, along: float, left: float) -> Floats:
+        """Return the point (2,) m."""
+        return np.asarray(self.start + along * self.ahead + left * self.left)
 
 
 def paint_ground(rng: np.random.Generator, course: Course, streets: Sequence[Street],

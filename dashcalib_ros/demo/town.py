@@ -11,10 +11,9 @@ import numpy.typing as npt
 from dashcalib_ros.arrays import Floats, GreyImage
 from dashcalib_ros.demo import paint
 from dashcalib_ros.demo.atlas import Atlas, Texture, pack
-from dashcalib_ros.demo.ground import paint_ground
+from dashcalib_ros.demo.ground import Street, paint_ground
 from dashcalib_ros.demo.path import Course
 from dashcalib_ros.demo.quads import QuadList, Quads
-from dashcalib_ros.demo.street import Street
 
 Grid = GreyImage
 

@@ -17,25 +17,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.config import LinesConfig
 from dashcalib_ros.detect.edges import Lines
-
-# place of k1 among the parameters, in every model
-K1 = 4
-# sine of 15 degrees; a line leaning more, with the camera's own lean, is not upright
-UPRIGHT = 0.26
-# px; the bend of the straightest line is no better known: pixels, and blur
-LEAST_NOISE_PX = 0.03
-# px; by so much all lines may be bent alike for other reasons: what is beside them, and the filter
-SYSTEMATIC_PX = 0.01
-# of the larger of both ways in which a ray moves a pixel, squared; less is next to the fold
-LEAST_SPREAD = 1e-4
-# with fewer lines, or groups of images, their own scatter is unknown
-LEAST_LINES, LEAST_GROUPS = 20, 4
-# each is omitted in turn; more cost time and change nothing
-MOST_GROUPS = 40
-# of the most sensitive line's
-LEAST_SENSITIVITY = 1e-9
-# of the plane through a line's points, and of the weights
-PLANE_STEPS, WEIGHT_STEPS = 3, 30
+from dashcalib_ros.robust import cauchy_fit, jackknife, weighted_median
 
 
 @dataclass(frozen=True)
@@ -67,6 +49,10 @@ class Bend:
         return abs(self.k1) / float(np.hypot(self.sigma, self.camera_sigma or 0.0))
 
 
+# place of k1 among the parameters, in every model
+K1 = 4
+
+
 @dataclass(frozen=True)
 class _Measured:
     """Lines against a camera: residual (n, k) px across each, and its derivatives (n, k, p).
@@ -83,6 +69,14 @@ class _Measured:
     def along(self) -> Floats:
         """Return the derivative by k1 (n, k)."""
         return np.asarray(self.derivatives[:, :, K1])
+
+
+# px; the bend of the straightest line is no better known: pixels, and blur
+LEAST_NOISE_PX = 0.03
+# px; by so much all lines may be bent alike for other reasons: what is beside them, and the filter
+SYSTEMATIC_PX = 0.01
+# with fewer lines, or groups of images, their own scatter is unknown
+LEAST_LINES, LEAST_GROUPS = 20, 4
 
 
 def bend(lines: Lines, camera: Camera, config: LinesConfig | None = None,
@@ -110,6 +104,12 @@ def bend(lines: Lines, camera: Camera, config: LinesConfig | None = None,
         len(wanted), groups,
         float(np.sqrt(np.average(_rms(measured.residual)**2, weights=weight))), k1, sigma,
         _camera_sigma(measured, weight / squares, covariance), _picture_px(camera, k1))
+
+
+# sine of 15 degrees; a line leaning more, with the camera's own lean, is not upright
+UPRIGHT = 0.26
+# of the larger of both ways in which a ray moves a pixel, squared; less is next to the fold
+LEAST_SPREAD = 1e-4
 
 
 def _measured(lines: Lines, camera: Camera, group_s: float) -> _Measured:
@@ -145,12 +145,20 @@ def _measured(lines: Lines, camera: Camera, group_s: float) -> _Measured:
     return _Measured(together[:, :, 0], together[:, :, 1:], _groups(stamps_s, group_s))
 
 
+# of the most sensitive line's
+LEAST_SENSITIVITY = 1e-9
+
+
 def _sensitive(measured: _Measured) -> _Measured:
     """Omit the lines that no k1 bends: those through the middle of the distortion."""
     squares = np.sum(measured.along**2, axis=1)
     sensitive = squares > LEAST_SENSITIVITY * squares.max(initial=0.0)
     return _Measured(measured.residual[sensitive], measured.derivatives[sensitive],
                      measured.group[sensitive])
+
+
+# of the plane through a line's points, and of the weights
+PLANE_STEPS, WEIGHT_STEPS = 3, 30
 
 
 def _planes(rays: Floats, across: Floats) -> tuple[Floats, Floats]:
@@ -177,6 +185,10 @@ def _slope(across: Floats, normal: Floats) -> Floats:
     return np.asarray(np.linalg.solve(both, moved)[..., 0])
 
 
+# each is omitted in turn; more cost time and change nothing
+MOST_GROUPS = 40
+
+
 def _groups(stamps_s: Floats, group_s: float) -> Ints:
     """Return the group (n,) of each line's image, from 0: images of so long a time are one.
 
@@ -198,21 +210,19 @@ def _location(wanted: Floats, information: Floats) -> tuple[float, Floats]:
     wanted: (n,) k1 of each line; information: (n,) inverse variances. What is curved in the world
     gives any k1, and hardly counts.
     """
-    order = np.argsort(wanted)
-    share = np.cumsum(np.sqrt(information[order]))
-    place = float(wanted[order][np.searchsorted(share, share[-1] / 2)])
-    for _ in range(WEIGHT_STEPS):
-        weight = information / (1 + information * (wanted - place)**2)
-        place = float(np.average(wanted, weights=weight))
-    return place, np.asarray(weight)
+    sigma = 1 / np.sqrt(information)
+    start = weighted_median(wanted, 1 / sigma)
+    found = cauchy_fit(np.ones((len(wanted), 1)), wanted, sigma, WEIGHT_STEPS, information,
+                       np.array([start]))
+    return float(found.params[0]), found.weights
 
 
 def _sigma(wanted: Floats, information: Floats, group: Ints, groups: int) -> float:
-    """Return the standard deviation by leaving out each group of images in turn (jackknife)."""
-    without = [_location(wanted[keep], information[keep])[0]
-               for keep in (group != left for left in range(groups))]
+    """Return the standard deviation by leaving out each group of images in turn."""
+    sigma = jackknife(lambda kept: np.array(_location(wanted[kept], information[kept])[0]),
+                      group, groups)
     # of few groups it is uncertain itself: the wider t distribution, for as many
-    return float(np.sqrt((groups - 1) * np.var(without) * (groups - 1) / (groups - 3)))
+    return float(sigma * np.sqrt((groups - 1) / (groups - 3)))
 
 
 def _camera_sigma(measured: _Measured, weight: Floats, covariance: Floats | None

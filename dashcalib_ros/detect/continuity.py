@@ -17,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32
+from dashcalib_ros.robust import LinearFit, cauchy_fit
 
 # fewer points prove nothing
 MIN_POINTS = 30
@@ -28,12 +29,6 @@ SHARE_KEPT = 0.6
 MAX_RATIO = 1.7
 # a point agrees when it is this far, px, and this share of its step, from where it should be
 AGREES_PX, AGREES_SHARE = 1.0, 0.15
-# px; a standing car's points move so much by noise, whatever its speed
-STILL_PX = 0.3
-# of reweighted least squares; it has settled after half of them
-ROUNDS = 10
-# px²; a parameter that no point determines is 0
-LEAST_NORMAL = 1e-6
 
 
 def goes_on(first: Floats32, middle: Floats32, last: Floats32, followed: float, usual: float
@@ -56,6 +51,10 @@ def goes_on(first: Floats32, middle: Floats32, last: Floats32, followed: float, 
             and share > max(MIN_SHARE, SHARE_KEPT * usual))
 
 
+# px; a standing car's points move so much by noise, whatever its speed
+STILL_PX = 0.3
+
+
 def _ratio(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
     """Return how much longer the steps have become, and (n,) how far each point is off, px.
 
@@ -69,24 +68,22 @@ def _ratio(before: Floats, now: Floats, xy: Floats) -> tuple[float, Floats]:
     # the first parameter is the ratio less 1: 0 where nothing determines it. As if each point had
     # moved by STILL_PX more; and equal points determine no roll
     wanted = now - before
-    params, off = reweighted(design, wanted, np.array([0.0, *np.median(wanted, axis=0), 0.0]),
-                             np.array([STILL_PX ** 2, 0.0, 0.0, 0.0]))
-    return 1.0 + float(params[0]), off
+    found = fitted_steps(design, wanted, np.array([0.0, *np.median(wanted, axis=0), 0.0]),
+                         np.array([STILL_PX ** 2, 0.0, 0.0, 0.0]))
+    return 1.0 + float(found.params[0]), found.off
 
 
-def reweighted(design: Floats, wanted: Floats, start: Floats, prior: Floats
-               ) -> tuple[Floats, Floats]:
-    """Return the parameters (k,) that explain most points' steps, and (n,) how far each is off.
+# of new weights; the fit has settled after half of them
+ROUNDS = 10
+# px²; a parameter that no point determines is 0
+LEAST_NORMAL = 1e-6
+
+
+def fitted_steps(design: Floats, wanted: Floats, start: Floats, prior: Floats) -> LinearFit:
+    """Return the fit of k parameters to most points' steps.
 
     design: (n, 2, k) px for a unit of each parameter. wanted: (n, 2) px. start: (k,), the first
     guess. prior: (k,), px² for a unit, of each point: what pulls a parameter to 0.
     """
-    params = start
-    for _ in range(ROUNDS):
-        off = np.linalg.norm(wanted - design @ params, axis=1)
-        # Cauchy's weights: points on other cars and wrong matches count little
-        weights = 1.0 / (1.0 + (off / max(float(np.median(off)), STILL_PX)) ** 2)
-        normal = np.einsum('nik,n,nil->kl', design, weights, design)
-        normal += np.diag(weights.sum() * prior + LEAST_NORMAL)
-        params = np.linalg.solve(normal, np.einsum('nik,n,ni->k', design, weights, wanted))
-    return params, np.linalg.norm(wanted - design @ params, axis=1)
+    return cauchy_fit(design, wanted, lambda off: max(float(np.median(off)), STILL_PX), ROUNDS,
+                      start=start, prior=lambda weights: weights.sum() * prior + LEAST_NORMAL)

@@ -17,6 +17,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask, Pixels
 from dashcalib_ros.config import LinesConfig
+from dashcalib_ros.robust import EvenlySpaced
 
 # points of an edge: means over as many equal parts of it
 KNOTS = 16
@@ -160,26 +161,21 @@ class LineCollector:
 
     def __init__(self, config: LinesConfig, beside: bool = False) -> None:
         """beside: a thread searches a picture until the next one comes."""
-        self._config = config
-        self._period_ns = PERIOD_S * 1e9
         self._thread = ThreadPoolExecutor(1) if beside else None
-        # stamps, and what returns the points, once they are found
-        self._found: list[tuple[int, Callable[[], Floats32]]] = []
+        # what returns the points, once they are found
+        self._found: EvenlySpaced[Callable[[], Floats32]] = EvenlySpaced(PERIOD_S, config.images)
 
     def push(self, image: GreyImage, stamp_ns: int) -> None:
         """Take a picture of the moving car; it is searched if the last one is long enough ago."""
-        if self._found and 0 <= stamp_ns - self._found[-1][0] < self._period_ns:
+        if not self._found.wants(stamp_ns):
             return
         if self._thread is None:
             points = _longest_edges(image)
-            self._found.append((stamp_ns, lambda: points))
+            self._found.append(stamp_ns, lambda: points)
         else:
-            for _, last in self._found[-1:]:
+            for _, last in self._found.items[-1:]:
                 last()
-            self._found.append((stamp_ns, self._thread.submit(_longest_edges, image).result))
-        if len(self._found) > self._config.images:
-            self._found = self._found[::2]
-            self._period_ns *= 2
+            self._found.append(stamp_ns, self._thread.submit(_longest_edges, image).result)
 
     def close(self) -> None:
         """End the thread: if Ctrl-C comes while it starts, nothing else ends it."""
@@ -188,7 +184,8 @@ class LineCollector:
 
     def lines(self) -> Lines:
         """Return the lines found so far."""
-        found = [np.zeros((0, KNOTS, 2), np.float32), *(points() for _, points in self._found)]
+        items = self._found.items
+        found = [np.zeros((0, KNOTS, 2), np.float32), *(points() for _, points in items)]
         return Lines(np.concatenate(found),
-                     np.repeat([stamp_ns / 1e9 for stamp_ns, _ in self._found],
+                     np.repeat([stamp_ns / 1e9 for stamp_ns, _ in items],
                                [len(points) for points in found[1:]]))

@@ -15,11 +15,14 @@ import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
 from dashcalib_ros.input.scale import shrink_image
+from dashcalib_ros.robust import cauchy_fit
 
 # px at the mask's resolution; with less flow the world does not count as moving
 LEAST_FLOW_PX = 2.5
 # px, the same for flow from rotation, above the horizon: epipoles are less exact than points
 LEAST_ROTATION_PX = 4.0
+# of new weights of the points that the flow is fitted to
+FLOW_ROUNDS = 3
 # samples a cell needs before it is classified
 SAMPLES = 12
 # samples of a cell at which all sums are halved: new samples count more than old ones
@@ -147,13 +150,10 @@ class EgoMask:
         if len(before) < 30 or moved.mean() < 0.5:
             return None
         terms = _quadratic(before[moved] / width)
-        target = flow[moved]
-        weight = np.ones(len(target))
-        for _ in range(4):
-            scale = weight[:, None]
-            fit, *_ = np.linalg.lstsq(terms * scale, target * scale, rcond=None)
-            error = np.linalg.norm(terms @ fit - target, axis=1)
-            weight = 1 / (1 + (error / (np.median(error) + 0.1)) ** 2)
+        # both components have parameters of their own, and one weight
+        both = np.einsum('nk,ij->nikj', terms, np.eye(2)).reshape(len(terms), 2, -1)
+        fit = cauchy_fit(both, flow[moved].astype(np.float64), lambda off: np.median(off) + 0.1,
+                         FLOW_ROUNDS, power=2).params.reshape(-1, 2)
         rows, columns = np.mgrid[:self.grid[0], :self.grid[1]]
         places = (np.column_stack([columns.ravel(), rows.ravel()]) + 0.5) * self._cell
         world = (_quadratic(places / width) @ fit).reshape(*self.grid, 2)

@@ -21,28 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
-from dashcalib_ros.detect.continuity import MIN_POINTS, reweighted
+from dashcalib_ros.detect.continuity import MIN_POINTS, fitted_steps
 from dashcalib_ros.detect.points import Tracking, follow_points
 
 APART = 'record each camera separately, with one topic per camera'
-# looks that count, and how many of them must show the same other camera: where it sends every
-# fourth of the images between, a quarter of the looks
-RECENT, SAME = 20, 5
-# of the points that the images before and after have: another view has fewer of them, and fewer of
-# these on their way. Of sound cameras 0.5 to 1 are found. Where the images between were mixed from
-# those around, as for another rate, few are found, but on their way
-LEAST_FOUND, LEAST_NEAR = 0.35, 0.06
-# px, and of its step: how far from its way a point may be found
-NEAR_PX, NEAR_STEP = 2.0, 0.15
-# of the working width, and of the median point's step; an image that is off by more is of another
-# camera, where others are off by the same
-OFF_WIDTH, OFF_STEP = 0.005, 0.15
-# of their median; looks that are nearer to it show the same camera
-ALIKE = 0.5
-# of the grey values' spread; a darker image, as black ones of a broken driver, shows nothing
-LEAST_CONTRAST = 0.3
-# px², as in reweighted(): while the car turns, its motion explains a shift before a mounting does
-SPEED_PRIOR, CAMERA_PRIOR = 1e-3, 1e-4
 
 
 @dataclass(frozen=True)
@@ -60,6 +42,22 @@ class OtherCamera:
     def __str__(self) -> str:
         return (f'the images are of two cameras: of {self.looks} skipped images that were '
                 f'compared, {self.shown} show {self.what}')
+
+
+# looks that count, and how many of them must show the same other camera: where it sends every
+# fourth of the images between, a quarter of the looks
+RECENT, SAME = 20, 5
+# of the points that the images before and after have: another view has fewer of them, and fewer of
+# these on their way. Of sound cameras 0.5 to 1 are found. Where the images between were mixed from
+# those around, as for another rate, few are found, but on their way
+LEAST_FOUND, LEAST_NEAR = 0.35, 0.06
+# of the working width, and of the median point's step; an image that is off by more is of another
+# camera, where others are off by the same
+OFF_WIDTH, OFF_STEP = 0.005, 0.15
+# of their median; looks that are nearer to it show the same camera
+ALIKE = 0.5
+# of the grey values' spread; a darker image, as black ones of a broken driver, shows nothing
+LEAST_CONTRAST = 0.3
 
 
 class OneCamera:
@@ -122,6 +120,10 @@ def _in_words(off: Floats) -> str:
     return f'the same view {100 * abs(zoom):.1f} % {"larger" if zoom > 0 else "smaller"}'
 
 
+# px, and of its step: how far from its way a point may be found
+NEAR_PX, NEAR_STEP = 2.0, 0.15
+
+
 def _near(to_between: Floats, to_after: Floats) -> Mask:
     """Return (n,) whether points lie near their way from the image before to the one after.
 
@@ -131,6 +133,10 @@ def _near(to_between: Floats, to_after: Floats) -> Mask:
     share = np.clip((to_between * to_after).sum(1, keepdims=True) / length**2, 0.0, 1.0)
     aside = np.linalg.norm(to_between - share * to_after, axis=1)
     return np.asarray(aside < NEAR_PX + NEAR_STEP * length[:, 0])
+
+
+# px², as in fitted_steps(): in a turn the car's motion explains a shift before a mounting does
+SPEED_PRIOR, CAMERA_PRIOR = 1e-3, 1e-4
 
 
 def _off(at: Floats, to_between: Floats, to_after: Floats, half: float) -> Floats:
@@ -143,6 +149,6 @@ def _off(at: Floats, to_between: Floats, to_after: Floats, half: float) -> Float
     one, none = np.ones(len(at)), np.zeros(len(at))
     design = np.stack([to_after, np.stack([one, none], 1), np.stack([none, one], 1),
                        np.stack([-around[:, 1], around[:, 0]], 1), around], axis=2)
-    params, _ = reweighted(design, to_between, np.zeros(5), np.array(
+    found = fitted_steps(design, to_between, np.zeros(5), np.array(
         [SPEED_PRIOR, *[CAMERA_PRIOR] * 4]))
-    return params[1:] / half
+    return np.asarray(found.params[1:] / half)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32
+from dashcalib_ros.robust import EvenlySpaced
 
 # points kept of a pair, and pairs of a drive: an hour takes no more than 2 MB
 POINTS, PAIRS = 150, 600
@@ -39,12 +40,12 @@ class StraightCollector:
     """Keeps pairs that are spread evenly over the drive; more only make them denser."""
 
     def __init__(self) -> None:
-        self._period_ns = PERIOD_S * 1e9
-        self._found: list[tuple[int, int, Floats32]] = []
+        # ns between both images, and their points
+        self._found: EvenlySpaced[tuple[int, Floats32]] = EvenlySpaced(PERIOD_S, PAIRS)
 
     def wants(self, stamp_ns: int) -> bool:
         """Return whether enough time has passed since the last pair."""
-        return not self._found or not 0 <= stamp_ns - self._found[-1][0] < self._period_ns
+        return self._found.wants(stamp_ns)
 
     def push(self, first_ns: int, stamp_ns: int, before: Floats32, after: Floats32) -> None:
         """Take a pair: before, after: (n, 2) px of the same points in both images."""
@@ -53,17 +54,15 @@ class StraightCollector:
         some = np.linspace(0, len(before) - 1, min(len(before), POINTS)).astype(int)
         pair = np.full((2, POINTS, 2), np.nan, np.float32)
         pair[:, :len(some)] = before[some], after[some]
-        self._found.append((stamp_ns, stamp_ns - first_ns, pair))
-        if len(self._found) > PAIRS:
-            self._found = self._found[::2]
-            self._period_ns *= 2
+        self._found.append(stamp_ns, (stamp_ns - first_ns, pair))
 
     def __len__(self) -> int:
-        return len(self._found)
+        return len(self._found.items)
 
     def straights(self, newest: int = PAIRS) -> Straights:
         """Return the pairs so far, or the newest of them."""
-        found = self._found[-newest:]
-        pairs = np.array([pair for *_, pair in found], np.float32).reshape(-1, 2, POINTS, 2)
-        stamps, apart = np.array([each[:2] for each in found], float).reshape(-1, 2).T / 1e9
+        found = self._found.items[-newest:]
+        pairs = np.array([pair for _, (_, pair) in found], np.float32).reshape(-1, 2, POINTS, 2)
+        stamps, apart = np.array([(stamp_ns, apart_ns) for stamp_ns, (apart_ns, _) in found],
+                                 float).reshape(-1, 2).T / 1e9
         return Straights(pairs[:, 0], pairs[:, 1], stamps, apart)

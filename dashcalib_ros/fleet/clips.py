@@ -27,7 +27,7 @@ from dashcalib_ros.fleet.storage import (
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.limits import read_file
 from dashcalib_ros.reconstruct import reconstruct
-from dashcalib_ros.reconstruct.scene_file import (
+from dashcalib_ros.store.scene_file import (
     FORMAT,
     LARGEST,
     SUFFIX,

@@ -20,18 +20,13 @@ from dashcalib_ros.input.source import by
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.agreement import focal_of, turns_of_another_camera
 from dashcalib_ros.judge.conclude import Evidence, conclude
-from dashcalib_ros.judge.verdict import lacks_knowledge_only
+from dashcalib_ros.judge.verdict import Grounds, lacks_knowledge_only
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.reconstruct.scene_file import Origin, SceneFile, StoredTurn
+from dashcalib_ros.robust import weighted_median
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
-
-# solutions at the most; each leaves out the clips that contradict the one before
-ROUNDS = 3
-# a clip whose own fx is farther off that of most, in sigmas and in shares of it, is of another
-# camera; on one real drive gentle bends differ by 3 % from the sharp turn
-OTHER_FOCAL, OTHER_FOCAL_SHARE = 4.0, 0.05
+from dashcalib_ros.store.scene_file import Origin, SceneFile, StoredTurn
 
 Clips = Mapping[str, SceneFile]
 
@@ -42,6 +37,10 @@ class ClipTurn:
 
     clip: str
     stored: StoredTurn
+
+
+# solutions at the most; each leaves out the clips that contradict the one before
+ROUNDS = 3
 
 
 def fuse(camera: str, make: str, clips: Clips, config: Config) -> Solved:
@@ -91,7 +90,8 @@ def _estimate(solution: Solution | None, origin: Origin, config: Config) -> Esti
         solution.camera.resized(px, origin.image_size), solution.covariance * units,
         solution.carried(solution.posterior.alike.covariance) * units,
         solution.picture.times(px),
-        solution.reprojection_error_px * px, lacks_knowledge_only(solution, config.verdict))
+        solution.reprojection_error_px * px,
+        lacks_knowledge_only(Grounds(solution, config.verdict)))
 
 
 def _same_content(clips: Clips) -> dict[str, str]:
@@ -200,6 +200,11 @@ def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn],
     return found if 2 * len(found) < len(used) else {}
 
 
+# a clip whose own fx is farther off that of most, in sigmas and in shares of it, is of another
+# camera; on one real drive gentle bends differ by 3 % from the sharp turn
+OTHER_FOCAL, OTHER_FOCAL_SHARE = 4.0, 0.05
+
+
 def _other_focal(shares: Mapping[str, ClipShare]) -> dict[str, str]:
     """Return the clips whose own fx is clearly off the median of all, each counted about once."""
     known = [(clip, share.fx, share.fx_sigma) for clip, share in sorted(shares.items())
@@ -208,10 +213,7 @@ def _other_focal(shares: Mapping[str, ClipShare]) -> dict[str, str]:
         return {}
     fx, sigma = (np.array([each[place] for each in known], float) for place in (1, 2))
     tolerance = OTHER_FOCAL_SHARE * fx
-    weight = 1 / (sigma**2 + tolerance**2)
-    order = np.argsort(fx, kind='stable')
-    passed = np.cumsum(weight[order])
-    middle = float(fx[order][np.searchsorted(passed, passed[-1] / 2)])
+    middle = weighted_median(fx, 1 / (sigma**2 + tolerance**2))
     limit = np.maximum(tolerance, OTHER_FOCAL * sigma)
     return {known[n][0]: f'shows another camera: fx from its turns alone is {fx[n]:.0f} px, and '
                          f'{middle:.0f} px from most clips'

@@ -27,27 +27,6 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import FleetConfig
 from dashcalib_ros.input.source import by
 
-# steps of EM, and how often units are thrown out and taken back
-STEPS, ROUNDS = 200, 10
-# of the change of B; EM has ended
-SETTLED = 1e-6
-# units that are left out together where there are many of them: one in so many changes nothing
-FOLDS = 40
-# candidates for the middle of the units
-CANDIDATES = 500
-# of the variance of units with one turn: real turns are off by 2 to 8 times the sigma of noise
-MOST_EXCESS = 64.0
-# of fx between units of a model; 14 models in public profiles: 1 to 1.5 %
-FOCAL_SPREAD = 0.0125
-# of k1 and the like between units of a model: much less than of fx
-DISTORTION_SPREAD = 0.01
-# units that the two spreads count as, beside those of the fleet
-SPREAD_UNITS = 20.0
-# by which one turn varies more than its noise, counts so, too
-ONE_TURN_EXCESS = 3.0
-# that a unit is in the mode of its make, by its own turns; with less: no prior
-LEAST_ODDS = 3.0
-
 
 @dataclass(frozen=True)
 class Unit:
@@ -90,6 +69,10 @@ class OfMake:
     other_mode: bool = False
 
 
+# units that are left out together where there are many of them: one in so many changes nothing
+FOLDS = 40
+
+
 def priors(units: Sequence[Unit], config: FleetConfig) -> dict[str, OfMake]:
     """Return each unit's prior, from the other units of its make."""
     found: dict[str, OfMake] = {}
@@ -113,6 +96,10 @@ def curvature(focal: Floats) -> Floats:
 def focal_length(curvature: Floats) -> Floats:
     """Return the focal lengths over the width that have these curvatures, all negative."""
     return np.asarray(1 / np.sqrt(-2 * np.asarray(curvature)))
+
+
+# that a unit is in the mode of its make, by its own turns; with less: no prior
+LEAST_ODDS = 3.0
 
 
 def _of_make(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> OfMake:
@@ -149,6 +136,10 @@ def off_by(unit: Unit, prior: LensPrior) -> float:
     return float(np.max(np.abs(unit.lens - prior.mean) / np.sqrt(variance)))
 
 
+# steps of EM, and how often units are thrown out and taken back
+STEPS, ROUNDS = 200, 10
+
+
 def lens_prior(units: Sequence[Unit], config: FleetConfig) -> LensPrior | None:
     """Return the distribution of the lenses of those units that agree; None if they are few."""
     if len(units) < config.least_units:
@@ -167,6 +158,12 @@ def lens_prior(units: Sequence[Unit], config: FleetConfig) -> LensPrior | None:
     return prior
 
 
+# candidates for the middle of the units
+CANDIDATES = 500
+# of fx between units of a model; 14 models in public profiles: 1 to 1.5 %
+FOCAL_SPREAD = 0.0125
+
+
 def _densest(focal: Floats, variance: Floats, config: FleetConfig) -> Mask:
     """Return (n,) the units around the value that most others agree with: the make's main mode.
 
@@ -180,6 +177,18 @@ def _densest(focal: Floats, variance: Floats, config: FleetConfig) -> Mask:
     near = np.abs(focal[best, None] - focal) < config.other_mode / 2 * np.sqrt(total)
     middle = focal[best[int(np.argmax(near @ weight))]]
     return np.asarray(np.abs(focal - middle) < config.other_mode * np.sqrt(total))
+
+
+# of the change of B; EM has ended
+SETTLED = 1e-6
+# of the variance of units with one turn: real turns are off by 2 to 8 times the sigma of noise
+MOST_EXCESS = 64.0
+# of k1 and the like between units of a model: much less than of fx
+DISTORTION_SPREAD = 0.01
+# units that the two spreads count as, beside those of the fleet
+SPREAD_UNITS = 20.0
+# by which one turn varies more than its noise, counts so, too
+ONE_TURN_EXCESS = 3.0
 
 
 def _fitted(units: Sequence[Unit], config: FleetConfig) -> LensPrior:

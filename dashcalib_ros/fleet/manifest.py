@@ -19,8 +19,8 @@ from dashcalib_ros.fleet.storage import needs
 from dashcalib_ros.input.inputs import VIDEO_SUFFIXES
 from dashcalib_ros.input.source import IMAGE_SUFFIXES, is_bag_file
 from dashcalib_ros.limits import MANIFEST_BYTES, MANIFEST_ROWS
-from dashcalib_ros.reconstruct.scene_file import LAST_S
-from dashcalib_ros.reconstruct.scene_file import SUFFIX as GATHERED
+from dashcalib_ros.store.scene_file import LAST_S
+from dashcalib_ros.store.scene_file import SUFFIX as GATHERED
 
 COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time')
 

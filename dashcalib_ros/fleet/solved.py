@@ -14,8 +14,10 @@ from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.errors import InputError, one_line
 from dashcalib_ros.fleet import lens_prior
 from dashcalib_ros.fleet.lens_prior import LensPrior, OfMake, Unit, conditioned
-from dashcalib_ros.judge import Calibration, Verdict
-from dashcalib_ros.report.result import calibration_of, result_dict
+from dashcalib_ros.formats import result_dict
+from dashcalib_ros.formats.ours import calibration_of
+from dashcalib_ros.judge import CalibrationData, Verdict
+from dashcalib_ros.judge.calibration import Condition
 from dashcalib_ros.solve.spread import PictureSigma
 
 # of the JSON text
@@ -69,7 +71,7 @@ class Solved:
 
     camera: str
     make: str
-    calibration: Calibration
+    calibration: CalibrationData
     estimate: Estimate | None
     shares: Mapping[str, ClipShare]
 
@@ -132,7 +134,7 @@ class Final:
     it gave. prior_note: why there is none, '' if there is. other_mode: it is in another mode.
     """
 
-    calibration: Calibration
+    calibration: CalibrationData
     prior_units: int = 0
     prior_share: float = 0.0
     prior_note: str = ''
@@ -175,23 +177,26 @@ def _with_prior(solved: Solved, prior: LensPrior) -> Final:
         camera=camera, sigma=sigmas(camera, covariance),
         reprojection_error_px=estimate.reprojection_error_px,
         sigma_px=_picture_sigma(camera, covariance, estimate.sigma_px),
-        details={**own.details, 'picture_covariance': covariance.tolist(), 'prior': {
+        covariance=covariance, picture_covariance=covariance,
+        details={**own.details, 'prior': {
             'make': solved.make, 'units': prior.units, 'share_of_fx': share,
             'fx_alone': estimate.camera.fx, 'sigma_alone': estimate.sigma}})
     return Final(calibration, prior.units, share)
 
 
-def _verdict(own: Calibration, make: str, camera: Camera, covariance: Floats, prior: LensPrior,
+def _verdict(own: CalibrationData, make: str, camera: Camera, covariance: Floats, prior: LensPrior,
              share: float) -> Verdict:
     """Return the verdict with a prior: it never makes a result accepted."""
     if own.verdict.level == 'accepted':
         return own.verdict
-    sigma = 100 * float(np.sqrt(covariance[0, 0])) / camera.fx
+    sigma, code = 100 * float(np.sqrt(covariance[0, 0])) / camera.fx, 'E-PRIOR-USED'
+    text = (f'{100 * share:.0f} % of the information about fx comes from the prior of the camera '
+            f'model {make} ({prior.units} other cameras), the rest from its own turns; sigma of '
+            f'fx with it: {sigma:.1f} %')
     return Verdict('weak', (
-        f'{100 * share:.0f} % of the information about fx comes from the prior of the camera '
-        f'model {make} ({prior.units} other cameras), the rest from its own turns; sigma of fx '
-        f'with it: {sigma:.1f} %',
-        *(f'without the prior: {reason}' for reason in own.verdict.reasons)))
+        text, *(f'without the prior: {reason}' for reason in own.verdict.reasons)),
+        codes=(code, *own.verdict.codes),
+        conditions=(Condition(code, text, '', '', False), *own.verdict.conditions))
 
 
 def _picture_sigma(camera: Camera, covariance: Floats, alone: PictureSigma) -> PictureSigma:

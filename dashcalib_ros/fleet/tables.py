@@ -20,9 +20,9 @@ from dashcalib_ros.fleet.clips import ClipResult, hash_of
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.solved import ClipShare, Final, Solved
 from dashcalib_ros.fleet.storage import has, joined, write
+from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.judge.calibration import ANGLES
-from dashcalib_ros.reconstruct.scene_file import DATES_S
-from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.store.scene_file import DATES_S
 
 PARAMETERS = tuple(dict.fromkeys(name for model in calibrated_models() for name in model.names()))
 MOUNT = (*ANGLES, 'height_m')

@@ -13,7 +13,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores
 
 from dashcalib_ros.camera import Camera, ros_camera
-from dashcalib_ros.camera.camera_info import SAME, RosCamera
+from dashcalib_ros.camera.camera_info import RosCamera
+from dashcalib_ros.camera.remap import SAME
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.input.bag_read import (
     WITHIN_LIMIT,
@@ -280,15 +281,14 @@ def _camera_info(c: RosCamera, header: Any) -> bytes:
     """Return a serialised CameraInfo."""
     store = types_of(Stores.ROS2_JAZZY)
     types: Any = store.types
-    width, height = c.image_size
+    fields = {name: np.array(value) if isinstance(value, list) else value
+              for name, value in vars(c).items()}
     info = types[CAMERA_INFO](
         header=types['std_msgs/msg/Header'](
             stamp=types['builtin_interfaces/msg/Time'](
                 sec=int(header.stamp.sec), nanosec=int(header.stamp.nanosec)),
             frame_id=str(header.frame_id)),
-        height=height, width=width, distortion_model=c.distortion_model,
-        d=np.array(c.d), k=np.array(c.k), r=np.array(c.r), p=np.array(c.p),
-        binning_x=0, binning_y=0,
+        **fields, binning_x=0, binning_y=0,
         roi=types['sensor_msgs/msg/RegionOfInterest'](
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False))
     return bytes(store.serialize_cdr(info, CAMERA_INFO))

@@ -1,28 +1,14 @@
-"""Solution -> verdict with reasons -> Calibration.
+"""Solution -> verdict with reasons -> CalibrationData.
 
 Does a given calibration explain a drive? Solution and camera -> Check; with poses, Odometry. And
 turn by turn: scene and camera -> Reading; readings -> Monitor, which names changes.
 """
-from dashcalib_ros.judge.calibration import (
-    AcceptedCalibration,
-    Calibration,
-    TurnSummary,
-    Verdict,
-)
+from dashcalib_ros.judge.calibration import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.check import Check, check, with_faults, with_lines
 from dashcalib_ros.judge.monitor import Change, Monitor, Reading, moved_text, watch
 from dashcalib_ros.judge.mount import moved
-from dashcalib_ros.judge.odometry import (
-    Odometry,
-    Poses,
-    odometry,
-    path_files,
-    read_poses,
-    track_poses,
-    trivial_guess,
-)
+from dashcalib_ros.judge.odometry import Odometry, odometry, path_files, trivial_guess
 
-__all__ = ['AcceptedCalibration', 'Calibration', 'Change', 'Check', 'Monitor', 'Odometry',
-           'Poses', 'Reading', 'TurnSummary', 'Verdict', 'check', 'moved', 'moved_text',
-           'odometry', 'path_files', 'read_poses', 'track_poses', 'trivial_guess', 'watch',
-           'with_faults', 'with_lines']
+__all__ = ['CalibrationData', 'Change', 'Check', 'Monitor', 'Odometry', 'Reading', 'TurnSummary',
+           'Verdict', 'check', 'moved', 'moved_text', 'odometry', 'path_files', 'trivial_guess',
+           'watch', 'with_faults', 'with_lines']

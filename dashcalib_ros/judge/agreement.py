@@ -1,4 +1,4 @@
-"""Whether the turns agree on one camera, and what each of them, and one more, tells of fx."""
+"""Whether the turns agree on one camera, and what each of them, and one more, knows of fx."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -9,6 +9,7 @@ import numpy as np
 from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.robust import weighted_mean
 from dashcalib_ros.solve.solution import Solution
 
 # why turns do not count
@@ -65,16 +66,15 @@ def focal_disagreement(solution: Solution) -> float:
     """Return the weighted scatter between the turns' own fx, relative to fx."""
     if len(solution.scenes) < 2:
         return 0.0
-    alone = list(focal_alone(solution).values())
-    fx, weights = (np.array(each) for each in zip(
-        *((turn.fx, turn.sigma**-2) for turn in alone), strict=True))
-    scatter = np.average((fx - np.average(fx, weights=weights))**2, weights=weights)
-    return float(np.sqrt(scatter) / solution.camera.fx)
+    own = list(focal_of_turns(solution).values())
+    mean = weighted_mean(np.array([turn.fx for turn in own]),
+                         np.array([turn.sigma**2 for turn in own]))
+    return float(np.sqrt(mean.squares * mean.variance) / solution.camera.fx)
 
 
 def leverages(solution: Solution) -> dict[TurnId, float]:
     """Return each turn's share in the information about fx; the shares sum to 1."""
-    known = {turn: found.sigma**-2 for turn, found in focal_alone(solution).items()}
+    known = {turn: found.sigma**-2 for turn, found in focal_of_turns(solution).items()}
     return {turn: own / sum(known.values()) for turn, own in known.items()}
 
 
@@ -86,7 +86,7 @@ class FocalEstimate:
     sigma: float
 
 
-def focal_alone(solution: Solution) -> dict[TurnId, FocalEstimate]:
+def focal_of_turns(solution: Solution) -> dict[TurnId, FocalEstimate]:
     """Return what each turn says of fx alone, linearised at the common result.
 
     Sigma cannot hold how much turns differ: one turn does not show that.
@@ -109,19 +109,19 @@ def sigma_by_count(solution: Solution) -> list[float]:
 
 
 # of fx; a larger sigma helps nobody to decide
-TOLD = 0.2
+SHOWN = 0.2
 
 
 def next_turn(solution: Solution) -> str:
-    """Return what one more turn would bring, in words; '' where nobody can tell."""
-    # how much two turns differ is chance; so a single one is told what two more bring
+    """Return what one more turn would bring, in words; '' where that is not known."""
+    # how much two turns differ is chance; so for a single one it is what two more bring
     more = 1 if len(solution.scenes) > 1 else 2
     sigma = with_right_angles(solution, more)
-    if not sigma < TOLD:
+    if not sigma < SHOWN:
         return ''
     # one digit is all that is known
-    return (f'{("one more right angle", "two more right angles")[more - 1]}: fx to about '
-            f'{float(f"{100 * sigma:.1g}"):g} %')
+    turns = ('one more right-angle turn', 'two more right-angle turns')[more - 1]
+    return f'{turns}: fx known to about {float(f"{100 * sigma:.1g}"):g} %'
 
 
 def with_right_angles(solution: Solution, more: int) -> float:

@@ -2,48 +2,62 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from dataclasses import field as default
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats, Mask
-from dashcalib_ros.camera import FISHEYE, Camera
+from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.camera.rotation import rotation_matrices
+from dashcalib_ros.camera.remap import rectify
+from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import InputError, NotAcceptedError
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.solve.solution import LeftOut, Solution
 from dashcalib_ros.solve.spread import PictureSigma, sigma_over
 
-UNKNOWN_COVARIANCE = ('this calibration does not know how its parameters are correlated: '
-                      'calibrate the drive again')
 # after the point, in one line of text
 MOST_DIGITS = 9
-# an optical frame that looks ahead (z ahead, x to the right, y downwards) to the car's (REP-103)
-OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 Level = Literal['accepted', 'weak', 'refused']
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition of the verdict in words, what this drive has, what is needed, and whether met.
+
+    value, limit: '' where two numbers do not say it. code: of the reason where it is not met.
+    """
+
+    code: str
+    name: str
+    value: str
+    limit: str
+    met: bool
 
 
 @dataclass(frozen=True)
 class Verdict:
     """accepted: use it. weak: look at the sigmas before using it. refused: there is no result.
 
-    reasons: one line each, what is wrong: what to do. cures: what to do, the gravest first.
+    reasons: one line each, what is wrong: what to do. cures: what to do, the likeliest to help
+    first. codes: of the reasons, in their order; a code stays when its text is reworded.
+    conditions: those that are not met, in the order of the reasons, then those that are met and
+    that two numbers say.
     """
 
     level: Level
     reasons: tuple[str, ...] = ()
     cures: tuple[str, ...] = ()
+    codes: tuple[str, ...] = ()
+    conditions: tuple[Condition, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,9 +119,9 @@ class Stabiliser:
 
 @dataclass(frozen=True)
 class Witness:
-    """What a sensor says of the focal length, from the angles of the turns.
+    """The focal length by a sensor, from the angles of the turns.
 
-    time_offset_s: what must be taken off the sensor's stamps; positive: its messages are late.
+    time_offset_s: to subtract from the sensor's stamps; positive: its messages are late.
     None where it is not known. scale: the sensor's angles over the camera's. fx_percent: by how
     much fx would have to change to agree with the sensor, of fx; fx_sigma_percent: with what the
     sensor's own scale may be off. agrees: no contradiction beyond 3 sigmas of both.
@@ -131,7 +145,7 @@ class Witness:
 
 @dataclass(frozen=True)
 class Witnesses:
-    """The sensors that were asked; each None where it has nothing to say."""
+    """The sensors that were compared; each None where it is not used."""
 
     gyro: Witness | None = None
     gps: Witness | None = None
@@ -152,6 +166,14 @@ class LensField:
     worst_px: float
     sigma_px: float
 
+    @property
+    def text(self) -> str:
+        """Return the clause that stands beside the camera's parameters, without a verb."""
+        side = 'below' if self.rms_px < self.sigma_px else 'above'
+        digits = 1 if self.rms_px >= 0.1 else 2
+        return (f'a smooth field of {self.rms_px:.{digits}f} px, {side} its sigma of '
+                f'{self.sigma_px:.{digits}f} px')
+
 
 # of a mounting, and what its sigmas are named by
 ANGLES = ('yaw_left_deg', 'pitch_up_deg', 'roll_right_deg')
@@ -164,7 +186,7 @@ class Mount:
     """How the camera sits on the car, relative to the direction of travel and to the road.
 
     yaw_left_deg, pitch_up_deg: where the optical axis points; roll_right_deg: by how much the
-    camera is turned clockwise, as seen from behind; None where nothing tells it. height_m: above
+    camera is turned clockwise, as seen from behind; None where it is not known. height_m: above
     the road; None where the speed is not known. sigma: by these four names. travel_px: the pixel
     (u, v) in which the car travels, with its sigma: less than that of the angles, which have the
     centre's, too. straight_m: of straight driving. moved_s: stamp after which the camera was
@@ -240,22 +262,25 @@ def _with_sigma(value: float, sigma: float) -> str:
 
 
 @dataclass(frozen=True, repr=False)
-class Calibration:
-    """The complete result. camera and sigma are None when the verdict is refused.
+class CalibrationData:
+    """The complete result. camera, sigma and covariance are None when the verdict is refused.
 
-    camera: of the full-size images. sigma: by the parameters' names.
+    camera: of the full-size images. sigma: by the parameters' names. covariance: (n, n) of the n
+    parameters, in the order of camera.named; its diagonal is sigma squared; None where it is not
+    known. picture_covariance: (w, w) of the parameters of the next larger lens model, what the
+    model leaves out of the picture included.
     turns: of this drive; stored_turns: of earlier ones, see config turns.store.
     timing: seconds, keys detect, calibrate, total. versions: package name -> version.
     magnitudes: (n, 2) float64, columns stamp [s] and filtered turning magnitude [of the width].
     mask: (h, w) bool, True where the picture is valid (not ego vehicle); None if none was made.
     rolling_shutter: the one that was found, and whose effect was removed; None for a global one.
     stabiliser: the one that was found, and whose effect was removed; None for a fixed picture.
-    mount: how the camera sits on the car; None where nothing tells it.
-    field: what the camera leaves over; None: nothing speaks for one. camera is the best without.
-    sigma_px: how far the whole camera may be off over the picture. held_out: what each turn says
-    of the calibration without it, in the full-size images' pixels; () for fewer than three turns.
-    straight_lines: what upright lines of the world say of the distortion; None: too few of them.
-    witnesses: what the car's own sensors say of the focal length.
+    mount: how the camera sits on the car; None where it is not known.
+    field: what the camera's model leaves over; None: no evidence for one. camera is without it.
+    sigma_px: how far the whole camera may be off over the picture. held_out: how each turn
+    fits the calibration without it, full-size images' px; () for fewer than three turns.
+    straight_lines: the distortion by upright lines of the world; None: too few of them.
+    witnesses: the focal length by the car's own sensors.
     start_s: stamp of the first image. material: what the report draws, None in a live drive.
     """
 
@@ -285,15 +310,8 @@ class Calibration:
     witnesses: Witnesses = default(default_factory=Witnesses)
     start_s: float = 0.0
     material: Material | None = default(default=None, compare=False)
-
-    if TYPE_CHECKING:
-        # report/, where files are read and written, adds them: see report/__init__.py
-        @staticmethod
-        def load(path: str | os.PathLike[str]) -> Calibration:
-            """Read what save() and `dashcalib run` write."""
-
-        def save(self, folder: str | os.PathLike[str] = 'calibration') -> tuple[Path, ...]:
-            """Write what `dashcalib run` writes."""
+    covariance: Floats | None = default(default=None, compare=False)
+    picture_covariance: Floats | None = default(default=None, compare=False)
 
     def __repr__(self) -> str:
         """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
@@ -302,19 +320,10 @@ class Calibration:
         sigma = self.sigma or {}
         found = [f'{name} {_with_sigma(value, sigma.get(name, math.nan))}'
                  for name, value in self.camera.named.items()]
-        text = f'{self.verdict.level}, {self.camera.model}, {", ".join(found)}'
+        field = self._used_field and self.field
+        text = (f'{self.verdict.level}, {self.camera.model}, {", ".join(found)}'
+                + (f', and {field.text}' if field else ''))
         return f'Calibration({"; ".join(part for part in (text, self.caveat) if part)})'
-
-    def accepted(self) -> AcceptedCalibration:
-        """Return the same calibration, whose camera and sigma are known not to be None.
-
-        Raises NotAcceptedError with the reasons if it is weak or refused.
-        """
-        if self.verdict.level != 'accepted':
-            raise NotAcceptedError('E-NOT-ACCEPTED', f'the calibration is {self.verdict.level}: '
-                                                     f'{"; ".join(self.verdict.reasons)}')
-        return AcceptedCalibration(**{each.name: getattr(self, each.name)
-                                      for each in fields(self)})
 
     @property
     def caveat(self) -> str:
@@ -335,20 +344,6 @@ class Calibration:
         Those of a fisheye are for cv2.fisheye.
         """
         return np.array(self._camera.ros_distortion())
-
-    @property
-    def covariance(self) -> Floats:
-        """Return the covariance of the n parameters (n, n), in the order of camera.named.
-
-        Its diagonal is sigma squared. Raises InputError where there is no camera, or where the
-        correlations are not known.
-        """
-        names = self._camera.names()
-        correlation = np.array(self.details.get('correlation', ()), np.float64)
-        if self.sigma is None or correlation.shape != (len(names), len(names)):
-            raise InputError(UNKNOWN_COVARIANCE)
-        sigma = np.array([self.sigma[name] for name in names])
-        return np.asarray(correlation * np.outer(sigma, sigma))
 
     def sigma_at(self, pixels: npt.ArrayLike) -> Floats:
         """Return (n,) how far the camera may be off at pixels (n, 2), one sigma, px.
@@ -378,10 +373,10 @@ class Calibration:
     @property
     def _posterior(self) -> tuple[Camera, Floats]:
         """Return the camera in the wider model, and the covariance (n, n) of its parameters."""
-        camera = self._camera.widened()
-        covariance = np.array(self.details.get('picture_covariance', ()), np.float64)
-        if covariance.shape != (len(camera.params),) * 2:
-            raise InputError(UNKNOWN_COVARIANCE)
+        camera, covariance = self._camera.widened(), self.picture_covariance
+        if covariance is None or covariance.shape != (len(camera.params),) * 2:
+            raise InputError('E-UNKNOWN-COVARIANCE', 'this calibration does not contain the '
+                             'correlations of its parameters: calibrate the drive again')
         return camera, covariance
 
     def rays(self, pixels: npt.ArrayLike) -> Floats:
@@ -413,25 +408,19 @@ class Calibration:
         The field is taken out, too, where one is used. Raises InputError for an image of another
         size, and where there is no camera.
         """
-        import cv2
         camera = self._camera
         if image.shape[1::-1] != camera.image_size:
-            raise InputError(f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
-                             f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}')
-        if self._used_field is not None:
-            y, x = np.indices(image.shape[:2])
-            ahead = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy,
-                              np.ones(x.shape)], axis=-1)
-            x, y = np.moveaxis(self.project(ahead).astype(np.float32), -1, 0)
-            return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR))
-        if camera.family == FISHEYE:
-            return np.asarray(cv2.fisheye.undistortImage(image, self.K, self.D, Knew=self.K))
-        return np.asarray(cv2.undistort(image, self.K, self.D))
+            raise InputError('E-OTHER-IMAGE-SIZE',
+                             f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
+                             f'calibration is for {camera.image_size[0]}x{camera.image_size[1]}: '
+                             f'resize the image, or use `dashcalib export --size`')
+        return rectify(image, camera, field=self._used_field)
 
     @property
     def _camera(self) -> Camera:
         if self.camera is None:
-            raise InputError(f'the calibration was refused: {"; ".join(self.verdict.reasons)}')
+            raise InputError('E-CALIBRATION-REFUSED', 'the calibration was refused: '
+                             f'{"; ".join(self.verdict.reasons)}')
         return self.camera
 
     @property
@@ -463,16 +452,3 @@ class Calibration:
     def turns_used(self) -> int:
         """Return how many turns the result is based on, including those of earlier drives."""
         return len(self.used_turns)
-
-
-@dataclass(frozen=True, repr=False)
-class AcceptedCalibration(Calibration):
-    """An accepted calibration, from Calibration.accepted(): camera and sigma are there."""
-
-    camera: Camera
-    sigma: Mapping[str, float]
-
-    @property
-    def intrinsics(self) -> dict[str, float]:
-        """Return the camera's parameters by name."""
-        return self.camera.named

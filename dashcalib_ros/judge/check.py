@@ -25,9 +25,6 @@ from dashcalib_ros.judge.verdict import lines_contradict
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import PictureSigma
 
-# what messages call the file of a camera whose file they do not know
-CALIBRATION = 'CALIBRATION'
-
 
 @dataclass(frozen=True)
 class Check:
@@ -36,7 +33,7 @@ class Check:
     answer: right: the given camera and the drive's own are the same within what the drive can
     determine, and near enough for the uses in good_for. differs: the difference is more than
     chance, and small enough for the uses in good_for. wrong: it is more than chance, and too large
-    for every use. cannot tell: neither is shown.
+    for every use. cannot tell: the error may be too large, and nothing shows whether it is.
     rms_px, worst_px: over the picture, between the given camera and the drive's own, the best
     common rotation removed; None where they cannot be compared. sigma_px: of the drive's own.
     told_apart: whether distance exceeds limit. distance: between the given camera and the drive's
@@ -61,6 +58,10 @@ class Check:
     bound_px: float | None = None
     limits_px: Mapping[Use, float] = default(default_factory=dict)
     good_for: tuple[Use, ...] = ()
+
+
+# what messages call the file of a camera whose file they do not know
+CALIBRATION = 'CALIBRATION'
 
 
 def check(given: Camera, image_size: tuple[int, int], solution: Solution | None, verdict: Verdict,
@@ -91,12 +92,12 @@ def check(given: Camera, image_size: tuple[int, int], solution: Solution | None,
         return Check('wrong', (size_reason(given, image_size, difference, name),))
     loss = loss_of(given.resized(1 / px, solution.camera.image_size), solution, config)
     scaled = scaled_parameters(here, difference) if here.answer == 'wrong' else ''
-    said = (scaled,) if scaled else reasons_of(here)
+    reasons = (scaled,) if scaled else reasons_of(here)
     answer = here.answer
     if answer == 'wrong' and loss <= 0:
         # a calibration that explains the turns as well as their own is not contradicted by them
-        answer, said = 'cannot tell', (UNDECIDED, *said[1:])
-    return Check(answer, (*said, _loss_text(loss)), here.rms_px, here.worst_px, here.sigma_px,
+        answer, reasons = 'cannot tell', (UNDECIDED, *reasons[1:])
+    return Check(answer, (*reasons, _loss_text(loss)), here.rms_px, here.worst_px, here.sigma_px,
                  here.told_apart, here.distance, here.limit, loss, bound_px=here.bound_px,
                  limits_px=here.limits_px, good_for=here.good_for)
 
@@ -226,27 +227,27 @@ def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int,
     if given.image_size != image_size:
         return found
     scale = Scale.of(image_size, config)
-    said = bend(lines, given.resized(1 / scale.px, scale.size(image_size)), config.lines)
-    if said is None:
+    bent = bend(lines, given.resized(1 / scale.px, scale.size(image_size)), config.lines)
+    if bent is None:
         return found
-    said = said.resized(scale.px)
-    against = lines_contradict(said, image_size[0], config.verdict)
+    bent = bent.resized(scale.px)
+    against = lines_contradict(bent, image_size[0], config.verdict)
     allowed = {'right': 0.0, 'differs': found.limits_px.get('detection', 0.0)}
-    answer = ('cannot tell' if against and said.picture_px > allowed.get(found.answer, np.inf)
+    answer = ('cannot tell' if against and bent.picture_px > allowed.get(found.answer, np.inf)
               else found.answer)
-    return replace(found, answer=answer, straight_lines=said, reasons=(
-        *found.reasons, _lines_text(said, against, config.verdict.max_line_sigmas)))
+    return replace(found, answer=answer, straight_lines=bent, reasons=(
+        *found.reasons, _lines_text(bent, against, config.verdict.max_line_sigmas)))
 
 
-def _lines_text(said: Bend, against: bool, limit: float) -> str:
+def _lines_text(bent: Bend, against: bool, limit: float) -> str:
     """Return what lines say, and whether it counts; limit: sigmas from which on it may."""
-    text = (f'{said.lines} upright lines (poles, edges of houses) indicate that its k1 is off: '
-            f'{said.k1:+.3f} ± {said.sigma:.3f} is missing, {said.picture_px:.1f} px over the '
-            f'picture: {said.sigmas:.1f} sigma, limit {limit:.1f}: ')
+    text = (f'{bent.lines} upright lines (poles, edges of houses) indicate that its k1 is off: '
+            f'{bent.k1:+.3f} ± {bent.sigma:.3f} is missing, {bent.picture_px:.1f} px over the '
+            f'picture: {bent.sigmas:.1f} sigma, limit {limit:.1f}: ')
     if against:
         return text + 'they contradict its distortion'
-    if said.sigmas > limit:
+    if bent.sigmas > limit:
         return text + 'real, but too few pixels to decide'
-    if said.sigmas > DOUBT_SIGMAS:
+    if bent.sigmas > DOUBT_SIGMAS:
         return text + 'they lean against its distortion, but not enough to decide'
     return text + 'they agree with its distortion'

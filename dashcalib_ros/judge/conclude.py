@@ -1,4 +1,4 @@
-"""Solution and evidence -> the Calibration that is given to the user."""
+"""Solution and evidence -> the CalibrationData that is given to the user."""
 from __future__ import annotations
 
 import platform
@@ -13,17 +13,18 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import AUTO
-from dashcalib_ros.config import Config
+from dashcalib_ros.config import Config, ReconstructConfig, VerdictConfig
 from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
+from dashcalib_ros.errors import counted
 from dashcalib_ros.input.motion import SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
 from dashcalib_ros.judge.calibration import (
-    Calibration,
+    CalibrationData,
     LensField,
     Material,
     Mount,
@@ -39,24 +40,20 @@ from dashcalib_ros.judge.verdict import (
     Finding,
     judge,
     profile_contrast,
+    turn_count,
     two_cameras,
     verdict_of,
+    yaw_in_all,
 )
-from dashcalib_ros.judge.witnesses import Asked
+from dashcalib_ros.judge.witnesses import SensorComparison
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, picture_of, rms_px
-from dashcalib_ros.reconstruct.scene_file import StoredTurn
 from dashcalib_ros.solve.evidence import largest_crop
 from dashcalib_ros.solve.solution import Solution, cross_validation
+from dashcalib_ros.store.scene_file import StoredTurn
 
 # why turns are not used
 NOT_NEEDED = 'more prominent turns were enough'
-STOOD = 'the car stood, its speed says: what turned were others, or the camera alone'
-
-# result.json has their versions: a result's last digits depend on them
-PACKAGES = (
-    'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap', 'pyceres')
-# px RMS; a warning tells of a field that no lens model has, if it is larger
-TOLD_FIELD_PX = 0.5
+STOOD = ('according to its speed the car stood: other things turned, or the camera alone')
 
 
 @dataclass(frozen=True)
@@ -64,12 +61,11 @@ class Evidence:
     """What a calibration needs beside the solution.
 
     image_size: of the input; scale: how it was resized for the scenes. built: scenes by their
-    turn. stored: the turns of earlier drives that were available. left_out: why turns were taken
+    turn. stored: the turns of earlier drives that were available. left_out: why turns were left
     out, in words. pictures: of turns whose images are gone; None: the report is not wanted.
     start_s: stamp of the first image. lines: upright ones, in the resized images; None where they
     were not looked for. straights: pairs of images of straight driving, likewise. motion: of the
-    car's sensors; asked: what they say. other_camera: that the stream has,
-    too.
+    car's sensors; sensors: what they say. other_camera: that the stream has, too.
     """
 
     image_size: tuple[int, int]
@@ -88,7 +84,7 @@ class Evidence:
     lines: Lines | None = None
     straights: Straights | None = None
     motion: SensorStream | None = None
-    asked: Asked = default(default_factory=Asked)
+    sensors: SensorComparison = default(default_factory=SensorComparison)
     other_camera: OtherCamera | None = None
 
 
@@ -120,26 +116,28 @@ def turns_that_stood(scenes: Sequence[Scene], motion: SensorStream | None, start
             and stream.stood(*(scene.tracks.stamps_ns[[0, -1]] / 1e9 - start_s))}
 
 
-def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> Calibration:
+def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> CalibrationData:
     """Return the calibration; a refused one has no intrinsics, so that they cannot be used."""
     scenes = {turn.scene.turn: turn.scene for turn in evidence.stored} | evidence.built
     if solution is not None:
         solution = replace(solution, px=evidence.scale.px)
         scenes |= {scene.turn: scene for scene in solution.scenes}
     lines = _straight_lines(solution, evidence, config)
-    said = evidence.asked.witnesses
-    found = Calibration(
-        verdict=(judge(solution, config.verdict, lines, True, said, evidence.other_camera)
-                 if solution else _verdict_without_solution(evidence)),
+    witnesses = evidence.sensors.witnesses
+    found = CalibrationData(
+        verdict=(judge(solution, config.verdict, lines, True, witnesses, evidence.other_camera)
+                 if solution else _verdict_without_solution(evidence, config.verdict)),
         image_size=evidence.image_size, camera=None, sigma=None,
         turns=tuple(_summary(turn, scenes.get(turn.id), evidence, solution)
                     for turn in sorted(evidence.turns, key=lambda turn: turn.center)),
         frames=evidence.frames, reprojection_error_px=None, timing=evidence.timing,
-        versions=versions(), config=config, warnings=evidence.warnings + evidence.asked.unused,
+        versions=versions(config.reconstruct), config=config,
+        warnings=evidence.warnings + evidence.sensors.unused,
         magnitudes=evidence.magnitudes, mask=_of_size(evidence.mask, evidence.image_size),
         stored_turns=tuple(_stored_summary(turn, scenes[turn.scene.turn], evidence, solution)
                            for turn in evidence.stored),
-        start_s=evidence.start_s, witnesses=said, material=_material(scenes, solution, evidence))
+        start_s=evidence.start_s, witnesses=witnesses,
+        material=_material(scenes, solution, evidence))
     if solution is None:
         return found
     crop_px = largest_crop(solution.crops) * solution.px if solution.crops else None
@@ -150,17 +148,17 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     return replace(found, warnings=found.warnings + _warnings(found, solution))
 
 
-def _with_numbers(found: Calibration, solution: Solution, lines: Bend | None, evidence: Evidence
-                  ) -> Calibration:
+def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None,
+                  evidence: Evidence) -> CalibrationData:
     """Return the calibration with what a refused one has not, in the input's pixels."""
     px, camera = solution.px, solution.camera.resized(solution.px, evidence.image_size)
-    units = camera.widened().units(px)
+    units, wide = camera.units(px), camera.widened().units(px)
     return replace(
         found, camera=camera,
-        sigma=dict(zip(camera.names(), (solution.sigma * camera.units(px)).tolist(), strict=True)),
+        sigma=dict(zip(camera.names(), (solution.sigma * units).tolist(), strict=True)),
+        covariance=solution.covariance * np.outer(units, units),
+        picture_covariance=solution.wide_covariance * np.outer(wide, wide),
         reprojection_error_px=solution.reprojection_error_px * px,
-        details=found.details | {'picture_covariance': (
-            solution.wide_covariance * np.outer(units, units)).tolist()},
         sigma_px=solution.picture.times(px),
         held_out=tuple(each.times(px) for each in cross_validation(solution)),
         straight_lines=lines and lines.resized(px), field=_field(solution, evidence.image_size),
@@ -169,27 +167,31 @@ def _with_numbers(found: Calibration, solution: Solution, lines: Bend | None, ev
         if solution.rolling else None)
 
 
-def _warnings(found: Calibration, solution: Solution) -> tuple[str, ...]:
+# px RMS; a warning names a field that no lens model has, if it is larger
+REPORTED_FIELD_PX = 0.5
+
+
+def _warnings(found: CalibrationData, solution: Solution) -> tuple[str, ...]:
     """Return what the user must know of the numbers, which are no reason for the verdict."""
-    level, asked_for, field = found.verdict.level, found.config.model, found.field
+    level, model, field = found.verdict.level, found.config.model, found.field
     warnings = []
-    if level != 'accepted' and asked_for != AUTO:
+    if level != 'accepted' and model != AUTO:
         warnings.append(
-            f'the lens model {asked_for} was asked for and may be why the result is {level}: '
-            f'--model {AUTO} takes the one that the turns prove')
-    if field is not None and field.rms_px >= max(TOLD_FIELD_PX, field.sigma_px):
+            f'the lens model {model} was chosen by hand and may be why the result is {level}: '
+            f'--model {AUTO} uses the one that fits the turns')
+    if field is not None and field.rms_px >= max(REPORTED_FIELD_PX, field.sigma_px):
         warnings.append(
             f'the picture is bent by {field.rms_px:.1f} px (up to {field.worst_px:.1f} px), as by '
-            f'a windscreen or a rectification: camera_info cannot say that, and sigma over the '
-            f'picture allows for it; `dashcalib export --to rays` has it')
+            f'a windscreen or a rectification: camera_info cannot describe this, and sigma over '
+            f'the picture includes it; `dashcalib export --to rays` keeps it')
     if found.mount is not None and found.mount.moved_s is not None:
         warnings.append(
             f'the camera was moved on the car {found.mount.moved_s - found.start_s:.0f} s into '
-            f'the drive: how it sits is told from there on')
+            f'the drive: the mounting is that from there on')
     if found.stabiliser is not None and STEADY not in found.verdict.cures:
         warnings.append(
             f'the picture seems to move by up to {found.stabiliser.largest_px:.0f} px against the '
-            f'lens, no more than the lens is uncertain; that was taken out: {STEADY}')
+            f'lens, which is within the uncertainty of the lens, and was removed: {STEADY}')
     return tuple(warnings)
 
 
@@ -248,25 +250,32 @@ def _field(solution: Solution, image_size: tuple[int, int]) -> LensField | None:
         float(np.sqrt(np.mean(sizes**2))), float(sizes.max()), px * solution.rays_sigma_px)
 
 
-def _verdict_without_solution(evidence: Evidence) -> Verdict:
+def _verdict_without_solution(evidence: Evidence, config: VerdictConfig) -> Verdict:
     """Return the verdict on a drive that gave no scene."""
+    turns = len(evidence.turns)
     if evidence.frames < 2:
-        what, cure = f'there is only {evidence.frames} image', 'record a drive with turns'
-    elif not evidence.turns:
-        what = ('no turn was found: the car stood or drove straight on, or the pictures show too '
-                'little')
-        cure = 'record a drive with turns at crossings, in daylight'
+        found = Finding('E-FEW-IMAGES', 'refused',
+                        f'the drive has only {counted(evidence.frames, "image")}',
+                        'record a drive with turns')
+    elif not turns:
+        found = Finding('E-NO-TURN', 'refused',
+                        'no turn was found: the car stood or drove straight on, or the pictures '
+                        'show too little', 'record a drive with turns at crossings, in daylight')
     elif evidence.left_out and set(evidence.left_out.values()) == {STOOD}:
-        what = (f'the car stood during all that look like turns ({len(evidence.turns)}), its '
-                f'speed says')
-        cure = 'drive through turns, or leave a speed away that is wrong'
+        found = Finding('E-CAR-STOOD', 'refused',
+                        f'the car stood during all turns that were found ({turns}), according to '
+                        f'its speed',
+                        'drive through turns, or omit the speed if it is wrong')
     else:
-        what = (f'none of the {len(evidence.turns)} turns could be reconstructed: the pictures '
-                f'are too dark or blurred, or the camera turned without moving')
-        cure = 'drive through turns at town speed, in daylight'
-    found = [Finding('refused', what, cure)]
-    return verdict_of([two_cameras(evidence.other_camera), *found] if evidence.other_camera
-                      else found)
+        found = Finding('E-NO-SCENE', 'refused',
+                        f'{counted(turns, "turn")} {"was" if turns == 1 else "were"} found, but '
+                        f'none could be reconstructed: the pictures are too dark or blurred, or '
+                        f'the camera turned without moving',
+                        'drive through turns at town speed, in daylight')
+    other = evidence.other_camera
+    verdict = verdict_of([two_cameras(other), found] if other else [found])
+    return replace(verdict, conditions=(*verdict.conditions, *(
+        each.condition for each in (turn_count(0, config), yaw_in_all(0.0, config)))))
 
 
 def _summary(turn: Turn, scene: Scene | None, evidence: Evidence, solution: Solution | None
@@ -328,7 +337,6 @@ def _material(scenes: Mapping[TurnId, Scene], solution: Solution | None, evidenc
 
 def _details(solution: Solution) -> dict[str, Any]:
     width = solution.camera.image_size[0]
-    alone = solution.alone
     details: dict[str, Any] = {
         'step1': {'f_over_width': solution.centred.fx / width,
                   **dict(list(solution.centred.named.items())[4:])},
@@ -339,18 +347,23 @@ def _details(solution: Solution) -> dict[str, Any]:
         'fixed_camera': {each.kind: {'strength': each.strength, 'size': each.size}
                          for each in solution.fixed_camera},
         'models': [asdict(candidate) for candidate in solution.tried],
-        'correlation': (solution.covariance / np.outer(solution.sigma, solution.sigma)).tolist(),
     }
-    if alone is not None:
+    pictures = solution.by_pictures
+    if pictures is not None:
         # what pictures alone say, where a gyro is in the solution
-        details['pictures_alone'] = {'fx': solution.px * alone.camera.fx,
-                                     'sigma_fx': solution.px * float(alone.sigma[0])}
+        details['pictures_alone'] = {'fx': solution.px * pictures.camera.fx,
+                                     'sigma_fx': solution.px * float(pictures.sigma[0])}
     return details
 
 
-def versions() -> dict[str, str]:
-    """Return those of PACKAGES, and Python's, by name."""
-    found = {'python': platform.python_version()}
+# result.json has their versions: a result's last digits depend on them
+PACKAGES = (
+    'dashcalib_ros', 'numpy', 'scipy', 'opencv-python-headless', 'av', 'pycolmap')
+
+
+def versions(reconstruct: ReconstructConfig) -> dict[str, str]:
+    """Return those of PACKAGES, and Python's, by name; and the engine that estimates poses."""
+    found = {'python': platform.python_version(), 'engine': reconstruct.used}
     for name in PACKAGES:
         try:
             found[name] = metadata.version(name)

@@ -97,14 +97,17 @@ class Difference:
         """Return what the distance and the pixels say.
 
         right: chance explains the difference, and it is small enough for detection. differs: it is
-        real, and small enough. wrong: it is real, and not small enough. cannot tell: chance
-        explains it, but an error that is too large may be there.
+        real, and small enough. wrong: it is real, and larger than detection allows. cannot tell:
+        the error may be too large, and nothing shows whether it is.
         """
         same = (self.rms_px is not None and self.rms_px <= self.limits_px['metrology']
                 if self.told_apart is None else not self.told_apart)
-        if same:
-            return 'right' if self.good_for else 'cannot tell'
-        return 'differs' if self.good_for and not self.centre_off else 'wrong'
+        if not same and (self.centre_off or self.rms_px is None
+                         or self.rms_px > self.limits_px['detection']):
+            return 'wrong'
+        if not self.good_for:
+            return 'cannot tell'
+        return 'right' if same else 'differs'
 
     @property
     def matters(self) -> bool | None:
@@ -314,10 +317,11 @@ def _answer_text(found: Difference) -> str:
     enough = f'good enough for {", ".join(found.good_for)}'
     if found.answer == 'right':
         return f'the same within what can be determined; {far}: {enough}'
-    if found.answer == 'cannot tell':
-        return f'chance explains the difference, but the error may be too large; {far}'
     if found.answer == 'differs':
         return f'differs by {far}: {enough}'
+    if found.answer == 'cannot tell':
+        what = 'differs by' if found.told_apart else 'chance explains the difference of'
+        return f'{what} {far}; but its error may be too large for every use'
     parts = ' and '.join(_blamed(found))
     return f'off by {far}{parts and f", because of the {parts}"}'
 

@@ -7,7 +7,7 @@ and a gyro's noise adds up with the time between.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -15,47 +15,55 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.input.motion import Samples
 
-# degrees a second, and the seconds over which they are taken; a straight has less
-STRAIGHT_DEG_S, RATE_OVER_S = 2.0, 1.0
-# s, m and fixes of a straight at the least; s that are left out at both ends, as clocks differ
-# and receivers filter
-STRAIGHT_S, STRAIGHT_M, FIXES, ENDS_S = 2.0, 20.0, 3, 0.7
-# degrees; what a heading is not better than: the aerial's place, and cambers
-HEADING_FLOOR_DEG = 0.3
-# degrees; a heading that is known worse says nothing
-HEADING_SIGMA_DEG = 5.0
-# m; fixes of one receiver share errors of this size, which no residual shows
-LEAST_NOISE_M = 0.05
-# of the median distance from a straight; fixes beyond have jumped
-JUMP = 4.0
-# degrees a root of a second: noise of cheap gyros
-GYRO_NOISE_DEG = 0.1
-# s between straights at the most; the bias drifts over more
-APART_S = 60.0
-# straights, and degrees between them in all, at the least
-LEAST_STRAIGHTS, LEAST_TURNED_DEG = 6, 240.0
+
+@dataclass(frozen=True)
+class Straight:
+    """Fixes of GPS along a line, in the order in which they were driven.
+
+    stamps_s: (n,). direction: (2,) east and north, of unit length. along, left: (n,) m, where the
+    fixes are from their mean, along the line and to its left.
+    """
+
+    stamps_s: Floats
+    direction: Floats
+    along: Floats
+    left: Floats
+
+    @property
+    def heading(self) -> float:
+        """Return the heading, rad, from east to the left."""
+        return float(np.arctan2(self.direction[1], self.direction[0]))
+
+    @property
+    def spread_m2(self) -> float:
+        """Return the sum of squares along the way."""
+        return float(self.along @ self.along)
+
+    @property
+    def off_m2(self) -> float:
+        """Return the sum of squares across the way."""
+        return float(self.left @ self.left)
+
+    @property
+    def freedom(self) -> int:
+        """Return how many fixes there are beyond those that a line needs."""
+        return len(self.left) - 2
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """A straight as the gyro has it. yaw: rad, in its middle; piece: between gaps of samples."""
+
+    straight: Straight
+    stamp_s: float
+    yaw: float
+    piece: int
+
+
 # a scale farther off is one of units, or of another drive
 SCALES = (0.7, 1.4)
 # one that is known worse tells less than that a gyro is no worse than 3 %
 LARGEST_SIGMA = 0.05
-# s between samples of a gyro; over more the angle between them is not known
-LONGEST_GAP_S = 0.35
-
-
-@dataclass(frozen=True)
-class _Straight:
-    """stamp_s: of its middle. heading: of GPS, rad; yaw: of the gyro; piece: between its gaps.
-
-    off_m2, spread_m2: sums of squares of the n fixes, across and along the way.
-    """
-
-    stamp_s: float
-    heading: float
-    off_m2: float
-    spread_m2: float
-    fixes: int
-    yaw: float = 0.0
-    piece: int = 0
 
 
 def scale_by_gps(rate: Samples, position: Samples) -> tuple[float, float] | None:
@@ -66,13 +74,22 @@ def scale_by_gps(rate: Samples, position: Samples) -> tuple[float, float] | None
     _, axes = np.linalg.eigh(rate.values.T @ rate.values)
     about_upright = rate.values @ axes[:, -1]
     found = [each for sign in (1, -1)
-             if (each := _fitted(_straights(rate.stamps_s, sign * about_upright, position)))]
+             if (each := _fitted(_stretches(rate.stamps_s, sign * about_upright, position)))]
     # about the wrong way, the headings do not follow
     scale, sigma = max(found, default=(0.0, 0.0))
     return (scale, sigma) if SCALES[0] < scale < SCALES[1] and sigma < LARGEST_SIGMA else None
 
 
-def _straights(stamps_s: Floats, rate: Floats, position: Samples) -> list[_Straight]:
+# degrees a second, and the seconds over which they are taken; a straight has less
+STRAIGHT_DEG_S, RATE_OVER_S = 2.0, 1.0
+# s and m of a straight at the least; s that are left out at both ends, as clocks differ and
+# receivers filter
+STRAIGHT_S, STRAIGHT_M, ENDS_S = 2.0, 20.0, 0.7
+# s between samples of a gyro; over more the angle between them is not known
+LONGEST_GAP_S = 0.35
+
+
+def _stretches(stamps_s: Floats, rate: Floats, position: Samples) -> list[_Stretch]:
     """Return where the car drove straight on. rate: (n,) rad/s to the left."""
     yaw = Samples(stamps_s, rate[:, None]).integral.values[:, 0]
     half = RATE_OVER_S / 2
@@ -81,68 +98,95 @@ def _straights(stamps_s: Floats, rate: Floats, position: Samples) -> list[_Strai
     piece = np.cumsum(gap)
     straight = np.abs(turning) < np.radians(STRAIGHT_DEG_S) * RATE_OVER_S
     edges = np.flatnonzero(np.diff(np.r_[False, straight, False].astype(int)) | np.r_[gap, False])
-    found = []
+    stretches = []
     for first, past in pairwise(edges):
-        if straight[first]:
-            each = _straight(stamps_s[first] + ENDS_S, stamps_s[past - 1] - ENDS_S, position)
-            if each is not None:
-                found.append(replace(each, piece=int(piece[first]), yaw=float(
-                    np.interp(each.stamp_s, stamps_s, yaw))))
-    return found
+        if not straight[first]:
+            continue
+        found = straight_between(stamps_s[first] + ENDS_S, stamps_s[past - 1] - ENDS_S, position,
+                                 STRAIGHT_M, STRAIGHT_S, without_jumps=True)
+        if found is not None:
+            stamp_s = float(found.stamps_s.mean())
+            stretches.append(_Stretch(found, stamp_s, float(np.interp(stamp_s, stamps_s, yaw)),
+                                      int(piece[first])))
+    return stretches
 
 
-def _straight(begin_s: float, end_s: float, position: Samples) -> _Straight | None:
-    """Return a straight without what the gyro says; None where fixes tell no heading."""
+# fixes of a straight at the least: a line through two of them is always exact
+FIXES = 3
+# m; fixes of one receiver share errors of this size, which no residual shows
+LEAST_NOISE_M = 0.05
+# of the median distance from a straight; fixes beyond have jumped
+JUMP = 4.0
+
+
+def straight_between(begin_s: float, end_s: float, position: Samples, least_m: float,
+                     least_s: float = 0.0, without_jumps: bool = False) -> Straight | None:
+    """Return the line that was driven between two stamps; None where fixes tell none.
+
+    least_m, least_s: its length, and the time. without_jumps: fixes far from the line do not
+    count.
+    """
     inside = (position.stamps_s >= begin_s) & (position.stamps_s <= end_s)
     when, where = position.stamps_s[inside], position.values[inside, :2]
-    for _ in range(2):
-        if len(where) < FIXES or np.ptp(when) < STRAIGHT_S:
+
+    def too_few() -> bool:
+        return len(where) < FIXES or bool(np.ptp(when) < least_s)
+
+    for _ in range(2 if without_jumps else 0):
+        if too_few():
             return None
-        direction = line_through(where)[0]
+        direction = _line_through(when, where).direction
         away = where - np.median(where, axis=0)
         off = np.abs(away @ np.array([-direction[1], direction[0]]))
         kept = off <= max(JUMP * float(np.median(off)), LEAST_NOISE_M)
         when, where = when[kept], where[kept]
-    if len(where) < FIXES or np.ptp(when) < STRAIGHT_S:
+    if too_few():
         return None
-    direction, along, left = line_through(where)
-    if np.ptp(along) < STRAIGHT_M:
-        return None
-    return _Straight(float(when.mean()), float(np.arctan2(direction[1], direction[0])),
-                     float(left @ left), float(along @ along), len(where))
+    found = _line_through(when, where)
+    return None if np.ptp(found.along) < least_m else found
 
 
-def line_through(where: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the direction (2,) in which fixes (n, 2) were driven, and where they are from it.
-
-    (n,) along it and (n,) to its left, from their mean.
-    """
+def _line_through(when: Floats, where: Floats) -> Straight:
+    """Return the line through fixes (n, 2), m, at stamps (n,)."""
     away = where - where.mean(axis=0)
     direction = np.linalg.svd(away, full_matrices=False)[2][0]
     direction = direction * np.sign(direction @ (where[-1] - where[0]))
-    return direction, away @ direction, away @ np.array([-direction[1], direction[0]])
+    return Straight(when, direction, away @ direction,
+                    away @ np.array([-direction[1], direction[0]]))
 
 
-def _fitted(straights: list[_Straight]) -> tuple[float, float] | None:
+# degrees; what a heading is not better than: the aerial's place, and cambers
+HEADING_FLOOR_DEG = 0.3
+# degrees; a heading that is known worse says nothing
+HEADING_SIGMA_DEG = 5.0
+# degrees a root of a second: noise of cheap gyros
+GYRO_NOISE_DEG = 0.1
+# s between straights at the most; the bias drifts over more
+APART_S = 60.0
+# straights, and degrees between them in all, at the least
+LEAST_STRAIGHTS, LEAST_TURNED_DEG = 6, 240.0
+
+
+def _fitted(stretches: list[_Stretch]) -> tuple[float, float] | None:
     """Return the slope of the gyro's angles over the headings', and its sigma."""
-    if len(straights) < LEAST_STRAIGHTS:
+    if len(stretches) < LEAST_STRAIGHTS:
         return None
-    off_m2, spread_m2, fixes = (np.array([getattr(each, name) for each in straights])
-                                for name in ('off_m2', 'spread_m2', 'fixes'))
-    own_m = np.sqrt(off_m2 / (fixes - 2))
+    off_m2, spread_m2, freedom = (np.array([getattr(each.straight, name) for each in stretches])
+                                  for name in ('off_m2', 'spread_m2', 'freedom'))
+    own_m = np.sqrt(off_m2 / freedom)
     # three fixes may lie in a line by chance
     noise_m = np.maximum(own_m, max(float(np.median(own_m)), LEAST_NOISE_M))
     sigma = np.hypot(noise_m / np.sqrt(spread_m2), np.radians(HEADING_FLOOR_DEG))
     usable = sigma < np.radians(HEADING_SIGMA_DEG)
-    straights = [each for each, fits in zip(straights, usable, strict=True) if fits]
+    stretches = [each for each, fits in zip(stretches, usable, strict=True) if fits]
     sigma = sigma[usable]
-    pairs = [n for n, (a, b) in enumerate(pairwise(straights))
+    pairs = [n for n, (a, b) in enumerate(pairwise(stretches))
              if a.piece == b.piece and b.stamp_s - a.stamp_s < APART_S]
     if len(pairs) < LEAST_STRAIGHTS - 1:
         return None
-    heading, yaw, stamps_s = (np.array([getattr(each, name) for each in straights])
-                              for name in ('heading', 'yaw', 'stamp_s'))
-    difference = np.zeros((len(pairs), len(straights)))
+    heading, yaw, stamps_s = np.array([
+        (each.straight.heading, each.yaw, each.stamp_s) for each in stretches]).T
+    difference = np.zeros((len(pairs), len(stretches)))
     difference[np.arange(len(pairs)), pairs] = -1
     difference[np.arange(len(pairs)), np.array(pairs) + 1] = 1
     measured, apart_s = difference @ yaw, difference @ stamps_s

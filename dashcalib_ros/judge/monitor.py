@@ -28,30 +28,6 @@ from dashcalib_ros.solve.prior import loss_px_of
 from dashcalib_ros.solve.quadratic import Quadratic
 
 Kind = Literal['lens', 'mount']
-# least sigma of a coefficient of distortion: good calibrations differ by this much
-LEAST_DISTORTION_SIGMA = 0.002
-# times the least sigmas: the error of a camera of which nothing is known
-UNKNOWN = 100.0
-# times the zoom that is found, between which the true one is: the linear step overshoots by half
-# and more, and noise adds to it
-TRUE_ZOOM = (0.4, 1.3)
-# a zoom that the camera in use explains no longer; of made turns it mostly explains 5 %, not 8 %
-UNEXPLAINED_ZOOM = 0.05
-# of the evidence; parts of the camera that leave less are the explanation: a turn's cost is not
-# exactly quadratic, so that the others gain some evidence from a change they have no part in
-UNEXPLAINED = 0.2
-# by which the turns of one camera vary more than their noise; KITTI 03: up to 5
-SCATTER = 3.0
-# of fx, or of the width: smaller changes are not told
-LEAST_CHANGE = 0.008
-# degrees; a camera that was moved by less is not told
-LEAST_TURNED_DEG = 0.6
-# degrees; the direction of travel varies so much between turns, sideways
-HEADING_SIGMA_DEG = 0.15
-# degrees; the same up and down: roads, brakes and load
-PITCH_SIGMA_DEG = 0.2
-# degrees; a turn that shows the direction of travel worse is not used
-MAX_HEADING_SIGMA_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +78,7 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
 
 
 def readings_of(scenes: Iterable[Scene], camera: Camera, config: Config) -> tuple[Reading, ...]:
-    """Return what each turn says of a camera in use; camera: of the scenes' pictures."""
+    """Return how each turn fits a camera in use; camera: of the scenes' pictures."""
     return tuple(reading_of(scene, camera, config) for scene in scenes)
 
 
@@ -114,7 +90,7 @@ class Change:
     wrong. mount: the camera points elsewhere in the car; the calibration stays right.
     zoom: by how much fx has grown, of fx; shift: (2,) of the centre, of the picture's width: what
     explains the turns best if nothing else has changed; both NaN where the camera in use explains
-    the turns so badly that they cannot be told. looks_like: in words, what explains the turns as
+    the turns so badly that they are not known. looks_like: in words, what explains the turns as
     well as any other camera does; each of the texts does so alone, () where none does.
     turned_deg: (2,) the yaw and pitch of the mounting. turns: how many show it; one is a
     suspicion.
@@ -138,10 +114,11 @@ class Change:
         if self.kind == 'mount':
             return moved_text(since, self.turned_deg)
         if not self.looks_like:
-            return (f'the calibration does not explain the pictures {since}: is it another '
-                    f'camera, or another part of its picture?')
+            return (f'the calibration does not explain the pictures {since}: check whether it is '
+                    f'another camera, or another part of its picture')
         return (f'the calibration does not fit {since}, as if {", or ".join(self.looks_like)}; '
-                f'was the camera zoomed, focused anew or exchanged, or its picture cropped?')
+                f'check whether the camera was zoomed, refocused or exchanged, or its picture '
+                f'cropped')
 
 
 def moved_text(than: str, turned_deg: Sequence[float] | Floats) -> str:
@@ -150,6 +127,30 @@ def moved_text(than: str, turned_deg: Sequence[float] | Floats) -> str:
     return (f'the camera points elsewhere {than}: by {abs(yaw):.1f} degrees to the '
             f'{"left" if yaw > 0 else "right"} and {abs(pitch):.1f} '
             f'{"up" if pitch > 0 else "down"}; its calibration stays right')
+
+
+# times the least sigmas: the error of a camera of which nothing is known
+UNKNOWN = 100.0
+# times the zoom that is found, between which the true one is: the linear step overshoots by half
+# and more, and noise adds to it
+TRUE_ZOOM = (0.4, 1.3)
+# a zoom that the camera in use explains no longer; of made turns it mostly explains 5 %, not 8 %
+UNEXPLAINED_ZOOM = 0.05
+# of the evidence; parts of the camera that leave less are the explanation: a turn's cost is not
+# exactly quadratic, so that the others gain some evidence from a change they have no part in
+UNEXPLAINED = 0.2
+# by which the turns of one camera vary more than their noise; KITTI 03: up to 5
+SCATTER = 3.0
+# of fx, or of the width: smaller changes are not told
+LEAST_CHANGE = 0.008
+# degrees; a camera that was moved by less is not told
+LEAST_TURNED_DEG = 0.6
+# degrees; the direction of travel varies so much between turns, sideways
+HEADING_SIGMA_DEG = 0.15
+# degrees; the same up and down: roads, brakes and load
+PITCH_SIGMA_DEG = 0.2
+# degrees; a turn that shows the direction of travel worse is not used
+MAX_HEADING_SIGMA_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -339,7 +340,7 @@ class Monitor:
             'focal length': f'its focal length were {least:.1f} to {most:.1f} % too '
                             f'{"short" if zoom > 0 else "long"}',
             'centre': f'its centre were up to {shift:.1f} % of the width off',
-            'distortion': 'its distortion were another'}
+            'distortion': 'its distortion were different'}
         return ' and '.join(texts[way] for way in ways)
 
     def _mount(self) -> Change | None:
@@ -383,6 +384,10 @@ def watch(readings: Iterable[Reading], camera: Camera, sigma: Mapping[str, float
     for reading in readings:
         monitor = monitor.after(reading)
     return monitor
+
+
+# least sigma of a coefficient of distortion: good calibrations differ by this much
+LEAST_DISTORTION_SIGMA = 0.002
 
 
 def _covariance(camera: Camera, sigma: Mapping[str, float]) -> Floats:

@@ -21,47 +21,16 @@ from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.judge.calibration import MOVED_DEG, MOVED_SIGMAS, Mount
 from dashcalib_ros.judge.monitor import HEADING_SIGMA_DEG, PITCH_SIGMA_DEG
-from dashcalib_ros.reconstruct.heading import MAD, heading
+from dashcalib_ros.reconstruct.heading import heading
 from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.robust import (
+    cauchy_fit,
+    cauchy_weights,
+    jackknife,
+    mad_sigma,
+    weighted_mean,
+)
 from dashcalib_ros.solve.solution import Solution
-
-# of a pair's poses: steps of Gauss-Newton, and the loss in px, narrowing to what tracks need
-STEPS, FIRST_PX, LAST_PX, NARROWING = 20, 3.0, 0.7, 0.8
-# m/s^2; a body that brakes or gathers speed nods: where the speed is known, it is left out
-STEADY_M_S2 = 1.0
-# radians; the farthest a step goes
-LONGEST_STEP = 0.1
-# degrees a second; beyond it a stretch is no straight one (openpilot's limit, too)
-STRAIGHT_DEG_S = 2.0
-# degrees; pairs that know their direction worse are left out, and what varies from pair to pair:
-# bumps, and tracks that share errors
-MOST_PAIR_SIGMA, PAIR_SCATTER_DEG = 1.0, 0.2
-# pairs are judged in so many blocks: neighbours share tracks and bumps
-BLOCKS, LEAST_PAIRS = 12, 8
-# pairs on either side of the moment in which a camera was moved; degrees, by which one may seem
-# to point elsewhere on other roads (KITTI 03 by 0.5 between its ends), and beyond which single
-# pairs do not count
-LEAST_SIDE, PLACES_DEG, OUTLIER_DEG = 20, 0.15, 2.0
-# every fifth point of a pair is enough to see that a camera was moved
-THINNED = 5
-# degrees of yaw and of pitch; with more it is weak. openpilot's spread on one car is as large
-ACCEPTED_DEG = 0.2
-# degrees; what no source is better than: slopes, crowns and bumps, between places
-HEADING_FLOOR_DEG, ROLL_FLOOR_DEG = 0.1, 0.3
-# degrees; no source sees it, and none makes it less: on a crowned road a car leans to the kerb by
-# 1.15 degrees (2 %), against its path and against what is upright
-CROWN_DEG = 0.6
-# degrees of a turn's yaw whose path tells a plane; of its largest bend, below which it is straight
-LEAST_YAW_DEG, UNBENT = 30.0, 0.3
-# upright lines, and the loss in radians
-LEAST_LINES, LINE_LOSS = 100, 0.05
-# times the height to the side of the path: the road between the wheels; images that see a point
-ROADWAY, LEAST_SEEN, LEAST_ROAD_POINTS = 1.0, 3, 8
-# of height: what turns differ by, and what all may share: slopes, and the load of the car
-TURN_SCATTER, HEIGHT_FLOOR = 0.01, 0.01
-# m above the road, and m/s: where speed is unknown, straight_m assumes a camera that high
-USUAL_HEIGHT_M, USUAL_SPEED = 1.4, 10.0
-ROUNDS = 20
 
 Speed = Callable[[Floats], Floats]
 
@@ -75,20 +44,28 @@ class _Pairs:
     rate_deg_s: Floats
 
 
+# m/s^2; a body that brakes or gathers speed nods: where the speed is known, it is left out
+MAX_ACCELERATION_M_S2 = 1.0
+# degrees; what no source is better than: slopes, crowns and bumps, between places
+HEADING_FLOOR_DEG, ROLL_FLOOR_DEG = 0.1, 0.3
+# m above the road, and m/s: where speed is unknown, straight_m assumes a camera that high
+USUAL_HEIGHT_M, USUAL_SPEED = 1.4, 10.0
+
+
 def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str,
              speed: Speed | None) -> Mount | None:
-    """Return how the camera sits on the car; None where nothing tells.
+    """Return how the camera sits on the car; None where that is not known.
 
     straights, lines: in the scenes' pixels. level: the lens's verdict; the mount's is never
     better. speed: m/s (n,) at stamps (n,), s.
     """
     camera = solution.camera
-    pairs = _fitted(camera, _without_field(straights, solution))
-    kept = _kept(pairs)
+    pairs = _poses_of_pairs(camera, _without_field(straights, solution))
+    kept = _straight_pairs(pairs)
     # where the speed is not known, a second is the unit
     driven = speed or (lambda stamps_s: np.ones(len(stamps_s)))
     before_s, apart_s = straights.stamps_s - straights.apart_s, straights.apart_s
-    kept &= np.abs(driven(straights.stamps_s) - driven(before_s)) < STEADY_M_S2 * apart_s
+    kept &= np.abs(driven(straights.stamps_s) - driven(before_s)) < MAX_ACCELERATION_M_S2 * apart_s
     roll = _roll(solution.scenes, lines, camera)
     scenes: Sequence[Scene] = solution.scenes
     change = _moved(pairs, kept, straights.stamps_s)
@@ -129,6 +106,10 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
         straight_m=metres, moved_s=moved_s)
 
 
+# every fifth point of a pair is enough to see that a camera was moved
+THINNED = 5
+
+
 def moved(straights: Straights, camera: Camera) -> tuple[float, Floats] | None:
     """Return when and by how much a camera was moved on the car; None where it was not.
 
@@ -137,21 +118,24 @@ def moved(straights: Straights, camera: Camera) -> tuple[float, Floats] | None:
     """
     some = replace(straights, before=straights.before[:, ::THINNED],
                    after=straights.after[:, ::THINNED])
-    pairs = _fitted(camera, some)
-    return _moved(pairs, _kept(pairs), straights.stamps_s)
+    pairs = _poses_of_pairs(camera, some)
+    return _moved(pairs, _straight_pairs(pairs), straights.stamps_s)
+
+
+# degrees of yaw and of pitch; with more it is weak. openpilot's spread on one car is as large
+MAX_SIGMA_DEG = 0.2
 
 
 def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[str, ...]:
     """Return why a mount is weak. sigma, own: (2,) all of it, and what the lens's centre adds."""
     found = []
     if level != 'accepted':
-        found.append(f'the lens is {level}, and where the camera points is no better known: see '
-                     f'the reasons of the lens')
-    if max(sigma) > ACCEPTED_DEG:
-        cure = ('drive more turns, the centre of the picture is not known better'
-                if max(own) > ACCEPTED_DEG else 'drive straight on for longer')
-        found.append(f'yaw and pitch are known to {max(sigma):.2f} degrees after {metres:.0f} m '
-                     f'of straight driving, {ACCEPTED_DEG:g} or better needed: {cure}')
+        found.append(f'the lens is {level}')
+    if max(sigma) > MAX_SIGMA_DEG:
+        cure = ('drive more turns, to know the centre of the picture better'
+                if max(own) > MAX_SIGMA_DEG else 'drive straight on for longer')
+        found.append(f'yaw and pitch are known only to {max(sigma):.2f}° after {metres:.0f} m of '
+                     f'straight driving, {MAX_SIGMA_DEG:g}° or better is needed: {cure}')
     return tuple(found)
 
 
@@ -166,7 +150,13 @@ def _without_field(straights: Straights, solution: Solution) -> Straights:
 
 # -- pairs of images ---------------------------------------------------------------------------
 
-def _fitted(camera: Camera, straights: Straights) -> _Pairs:
+# of a pair's poses: steps of Gauss-Newton, and the loss in px, narrowing to what tracks need
+STEPS, FIRST_PX, LAST_PX, NARROWING = 20, 3.0, 0.7, 0.8
+# radians; the farthest a step goes
+LONGEST_STEP = 0.1
+
+
+def _poses_of_pairs(camera: Camera, straights: Straights) -> _Pairs:
     """Return the poses of all pairs at once: robust Gauss-Newton from straight ahead."""
     first, second = (camera.rays(np.asarray(each, np.float64))
                      for each in (straights.before, straights.after))
@@ -180,7 +170,7 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
     for step in range(STEPS):
         errors, slopes, tangents = _epipolar(turned, back, first, second)
         loss = unit * max(LAST_PX, FIRST_PX * NARROWING**step)
-        weights = seen / (1 + (errors / loss)**2)
+        weights = seen * cauchy_weights(errors, loss)
         weighted = (weights[..., None] * slopes).transpose(0, 2, 1)
         hessian = weighted @ slopes + np.finfo(float).eps * np.eye(5)
         change = np.asarray(
@@ -190,8 +180,8 @@ def _fitted(camera: Camera, straights: Straights) -> _Pairs:
         turned = rotation_matrices(change[:, :3]) @ turned
         back = back + np.einsum('nk,nki->ni', change[:, 3:], tangents)
         back /= np.linalg.norm(back, axis=1)[:, None]
-    noise = MAD * np.array([np.median(np.abs(row[valid])) if valid.any() else np.inf
-                            for row, valid in zip(errors, seen, strict=True)])
+    noise = np.array([mad_sigma(row[valid]) if valid.any() else np.inf
+                      for row, valid in zip(errors, seen, strict=True)])
     variance = np.linalg.inv(hessian)[:, [3, 4], [3, 4]].mean(axis=1)
     vector = rotation_vectors(turned)
     ahead = -(rotation_matrices(-vector / 2) @ back[:, :, None])[:, :, 0]
@@ -220,12 +210,16 @@ def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
 
 # -- yaw and pitch -----------------------------------------------------------------------------
 
+# pairs are judged in so many blocks: neighbours share tracks and bumps
+BLOCKS, LEAST_PAIRS = 12, 8
+
+
 def _heading(pairs: _Pairs, kept: Mask, scenes: Sequence[Scene], roll: float
              ) -> tuple[Floats, Floats] | None:
     """Return (2,) yaw and pitch, degrees, and their sigmas without those of the lens."""
     values, sigmas = [], []
     if kept.sum() >= LEAST_PAIRS:
-        value, sigma = _of_pairs(pairs, kept, roll)
+        value, sigma = _heading_of_pairs(pairs, kept, roll)
         values.append(value)
         sigmas.append(sigma)
     for scene in scenes:
@@ -243,21 +237,34 @@ def _heading(pairs: _Pairs, kept: Mask, scenes: Sequence[Scene], roll: float
     return np.array([value for value, _ in both]), np.array([sigma for _, sigma in both])
 
 
-def _of_pairs(pairs: _Pairs, kept: Mask, roll: float) -> tuple[Floats, Floats]:
+# degrees; pairs that know their direction worse are left out, and what varies from pair to pair:
+# bumps, and tracks that share errors
+MOST_PAIR_SIGMA, PAIR_SCATTER_DEG = 1.0, 0.2
+
+
+def _heading_of_pairs(pairs: _Pairs, kept: Mask, roll: float) -> tuple[Floats, Floats]:
     """Return (2,) yaw and pitch, degrees, of these pairs, and their sigmas (jackknife)."""
     angles, rate = _angles(pairs.ahead[kept], roll), pairs.rate_deg_s[kept]
     weights = 1 / (pairs.sigma_deg[kept]**2 + PAIR_SCATTER_DEG**2)
     blocks = np.arange(len(weights)) * BLOCKS // len(weights)
-    without = np.array([_at_rest(angles[blocks != n], rate[blocks != n], weights[blocks != n])
-                        for n in range(blocks.max() + 1)])
-    count = len(without)
-    return _at_rest(angles, rate, weights), np.sqrt((count - 1) / count * np.sum(
-        (without - without.mean(axis=0))**2, axis=0))
+    return _at_no_rate(angles, rate, weights), jackknife(
+        lambda some: _at_no_rate(angles[some], rate[some], weights[some]),
+        blocks, int(blocks.max()) + 1)
 
 
-def _kept(pairs: _Pairs) -> Mask:
+# degrees a second; beyond it a stretch is no straight one (openpilot's limit, too)
+STRAIGHT_DEG_S = 2.0
+
+
+def _straight_pairs(pairs: _Pairs) -> Mask:
     return np.asarray((np.abs(pairs.rate_deg_s) < STRAIGHT_DEG_S)
                       & (pairs.sigma_deg < MOST_PAIR_SIGMA), bool)
+
+
+# pairs on either side of the moment in which a camera was moved; degrees, by which one may seem
+# to point elsewhere on other roads (KITTI 03 by 0.5 between its ends), and beyond which single
+# pairs do not count
+LEAST_SIDE, PLACES_DEG, OUTLIER_DEG = 20, 0.15, 2.0
 
 
 def _moved(pairs: _Pairs, kept: Mask, stamps_s: Floats) -> tuple[float, Floats] | None:
@@ -273,7 +280,7 @@ def _moved(pairs: _Pairs, kept: Mask, stamps_s: Floats) -> tuple[float, Floats] 
              * np.sqrt(n * (len(places) - n)) for n in splits]
     split = splits[int(np.argmax(apart))]
     sides = [np.isin(np.arange(len(kept)), part) for part in (places[:split], places[split:])]
-    (before, its_sigma), (after, sigma) = (_of_pairs(pairs, side, 0.0) for side in sides)
+    (before, its_sigma), (after, sigma) = (_heading_of_pairs(pairs, side, 0.0) for side in sides)
     floor = np.sqrt(2) * PLACES_DEG
     limit = np.maximum(MOVED_DEG, MOVED_SIGMAS * np.sqrt(its_sigma**2 + sigma**2 + floor**2))
     if (np.abs(after - before) <= limit).all():
@@ -281,20 +288,19 @@ def _moved(pairs: _Pairs, kept: Mask, stamps_s: Floats) -> tuple[float, Floats] 
     return float(stamps_s[places[split - 1]]), after - before
 
 
-def _at_rest(angles: Floats, rate: Floats, weights: Floats) -> Floats:
+# of new weights
+ROUNDS = 20
+# a smaller scatter is rounding
+EPSILON = float(np.finfo(float).eps)
+
+
+def _at_no_rate(angles: Floats, rate: Floats, weights: Floats) -> Floats:
     """Return robust yaw and pitch (2,): a camera ahead of the rear axle moves aside in a bend."""
-    found = []
-    for n, columns in ((0, np.column_stack([np.ones(len(rate)), rate])),
-                       (1, np.ones((len(rate), 1)))):
-        robust = weights
-        for _ in range(ROUNDS):
-            root = np.sqrt(robust)
-            line = np.linalg.lstsq(columns * root[:, None], angles[:, n] * root, rcond=None)[0]
-            errors = angles[:, n] - columns @ line
-            scatter = max(MAD * float(np.median(np.abs(errors))), np.finfo(float).eps)
-            robust = weights / (1 + (errors / (2 * scatter))**2)
-        found.append(float(line[0]))
-    return np.array(found)
+    one = np.ones(len(rate))
+    return np.array([cauchy_fit(
+        np.column_stack(columns), angle, lambda off: 2 * max(mad_sigma(off), EPSILON), ROUNDS,
+        weights).params[0] for columns, angle in (([one, rate], angles[:, 0]),
+                                                  ([one], angles[:, 1]))])
 
 
 def _angles(ahead: Floats, roll: float) -> Floats:
@@ -313,20 +319,24 @@ def _direction(angles: Floats, roll: float) -> Floats:
 
 
 def _averaged(values: Floats, sigmas: Floats, floor: float) -> tuple[float, float]:
-    """Return the weighted mean and its sigma, widened where the values differ by more."""
-    weights = 1 / (sigmas**2 + floor**2)
-    mean = float(weights @ values / weights.sum())
-    freedom = max(len(values) - 1, 1)
-    ratio = max(1.0, float(weights @ (values - mean)**2) / freedom)
-    return mean, float(np.sqrt(ratio / weights.sum()))
+    """Return the mean of sources, none of which is better than floor, and its sigma."""
+    mean = weighted_mean(values, sigmas**2 + floor**2)
+    return mean.value, float(np.sqrt(mean.widened))
 
 
 # -- roll and height ---------------------------------------------------------------------------
 
+# degrees; no source sees it, and none makes it less: on a crowned road a car leans to the kerb by
+# 1.15 degrees (2 %), against its path and against what is upright
+CROWN_DEG = 0.6
+# upright lines, and the loss in radians
+LEAST_LINES, LINE_LOSS = 100, 0.05
+
+
 def _roll(scenes: Sequence[Scene], lines: Lines | None, camera: Camera
           ) -> tuple[float, float] | None:
     """Return the roll to the right and its sigma, degrees; None where nothing tells it."""
-    found = [each for scene in scenes if (each := _roll_of_path(scene)) is not None]
+    found = [each for scene in scenes if (each := roll_of_path(scene)) is not None]
     if lines is not None and len(lines) >= LEAST_LINES:
         found.append(_roll_of_lines(lines, camera))
     if not found:
@@ -337,7 +347,11 @@ def _roll(scenes: Sequence[Scene], lines: Lines | None, camera: Camera
     return roll, float(np.hypot(sigma, CROWN_DEG))
 
 
-def _roll_of_path(scene: Scene) -> float | None:
+# degrees of a turn's yaw whose path tells a plane; of its largest bend, below which it is straight
+LEAST_YAW_DEG, UNBENT = 30.0, 0.3
+
+
+def roll_of_path(scene: Scene) -> float | None:
     """Return the roll against the plane of a turn's path, where it does not bend, degrees."""
     if abs(scene.yaw_deg) < LEAST_YAW_DEG:
         return None
@@ -367,14 +381,15 @@ def _roll_of_lines(lines: Lines, camera: Camera) -> float:
     normals = np.cross(rays[:, 0], rays[:, 1])
     lengths = np.linalg.norm(normals, axis=1)
     normals /= lengths[:, None]
-    upright, up = np.minimum(lengths / np.median(lengths), 3.0)**2, np.array([0.0, -1.0, 0.0])
-    for _ in range(ROUNDS):
-        errors = normals @ up
-        loss = min(MAD * float(np.median(np.abs(errors))) + np.finfo(float).eps, LINE_LOSS)
-        weights = upright / (1 + (errors / loss)**2)**2
-        up = np.linalg.eigh(normals.T * weights @ normals)[1][:, 0]
-        up *= -np.sign(up[1])
-    return float(np.degrees(np.arctan2(-up[0], -up[1])))
+    # upwards is (x, -1, z), across all normals
+    found = cauchy_fit(normals[:, [0, 2]], normals[:, 1],
+                       lambda off: min(mad_sigma(off) + EPSILON, LINE_LOSS), ROUNDS,
+                       np.minimum(lengths / np.median(lengths), 3.0)**2, np.zeros(2), power=2)
+    return float(np.degrees(np.arctan2(-found.params[0], 1.0)))
+
+
+# of height: what turns differ by, and what all may share: slopes, and the load of the car
+TURN_SCATTER, HEIGHT_FLOOR = 0.01, 0.01
 
 
 def _height(scenes: Sequence[Scene], speed: Speed, down: Floats) -> tuple[float, float] | None:
@@ -388,6 +403,10 @@ def _height(scenes: Sequence[Scene], speed: Speed, down: Floats) -> tuple[float,
     logs, sigmas = np.array(found).T
     log, sigma = _averaged(logs, sigmas, TURN_SCATTER)
     return float(np.exp(log)), float(np.exp(log) * np.hypot(sigma, HEIGHT_FLOOR))
+
+
+# times the height to the side of the path: the road between the wheels; images that see a point
+ROADWAY, LEAST_SEEN, LEAST_ROAD_POINTS = 1.0, 3, 8
 
 
 def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, float] | None:
@@ -420,4 +439,4 @@ def _height_in_turn(scene: Scene, speed: Speed, down: Floats) -> tuple[float, fl
         return None
     logs = np.log(depth[road] * unit)
     middle = float(np.median(logs))
-    return middle, MAD * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
+    return middle, mad_sigma(logs - middle) / np.sqrt(len(logs))

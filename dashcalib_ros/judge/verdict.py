@@ -7,9 +7,7 @@ RULES.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Literal
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,42 +23,73 @@ from dashcalib_ros.judge.agreement import (
     next_turn,
     turns_of_another_camera,
 )
-from dashcalib_ros.judge.calibration import Verdict, Witnesses
+from dashcalib_ros.judge.calibration import Condition, Level, Verdict, Witnesses
+from dashcalib_ros.judge.mount import roll_of_path
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.solve.evidence import LEAST_GAIN, FixedCameraTest, largest_crop
 from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Solution
 
-# of the range between its bounds; a parameter nearer to one of them counts as lying on it
-ON_BOUND = 0.01
-STEADY = 'switch the stabiliser off, and fix the zoom'
-# of the sigma of fx by pictures alone; a gyro that knows as much as these leaves 0.71
-CONFIRMED = 0.71
-# relative rise of the error; less is refused
-REFUSED_CONTRAST = 0.01
-# sigma of fx, of fx; more is refused
-REFUSED_SIGMA = 0.1
-# ms; a rolling shutter that takes longer is weak: one picture at 20 fps
-MAX_READOUT_MS = 50.0
-# of the width; only if that k1 moves the picture by more: less does no harm
-MAX_LINE_MOVE = 0.001
-# over the picture; a model asked for, but farther from what turns choose, is weak
-MAX_MODEL_SIGMAS = 2.0
-# over the picture; kinds of lenses that differ by less may be mistaken
-MAX_KIND_SIGMAS = 10.0
+# cures that several rules have, or that others look for
+STEADY = 'switch off the stabiliser and fix the zoom, then record another drive'
+MORE_TURNS = 'drive more and sharper turns, as at crossings, in daylight'
+CORNERS = 'drive where there are things to see up to the corners of the picture'
+# for what no camera_info holds
+RAYS = 'use `dashcalib export --to rays`'
+
+
+@dataclass(frozen=True)
+class Grounds:
+    """What a verdict rests on.
+
+    lines: what straight lines show of the solution; None where there are too few. witnesses: what
+    sensors know of it. other_camera: a second one in the same stream.
+    """
+
+    solution: Solution
+    config: VerdictConfig
+    lines: Bend | None = None
+    witnesses: Witnesses = field(default_factory=Witnesses)
+    other_camera: OtherCamera | None = None
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A rule's objection to a solution: the verdict it leads to, what is wrong, and what to do.
+    """What a rule finds: the verdict it leads to, what is wrong, and what to do.
 
-    Both are in the words of the driver, with the figures; docs/troubleshooting.md explains each.
-    cause: whether the other findings may come from it; then it is the first one.
+    code: names what is wrong; it stays when the texts are reworded. level: 'accepted' where
+    nothing is wrong. what, cure: in the words of the driver, with the figures;
+    docs/troubleshooting.md explains each. cure: the likeliest first, and only what can help here.
+    cause: whether the other findings may come from it; then it is the first one. name, value,
+    limit: what was measured, of this drive, and what is needed; '' where no two numbers say it.
     """
 
-    level: Literal['weak', 'refused']
+    code: str
+    level: Level
     what: str
     cure: str
     cause: bool = False
+    name: str = ''
+    value: str = ''
+    limit: str = ''
+
+    def measured(self, name: str, value: str, limit: str) -> Finding:
+        """Return it with the numbers that say it."""
+        return replace(self, name=name, value=value, limit=limit)
+
+    @property
+    def objects(self) -> bool:
+        """Return whether something is wrong."""
+        return self.level != 'accepted'
+
+    @property
+    def condition(self) -> Condition:
+        """Return what the report shows of it."""
+        return Condition(self.code, self.name or self.what, self.value, self.limit,
+                         not self.objects)
+
+
+# None where nothing is wrong, and nothing was measured that two numbers say
+Rule = Callable[[Grounds], Finding | None]
 
 
 def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
@@ -68,77 +97,99 @@ def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
           other_camera: OtherCamera | None = None) -> Verdict:
     """Return the verdict on a solution, its reasons sorted: causes, then those that refuse it.
 
-    lines: what straight lines say of it, if there are enough of them. outlook: to tell what one
-    more turn would bring, where only knowledge is missing. witnesses: what sensors say of it.
-    other_camera: that is in the stream, too.
+    lines, witnesses, other_camera: as in Grounds. outlook: whether to predict what one more turn
+    would bring, where only knowledge is missing.
     """
-    of_lines: tuple[Rule, ...] = () if lines is None else (partial(_lines_disagree, lines),)
-    if witnesses is not None:
-        of_lines += (partial(_sensors_disagree, witnesses),)
-    if other_camera is not None:
-        of_lines += (lambda *_: two_cameras(other_camera),)
-    findings = [found for rule in (*RULES, *of_lines)
-                if (found := rule(solution, config)) is not None]
-    findings.sort(key=lambda found: (not found.cause, found.level != 'refused'))
-    if findings and outlook and lacks_knowledge_only(solution, config, of_lines):
-        more = next_turn(solution)
-        findings[0] = replace(findings[0], cure=findings[0].cure + (more and f' ({more})'))
+    grounds = Grounds(solution, config, lines, witnesses or Witnesses(), other_camera)
+    findings = [found for rule in RULES if (found := rule(grounds)) is not None]
+    findings.sort(key=lambda found: (not found.objects, not found.cause, found.level != 'refused'))
+    if outlook and findings[0].objects and lacks_knowledge_only(grounds):
+        first, more = findings[0].cure, next_turn(solution)
+        findings = [replace(found, cure=first + (more and f' ({more})')) if found.cure == first
+                    else found for found in findings]
     return verdict_of(findings)
 
 
 def verdict_of(findings: Sequence[Finding]) -> Verdict:
     """Return the verdict that findings lead to, in their order; without any it is accepted."""
-    if not findings:
-        return Verdict('accepted')
-    refused = any(found.level == 'refused' for found in findings)
-    return Verdict('refused' if refused else 'weak',
-                   tuple(f'{found.what}: {found.cure}' for found in findings),
-                   tuple(dict.fromkeys(found.cure for found in findings)))
+    against = [found for found in findings if found.objects]
+    levels = {found.level for found in against}
+    return Verdict('refused' if 'refused' in levels else 'weak' if levels else 'accepted',
+                   tuple(f'{found.what}: {found.cure}' for found in against),
+                   tuple(dict.fromkeys(found.cure for found in against)),
+                   tuple(found.code for found in against),
+                   tuple(found.condition for found in findings))
 
 
-def lacks_knowledge_only(solution: Solution, config: VerdictConfig,
-                         witnesses: Sequence[Rule] = ()) -> bool:
+def lacks_knowledge_only(grounds: Grounds) -> bool:
     """Return whether nothing contradicts a solution: where it is weak, its turns know too little.
 
-    Another focal length may explain them as well, but not clearly better. witnesses: the rules of
-    what is not in the solution.
+    Another focal length may explain them as well, but not clearly better.
     """
-    return (profile_contrast(solution) > -config.min_contrast
-            and not any(rule(solution, config) for rule in (*SOUND, *witnesses)))
+    found = [rule(grounds) for rule in SOUND]
+    return (profile_contrast(grounds.solution) > -grounds.config.min_contrast
+            and not any(each is not None and each.objects for each in found))
 
 
-def _too_few_turns(solution: Solution, config: VerdictConfig) -> Finding | None:
-    count = len(solution.scenes)
-    if count >= config.min_turns or _gyro_confirms(solution):
-        return None
-    lone = ', so that nothing confirms the numbers and their sigma' if count == 1 else ''
-    return Finding('weak', f'only {count} of at least {config.min_turns} turns could be used'
-                           f'{lone}', 'drive more turns, as at crossings')
+def _graded(refused: bool, weak: bool) -> Level:
+    """Return the graver level whose condition holds."""
+    return 'refused' if refused else 'weak' if weak else 'accepted'
 
 
-def _gyro_confirms(solution: Solution) -> bool:
+# of the sigma of fx by pictures alone; a gyro that knows as much as these leaves 0.71
+CONFIRMED = 0.71
+
+
+def gyro_confirms(solution: Solution) -> bool:
     """Return whether a gyro that agrees knows fx as well as the turns do, or better."""
-    alone = solution.alone
-    return alone is not None and bool(solution.sigma[0] <= CONFIRMED * alone.sigma[0])
+    pictures = solution.by_pictures
+    return pictures is not None and bool(solution.sigma[0] <= CONFIRMED * pictures.sigma[0])
 
 
-def _too_little_yaw(solution: Solution, config: VerdictConfig) -> Finding | None:
-    yaw = sum(scene.yaw_deg for scene in solution.scenes)
-    return _graded(
-        yaw < config.refused_yaw_deg, yaw < config.min_yaw_deg,
-        f'{yaw:.0f}° of yaw in all turns; at least {config.min_yaw_deg:.0f}° needed',
-        'drive sharper turns, as at crossings')
+def _number_of_turns(grounds: Grounds) -> Finding:
+    return turn_count(len(grounds.solution.scenes), grounds.config,
+                      gyro_confirms(grounds.solution))
 
 
-def flat_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
+def turn_count(count: int, config: VerdictConfig, confirmed: bool = False) -> Finding:
+    """Judge the number of turns. confirmed: by a gyro, so that one is enough."""
+    lone = ', and nothing confirms its numbers and their sigma' if count == 1 else ''
+    return Finding('E-FEW-TURNS', _graded(False, count < config.min_turns and not confirmed),
+                   f'only {count} of at least {config.min_turns} turns could be used{lone}',
+                   MORE_TURNS).measured(
+        'turns used', f'{count}',
+        'the gyro confirms them' if confirmed else f'at least {config.min_turns}')
+
+
+def _yaw_of_turns(grounds: Grounds) -> Finding:
+    return yaw_in_all(sum(scene.yaw_deg for scene in grounds.solution.scenes), grounds.config)
+
+
+def yaw_in_all(yaw_deg: float, config: VerdictConfig) -> Finding:
+    """Judge the yaw of all turns together."""
+    least = config.min_yaw_deg
+    return Finding('E-LITTLE-YAW', _graded(yaw_deg < config.refused_yaw_deg,
+                                           yaw_deg < least),
+                   f'the turns have {yaw_deg:.0f}° of yaw in all, at least {least:.0f}° are '
+                   f'needed', MORE_TURNS).measured(
+        'yaw of these turns together', f'{yaw_deg:.0f}°', f'at least {least:.0f}°')
+
+
+# relative rise of the error; less is refused
+REFUSED_CONTRAST = 0.01
+
+
+def flat_profile(grounds: Grounds) -> Finding:
     """The cost must rise on both sides of its minimum, or the focal length is not observable."""
-    contrast = profile_contrast(solution)
-    return _graded(
+    contrast, least = profile_contrast(grounds.solution), grounds.config.min_contrast
+    percent = 100 * max(contrast, 0.0)
+    return Finding(
         # written with not: a contrast of NaN is refused, too
-        not contrast >= REFUSED_CONTRAST, contrast < config.min_contrast,
+        'E-FLAT-PROFILE', _graded(not contrast >= REFUSED_CONTRAST, contrast < least),
         f'a focal length 20 % off would explain the pictures almost as well (the error rises by '
-        f'{100 * max(contrast, 0.0):.1f} %; at least {100 * config.min_contrast:.0f} % needed)',
-        'drive sharper turns, in daylight')
+        f'{percent:.1f} %, at least {100 * least:.0f} % is needed)',
+        MORE_TURNS).measured('rise of the error when the focal length is 20 % off',
+                             f'{percent:.1f} %', f'at least {100 * least:.0f} %')
 
 
 def profile_contrast(solution: Solution) -> float:
@@ -146,58 +197,76 @@ def profile_contrast(solution: Solution) -> float:
     return solution.around.contrast(solution.camera.fx / solution.camera.image_size[0])
 
 
-def _far_from_profile(solution: Solution, config: VerdictConfig) -> Finding | None:
+def _far_from_profile(grounds: Grounds) -> Finding | None:
     # the profile is of the pictures alone
-    solution = solution.alone or solution
+    solution = grounds.solution.by_pictures or grounds.solution
     best = solution.around.best * solution.camera.image_size[0]
     if np.isclose(best, solution.camera.fx):
         return None
-    return Finding('refused', f'two ways to find the focal length contradict each other, with '
-                              f'{solution.px * solution.camera.fx:.0f} px and about '
-                              f'{solution.px * best:.0f} px, so that neither can be trusted',
+    return Finding('E-TWO-FOCAL-LENGTHS', 'refused',
+                   f'two ways to find the focal length contradict each other: '
+                   f'{solution.px * solution.camera.fx:.0f} px and about '
+                   f'{solution.px * best:.0f} px; neither can be trusted',
                    'record another drive, with sharper turns and less traffic')
 
 
-def sigma_too_large(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """Fx must be known well enough; a sigma that is not known is none."""
-    relative = float(solution.sigma[0] / solution.camera.fx)
-    known = f'to {100 * relative:.1f} % only' if np.isfinite(relative) else 'not at all'
-    return _graded(
-        not np.isfinite(relative) or relative > REFUSED_SIGMA, relative > config.max_sigma,
-        f'the focal length is known {known}; {100 * config.max_sigma:.1f} % or better needed',
-        'drive more turns, or sharper ones')
+# sigma of fx, of fx; more is refused
+REFUSED_SIGMA = 0.1
 
 
-def one_turn_dominates(solution: Solution, config: VerdictConfig) -> Finding | None:
+def sigma_too_large(grounds: Grounds) -> Finding:
+    """Fx must be known well enough; an unknown sigma is refused, too."""
+    sigma, most = _relative_sigma(grounds.solution), grounds.config.max_sigma
+    known = f'only to {100 * sigma:.1f} %' if np.isfinite(sigma) else 'not at all'
+    return Finding(
+        'E-LARGE-SIGMA', _graded(not np.isfinite(sigma) or sigma > REFUSED_SIGMA, sigma > most),
+        f'the focal length is known {known}, {100 * most:.1f} % or better is needed',
+        MORE_TURNS).measured('uncertainty of fx', f'{100 * sigma:.2g} %',
+                             f'at most {100 * most:.3g} %')
+
+
+def _relative_sigma(solution: Solution) -> float:
+    """Return the sigma of fx, of fx."""
+    return float(solution.sigma[0] / solution.camera.fx)
+
+
+def one_turn_dominates(grounds: Grounds) -> Finding:
     """If one turn gives nearly all information about fx, the others cannot confirm it."""
-    shares = leverages(solution)
+    shares, most = leverages(grounds.solution), grounds.config.max_leverage
     turn = max(shares, key=lambda turn: shares[turn])
-    if len(shares) < 2 or shares[turn] <= config.max_leverage or _gyro_confirms(solution):
-        return None
-    return Finding('weak', f'no other turn confirms {_turns([turn])}, which gives '
-                           f'{100 * min(shares[turn], 1.0):.0f} % of what is known about the '
-                           f'focal length', 'drive another turn that is as sharp')
+    percent, confirmed = 100 * min(shares[turn], 1.0), gyro_confirms(grounds.solution)
+    return Finding('E-ONE-TURN-DOMINATES',
+                   _graded(False, len(shares) > 1 and shares[turn] > most and not confirmed),
+                   f'no other turn confirms {_turns([turn])}, which gives {percent:.0f} % of the '
+                   f'information about the focal length',
+                   'drive another turn that is as sharp').measured(
+        'largest share of one turn in the information about fx', f'{percent:.0f} %',
+        'the gyro confirms it' if confirmed else f'at most {100 * most:.0f} %')
 
 
-def turns_disagree(solution: Solution, config: VerdictConfig) -> Finding | None:
+def turns_disagree(grounds: Grounds) -> Finding:
     """Compare the values of fx that the turns would give separately."""
-    spread = focal_disagreement(solution)
-    if spread <= config.max_disagreement:
-        return None
-    return Finding('weak', f'the turns disagree about the focal length by {100 * spread:.1f} %; '
-                           f'at most {100 * config.max_disagreement:.0f} % is usual',
-                   'check that nobody moved or zoomed the camera, and avoid heavy traffic')
+    spread, most = focal_disagreement(grounds.solution), grounds.config.max_disagreement
+    return Finding('E-TURNS-DISAGREE', _graded(False, spread > most),
+                   f'the turns disagree about the focal length by {100 * spread:.1f} %, at most '
+                   f'{100 * most:.0f} % is usual',
+                   'record another drive with little traffic, and make sure that nobody zooms or '
+                   'moves the camera').measured(
+        'scatter of fx between the turns', f'{100 * spread:.2g} %', f'at most {100 * most:.3g} %')
 
 
-def other_camera(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """No turn may ask for a camera of its own."""
-    turns = sorted(turns_of_another_camera(solution.misfits, config))
-    if not turns:
-        return None
-    fit = f'{_turns(turns)} fit{"s" * (len(turns) == 1)}'
-    return Finding('weak', f'{fit} another camera far better than the one of the other turns, as '
-                           f'if it was zoomed, exchanged or cropped in between',
-                   'calibrate what was recorded before and after that apart')
+def other_camera(grounds: Grounds) -> Finding:
+    """No turn may fit a camera of its own far better than the common one."""
+    misfits = grounds.solution.misfits
+    turns = sorted(turns_of_another_camera(misfits, grounds.config))
+    return Finding('E-ANOTHER-CAMERA', _graded(False, bool(turns)),
+                   f'{_turns(turns)} fit{"s" * (len(turns) == 1)} another camera far better than '
+                   f'that of the other turns, as if the camera was zoomed, exchanged or cropped '
+                   f'in between',
+                   'calibrate the parts before and after that change separately').measured(
+        'error of a turn, over that with a camera of its own',
+        f'{max(misfits.values(), default=0.0):.2g} times',
+        f'at most {grounds.config.max_misfit:.2g} times')
 
 
 def _turns(turns: list[TurnId]) -> str:
@@ -212,36 +281,41 @@ def _turns(turns: list[TurnId]) -> str:
     return ' and '.join(names)
 
 
-def _not_fixed(solution: Solution, config: VerdictConfig) -> Finding | None:
+def _not_fixed(grounds: Grounds) -> Finding | None:
     """Name what no fixed camera does.
 
     A stabilised video's movement may have been taken out. The lens is right then, but no
     camera_info holds for pictures that move.
     """
-    known = float(solution.sigma[0] / solution.camera.fx)
+    solution = grounds.solution
+    known = _relative_sigma(solution)
     # a zoom that is smaller than what is known of the focal length is none
     clear = [each for each in solution.fixed_camera
              if each.clear and not (each.kind == 'zoom' and each.size < known)]
     crop = largest_crop(solution.crops) if solution.crops else 0.0
-    if crop > config.max_crop_sigmas * solution.picture.rms:
+    if crop > grounds.config.max_crop_sigmas * solution.picture.rms:
         return _moving('up to', crop, solution)
     if not clear:
         return None
     if clear[0].kind == 'shift':
         return _moving('about', clear[0].size, solution)
     if clear[0].kind == 'bend':
-        return Finding('weak', f'the picture is bent in places, as no lens of the model '
-                               f'{solution.camera.model} bends it',
-                       'take away the windscreen or cover that does so, or try another --model')
-    return Finding('weak', _zoomed(clear[0]), 'fix the zoom and the focus')
+        return Finding('E-PICTURE-BENT', 'weak',
+                       f'the picture is bent in places, in a way that the lens model '
+                       f'{solution.camera.model} cannot describe',
+                       f'{RAYS}, which includes the smooth part of it'
+                       if solution.field is not None else
+                       'clean the lens and the glass in front of it, then record another drive')
+    return Finding('E-ZOOM-CHANGES', 'weak', _zoomed(clear[0]),
+                   'fix the zoom and the focus, then record another drive')
 
 
 def _moving(how: str, px: float, solution: Solution) -> Finding:
     share = 100 * px / solution.camera.image_size[0]
-    return Finding('weak', f'the picture moves against the lens by {how} {share:.1f} % of its '
-                           f'width, as in a stabilised video or while the zoom changes: no '
-                           f'camera_info holds for all pictures', STEADY,
-                   cause=True)
+    return Finding('E-PICTURE-MOVES', 'weak',
+                   f'the picture moves against the lens by {how} {share:.1f} % of its width, as '
+                   f'in a stabilised video or while the zoom changes, so no single camera_info is '
+                   f'right for all pictures', STEADY, cause=True)
 
 
 def _zoomed(test: FixedCameraTest) -> str:
@@ -254,83 +328,126 @@ def _zoomed(test: FixedCameraTest) -> str:
             f'than in the others')
 
 
-def _turned_pictures(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """A car turns about the vertical, and the road is below it."""
-    turned = abs(roll_deg(solution.scenes))
-    if turned <= config.max_roll_deg:
+# where the road is in turned pictures, by quarters of a turn, and ffmpeg's filter against it
+TURNED = {1: ('right side', 'transpose=1'), -1: ('left side', 'transpose=2'),
+          2: ('top', 'hflip,vflip'), -2: ('top', 'hflip,vflip'), 0: ('bottom', 'rotate=RADIANS')}
+# degrees; the plane of a path of upright pictures is tilted by less, also on a slope
+LEAST_PATH_ROLL_DEG = 45.0
+
+
+def _turned_pictures(grounds: Grounds) -> Finding | None:
+    """A car turns about the vertical, and the road is below it.
+
+    Only a turn of enough yaw shows that axis: in others bumps and the lean of a two-wheeler turn
+    the camera as much. The plane of the path of such turns must agree.
+    """
+    scenes = grounds.solution.scenes
+    paths = [abs(roll) for scene in scenes if (roll := roll_of_path(scene)) is not None]
+    if not paths:
         return None
-    return Finding('weak', f'the pictures are turned by about {90 * round(turned / 90)}°, as the '
-                           f'axis about which the car turns and the road under it say',
-                   'mend what the video says of it (ffmpeg -display_rotation 0 -i IN -c copy '
-                   'OUT.mp4), or --set verdict.max_roll_deg=180 for a camera mounted so',
+    roll = roll_deg(scenes)
+    quarters = round(roll / 90)
+    # the plane of a path has no upper side: of pictures upside down it says 0
+    agrees = abs(quarters) != 1 or np.median(paths) > LEAST_PATH_ROLL_DEG
+    if abs(roll) <= grounds.config.max_roll_deg or not agrees:
+        return None
+    where, turn = TURNED[quarters]
+    return Finding('E-TURNED-PICTURES', 'weak',
+                   f'the pictures are turned by about {abs(roll):.0f}°: the road is at their '
+                   f'{where}',
+                   f'turn them upright (a video: ffmpeg -i IN -vf {turn} OUT.mp4), or use --set '
+                   f'verdict.max_roll_deg=180 for a camera that is mounted this way',
                    cause=True)
 
 
-def _strange_aspect(solution: Solution, config: VerdictConfig) -> Finding | None:
+def _strange_aspect(grounds: Grounds) -> Finding | None:
     """A rolling shutter that was not removed changes fy first; so does a stretched picture."""
-    aspect = solution.camera.fy / solution.camera.fx
-    if abs(aspect - 1) <= config.max_aspect:
+    camera = grounds.solution.camera
+    aspect = camera.fy / camera.fx
+    if abs(aspect - 1) <= grounds.config.max_aspect:
         return None
-    return Finding('weak', f'the pixels seem to be out of square (fy is {100 * (aspect - 1):+.1f} '
-                           f'% off fx), as a stretched picture, a decentred lens or a strong '
-                           f'rolling shutter makes them look',
-                   'unstretch the pictures, check the stamps (--fps), which a rolling shutter '
-                   'is found by, or try --model brown')
+    brown = '' if camera.model != 'radial' else ', or try --model brown'
+    return Finding('E-PIXEL-ASPECT', 'weak',
+                   f'fy is {100 * (aspect - 1):+.1f} % off fx, as with stretched pictures, a '
+                   f'decentred lens or a strong rolling shutter',
+                   f'check the time stamps (--fps), by which a rolling shutter is found, and undo '
+                   f'any stretching of the pictures{brown}')
 
 
-def _strange_shutter(solution: Solution, config: VerdictConfig) -> Finding | None:
-    readout_ms = 1e3 * abs(solution.readout_s)
-    if not solution.rolling or readout_ms <= MAX_READOUT_MS:
+# ms; a rolling shutter that takes longer is weak: one picture at 20 fps
+MAX_READOUT_MS = 50.0
+
+
+def _strange_shutter(grounds: Grounds) -> Finding | None:
+    readout_ms = 1e3 * abs(grounds.solution.readout_s)
+    if not grounds.solution.rolling or readout_ms <= MAX_READOUT_MS:
         return None
-    return Finding('weak', f'the rows of a picture seem to be exposed over {readout_ms:.0f} ms, '
-                           f'longer than rolling shutters take',
-                   'check that the stamps, or --fps, are right')
+    return Finding('E-LONG-READOUT', 'weak',
+                   f'reading out the rows of a picture seems to take {readout_ms:.0f} ms, longer '
+                   f'than rolling shutters take', 'check the time stamps, or --fps')
 
 
-def _on_bound(solution: Solution, config: VerdictConfig) -> Finding | None:
-    low, high = solution.bounds
-    share = (solution.camera.params - low) / (high - low)
-    names = [name for name, value in zip(solution.camera.names(), share, strict=True)
+# of the range between its bounds; a parameter nearer to one of them counts as lying on it
+ON_BOUND = 0.01
+
+
+def _on_bound(grounds: Grounds) -> Finding | None:
+    (low, high), camera = grounds.solution.bounds, grounds.solution.camera
+    share = (camera.params - low) / (high - low)
+    names = [name for name, value in zip(camera.names(), share, strict=True)
              if not ON_BOUND < value < 1 - ON_BOUND]
     if not names:
         return None
-    return Finding('weak', f'the search for {", ".join(names)} ended at the limit of what lenses '
-                           f'have', 'give the whole picture, or record another drive; mirrors '
-                                    'and lenses of more than 190° cannot be calibrated')
+    return Finding('E-PARAMETER-LIMIT', 'weak',
+                   f'the search for {", ".join(names)} ended at the limit of real lenses',
+                   'use the whole picture, not a part of it, or record another drive; mirrors and '
+                   'lenses wider than 190° cannot be calibrated')
 
 
-def _folds_over(solution: Solution, config: VerdictConfig) -> Finding | None:
-    if solution.camera.covers_picture():
+def _folds_over(grounds: Grounds) -> Finding | None:
+    camera = grounds.solution.camera
+    if camera.covers_picture():
         return None
-    return Finding('weak', 'the distortion near the corners of the picture is no real one (it '
-                           'folds over), as nothing was seen there',
-                   'drive where there is something to see up to the corners, or try --model '
-                   'fisheye for a wide lens')
+    fisheye = '' if camera.family != PINHOLE else (
+        ', or try --model fisheye for a wide lens')
+    return Finding('E-FOLDS-OVER', 'weak',
+                   'the distortion folds over near the corners of the picture, which no real lens '
+                   'does: no point was seen there', f'{CORNERS}{fisheye}')
 
 
-def _other_model(solution: Solution, config: VerdictConfig) -> Finding | None:
-    """Compare a model that was asked for with what the turns would have chosen."""
-    asked, px = solution.camera, solution.px
+# over the picture; a model that was chosen by hand, but farther from what turns choose, is weak
+MAX_MODEL_SIGMAS = 2.0
+
+
+def _other_model(grounds: Grounds) -> Finding | None:
+    """Compare a model that was chosen by hand with what the turns would have chosen."""
+    solution = grounds.solution
+    by_hand, px = solution.camera, solution.px
     chosen = next((each for each in solution.tried if each.chosen), None)
-    if chosen is not None and MODELS[chosen.model].family != asked.family:
-        apart_px = next((each.apart_px for each in solution.tried if each.model == asked.model),
+    if chosen is not None and MODELS[chosen.model].family != by_hand.family:
+        apart_px = next((each.apart_px for each in solution.tried if each.model == by_hand.model),
                         None)
         far = 'far' if apart_px is None else f'{px * apart_px:.1f} px'
     elif solution.written.apart_px > MAX_MODEL_SIGMAS * solution.rays_sigma_px:
         chosen, far = None, f'{px * solution.written.apart_px:.1f} px'
     else:
         return None
-    other = chosen.model if chosen else 'with more coefficients'
-    return Finding('weak', f'the turns ask for a lens of the model {other}, not '
-                           f'{asked.model}, and that one is {far} away', 'leave --model away')
+    other = f'the lens model {chosen.model}' if chosen else 'a lens model with more coefficients'
+    return Finding('E-ANOTHER-MODEL', 'weak',
+                   f'{other} fits the turns better than {by_hand.model} does, and the two are '
+                   f'{far} apart', 'omit --model')
 
 
-def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
+# over the picture; kinds of lenses that differ by less may be mistaken
+MAX_KIND_SIGMAS = 10.0
+
+
+def _other_kind(grounds: Grounds) -> Finding | None:
     """Doubt a lens that explains the turns hardly better than one of the other kind.
 
     A fisheye must explain them far better, as a pinhole has the same number of coefficients.
     """
-    camera = solution.camera
+    solution, camera = grounds.solution, grounds.solution.camera
     for each in solution.tried:
         if MODELS[each.model].family == camera.family:
             continue
@@ -339,41 +456,14 @@ def _other_kind(solution: Solution, config: VerdictConfig) -> Finding | None:
         alike_px = MAX_KIND_SIGMAS * solution.picture.rms
         far = each.apart_px is None or each.apart_px > alike_px
         if far and each.cost_ratio < CLEAR_KIND_RATIO:
-            return Finding('weak', f'the turns do not tell whether the lens is {camera.model} or '
-                                   f'{each.model}, and near the corners these differ',
-                           'drive where there is something to see up to the corners')
+            return Finding('E-LENS-AMBIGUOUS', 'weak',
+                           f'the turns do not show whether the lens is {camera.model} or '
+                           f'{each.model}, and these differ near the corners', CORNERS)
     return None
 
 
-def _lines_disagree(lines: Bend, solution: Solution, config: VerdictConfig) -> Finding | None:
-    """Poles and the edges of houses must be straight: nothing of this comes from motion."""
-    if not lines_contradict(lines, solution.camera.image_size[0], config):
-        return None
-    return Finding('weak', f'poles and the edges of houses are not straight with this distortion '
-                           f'({lines.lines} upright lines ask for k1 {lines.k1:+.3f}, '
-                           f'{lines.sigmas:.0f} times what both may be off)',
-                   'look for a curved windscreen or cover before the lens, try another --model, '
-                   'or drive more turns')
-
-
-def two_cameras(found: OtherCamera) -> Finding:
-    """Refuse a stream of two cameras: a calibration of one would be given to both."""
-    return Finding('refused', str(found), APART, cause=True)
-
-
-def _sensors_disagree(witnesses: Witnesses, solution: Solution, config: VerdictConfig
-                      ) -> Finding | None:
-    """A gyro and GPS know the angles of the turns, and so the focal length, without pictures."""
-    for name, said in (('the gyro', witnesses.gyro), ('GPS', witnesses.gps)):
-        if said is not None and not said.agrees:
-            own = 100 * float(solution.sigma[0]) / solution.camera.fx
-            return Finding('weak', f'the pictures and {name} contradict each other: by {name} the '
-                                   f'focal length is {said.fx_percent:+.1f} ± '
-                                   f'{said.fx_sigma_percent:.1f} % off, which the pictures '
-                                   f'know to {own:.1f} %',
-                           'check its scale, its clock and that it is of this drive, and leave '
-                           'it away if it is wrong; else drive more turns')
-    return None
+# of the width; only if that k1 moves the picture by more: less does no harm
+MAX_LINE_MOVE = 0.001
 
 
 def lines_contradict(lines: Bend, width: int, config: VerdictConfig) -> bool:
@@ -382,20 +472,50 @@ def lines_contradict(lines: Bend, width: int, config: VerdictConfig) -> bool:
             and lines.picture_px / width > MAX_LINE_MOVE)
 
 
-def _graded(refused: bool, weak: bool, what: str, cure: str) -> Finding | None:
-    """Return a finding of the graver condition that holds, None if neither does."""
-    if refused:
-        return Finding('refused', what, cure)
-    return Finding('weak', what, cure) if weak else None
+def _lines_disagree(grounds: Grounds) -> Finding | None:
+    """Poles and the edges of houses must be straight: nothing of this comes from motion."""
+    lines, solution = grounds.lines, grounds.solution
+    if lines is None or not lines_contradict(lines, solution.camera.image_size[0],
+                                             grounds.config):
+        return None
+    glass = '' if solution.field is None else f', or {RAYS} if a curved windscreen bends them'
+    return Finding('E-LINES-BENT', 'weak',
+                   f'poles and the edges of houses are not straight with this distortion '
+                   f'({lines.lines} upright lines indicate k1 {lines.k1:+.3f}, {lines.sigmas:.0f} '
+                   f'times the sigma of the difference)', f'{MORE_TURNS}{glass}')
 
 
-Rule = Callable[[Solution, VerdictConfig], Finding | None]
+def _sensors_disagree(grounds: Grounds) -> Finding | None:
+    """A gyro and GPS know the angles of the turns, and so the focal length, without pictures."""
+    witnesses = grounds.witnesses
+    for name, witness in (('the gyro', witnesses.gyro), ('GPS', witnesses.gps)):
+        if witness is not None and not witness.agrees:
+            return Finding('E-SENSOR-CONTRADICTS', 'weak',
+                           f'the pictures and {name} contradict each other: according to {name} '
+                           f'the focal length is off by {witness.fx_percent:+.1f} ± '
+                           f'{witness.fx_sigma_percent:.1f} %, and the pictures know it to '
+                           f'{100 * _relative_sigma(grounds.solution):.1f} %',
+                           'check the scale and the clock of the sensor and that it belongs to '
+                           'this drive; omit it if it is wrong, otherwise drive more turns')
+    return None
+
+
+def _two_cameras(grounds: Grounds) -> Finding | None:
+    return None if grounds.other_camera is None else two_cameras(grounds.other_camera)
+
+
+def two_cameras(found: OtherCamera) -> Finding:
+    """Refuse a stream of two cameras: a calibration of one would be used for both."""
+    return Finding('E-TWO-CAMERAS', 'refused', str(found), APART, cause=True)
+
+
 # whether the turns know enough: where they do not, a fleet's prior may help
 ENOUGH: tuple[Rule, ...] = (
-    _too_few_turns, _too_little_yaw, flat_profile, _far_from_profile, sigma_too_large,
+    _number_of_turns, _yaw_of_turns, flat_profile, _far_from_profile, sigma_too_large,
     one_turn_dominates)
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
     turns_disagree, other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,
-    _folds_over, _other_model, _other_kind, _turned_pictures)
+    _folds_over, _other_model, _other_kind, _turned_pictures, _lines_disagree, _sensors_disagree,
+    _two_cameras)
 RULES = (*ENOUGH, *SOUND)

@@ -1,4 +1,4 @@
-"""What a gyro and GPS say of a solution: they know the angles of the turns without any picture.
+"""What a gyro and GPS know of a solution: the angles of the turns, without any picture.
 
 A turn's angle by the pictures depends on the focal length; by a gyro it does not. The model: from
 keyframe to keyframe the camera turned by phi, in its own axes; the sensor by theta, in its axes,
@@ -28,75 +28,26 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge.calibration import Witness, Witnesses
 from dashcalib_ros.judge.gyro_scale import (
-    FIXES,
     HEADING_SIGMA_DEG,
     JUMP,
     LEAST_NOISE_M,
     LONGEST_GAP_S,
     SCALES,
-    line_through,
+    Straight,
     scale_by_gps,
+    straight_between,
 )
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
+from dashcalib_ros.robust import weighted_mean
 from dashcalib_ros.solve.imaging import lens_alone
 from dashcalib_ros.solve.linear import normal_equations, used_keyframes
 from dashcalib_ros.solve.prior import loss_px_of
 from dashcalib_ros.solve.solution import Solution, with_measurement
 
-# s to either side: clocks of sensors in one car are not farther apart
-LARGEST_OFFSET_S = 0.5
-# s between the offsets that are tried first; a turn takes seconds
-COARSE_S = 0.02
-# s over which a rate is taken, to know how an angle follows the offset
-RATE_S = 0.03
-# keyframes of a turn at the least
-LEAST_KEYFRAMES = 5
-# degrees in all turns; with less there is no angle to compare
-LEAST_TURNED_DEG = 10.0
-# of the squared angles; a sensor that explains less is of another drive, or its clock is
-LEAST_EXPLAINED = 0.9
-# times ours; a scale farther off than SCALES, and in between, is one of units
-DEGREES = (40.0, 80.0)
-# of a turn's angle: what pictures of real drives may be off in one turn, beyond their noise
-TURN_SIGMA = 0.0045
-# of time, one sigma: what a rate that was given with --fps may be off, as the frames of two real
-# drives are; and sigmas beyond which a clock is not used
-PACE, LARGEST_PACE = 0.005, 2.0
-# s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
-LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
-# times what a turn's other steps leave; where an image is missing in a turn of 50 degrees or more
-# one step left 4.7 to 14 times that, and else 4.2 at the most
-LARGEST_JUMP = 4.5
-# ratios of the poses' variance to the gyro's in a second, of which the likeliest is taken
-RATIOS = np.logspace(-4, 3, 22)
-# parameters of a gyro beside a camera
-UNKNOWNS = 9
-# of likelihoods; beyond it the less likely case counts for nothing
-LARGEST_LOG = 100.0
-# steps of the fit, and those at which the noises are weighed anew
-STEPS, WEIGHED = 8, (1, 4)
-# sigmas; where a witness is farther off, it contradicts
-CONTRADICTED = 3.0
-# the same for one turn, which a gyro alone confirms: farther off, it confirms nothing. Of gyros
-# that are 3 % wrong and called calibrated, 2 sigmas let 12 of 80 pass, and these none
-DOUBTED = 1.25
-
-# degrees by which the car may turn on what counts as a straight
-STRAIGHT_DEG = 1.5
-# degrees of a turn at the least, between two headings of GPS
-LEAST_GPS_DEG = 30.0
-# m from the rear axle, which goes where the car points, to the aerial
-LEVER_M = 2.0
-# m of a straight at the least
-STRAIGHT_M = 8.0
-# sigma of a gyro's scale; one that is known worse is a witness only: a gyro that is 3 % off, and
-# does not say so, must not move an accepted camera
-KNOWN_SCALE = 0.015
-
 
 @dataclass(frozen=True)
-class Asked:
-    """What a drive's sensors say of its solution by pictures alone.
+class SensorComparison:
+    """A drive's sensors beside its solution by pictures.
 
     solution: with what the gyro knows. unused: a line for each sensor that is not used.
     """
@@ -106,17 +57,21 @@ class Asked:
     unused: tuple[str, ...] = ()
 
 
-def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s: float,
-                config: Config) -> Asked:
-    """Ask a drive's sensors about its solution. start_s: stamp of the drive's first image.
+# keyframes of a turn at the least
+LEAST_KEYFRAMES = 5
+
+
+def compare_sensors(solution: Solution | None, stream: SensorStream | None, start_s: float,
+                    config: Config) -> SensorComparison:
+    """Compare a drive's sensors with its solution. start_s: stamp of the drive's first image.
 
     Where the gyro's scale is known well enough its angles are information, too; that loads COLMAP.
     """
     if stream is None:
-        return Asked(solution)
+        return SensorComparison(solution)
     stream = stream.since(start_s)
     if solution is None or stream.empty:
-        return Asked(solution, unused=stream.warnings)
+        return SensorComparison(solution, unused=stream.warnings)
     scenes = [scene for scene in solution.scenes if scene.turn.of_this_drive]
     gyro = gps = informed = None
     lines = list(stream.warnings)
@@ -140,7 +95,7 @@ def ask_sensors(solution: Solution | None, stream: SensorStream | None, start_s:
     except (np.linalg.LinAlgError, ValueError, FloatingPointError) as error:
         lines.append(f'the motion sensors could not be compared with the turns ({error})')
     kept = solution if informed is None or (gps is not None and not gps.agrees) else informed
-    return Asked(kept, Witnesses(gyro, gps), tuple(line for line in lines if line))
+    return SensorComparison(kept, Witnesses(gyro, gps), tuple(line for line in lines if line))
 
 
 @dataclass(frozen=True)
@@ -157,6 +112,10 @@ class _OwnScale:
     contradiction: str = ''
 
 
+# sigmas; where a witness is farther off, it contradicts
+CONTRADICTED = 3.0
+
+
 def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnScale:
     """Return what is known of a gyro's scale. prior: its sigma, without GPS."""
     found = None if position is None else scale_by_gps(rate, position)
@@ -165,10 +124,18 @@ def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnSca
     scale, sigma = found
     if abs(scale - 1) > CONTRADICTED * np.hypot(sigma, prior):
         return _OwnScale(scale, sigma, found, (
-            f'the gyro is {scale:.4f} ± {sigma:.4f} times what GPS headings say, and that is '
-            f'used: set motion.gyro_scale_sigma, {prior:g}, higher'))
+            f'the angles of the gyro are {scale:.4f} ± {sigma:.4f} times those of GPS headings, '
+            f'and this scale is used: set motion.gyro_scale_sigma, {prior:g}, higher'))
     share = prior**2 / (prior**2 + sigma**2)
     return _OwnScale(1 + share * (scale - 1), sigma * float(np.sqrt(share)), found)
+
+
+# the same for one turn, which a gyro alone confirms: farther off, it confirms nothing. Of gyros
+# that are 3 % wrong and called calibrated, 2 sigmas let 12 of 80 pass, and these none
+DOUBTED = 1.25
+# sigma of a gyro's scale; one that is known worse is a witness only: a gyro that is 3 % off, and
+# does not say so, must not move an accepted camera
+KNOWN_SCALE = 0.015
 
 
 def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
@@ -186,39 +153,49 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
         return None, ''
     apart = abs(1 - fit.gyro.inverse_scale) / float(np.sqrt(own + known))
     if len(solution.scenes) == 1 and apart > DOUBTED:
-        return None, (f'the gyro does not confirm the only turn, it is {apart:.1f} sigma off: '
-                      f'check its scale, its clock and that it is of this drive')
+        return None, (f'the gyro does not confirm the only turn, it is {apart:.1f} sigmas off: '
+                      f'check its scale, its clock and that it belongs to this drive')
     moved = with_measurement(solution, fit.by_camera @ solution.written.by_solution,
                              1 - fit.gyro.inverse_scale, known)
     scenes = [scene_with(moved.camera, scene, config) for scene in solution.scenes]
     if any(scene is None for scene in scenes):
         return None, ''
-    return replace(moved, alone=solution, scenes=tuple(
+    return replace(moved, by_pictures=solution, scenes=tuple(
         scene for scene in scenes if scene is not None)), ''
+
+
+# s to either side: clocks of sensors in one car are not farther apart
+LARGEST_OFFSET_S = 0.5
+# of the squared angles; a sensor that explains less is of another drive, or its clock is
+LEAST_EXPLAINED = 0.9
+# times ours; a scale farther off than SCALES, and in between, is one of units
+DEGREES = (40.0, 80.0)
 
 
 def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness | None, str]:
     """Return what the gyro says, or why it says nothing."""
     if fit is None:
         return None, ('the gyro is not used: it has no samples during the turns, within 0.5 s of '
-                      'their stamps')
+                      'their time stamps: check its clock')
     gyro = fit.gyro
     if abs(gyro.offset_s) >= LARGEST_OFFSET_S or not fit.explained >= LEAST_EXPLAINED:
         return None, (f'the gyro is not used: it does not turn as the pictures do (it explains '
-                      f'{100 * max(fit.explained, 0.0):.0f} % of that): check that it is of this '
-                      f'drive, and that its stamps are within 0.5 s of those of the pictures')
+                      f'{100 * max(fit.explained, 0.0):.0f} % of their turning): check that it '
+                      f'belongs to this drive, and that its time stamps are within 0.5 s of those '
+                      f'of the pictures')
     if not SCALES[0] < fit.scale < SCALES[1]:
-        cure = ('write rad/s, not degrees a second' if DEGREES[0] < fit.scale < DEGREES[1] else
+        cure = ('write rad/s, not degrees per second' if DEGREES[0] < fit.scale < DEGREES[1] else
                 'check its unit')
         return None, (f'the gyro is not used: its angles are {fit.scale:.3g} times those of the '
                       f'pictures: {cure}')
     if fit.out_of_pace:
-        return None, (f'the gyro is not used: its stamps and those of the pictures do not keep '
-                      f'pace ({fit.out_of_pace}): check --fps, and that no images are missing')
+        return None, (f'the gyro is not used: its time stamps and those of the pictures do not '
+                      f'keep pace ({fit.out_of_pace}): check --fps, and whether images are '
+                      f'missing')
     sigmas = np.sqrt(np.diag(fit.covariance))
-    said = _witness(gyro.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
+    witness = _witness(gyro.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
     return replace(
-        said, time_offset_s=gyro.offset_s, time_sigma_s=float(sigmas[7]),
+        witness, time_offset_s=gyro.offset_s, time_sigma_s=float(sigmas[7]),
         camera_from_sensor=tuple(tuple(row) for row in gyro.alignment.tolist()),
         alignment_sigma_deg=float(np.degrees(np.sqrt(np.trace(fit.covariance[:3, :3])))),
         bias_rad_s=tuple(gyro.bias.tolist()), scale_by_gps=own.by_gps), ''
@@ -279,6 +256,16 @@ class Gyro:
         return Gyro(turned @ self.alignment, self.bias + step[3:6],
                     float(self.inverse_scale + step[6]), float(offset), self.middle_s,
                     float(self.pace + step[8]))
+
+
+# of time, one sigma: what a rate that was given with --fps may be off, as the frames of two real
+# drives are; and sigmas beyond which a clock is not used
+PACE, LARGEST_PACE = 0.005, 2.0
+# s, and sigmas; turns whose own offsets are farther apart have clocks that do not keep pace
+LARGEST_SKEW_S, SKEW_SIGMAS = 0.02, 5.0
+# times what a turn's other steps leave; where an image is missing in a turn of 50 degrees or more
+# one step left 4.7 to 14 times that, and else 4.2 at the most
+LARGEST_JUMP = 4.5
 
 
 @dataclass(frozen=True)
@@ -344,6 +331,10 @@ def _turned(rotations: Floats) -> Floats:
         rotations[:-1] @ rotations[1:].transpose(0, 2, 1)).as_rotvec())
 
 
+# s over which a rate is taken, to know how an angle follows the offset
+RATE_S = 0.03
+
+
 def _covered(turn: Steps, stamps_s: Floats, when: Floats) -> Steps | None:
     """Return the part of a turn for which there are samples; None where it is too short.
 
@@ -372,6 +363,16 @@ def fit_to(turns: Sequence[Steps], rate: Samples) -> Fit | None:
         if found is None or not abs(found.gyro.offset_s) < LARGEST_OFFSET_S:
             break
     return found
+
+
+# s between the offsets that are tried first; a turn takes seconds
+COARSE_S = 0.02
+# degrees in all turns; with less there is no angle to compare
+LEAST_TURNED_DEG = 10.0
+# parameters of a gyro beside a camera
+UNKNOWNS = 9
+# steps of the fit, and those at which the noises are weighed anew
+STEPS, WEIGHED = 8, (1, 4)
 
 
 def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
@@ -410,16 +411,16 @@ def _fit_gyro(turns: Sequence[Steps], angles: Samples) -> Fit | None:
     parts, rests = _by_turn(turns, jacobian), _by_turn(turns, residual)
     # what each turn alone would change of the scale and of the offset, all else as it is
     variances = np.array([noise / np.sum(part[:, 6:8]**2, axis=0) for part in parts])
-    alone = np.array([part[:, 6:8].T @ rest / np.sum(part[:, 6:8]**2, axis=0)
-                      for part, rest in zip(parts, rests, strict=True)])
-    covariance[6, 6] += _between_turns(alone[:, 0], variances[:, 0], gyro.inverse_scale)
-    clear = np.abs(alone[:, 1]) > SKEW_SIGMAS * np.sqrt(variances[:, 1])
+    own = np.array([part[:, 6:8].T @ rest / np.sum(part[:, 6:8]**2, axis=0)
+                    for part, rest in zip(parts, rests, strict=True)])
+    covariance[6, 6] += _between_turns(own[:, 0], variances[:, 0], gyro.inverse_scale)
+    clear = np.abs(own[:, 1]) > SKEW_SIGMAS * np.sqrt(variances[:, 1])
     turned = np.concatenate([turn.turned for turn in turns])
     lefts = [np.linalg.norm(row[1], axis=1) for row in rows]
     left = np.concatenate(lefts)
     return Fit(gyro, covariance, np.linalg.solve(hessian, jacobian.T @ follow)[6],
                1 - float(np.sum(left**2) / np.sum(turned**2)),
-               float(np.max(np.abs(alone[:, 1]), where=clear, initial=0.0)),
+               float(np.max(np.abs(own[:, 1]), where=clear, initial=0.0)),
                max(_largest(each) for each in lefts))
 
 
@@ -427,6 +428,10 @@ def _largest(left: Floats) -> float:
     """Return the largest of what a turn's steps (k,) leave over the RMS of the others."""
     largest = float(left.max())
     return largest / float(np.sqrt((np.sum(left**2) - largest**2) / (len(left) - 1)))
+
+
+# of a turn's angle: what pictures of real drives may be off in one turn, beyond their noise
+TURN_SIGMA = 0.0045
 
 
 def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:
@@ -441,6 +446,10 @@ def _between_turns(offsets: Floats, variances: Floats, size: float) -> float:
     return float(max(whole - 1 / np.sum(1 / variances), 0.0))
 
 
+# of likelihoods; beyond it the less likely case counts for nothing
+LARGEST_LOG = 100.0
+
+
 def variance_if_turns_differ(offsets: Floats, variances: Floats, more: float) -> float:
     """Return the variance of a common value where each turn may be off by a variance more.
 
@@ -450,12 +459,10 @@ def variance_if_turns_differ(offsets: Floats, variances: Floats, more: float) ->
     """
     logs, found = [], []
     for extra in (0.0, more):
-        weights = 1 / (variances + extra)
-        mean = float(np.average(offsets, weights=weights))
-        squares = weights @ (offsets - mean)**2
-        logs.append(0.5 * float(np.log(weights).sum() - np.log(weights.sum()) - squares))
-        ratio = max(float(squares) / (len(offsets) - 1), 1.0)
-        found.append(ratio / float(weights.sum()) + mean**2)
+        mean = weighted_mean(offsets, variances + extra)
+        logs.append(0.5 * float(np.log(mean.variance) - np.log(variances + extra).sum()
+                                - mean.squares))
+        found.append(mean.widened + mean.value**2)
     share = 1 / (1 + np.exp(min(logs[0] - logs[1], LARGEST_LOG)))
     return float((1 - share) * found[0] + share * found[1])
 
@@ -529,6 +536,10 @@ def _by_turn(turns: Sequence[Steps], rows: Floats) -> list[Floats]:
     return np.split(rows, np.cumsum([3 * len(turn.turned) for turn in turns])[:-1])
 
 
+# ratios of the poses' variance to the gyro's in a second, of which the likeliest is taken
+RATIOS = np.logspace(-4, 3, 22)
+
+
 def _likeliest_ratio(turns: Sequence[Steps], rows: Rows) -> float:
     """Return the ratio of the two noises that explains the residuals best."""
     def badness(ratio: float) -> float:
@@ -541,49 +552,53 @@ def _likeliest_ratio(turns: Sequence[Steps], rows: Rows) -> float:
 
 
 @dataclass(frozen=True)
-class Heading:
+class _End:
     """A straight before or after a turn.
 
-    gps: its heading, rad, left positive; yaw: the camera's there; follow: (n,) what that does with
-    the camera's parameters. off_m: RMS of the fixes; spread_m2: their sum of
-    squares along the way; freedom: fixes beyond those that a line needs. slip: rad by which an
-    aerial that is not over the rear axle goes beside the car's heading, and by which the fixes
-    turn there: where they are late, or filtered, a straight ends in the turn.
+    yaw: rad, the camera's there; follow: (n,) what that does with the camera's parameters. slip:
+    rad by which an aerial that is not over the rear axle goes beside the car's heading, and by
+    which the fixes turn there: where they are late, or filtered, a straight ends in the turn.
     """
 
-    gps: float
+    straight: Straight
     yaw: float
     follow: Floats
-    off_m: float
-    spread_m2: float
-    freedom: int
     slip: float
+
+    @property
+    def off_m(self) -> float:
+        """Return the RMS distance of the fixes from the straight."""
+        return float(np.sqrt(np.mean(self.straight.left**2)))
+
+
+# degrees of a turn at the least, between two headings of GPS
+LEAST_GPS_DEG = 30.0
 
 
 def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
          ) -> tuple[Witness | None, str]:
     """Return what GPS headings say, from straight to straight, or why they say nothing."""
-    pairs = [pair for turn in turns if (pair := _straights(turn, position)) is not None]
+    pairs = [pair for turn in turns if (pair := _ends(turn, position)) is not None]
     if not pairs:
         return None, ''
-    straights = [each for pair in pairs for each in pair]
-    usual = float(np.median([each.off_m for each in straights]))
+    usual = float(np.median([each.off_m for pair in pairs for each in pair]))
     sound = [pair for pair in pairs
              if all(each.off_m <= max(JUMP * usual, LEAST_NOISE_M) for each in pair)]
     if not sound:
         return None, ''
-    squares = sum(each.off_m**2 * (each.freedom + 2) for pair in sound for each in pair)
-    noise_m = max(float(np.sqrt(squares / sum(each.freedom for pair in sound for each in pair))),
-                  LEAST_NOISE_M)
+    straights = [each.straight for pair in sound for each in pair]
+    noise_m = max(float(np.sqrt(sum(each.off_m2 for each in straights)
+                                / sum(each.freedom for each in straights))), LEAST_NOISE_M)
     measured, ours, sigmas, follow = [], [], [], []
     for before, after in sound:
-        sigma = float(np.sqrt(noise_m**2 * (1 / before.spread_m2 + 1 / after.spread_m2)
-                              + before.slip**2 + after.slip**2))
+        sigma = float(np.sqrt(
+            noise_m**2 * (1 / before.straight.spread_m2 + 1 / after.straight.spread_m2)
+            + before.slip**2 + after.slip**2))
         ours_rad = after.yaw - before.yaw
         if np.degrees(sigma) > HEADING_SIGMA_DEG or abs(ours_rad) < np.radians(LEAST_GPS_DEG):
             continue
         # of all angles that headings allow, the nearest: turns are less than 180 degrees off
-        turned = after.gps - before.gps
+        turned = after.straight.heading - before.straight.heading
         ours.append(ours_rad)
         measured.append(ours_rad + float(np.angle(np.exp(1j * (turned - ours_rad)))))
         sigmas.append(sigma)
@@ -591,18 +606,25 @@ def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
     if not ours:
         return None, ''
     camera, gps = np.array(ours), np.array(measured)
-    weights = (gps / np.array(sigmas))**2
-    each = camera / gps
-    kappa = float(np.average(each, weights=weights))
-    if not 1 / SCALES[1] < kappa < 1 / SCALES[0]:
-        return None, ('GPS is not used: it does not turn as the pictures do: check that it is of '
-                      'this drive, and its stamps')
-    variance = 1 / float(weights.sum()) + _between_turns(each - kappa, 1 / weights, kappa)
-    by_camera = np.average(np.array(follow) / gps[:, None], axis=0, weights=weights)
-    return _witness(kappa, float(np.sqrt(variance)), 0.0, by_camera, solution), ''
+    ratios, variances = camera / gps, (np.array(sigmas) / gps)**2
+    mean = weighted_mean(ratios, variances)
+    if not 1 / SCALES[1] < mean.value < 1 / SCALES[0]:
+        return None, ('GPS is not used: it does not turn as the pictures do: check its time '
+                      'stamps, and that it belongs to this drive')
+    variance = mean.variance + _between_turns(ratios - mean.value, variances, mean.value)
+    by_camera = np.average(np.array(follow) / gps[:, None], axis=0, weights=1 / variances)
+    return _witness(mean.value, float(np.sqrt(variance)), 0.0, by_camera, solution), ''
 
 
-def _straights(turn: Steps, position: Samples) -> tuple[Heading, Heading] | None:
+# degrees by which the car may turn on what counts as a straight
+STRAIGHT_DEG = 1.5
+# m from the rear axle, which goes where the car points, to the aerial
+LEVER_M = 2.0
+# m of a straight at the least
+STRAIGHT_M = 8.0
+
+
+def _ends(turn: Steps, position: Samples) -> tuple[_End, _End] | None:
     """Return the straights before and after a turn; None where one has too few fixes."""
     # a car turns about the vertical: y points down, and a turn to the left is negative about it
     axis = main_axis(np.cumsum(turn.turned, axis=0))
@@ -614,19 +636,14 @@ def _straights(turn: Steps, position: Samples) -> tuple[Heading, Heading] | None
     begin = int(np.argmax(np.abs(yaw - yaw[0]) > limit)) - 1
     end = last - int(np.argmax(np.abs(yaw[::-1] - yaw[-1]) > limit)) + 1
     for first, past in ((0, begin), (end, last)):
-        inside = ((position.stamps_s >= turn.stamps_s[first])
-                  & (position.stamps_s <= turn.stamps_s[past]))
-        where, when = position.values[inside, :2], position.stamps_s[inside]
-        if past <= first or len(where) < FIXES:
+        straight = None if past <= first else straight_between(
+            turn.stamps_s[first], turn.stamps_s[past], position, STRAIGHT_M)
+        if straight is None:
             return None
-        direction, along, left = line_through(where)
-        if np.ptp(along) < STRAIGHT_M:
-            return None
-        found.append(Heading(
-            float(np.arctan2(direction[1], direction[0])),
-            float(np.interp(when, turn.stamps_s, yaw).mean()),
+        when, along = straight.stamps_s, straight.along
+        found.append(_End(
+            straight, float(np.interp(when, turn.stamps_s, yaw).mean()),
             np.array([np.interp(when, turn.stamps_s, column).mean() for column in follow.T]),
-            float(np.sqrt(np.mean(left**2))), float(along @ along), len(where) - 2,
             float(np.hypot(np.ptp(yaw[first:past + 1]) * LEVER_M / np.ptp(along),
-                           2 * np.polyfit(along, left, 2)[0] * np.ptp(along)))))
+                           2 * np.polyfit(along, straight.left, 2)[0] * np.ptp(along)))))
     return found[0], found[1]

@@ -39,8 +39,11 @@ def finish(turn: Turn, config: Config, begun: Draft) -> Scene | None:
 
 
 def load() -> None:
-    """Import all that reconstruct() needs, such as COLMAP."""
+    """Import all that reconstruct() needs, such as COLMAP where it is the default engine."""
     import dashcalib_ros.reconstruct.build  # noqa: F401
+    from dashcalib_ros.config import ReconstructConfig
+    from dashcalib_ros.reconstruct.geometry import engine_named
+    engine_named(ReconstructConfig().used)
 
 
 @contextlib.contextmanager

@@ -93,7 +93,7 @@ def _begun(draft: Draft, turn: TurnId, config: Config) -> Scene | None:
     found = []
     for choose in (spread, longest):
         scene = chain_scene(choose(draft.tracks, config.scene.tracks), turn, draft.start.camera,
-                            draft.start.profile, config.scene, config.seed)
+                            draft.start.profile, config)
         if scene is not None:
             found.append(scene)
             if scene.structure.registered.all():

@@ -3,22 +3,16 @@
 Images of a drive come in order and their tracks are known, so most of incremental mapping (match
 graph, next-best-view search, local adjustments) is not needed. Resection and triangulation in turn
 take a tenth of its time, and keep the given focal length.
-
-COLMAP's estimators of poses work with rays, but take pixels and a camera. An equirectangular
-camera sees all directions, so every ray can be given to them as a pixel of such a camera.
 """
 from __future__ import annotations
-
-from functools import cache
-from typing import Any
 
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.config import SceneConfig
+from dashcalib_ros.config import Config, ReconstructConfig
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.reconstruct.colmap import pycolmap
+from dashcalib_ros.reconstruct.geometry import Engine, engine_named
 from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure, rays_of, triangulate
 from dashcalib_ros.reconstruct.tracks import Tracks
 
@@ -28,28 +22,22 @@ MIN_SHARED = 40
 MIN_RESECTION = 15
 MIN_INLIERS = 12
 MIN_SHARE = 0.3
-# px for each radian of the equirectangular camera
-SCALE = 1000.0
-# samples drawn at the least and at the most: drives have many inliers
-RELATIVE_TRIALS = (50, 1000)
-ABSOLUTE_TRIALS = (10, 100)
-# steps of a pose's refinement: the adjustments that follow go on from there
-REFINEMENTS = 5
-Pose = tuple[Floats, Floats]
 
 
 def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
-          seed: int = 0) -> Structure | None:
+          seed: int = 0, engine: Engine | None = None) -> Structure | None:
     """Return a first structure, or None where no pair of images starts one.
 
     error_px: largest reprojection error; generous, as the camera is only a guess.
-    min_angle_deg: smaller triangulation angles give no point.
+    min_angle_deg: smaller triangulation angles give no point. engine: of poses, None for the
+    default.
     """
+    engine = engine or engine_named(ReconstructConfig().used)
     rays = rays_of(tracks, camera)
     # where the distortion folds over, pixels have no ray
     seen = np.isfinite(rays[:, :, 0])
     error_rad = error_px / camera.fx
-    start = _initial_pair(rays, error_rad, seed)
+    start = _initial_pair(rays, error_rad, seed, engine)
     if start is None:
         return None
     first, second, rotation, translation = start
@@ -75,7 +63,7 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
         if support[nearest] < MIN_RESECTION:
             return Structure(rotations, translations, points, registered, used)
         common = known & seen[nearest]
-        found = absolute_pose(rays[nearest, common], points[common], error_rad, seed)
+        found = engine.absolute_pose(rays[nearest, common], points[common], error_rad, seed)
         if found is None or found[1] < max(MIN_INLIERS, MIN_SHARE * common.sum()):
             failed[nearest] = True
             continue
@@ -86,16 +74,18 @@ def chain(tracks: Tracks, camera: Camera, error_px: float, min_angle_deg: float,
 
 
 def chain_scene(tracks: Tracks, turn: TurnId, camera: Camera, profile: Profile,
-                config: SceneConfig, seed: int) -> Scene | None:
+                config: Config) -> Scene | None:
     """Return a first scene with a camera that is known roughly; None if no pair starts a chain."""
-    generous = max(config.error_px, config.chain_error * tracks.image_size[0])
-    structure = chain(tracks, camera, generous, config.min_angle_deg, seed)
+    limits = config.scene
+    generous = max(limits.error_px, limits.chain_error * tracks.image_size[0])
+    structure = chain(tracks, camera, generous, limits.min_angle_deg, config.seed,
+                      engine_named(config.reconstruct.used))
     if structure is None:
         return None
     return Scene(turn, tracks, structure, camera, profile)
 
 
-def _initial_pair(rays: Floats, error_rad: float, seed: int
+def _initial_pair(rays: Floats, error_rad: float, seed: int, engine: Engine
                   ) -> tuple[int, int, Floats, Floats] | None:
     """Return the image pair with the best parallax among those that share many points.
 
@@ -114,71 +104,7 @@ def _initial_pair(rays: Floats, error_rad: float, seed: int
                 candidates.append((float(both.sum()) * min(high - low, 0.2), first, first + gap))
     for _, first, second in sorted(candidates, reverse=True)[:5]:
         both = seen[first] & seen[second]
-        found = relative_pose(rays[first, both], rays[second, both], error_rad / 2, seed)
+        found = engine.relative_pose(rays[first, both], rays[second, both], error_rad / 2, seed)
         if found is not None and found[1] >= 0.5 * both.sum():
             return first, second, *found[0]
     return None
-
-
-# robust poses from viewing rays of any direction ----------------------------------------------
-
-
-def relative_pose(before: Floats, after: Floats, error_rad: float, seed: int
-                  ) -> tuple[Pose, int] | None:
-    """Return the pose of the second image in the first one's frame, and how many rays agree.
-
-    before, after: (n, 3) unit rays of the same points. error_rad: largest error of an inlier. The
-    pose takes points from the first frame to the second: rotation (3, 3), unit translation (3,).
-    """
-    found = pycolmap.estimate_essential_matrix(
-        _pixels(before), _pixels(after), _all_around(), _all_around(),
-        _ransac(error_rad, seed, RELATIVE_TRIALS))
-    if found is None:
-        return None
-    return _pose(found['cam2_from_cam1']), int(found['num_inliers'])
-
-
-def absolute_pose(rays: Floats, points: Floats, error_rad: float, seed: int
-                  ) -> tuple[Pose, int] | None:
-    """Return the pose of an image that sees points (n, 3) along unit rays (n, 3).
-
-    The pose is world to camera, refined on the inliers; their number is returned with it.
-    """
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac = _ransac(error_rad, seed, ABSOLUTE_TRIALS)
-    pixels = _pixels(rays)
-    found = pycolmap.estimate_absolute_pose(pixels, points, _all_around(), options)
-    if found is None:
-        return None
-    how = pycolmap.AbsolutePoseRefinementOptions()
-    how.max_num_iterations = REFINEMENTS
-    how.print_summary = False
-    refined = pycolmap.refine_absolute_pose(
-        found['cam_from_world'], pixels, points, found['inlier_mask'], _all_around(), how)
-    if refined is None:
-        return None
-    return _pose(refined['cam_from_world']), int(found['num_inliers'])
-
-
-@cache
-def _all_around() -> Any:
-    return pycolmap.Camera.create_from_model_name(
-        1, 'EQUIRECTANGULAR', 0.0, round(2 * np.pi * SCALE), round(np.pi * SCALE))
-
-
-def _pixels(rays: Floats) -> Floats:
-    return np.asarray(_all_around().img_from_cam(rays), np.float64)
-
-
-def _ransac(error_rad: float, seed: int, trials: tuple[int, int]) -> Any:
-    options = pycolmap.RANSACOptions()
-    options.max_error = error_rad * SCALE
-    options.random_seed = seed
-    options.min_num_trials, options.max_num_trials = trials
-    options.confidence = 0.999
-    return options
-
-
-def _pose(transform: Any) -> Pose:
-    return (np.asarray(transform.rotation.matrix(), np.float64),
-            np.asarray(transform.translation, np.float64))

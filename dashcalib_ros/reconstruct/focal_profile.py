@@ -135,8 +135,7 @@ class _Trials:
         self._found[n] = scene
 
     def _chained(self, camera: Camera) -> Scene | None:
-        scene = chain_scene(self._tracks, self._turn, camera, NO_PROFILE, self._config.scene,
-                            self._config.seed)
+        scene = chain_scene(self._tracks, self._turn, camera, NO_PROFILE, self._config)
         return scene and self._adjusted(scene)
 
     def _adjusted(self, scene: Scene) -> Scene:

@@ -15,23 +15,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
-
-# rounds of reweighting; ten drives changed by less than 0.01 degrees after the fifth
-ROUNDS = 10
-# of the scatter; errors beyond it lose weight (Cauchy)
-LOSS = 2.0
-# of a normal distribution: its standard deviation over its median absolute deviation
-MAD = 1.4826
-# degrees; less scatter than this is rounding
-LEAST_SCATTER = 1e-3
-# of the steps at either end, left out of a mean: bumps and bad poses
-TRIMMED = 0.1
-# points near the path; fewer do not tell how high the world is
-LEAST_POINTS = 30
-# of the logarithm; the turns of six upright drives have -4.9 to -0.7
-OPEN = 0.4
-# keyframes; a line needs more steps between them than it has parameters
-LEAST_KEYFRAMES = 6
+from dashcalib_ros.robust import cauchy_fit, mad_sigma
 
 
 @dataclass(frozen=True)
@@ -46,6 +30,10 @@ class Heading:
     pitch_deg: float
     yaw_sigma_deg: float
     pitch_sigma_deg: float
+
+
+# keyframes; a line needs more steps between them than it has parameters
+LEAST_KEYFRAMES = 6
 
 
 def heading(scene: Scene) -> Heading | None:
@@ -68,10 +56,18 @@ def heading(scene: Scene) -> Heading | None:
                    float(np.std(pitch) / np.sqrt(len(pitch))))
 
 
+# of the steps at either end, left out of a mean: bumps and bad poses
+TRIMMED = 0.1
+
+
 def _trimmed_mean(values: Floats) -> float:
     """Return the mean without the share TRIMMED at either end; scipy.stats loads for 0.4 s."""
     cut = int(TRIMMED * len(values))
     return float(np.sort(values)[cut:len(values) - cut].mean())
+
+
+# of the logarithm; the turns of six upright drives have -4.9 to -0.7
+OPEN = 0.4
 
 
 def roll_deg(scenes: Sequence[Scene]) -> float:
@@ -84,6 +80,10 @@ def roll_deg(scenes: Sequence[Scene]) -> float:
     if np.median([_open_below(scene, down) for scene in scenes]) > OPEN:
         down = -down
     return float(np.degrees(np.arctan2(down[0], down[1])))
+
+
+# points near the path; fewer do not tell how high the world is
+LEAST_POINTS = 30
 
 
 def _open_below(scene: Scene, down: Floats) -> float:
@@ -105,15 +105,20 @@ def _open_below(scene: Scene, down: Floats) -> float:
     return float(np.log((deepest - deep + tiny) / (high - highest + tiny)))
 
 
+# rounds of new weights; ten drives changed by less than 0.01 degrees after the fifth
+ROUNDS = 9
+# of the scatter; errors beyond it lose weight (Cauchy)
+LOSS = 2.0
+# degrees; less scatter than this is rounding
+LEAST_SCATTER = 1e-3
+
+
 def _at_no_curvature(curvature: Floats, angle: Floats) -> tuple[float, float]:
     """Return the value of a robust line over the curvature at 0, and its standard deviation."""
-    columns = np.column_stack([np.ones(len(curvature)), curvature])
-    weights = np.ones(len(curvature))
-    for _ in range(ROUNDS):
-        information = columns.T * weights @ columns
-        line = np.linalg.lstsq(information, columns.T @ (weights * angle), rcond=None)[0]
-        errors = angle - columns @ line
-        scatter = max(MAD * float(np.median(np.abs(errors))), LEAST_SCATTER)
-        weights = 1 / (1 + (errors / (LOSS * scatter))**2)
-    variance = scatter**2 * np.linalg.pinv(information)[0, 0]
-    return float(line[0]), float(np.sqrt(variance))
+    def scatter(off: Floats) -> float:
+        return max(mad_sigma(off), LEAST_SCATTER)
+
+    line = cauchy_fit(np.column_stack([np.ones(len(curvature)), curvature]), angle,
+                      lambda off: LOSS * scatter(off), ROUNDS)
+    variance = scatter(line.off)**2 * np.linalg.pinv(line.normal)[0, 0]
+    return float(line.params[0]), float(np.sqrt(variance))

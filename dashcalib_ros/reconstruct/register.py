@@ -15,9 +15,9 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruct.heading import MAD
 from dashcalib_ros.reconstruct.scene import Structure
 from dashcalib_ros.reconstruct.tracks import Tracks
+from dashcalib_ros.robust import mad_sigma
 
 # px; patches are twice as wide, and one
 HALF_WINDOW = 7
@@ -86,7 +86,7 @@ def _noise_of(image: GreyImage) -> float:
     """Return the standard deviation of a picture's noise, grey levels."""
     response = cv2.filter2D(image, cv2.CV_16S, NOISE_FILTER)
     # edges, which few pixels are on, do not count in a median; of 16 pixels one is enough
-    return MAD * float(np.median(np.abs(response[::4, ::4]))) / 6
+    return mad_sigma(response[::4, ::4].astype(np.float64)) / 6
 
 
 def _doubled(image: GreyImage, smoothing_px: float) -> Floats32:

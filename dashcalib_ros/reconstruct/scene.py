@@ -22,6 +22,8 @@ BAD_COST = 1.8
 BUMPS_DEG = 10.0
 # px; wider pictures are made smaller: several of them go into one report
 PICTURE_WIDTH = 720
+# world to camera: rotation (3, 3), translation (3,)
+Pose = tuple[Floats, Floats]
 
 
 @dataclass(frozen=True)

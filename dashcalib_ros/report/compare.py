@@ -3,24 +3,30 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.formats import Given, given_camera
+from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.source import by
+from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.check import export_command, same_shape
-from dashcalib_ros.judge.difference import Difference as WholeDifference
-from dashcalib_ros.judge.difference import NamedCamera, answers_of, difference_between
-from dashcalib_ros.report.camera_file import Given, given_camera
-from dashcalib_ros.report.result import plain_values
+from dashcalib_ros.judge.difference import (
+    Difference,
+    NamedCamera,
+    answers_of,
+    difference_between,
+)
 from dashcalib_ros.report.wording import digits_of, mounts_text, number, optional
 
 
 @dataclass(frozen=True)
-class Difference:
+class ParameterDifference:
     """One parameter of both. difference is a - b; percent is of b, None where b is zero.
 
     sigma: of the difference, from the sides that have one (both: the root of the sum of squares).
@@ -45,8 +51,8 @@ class Comparison:
 
     a: NamedCamera
     b: NamedCamera
-    differences: tuple[Difference, ...]
-    whole: WholeDifference
+    differences: tuple[ParameterDifference, ...]
+    whole: Difference
     unseen: float = 0.0
 
     @property
@@ -82,6 +88,26 @@ def mount_dict(mount: Mount | None, other: Mount | None) -> dict[str, Any] | Non
         for name, (degrees, sigma) in mount.apart(other).items()}}
 
 
+def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = None,
+                mount: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the answer of a drive about a given calibration as types of strict JSON.
+
+    changes: of the camera during the drive, in words. motion: the comparison with true poses.
+    mount: how far the mounting is from the calibration's.
+    """
+    values: dict[str, Any] = plain_values(found) | {'changes': list(changes), 'mount': mount}
+    if motion is not None:
+        values |= motion.medians()
+        values['turns'] = [{'center': turn.turn.number, 'true_deg': turn.angle_deg,
+                            'length_m': turn.length_m,
+                            'rotation_deg': {name: turn.rotation_deg(name)
+                                             for name in motion.names},
+                            'scale_drift': {name: turn.scale_drift(name)
+                                            for name in motion.names}}
+                           for turn in motion.turns]
+    return values
+
+
 def compare(a: Given, b: Given) -> Comparison:
     """Compare calibration a with the reference b.
 
@@ -113,15 +139,16 @@ def _common_names(a: Camera, b: Camera) -> tuple[str, ...]:
     return max(a.names(), b.names(), key=len)
 
 
-def _difference(name: str, a: NamedCamera, b: NamedCamera) -> Difference:
+def _difference(name: str, a: NamedCamera, b: NamedCamera) -> ParameterDifference:
     value, reference = (each.camera.named.get(name, 0.0) for each in (a, b))
     difference = value - reference
     sigmas = [each.sigma[name] for each in (a, b)
               if each.sigma is not None and name in each.sigma]
     sigma = math.hypot(*sigmas) if sigmas else None
-    return Difference(name, value, reference, difference,
-                      100 * difference / abs(reference) if reference else None,
-                      sigma, difference / sigma if sigma else None)
+    return ParameterDifference(
+        name, value, reference, difference,
+        100 * difference / abs(reference) if reference else None,
+        sigma, difference / sigma if sigma else None)
 
 
 def comparison_rows(found: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
@@ -150,7 +177,7 @@ def unseen_text(found: Comparison) -> str:
         f'{found.a.camera.model} model cannot see')
 
 
-def difference_row(d: Difference) -> tuple[str, ...]:
+def difference_row(d: ParameterDifference) -> tuple[str, ...]:
     """Return a parameter's name, both values, their difference, in percent and in sigmas."""
     digits = max(4, digits_of(d.name))
     return (d.name, number(d.name, d.a), number(d.name, d.b), f'{d.difference:+.{digits}f}',

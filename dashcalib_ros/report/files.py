@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.judge import Calibration
+from dashcalib_ros.formats import calibration_yaml, load_camera, result_json
+from dashcalib_ros.formats.ros import CAMERA_NAME
+from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import NamedCamera
-from dashcalib_ros.report.camera_file import load_camera
 from dashcalib_ros.report.page import report_html
-from dashcalib_ros.report.result import CAMERA_NAME, calibration_yaml, result_json
 from dashcalib_ros.whole_files import prepared, remove_leftovers, sync, write_whole
 
 ACCEPTED = 'calibration.yaml'
@@ -35,7 +35,7 @@ class Written:
     set_aside: Path | None = None
 
 
-def write_results(calibration: Calibration, out_dir: str | os.PathLike[str],
+def write_results(calibration: CalibrationData, out_dir: str | os.PathLike[str],
                   camera_name: str = CAMERA_NAME,
                   created: str | None = None, truth: NamedCamera | None = None) -> Written:
     """Write the result's files into out_dir, which is made if needed, and return their paths.
@@ -69,16 +69,6 @@ def write_results(calibration: Calibration, out_dir: str | os.PathLike[str],
     return Written(tuple(folder / name for name in texts), moved)
 
 
-def save(calibration: Calibration, folder: str | os.PathLike[str] = 'calibration'
-         ) -> tuple[Path, ...]:
-    """Write what `dashcalib run` writes into a folder, and return the files' paths.
-
-    These are result.json, report.html and calibration.yaml (calibration.weak.yaml where it is
-    weak, none where it is refused). Raises OutputError, which tells what to do.
-    """
-    return write_results(calibration, folder).files
-
-
 def write_text(path: str | Path, text: str | bytes) -> None:
     """Write one file, completely or not at all. Raises OutputError."""
     path = Path(path)
@@ -105,7 +95,8 @@ def set_aside(path: Path) -> Path | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        raise OutputError(f'{path} could not be moved aside: {error.strerror or error}; move it '
+        raise OutputError('E-FILE-NOT-MOVED',
+                          f'{path} could not be moved aside: {error.strerror or error}; move it '
                           f'yourself, or allow writing to {path.parent}') from error
     sync(path.parent)
     return target
@@ -165,15 +156,16 @@ def _output_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OutputError(f'cannot write to {folder}: {error.strerror or error}; '
-                          f'{_cure(error)}') from error
+        raise _cannot_write(folder, error) from error
 
 
-def _cure(error: OSError) -> str:
+def _cannot_write(folder: Path, error: OSError) -> OutputError:
+    what = f'cannot write to {folder}: {error.strerror or error}; '
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return 'free some space or choose another output folder'
+        return OutputError('E-DISK-FULL', what + 'free some space or choose another output folder')
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return 'choose an output folder you may write to'
+        return OutputError('E-NOT-WRITABLE', what + 'choose an output folder you may write to')
     if error.errno in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR):
-        return 'something else has that name: move it or choose another output folder'
-    return 'choose another output folder'
+        return OutputError('E-NAME-TAKEN', what + 'something else has that name: rename it or '
+                           'choose another output folder')
+    return OutputError('E-CANNOT-WRITE', what + 'choose another output folder')

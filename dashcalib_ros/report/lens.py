@@ -8,9 +8,9 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Pixels
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.camera_info import WIDEST, rectified_matrix
-from dashcalib_ros.judge import Calibration
-from dashcalib_ros.judge.agreement import sigma_by_count
+from dashcalib_ros.camera.remap import WIDEST, rectified_matrix, rectify, seen_at
+from dashcalib_ros.judge import CalibrationData
+from dashcalib_ros.judge.agreement import focal_of_turns, sigma_by_count
 from dashcalib_ros.judge.calibration import Material, Mount
 from dashcalib_ros.reconstruct.scene import Profile, Scene, residuals_px
 from dashcalib_ros.report.charts import (
@@ -29,6 +29,7 @@ from dashcalib_ros.report.charts import (
     ticks,
 )
 from dashcalib_ros.report.turns import focal_by_turn
+from dashcalib_ros.report.wording import angle_text
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import SigmaMap
 
@@ -38,13 +39,17 @@ FEWEST = 4  # observations of a cell whose mean residual is drawn
 GRID_LINES = 12  # over the picture's width
 # from little to much, BGR
 RAMP = np.array([(250, 243, 236), (238, 205, 160), (206, 148, 78), (142, 86, 34), (72, 38, 16)])
-BY_TURN = ('Each turn alone, one sigma. Last, and as a band: all together, with how much the '
-           'turns differ.')
+BY_TURN = ('fx by each turn alone, with one sigma. Last, and as a band: all turns together, '
+           'including how much they differ.')
+# times the sigma of the best turn; where all together know less, that needs no explanation
+MUCH_BETTER = 0.5
+WHY_TOGETHER = (' One turn alone cannot separate fx from the other parameters of the lens; turns '
+                'that differ can, so together they know fx far better than each alone.')
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A drawing with its title, and what it tells."""
+    """A drawing with its title, and a sentence about it."""
 
     title: str
     svg: str
@@ -64,7 +69,7 @@ class Slider:
     caption: str
 
 
-def uncertainty_of(c: Calibration) -> Drawing | None:
+def uncertainty_of(c: CalibrationData) -> Drawing | None:
     """Return the uncertainty over the picture; None where it is not known."""
     if c.material is None or c.camera is None or c.material.solution is None:
         return None
@@ -73,11 +78,11 @@ def uncertainty_of(c: Calibration) -> Drawing | None:
         return None
     return Drawing(
         'Uncertainty over the picture', sigma_svg(found, c.image_size, c.material.px),
-        f'By how many pixels this camera may be off, one sigma: {c.sigma_px.rms:.2f} px over '
-        f'the picture (RMS), {c.sigma_px.worst:.2f} px at the worst.')
+        f'How many pixels this camera may be off, one sigma: {c.sigma_px.rms:.2f} px over the '
+        f'picture (RMS), {c.sigma_px.worst:.2f} px at the worst place.')
 
 
-def slider_of(c: Calibration) -> Slider | None:
+def slider_of(c: CalibrationData) -> Slider | None:
     """Return the picture of the turn that shows most, of this drive, without distortion."""
     pictures = {} if c.material is None or c.material.solution is None else c.material.pictures
     turns = [turn for turn in c.turns if turn.id in pictures]
@@ -90,11 +95,11 @@ def slider_of(c: Calibration) -> Slider | None:
     straight, bent_grid, straight_grid, moved = undistorted(image, camera, c.config.rectified)
     moved *= c.image_size[0] / width
     return Slider(data_uri(image), data_uri(straight), bent_grid, straight_grid, width,
-                  height, f'The orange grid is of the same rays on both sides. The lens moves '
+                  height, f'The orange grid shows the same rays on both sides. The lens moves '
                           f'points by up to {moved:.0f} px.')
 
 
-def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
+def evidence_of(c: CalibrationData, mask_id: str | None) -> list[Drawing]:
     """Return the plots of the evidence; none where no turn was reconstructed."""
     material = c.material
     if material is None or not material.scenes:
@@ -105,7 +110,9 @@ def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
     if solution is not None and c.camera is not None and c.sigma is not None:
         drawings += _growth(c, solution, material.px)
         if by_turn := focal_by_turn(c):
-            drawings.append(Drawing('What each turn says of fx', by_turn, BY_TURN))
+            best = material.px * min(turn.sigma for turn in focal_of_turns(solution).values())
+            why = WHY_TOGETHER if c.sigma['fx'] < MUCH_BETTER * best else ''
+            drawings.append(Drawing('fx by turn', by_turn, BY_TURN + why))
     camera = None if solution is None else solution.camera
     xy, residual = observations_of(scenes, camera)
     if len(xy):
@@ -114,7 +121,7 @@ def evidence_of(c: Calibration, mask_id: str | None) -> list[Drawing]:
     return drawings
 
 
-def _profile(c: Calibration, material: Material, scenes: list[Scene]) -> Drawing:
+def _profile(c: CalibrationData, material: Material, scenes: list[Scene]) -> Drawing:
     """Return the error that is left at each focal length held fixed, by turn and for all."""
     solution, fx = material.solution, None if c.camera is None else c.camera.fx
     each = [scene.profile for scene in scenes]
@@ -144,11 +151,11 @@ def _profile(c: Calibration, material: Material, scenes: list[Scene]) -> Drawing
         content += line(x, axes.top, x, axes.height - axes.bottom, 'joint')
     return Drawing(
         'Focal profile', svg(WIDTH, axes.height, 'focal profile', content),
-        'Each turn (thin) and all together (thick) were explained with the focal length held '
-        'fixed. A clear minimum means that the turns know it; a flat line means that they do not.')
+        'The error of each turn (thin) and of all together (thick) at fixed focal lengths. A '
+        'clear minimum: the turns determine the focal length. A flat line: they do not.')
 
 
-def _growth(c: Calibration, solution: Solution, px: float) -> list[Drawing]:
+def _growth(c: CalibrationData, solution: Solution, px: float) -> list[Drawing]:
     """Return the sigma of fx, in %, with the first turn, with two of them, and so on."""
     assert c.camera is not None
     percent = [100 * sigma * px / c.camera.fx for sigma in sigma_by_count(solution)]
@@ -163,13 +170,13 @@ def _growth(c: Calibration, solution: Solution, px: float) -> list[Drawing]:
     if count > 2:
         # one turn does not show how much turns differ
         content += strokes([where[1:]], 'all-turns')
-    content += (strokes(where[:1, None], 'dot other') + strokes(where[1:, None], 'dot own')
+    content += (strokes(where[:1, None], 'dot other') + strokes(where[1:, None], 'dot all')
                 + ''.join(text(x, y - 9, f'{value:.2g}', 'mid strong halo')
                           for (x, y), value in zip(where, percent, strict=True)))
     return [Drawing('Uncertainty against number of turns',
                     svg(WIDTH, axes.height, 'sigma of fx over the number of turns', content),
                     'The most prominent turn first. One turn (grey) does not show how much turns '
-                    'differ; that comes in with the second, and few turns know it badly.')]
+                    'differ; two do, and more do so better. So sigma may rise at the second.')]
 
 
 def _residuals(xy: Floats, residual: Floats, size: tuple[int, int], px: float) -> Drawing:
@@ -198,9 +205,9 @@ def _residuals(xy: Floats, residual: Floats, size: tuple[int, int], px: float) -
     return Drawing('Residuals over the picture',
                    svg(WIDTH, height, 'residuals over the picture', content, 'plot map'),
                    f'Half of the {len(residual):,} are below {half:.2f} px. Arrows: mean residual '
-                   f'of a cell, {magnified} times as long as it is; tint: how much residuals '
-                   'scatter there. Arrows that point the same way over a large part of the '
-                   'picture mean that the lens model does not fit there.')
+                   f'of a cell, magnified {magnified} times. Tint: how much residuals scatter '
+                   'there. Where neighbouring arrows point the same way over a large part of the '
+                   'picture, the lens model does not fit.')
 
 
 def _coverage(xy: Floats, size: tuple[int, int], mask_id: str | None) -> Drawing:
@@ -211,7 +218,7 @@ def _coverage(xy: Floats, size: tuple[int, int], mask_id: str | None) -> Drawing
     shown = np.sqrt(count.astype(np.float64) / max(int(count.max()), 1))
     content = (_heat(np.where(count > 0, shown, np.nan), WIDTH, height)
                + mask_over(mask_id, WIDTH, height))
-    masked = '; what is tinted moves with the car and is not used' if mask_id else ''
+    masked = '; the tinted part moves with the car and is not used' if mask_id else ''
     return Drawing('Coverage',
                    svg(WIDTH, height, 'observations over the picture', content, 'plot map'),
                    f'Where points were observed. {100 * float(np.mean(count == 0)):.0f} % of the '
@@ -267,35 +274,25 @@ def undistorted(image: Pixels, camera: Camera, rectified: str
     the bent one of the original, then the straight one. Last comes how far the lens moves a
     point at the most, px, within 75 degrees of its axis.
     """
-    import cv2
     height, width = image.shape[:2]
     with np.errstate(all='ignore'):
+        straight = rectify(image, camera, rectified)
         matrix = rectified_matrix(camera, rectified)
-        u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height))
-        source = _seen_at(np.stack([u, v], -1), matrix, camera).astype(np.float32)
-        straight = cv2.remap(image, source[..., 0], source[..., 1], cv2.INTER_LINEAR)
         step = width / GRID_LINES
         lines = []
         for x in np.arange(step / 2, width, step):
             lines.append(np.column_stack([np.full(60, x), np.linspace(0, height - 1, 60)]))
         for y in np.arange(step / 2, height, step):
             lines.append(np.column_stack([np.linspace(0, width - 1, 60), np.full(60, y)]))
-        bent = [_seen_at(each, matrix, camera) for each in lines]
+        bent = [seen_at(each, matrix, camera) for each in lines]
         places = np.concatenate(lines)
         rays = camera.rays(places)
         plain = rays[:, :2] / rays[:, 2:] * camera.params[:2] + camera.params[2:4]
         moved = np.linalg.norm(plain - places, axis=1)[rays[:, 2] > np.cos(WIDEST)]
     most = float(moved.max(initial=0.0))
     seen = [xy[np.abs(xy).max(axis=1) < 1e5] for xy in bent]
-    return (np.asarray(straight, np.uint8), outline(xy for xy in seen if len(xy) > 1),
+    return (straight, outline(xy for xy in seen if len(xy) > 1),
             outline(each[[0, -1]] for each in lines), most)
-
-
-def _seen_at(pixels: Floats, matrix: Floats, camera: Camera) -> Floats:
-    """Return where the lens puts what the rectified picture with K shows at pixels (..., 2)."""
-    rays = np.concatenate([(pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]],
-                           np.ones((*pixels.shape[:-1], 1))], axis=-1)
-    return np.asarray(np.nan_to_num(camera.project(rays), nan=-1e6))
 
 
 def _heat(share: Floats, width: float, height: float) -> str:
@@ -334,22 +331,25 @@ HEIGHT, AXIS = 160, 130.0
 ARROWS = 18
 
 
-def mounting_of(c: Calibration) -> list[Drawing]:
+def mounting_of(c: CalibrationData) -> list[Drawing]:
     """Return the car from the side and from above, and the horizon in a picture."""
     if c.mount is None or c.camera is None:
         return []
-    mount, sigma = c.mount, c.mount.sigma
+    mount = c.mount
     drawings = [
         Drawing('From the side', _car(SIDE, CAMERA_SIDE, -mount.pitch_up_deg, 'from the side'),
-                f'Pitch {mount.pitch_up_deg:+.2f} ± {sigma["pitch_up_deg"]:.2f}° upwards, drawn '
-                f'{ENLARGED:.0f} times as large.'),
+                _angle('pitch_up_deg', mount)),
         Drawing('From above', _car(ABOVE, CAMERA_ABOVE, -mount.yaw_left_deg, 'from above'),
-                f'Yaw {mount.yaw_left_deg:+.2f} ± {sigma["yaw_left_deg"]:.2f}° to the left, drawn '
-                f'{ENLARGED:.0f} times as large.')]
+                _angle('yaw_left_deg', mount))]
     return [*drawings, _horizon(c, mount, c.camera)]
 
 
-def field_of(c: Calibration) -> list[Drawing]:
+def _angle(name: str, mount: Mount) -> str:
+    text = angle_text(name, getattr(mount, name), mount.sigma[name])
+    return f'{text[0].upper()}{text[1:]}, drawn {ENLARGED:.0f} times as large.'
+
+
+def field_of(c: CalibrationData) -> list[Drawing]:
     """Return the field as arrows over the picture; none where none is used."""
     if c.field is None or not c.field.used or c.camera is None:
         return []
@@ -363,8 +363,9 @@ def field_of(c: Calibration) -> list[Drawing]:
     drawn = arrows(pixels * small, moves * small * cell / longest, 'arrow')
     return [Drawing(
         'The field', svg(WIDTH, height * small, 'displacements over the picture', drawn, 'map'),
-        f'What the lens model leaves over, as a windscreen does: {c.field.rms_px:.2f} px RMS, '
-        f'{c.field.worst_px:.2f} px at the worst. The longest arrow is {longest:.2f} px.')]
+        f'What the lens model cannot describe, for example the bend of a windscreen: '
+        f'{c.field.text} (RMS), {c.field.worst_px:.2f} px at the worst place. The longest arrow '
+        f'is {longest:.2f} px.')]
 
 
 def _car(side: Floats, camera: tuple[float, float], turned_deg: float, label: str) -> str:
@@ -379,7 +380,7 @@ def _car(side: Floats, camera: tuple[float, float], turned_deg: float, label: st
         text(20, HEIGHT - 8, 'dashed: direction of travel')]))
 
 
-def _horizon(c: Calibration, mount: Mount, camera: Camera) -> Drawing:
+def _horizon(c: CalibrationData, mount: Mount, camera: Camera) -> Drawing:
     """Return the horizon, and the pixel that the car travels to, in a picture of the drive."""
     width, height = c.image_size
     level = replace(mount, yaw_left_deg=0.0)
@@ -399,4 +400,4 @@ def _horizon(c: Calibration, mount: Mount, camera: Camera) -> Drawing:
                    svg(WIDTH, height * small, 'horizon and point of travel', below + marks, 'map'),
                    f'The horizon of a flat road, and the pixel towards which the car travels: '
                    f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± '
-                   f'{mount.travel_sigma_px:.1f}.')
+                   f'{mount.travel_sigma_px:.1f} px.')

@@ -12,9 +12,9 @@ import numpy as np
 
 from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.config import Config
-from dashcalib_ros.judge import Calibration
+from dashcalib_ros.formats import calibrated_camera
+from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import NamedCamera
-from dashcalib_ros.report.camera_file import calibrated_camera
 from dashcalib_ros.report.charts import arrows, magnitude_svg, mask_data_uri
 from dashcalib_ros.report.compare import Comparison, answers, compare, comparison_rows
 from dashcalib_ros.report.lens import (
@@ -30,14 +30,16 @@ from dashcalib_ros.report.lens import (
 from dashcalib_ros.report.turns import turn_rows, turn_sections
 from dashcalib_ros.report.wording import (
     ADVICE,
-    checks,
+    conditions,
     digits_of,
     key_figures,
     next_steps,
     number,
+    objections,
     optional,
     parameter_rows,
     run_facts,
+    verdict_text,
 )
 from dashcalib_ros.solve.spread import SigmaMap
 
@@ -49,7 +51,7 @@ LONGEST = 22.0  # px of the drawing; of an arrow
 MASK_ID = 'mask'
 
 
-def report_html(calibration: Calibration, truth: NamedCamera | None = None,
+def report_html(calibration: CalibrationData, truth: NamedCamera | None = None,
                 calibration_file: Path | None = None) -> str:
     """Return the page's text; all text from the input is escaped.
 
@@ -64,7 +66,8 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
     return template('report.html').render(
         c=c, title=f'Calibration of {c.input_name}' if c.input_name else 'Calibration',
         headline=ADVICE[c.verdict.level], figures=key_figures(c), steps=next_steps(c),
-        checks=checks(c), parameters=parameter_rows(c),
+        reasons=[what for _, what, _ in objections(c.verdict)], conditions=conditions(c.verdict),
+        parameters=parameter_rows(c),
         truth=[] if against is None else _truth_rows(against),
         truth_px='' if against is None else optional(against.mapping_px, 2, ' px'),
         snippets=_snippets(c, calibration_file),
@@ -73,6 +76,7 @@ def report_html(calibration: Calibration, truth: NamedCamera | None = None,
                                                             c.start_s or None),
         turns=turn_sections(c, mask_id), rows=turn_rows(c),
         evidence=[*evidence_of(c, mask_id), *field_of(c)], mounting=mounting_of(c),
+        mount_verdict='' if c.mount is None else verdict_text(c.mount),
         facts=run_facts(c),
         mask='' if mask is None else mask_data_uri(mask), mask_id=MASK_ID,
         changed={key: value for key, value in settings.items() if value != defaults[key]},
@@ -109,7 +113,7 @@ def _text(values: Mapping[str, Any]) -> str:
                      for key, value in values.items())
 
 
-def _snippets(c: Calibration, path: Path | None) -> list[tuple[str, str, str]]:
+def _snippets(c: CalibrationData, path: Path | None) -> list[tuple[str, str, str]]:
     """Return how ROS drivers, OpenCV and COLMAP take the camera: an id, what for, text to copy."""
     if c.camera is None or not np.isfinite(c.camera.params).all():
         return []

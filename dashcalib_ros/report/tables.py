@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dashcalib_ros.errors import visible
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.report.compare import (
     Comparison,
     answers,
@@ -20,18 +20,22 @@ from dashcalib_ros.report.compare import (
     difference_row,
     unseen_text,
 )
-from dashcalib_ros.report.wording import number, optional, parameter_rows, run_facts
+from dashcalib_ros.report.wording import (
+    cures,
+    number,
+    objections,
+    optional,
+    parameter_rows,
+    run_facts,
+)
 
 # columns between two of a table
 APART = 3
 TURNS = ('at s', 'frames', 'yaw °', 'images', 'error px', 'used')
-# where the reasons do not say it
-NEXT = {
-    'accepted': 'give calibration.yaml to the camera driver; report.html tells more',
-    'weak': 'read report.html before you use calibration.weak.yaml',
-    'refused': 'record a drive with turns at crossings, in daylight',
-}
-COLOURS = {'accepted': 'bold green', 'weak': 'bold yellow', 'refused': 'bold red'}
+# of verdicts, and of answers
+COLOURS = {'accepted': 'bold green', 'weak': 'bold yellow', 'refused': 'bold red',
+           'right': 'bold green', 'differs': 'bold cyan', 'cannot tell': 'bold yellow',
+           'wrong': 'bold red'}
 
 
 def line(text: str) -> Text:
@@ -39,7 +43,7 @@ def line(text: str) -> Text:
     return Text(visible(text))
 
 
-def summary(calibration: Calibration) -> RenderableType:
+def summary(calibration: CalibrationData) -> RenderableType:
     """Return the estimate with its sigma, the table of turns, and a few facts."""
     c = calibration
     parts: list[RenderableType] = []
@@ -54,21 +58,21 @@ def summary(calibration: Calibration) -> RenderableType:
 
 def conclusion(verdict: Verdict) -> RenderableType:
     """Return the verdict, coloured, and its reasons."""
-    parts: list[RenderableType] = [labelled('verdict', verdict.level, COLOURS[verdict.level])]
-    for reason in verdict.reasons:
-        cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), None)
-        parts.append(Padding.indent(line(reason.removesuffix(f': {cure}')), 2))
+    parts: list[RenderableType] = [labelled('verdict', verdict.level)]
+    parts += [Padding.indent(line(f'{what} [{code}]' if code else what), 2)
+              for code, what, _ in objections(verdict)]
     return Group(*parts)
 
 
-def labelled(label: str, word: str, colour: str) -> Text:
+def labelled(label: str, word: str) -> Text:
     """Return the line that all others explain: its word is coloured."""
-    return Text.assemble(f'{label}: ', (word, colour))
+    return Text.assemble(f'{label}: ', (word, COLOURS[word]))
 
 
-def next_step(verdict: Verdict) -> Text:
-    """Return what to do next."""
-    return line(f'next: {(verdict.cures or (NEXT[verdict.level],))[0]}')
+def next_step(verdict: Verdict) -> RenderableType:
+    """Return what to do next: all cures, the likeliest to help first."""
+    first, *others = cures(verdict)
+    return Group(line(f'next: {first}'), *(line(f'also: {cure}') for cure in others))
 
 
 def _turn_row(turn: TurnSummary, start_s: float) -> tuple[str, ...]:

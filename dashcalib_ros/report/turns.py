@@ -1,4 +1,4 @@
-"""What the page shows of each turn: its tracks, a view in space, and what it says of fx."""
+"""What the page shows of each turn: its tracks, a view in space, and its own fx."""
 from __future__ import annotations
 
 import math
@@ -10,8 +10,8 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.judge import Calibration, TurnSummary
-from dashcalib_ros.judge.agreement import focal_alone, leverages
+from dashcalib_ros.judge import CalibrationData, TurnSummary
+from dashcalib_ros.judge.agreement import focal_of_turns, leverages, turns_of_another_camera
 from dashcalib_ros.judge.calibration import Material, StoredTurnSummary
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture, residuals_px
 from dashcalib_ros.report.charts import (
@@ -49,8 +49,8 @@ AnySummary = TurnSummary | StoredTurnSummary
 class TurnSection:
     """A turn as the page shows it; SVG texts are '' where there is nothing to draw.
 
-    frame: of the picture; magnified: by how much its residuals are, 0 for none drawn. alone: what
-    it says of fx, in words.
+    frame: of the picture; magnified: by how much its residuals are, 0 for none drawn. alone: its
+    own fx, in words.
     """
 
     name: str
@@ -64,21 +64,21 @@ class TurnSection:
     alone: str
 
 
-def turn_sections(c: Calibration, mask_id: str | None) -> list[TurnSection]:
+def turn_sections(c: CalibrationData, mask_id: str | None) -> list[TurnSection]:
     """Return a section for each turn of which there is anything to see."""
     if c.material is None:
         return []
     alone, solution = _fx_alone(c), c.material.solution
     shares = leverages(solution) if alone and solution is not None else {}
-    said = {turn: _said(fx, sigma, shares.get(turn, 0.0))
-            for turn, (fx, sigma) in alone.items()}
-    found = [_section(turn, c, c.material, said.get(turn.id, ''), mask_id)
+    texts = {turn: _alone_text(fx, sigma, shares.get(turn, 0.0))
+             for turn, (fx, sigma) in alone.items()}
+    found = [_section(turn, c, c.material, texts.get(turn.id, ''), mask_id)
              for turn in c.all_turns]
     return [each for each in found if each.picture or each.view]
 
 
-def _fx_alone(c: Calibration) -> dict[TurnId, tuple[float, float]]:
-    """Return what each turn alone says of fx, and its sigma, px of the input.
+def _fx_alone(c: CalibrationData) -> dict[TurnId, tuple[float, float]]:
+    """Return fx by each turn alone, and its sigma, px of the input.
 
     Nothing of a refused calibration, which has no numbers.
     """
@@ -89,17 +89,17 @@ def _fx_alone(c: Calibration) -> dict[TurnId, tuple[float, float]]:
     if solution is None:
         return {}
     alone = {turn: (found.fx * c.material.px, found.sigma * c.material.px)
-             for turn, found in focal_alone(solution).items()}
+             for turn, found in focal_of_turns(solution).items()}
     return alone if np.isfinite(list(alone.values())).all() else {}
 
 
-def names(c: Calibration) -> dict[TurnId, str]:
+def names(c: CalibrationData) -> dict[TurnId, str]:
     """Return the turns' short names: numbers in the order of time, s1, s2 for stored ones."""
     own = {turn.id: str(n) for n, turn in enumerate(c.turns, 1)}
     return own | {turn.id: f's{n}' for n, turn in enumerate(c.stored_turns, 1)}
 
 
-def _section(turn: AnySummary, c: Calibration, material: Material,
+def _section(turn: AnySummary, c: CalibrationData, material: Material,
              alone: str, mask_id: str | None) -> TurnSection:
     scene, shown = material.scenes.get(turn.id), material.pictures.get(turn.id)
     camera = material.solution.camera if turn.used and material.solution is not None else None
@@ -111,24 +111,24 @@ def _section(turn: AnySummary, c: Calibration, material: Material,
         drawn, frame, magnified, '' if scene is None else view_svg(scene, frame), alone)
 
 
-def _facts(turn: AnySummary, scene: Scene | None, c: Calibration) -> tuple[str, ...]:
+def _facts(turn: AnySummary, scene: Scene | None, c: CalibrationData) -> tuple[str, ...]:
     facts = ['of an earlier drive' if isinstance(turn, StoredTurnSummary)
              else f'at {since_start(turn, c)} s, frames {turn.first} to {turn.last}']
     if turn.yaw_deg is not None:
         way = '' if scene is None else ' ' + direction(scene)
         facts.append(f'{turn.yaw_deg:.0f}°{way}')
-    if turn.misfit is not None and turn.misfit > c.config.verdict.max_misfit:
+    if turns_of_another_camera({turn.id: turn.misfit or 0.0}, c.config.verdict):
         facts.append(f'fits another camera: {turn.misfit:.1f} times the error of its own')
     return tuple(facts)
 
 
-def _said(fx: float, sigma: float, share: float) -> str:
+def _alone_text(fx: float, sigma: float, share: float) -> str:
     percent = min(max(100 * share, 0.0), 100.0)
-    return (f'Alone it says fx {with_sigma(fx, sigma)}, and gives '
-            f'{f"{percent:.0f}" if percent >= 1 else "less than 1"} % of what is known of fx.')
+    part = f'{percent:.0f}' if percent >= 1 else 'less than 1'
+    return f'Alone: fx {with_sigma(fx, sigma)}, {part} % of the information about fx.'
 
 
-def turn_rows(c: Calibration) -> list[dict[str, str]]:
+def turn_rows(c: CalibrationData) -> list[dict[str, str]]:
     """Return the table of all turns: name, time, frames, yaw, keyframes, error, why unused."""
     short = names(c)
     apart = {each.turn: f'{each.px:.3g} px, {each.sigmas:.1f} sigmas' for each in c.held_out}
@@ -237,8 +237,8 @@ def direction(scene: Scene) -> str:
     return 'to the right' if net > 0 else 'to the left'
 
 
-def focal_by_turn(c: Calibration) -> str:
-    """Return what each turn says of fx, beside the result of all; '' where there is nothing."""
+def focal_by_turn(c: CalibrationData) -> str:
+    """Return a plot of fx by each turn, beside that of all; '' where there is nothing."""
     alone = _fx_alone(c)
     if not alone or c.camera is None or c.sigma is None:
         return ''

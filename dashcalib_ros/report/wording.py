@@ -2,46 +2,45 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from itertools import zip_longest
 
 import numpy as np
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.judge import Calibration, TurnSummary
-from dashcalib_ros.judge.agreement import focal_disagreement, leverages
-from dashcalib_ros.judge.calibration import Mount, Witnesses
-from dashcalib_ros.judge.verdict import (
-    flat_profile,
-    one_turn_dominates,
-    other_camera,
-    profile_contrast,
-    sigma_too_large,
-    turns_disagree,
-)
+from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
+from dashcalib_ros.judge.calibration import Condition, Mount, Witnesses
 
 ADVICE = {
     'accepted': 'Good to use.',
-    'weak': 'There is a number, but the evidence for it is thin: read the reasons first.',
-    'refused': 'There is no calibration: this drive has not shown enough.',
+    'weak': 'There are numbers, but they may be wrong: read the reasons first.',
+    'refused': 'There is no calibration: this drive does not show enough.',
+}
+# where a verdict has no cures
+NEXT = {
+    'accepted': 'use calibration.yaml in the camera driver; report.html has the details',
+    'weak': 'read report.html before you use calibration.weak.yaml',
+    'refused': 'record a drive with turns at crossings, in daylight',
 }
 
 # parameters that are lengths in the picture; the others have no unit
 PIXELS = ('fx', 'fy', 'cx', 'cy')
 
 
-def parameter_rows(calibration: Calibration) -> list[tuple[str, str, str, str]]:
+def parameter_rows(calibration: CalibrationData) -> list[tuple[str, str, str, str]]:
     """Return each parameter's name, value, sigma and sigma in percent, as text."""
     rows = []
     for name, value in ({} if calibration.camera is None else calibration.camera.named).items():
         sigma = (calibration.sigma or {}).get(name, math.inf)
-        said, relative = '± ' + number(name, sigma), ''
+        absolute, relative = '± ' + number(name, sigma), ''
         if not math.isfinite(sigma):
-            said = 'unknown'
+            absolute = 'unknown'
         elif value:
             share = 100 * sigma / abs(value)
             # one as large as its value has no sensible digits
             relative = ('over 100 %' if share > 100 else
                         f'{share:.0f} %' if share >= 10 else f'{share:.2f} %')
-        rows.append((name, number(name, value), said, relative))
+        rows.append((name, number(name, value), absolute, relative))
     return rows
 
 
@@ -58,68 +57,77 @@ def digits_of(name: str) -> int:
     return 4 if name in ('k1', 'k2') else 6
 
 
+# of each angle of a mounting: its name, and where it goes when it is positive, and negative
+WAYS = {'yaw_left_deg': ('yaw', 'to the left', 'to the right'),
+        'pitch_up_deg': ('pitch', 'up', 'down'),
+        'roll_right_deg': ('roll', 'to the right', 'to the left')}
+
+
+def angle_text(name: str, degrees: float | None, sigma: float | None) -> str:
+    """Return an angle of a mounting with its direction, so that it needs no sign."""
+    word, positive, negative = WAYS[name]
+    if degrees is None or sigma is None:
+        return f'{word} unknown'
+    return f'{word} {abs(degrees):.2f} ± {sigma:.2f}° {positive if degrees >= 0 else negative}'
+
+
 def mounts_text(mount: Mount, other: Mount) -> str:
     """Return how far a mounting is from another one, and whether the camera was moved."""
-    apart = mount.apart(other)
-    parts = [f'{degrees:+.2f} ± {sigma:.2f} ° {words}' for words, (degrees, sigma) in zip(
-        ('to the left', 'upwards', 'rolled right'), apart.values(), strict=False)]
+    parts = [angle_text(name, *apart) for name, apart in mount.apart(other).items()]
     moved = 'the camera was moved' if mount.moved_from(other) else 'it sits as before'
-    return f'mounting: {", ".join(parts)}: {moved}'
+    return f'mounting: differs by {", ".join(parts)}: {moved}'
+
+
+def verdict_text(mount: Mount) -> str:
+    """Return a mounting's verdict, and why it is weak."""
+    return mount.verdict + (f' ({"; ".join(mount.reasons)})' if mount.reasons else '')
 
 
 def mount_text(mount: Mount) -> str:
     """Return how the camera sits on the car, with its verdict."""
-    def angle(name: str, value: float | None, words: tuple[str, str]) -> str:
-        sigma = mount.sigma[name]
-        if value is None or sigma is None:
-            return f'{words[0]} unknown'
-        return f'{abs(value):.2f} ± {sigma:.2f} ° {words[value < 0]}'
-
-    parts = [angle('yaw_left_deg', mount.yaw_left_deg, ('to the left', 'to the right')),
-             angle('pitch_up_deg', mount.pitch_up_deg, ('upwards', 'downwards')),
-             angle('roll_right_deg', mount.roll_right_deg, ('rolled right', 'rolled left'))]
+    parts = [angle_text(name, getattr(mount, name), mount.sigma[name]) for name in WAYS]
     height = mount.sigma['height_m']
     parts.append('height unknown without a speed' if mount.height_m is None or height is None
                  else f'{mount.height_m:.2f} ± {height:.2f} m above the road')
-    return (f'{mount.verdict}: looks {", ".join(parts)}; it travels towards pixel '
-            f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± {mount.travel_sigma_px:.1f}')
+    return (f'{verdict_text(mount)}: {", ".join(parts)}; the car travels towards pixel '
+            f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± {mount.travel_sigma_px:.1f} px')
 
 
 def witness_texts(witnesses: Witnesses) -> list[str]:
-    """Return a line for each sensor that says something of the focal length."""
+    """Return a line for each sensor that knows something of the focal length."""
     lines = []
-    for name, said in (('gyro', witnesses.gyro), ('GPS', witnesses.gps)):
-        if said is None:
+    for name, each in (('gyro', witnesses.gyro), ('GPS', witnesses.gps)):
+        if each is None:
             continue
-        text = (f'the {name} {"agrees" if said.agrees else "contradicts"}: fx off by '
-                f'{said.fx_percent:+.2f} ± {said.fx_sigma_percent:.2f} %')
-        if said.time_offset_s is not None and said.time_sigma_s is not None:
-            text += (f', its stamps late by {1e3 * said.time_offset_s:.0f} ± '
-                     f'{max(1e3 * said.time_sigma_s, 0.1):.1f} ms')
-        if said.scale_by_gps is not None:
-            text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*said.scale_by_gps)
+        text = (f'the {name} {"agrees" if each.agrees else "contradicts"}: fx off by '
+                f'{each.fx_percent:+.2f} ± {each.fx_sigma_percent:.2f} %')
+        if each.time_offset_s is not None and each.time_sigma_s is not None:
+            text += (f', its time stamps late by {1e3 * each.time_offset_s:.0f} ± '
+                     f'{max(1e3 * each.time_sigma_s, 0.1):.1f} ms')
+        if each.scale_by_gps is not None:
+            text += ', its angles {:.4f} ± {:.4f} times those of GPS'.format(*each.scale_by_gps)
         lines.append(text)
     return lines
 
 
-def since_start(turn: TurnSummary, calibration: Calibration) -> str:
+def since_start(turn: TurnSummary, calibration: CalibrationData) -> str:
     """Return when a turn was, in s since the start of the drive, as on the plot's axis."""
     return f'{turn.stamp_s - calibration.start_s:.1f}'
 
 
-def key_figures(c: Calibration) -> list[tuple[str, str, str]]:
+def key_figures(c: CalibrationData) -> list[tuple[str, str, str]]:
     """Return the figures that matter most: a name, a value, and what belongs to it."""
     yaw = c.yaw_deg
     found = [('turns used', f'{c.turns_used}',
-              f'of {len(c.turns) + len(c.stored_turns)} found, {yaw:.0f}° of yaw')]
+              f'of {len(c.turns) + len(c.stored_turns)} found, {yaw:.0f}° of yaw in all')]
     if c.camera is None:
         return [*found, ('images', f'{c.frames}', f'of {c.image_size[0]} × {c.image_size[1]} px'),
                 ('yaw of these turns', f'{yaw:.0f}°',
-                 f'at least {c.config.verdict.min_yaw_deg:.0f}° needed')]
+                 f'at least {c.config.verdict.min_yaw_deg:.0f}° are needed')]
     front, lone = [], c.caveat and f'; {c.caveat}'
     if c.sigma_px is not None:
         front.append(('uncertainty in the picture', optional(c.sigma_px.rms, 2, ' px'),
-                      f'RMS; {optional(c.sigma_px.worst, 2)} px at the worst{lone}'))
+                      f'RMS; {optional(c.sigma_px.worst, 2)} px at the worst place{lone}'))
     sigma = (c.sigma or {}).get('fx', math.nan)
     front.append(('focal length fx', f'{c.camera.fx:.1f} px',
                   (f'± {sigma:.1f} px, {100 * sigma / c.camera.fx:.2f} %'
@@ -146,39 +154,51 @@ def field_of_view(camera: Camera) -> tuple[float, float, float]:
     return float(angles[0]), float(angles[1]), float(angles[2:].max())
 
 
-def next_steps(c: Calibration) -> list[str]:
+def cures(verdict: Verdict) -> tuple[str, ...]:
+    """Return what to do next, the likeliest to help first."""
+    return verdict.cures or (NEXT[verdict.level],)
+
+
+def objections(verdict: Verdict) -> Iterator[tuple[str, str, str]]:
+    """Yield each reason of a verdict: its code, '' where it has none, what is wrong, the cure."""
+    for reason, code in zip_longest(verdict.reasons, verdict.codes, fillvalue=''):
+        cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), '')
+        yield code, reason.removesuffix(f': {cure}'), cure
+
+
+def next_steps(c: CalibrationData) -> list[str]:
     """Return what to do next, most useful first."""
     needed = c.config.verdict
     together = ('Short drives add up: with `--set turns.store=FOLDER`, each run uses the turns of '
                 'those before it.')
     if c.verdict.level == 'accepted':
-        steps = ['Give `calibration.yaml` to the camera driver, or copy the lines below.']
+        steps = ['Use `calibration.yaml` in the camera driver, or copy the lines below.']
         if (c.sigma or {}).get('fx', 0.0) > 0.005 * (c.camera.fx if c.camera else 1.0):
             steps.append('It can become more exact: another drive with sharp turns lowers the '
                          'uncertainty. ' + together)
         return [*steps,
-                'To check it, ask another drive of the same camera: '
+                'To check it with another drive of the same camera: '
                 '`dashcalib check calibration DRIVE`.',
                 'Calibrate again when the lens, the zoom, the focus or the video mode changes. '
                 'Moving the camera on the car changes nothing here.']
     yaw = c.yaw_deg
-    steps = ['First mend what the reasons above name.']
+    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in c.verdict.cures]
     if c.turns_used < c.config.turns.wanted or yaw < needed.min_yaw_deg:
-        steps.append(f'Then drive on: {c.config.turns.wanted} turns of 60° or more, at town '
+        steps.append(f'For the next drive: {c.config.turns.wanted} turns of 60° or more, at town '
                      f'speed, in daylight. At least {needed.min_turns} turns and '
                      f'{needed.min_yaw_deg:.0f}° together are needed; this drive has '
                      f'{c.turns_used} and {yaw:.0f}°. Turning on the spot does not count.')
     else:
-        steps.append('Then record another drive with turns of 60° or more, at town speed, in '
-                     'daylight, with little traffic ahead.')
+        steps.append('For the next drive: turns of 60° or more, at town speed, in daylight, with '
+                     'little traffic ahead.')
     steps.append(together)
     if c.verdict.level == 'weak':
         steps.append('To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.')
     return steps
 
 
-def run_facts(c: Calibration) -> list[tuple[str, str]]:
-    """Return what else is to be said of the run: a name, and a text."""
+def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
+    """Return what else is known of the run: a name, and a text."""
     facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
     for name, turns in (('turns', c.turns), ('turns of earlier drives', c.stored_turns)):
         if turns:
@@ -189,18 +209,20 @@ def run_facts(c: Calibration) -> list[tuple[str, str]]:
         facts.append(('reprojection error', f'{c.reprojection_error_px:.2f} px'))
     if c.sigma_px is not None:
         facts.append(('sigma over the picture',
-                      f'{c.sigma_px.rms:.2f} px RMS, {c.sigma_px.worst:.2f} px at the worst'))
+                      f'{c.sigma_px.rms:.2f} px RMS, {c.sigma_px.worst:.2f} px at the worst place'
+                      ))
     if c.rolling_shutter is not None:
         facts.append(('rolling shutter', f'{c.rolling_shutter.readout_ms:.1f} ± '
                                          f'{c.rolling_shutter.sigma_ms:.1f} ms, removed'))
+    if c.field is not None and c.field.used:
+        facts.append(('beside the lens model', c.field.text))
     if c.stabiliser is not None:
         facts.append(('stabiliser', f'moved the picture by up to {c.stabiliser.largest_px:.0f} '
                                     'px, removed'))
     if c.straight_lines is not None:
         lines = c.straight_lines
-        facts.append(('straight lines', f'{lines.lines} upright ones, bent by '
-                                        f'{lines.bend_px:.2f} px: k1 off by {lines.k1:+.4f} ± '
-                                        f'{lines.sigma:.4f}'))
+        facts.append(('upright lines', f'{lines.lines} found, bent by {lines.bend_px:.2f} px: k1 '
+                                       f'off by {lines.k1:+.4f} ± {lines.sigma:.4f}'))
     if c.mask is not None and not c.mask.all():
         facts.append(('not used', f'{100 * (1 - float(np.mean(c.mask))):.1f} % of the picture, '
                                   f'which moves with the car (bonnet, pillar, burnt-in text)'))
@@ -216,31 +238,7 @@ def optional(value: float | None, digits: int, unit: str = '') -> str:
     return '-' if value is None or not math.isfinite(value) else f'{value:.{digits}f}{unit}'
 
 
-def checks(calibration: Calibration) -> list[tuple[str, str, str, bool]]:
-    """Return the verdict's conditions that can be put in a number, those of the evidence first.
-
-    Each in words, what this drive has, what is needed, and whether it has it.
-    """
-    needed = calibration.config.verdict
-    count, yaw = calibration.turns_used, calibration.yaw_deg
-    found = [('turns used', f'{count}', f'at least {needed.min_turns}', count >= needed.min_turns),
-             ('yaw of these turns together', f'{yaw:.0f}°',
-              f'at least {needed.min_yaw_deg:.0f}°', yaw >= needed.min_yaw_deg)]
-    solution = None if calibration.material is None else calibration.material.solution
-    if solution is None:
-        return found
-    share = max(leverages(solution).values(), default=1.0)
-    return found + [(name, value, limit, rule(solution, needed) is None)
-                    for name, value, limit, rule in (
-        ('rise of the error when the focal length is 20 % off',
-         f'{100 * max(profile_contrast(solution), 0.0):.1f} %',
-         f'at least {100 * needed.min_contrast:.0f} %', flat_profile),
-        ('uncertainty of fx', f'{100 * float(solution.sigma[0] / solution.camera.fx):.2g} %',
-         f'at most {100 * needed.max_sigma:.3g} %', sigma_too_large),
-        ('scatter of fx between the turns', f'{100 * focal_disagreement(solution):.2g} %',
-         f'at most {100 * needed.max_disagreement:.3g} %', turns_disagree),
-        ('share of the turn that knows most of fx', f'{100 * min(share, 1.0):.0f} %',
-         f'at most {100 * needed.max_leverage:.0f} %', one_turn_dominates),
-        ('a turn’s error, over that with a camera of its own',
-         f'{max(solution.misfits.values(), default=0.0):.2g} times',
-         f'at most {needed.max_misfit:.2g} times', other_camera))]
+def conditions(verdict: Verdict) -> tuple[Condition, ...]:
+    """Return the conditions of a verdict; of one without any, its reasons."""
+    return verdict.conditions or tuple(Condition(code, what, '', '', False)
+                                       for code, what, _ in objections(verdict))

@@ -17,11 +17,10 @@ from dashcalib_ros.errors import DashcalibError, InputError, coded, counted, one
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.motion import SensorBuffer
-from dashcalib_ros.judge import Calibration, Check, Monitor, moved_text
+from dashcalib_ros.judge import Check, Monitor, moved_text
 from dashcalib_ros.judge.agreement import CONTRADICTS, outdated, turns_of_another_camera
 from dashcalib_ros.pipeline import Calibrator, Status
-from dashcalib_ros.questions import Questions
-from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.workers.memory import mapped_copy
 
 # s between two checks whether enough turns are built: scenes are finished without a push
@@ -164,7 +163,6 @@ class _Bank:
 
     number: int
     calibrator: Calibrator
-    questions: Questions
     depth: BitDepth = field(default_factory=BitDepth)
     tried: frozenset[TurnId] = frozenset()
     logged: frozenset[TurnId] = frozenset()
@@ -361,7 +359,7 @@ class Learner:
             bank.earlier = self._monitor
         # the same turns alone are not tried again
         bank.read |= turns
-        found = bank.questions.watch(camera.camera, camera.sigma)
+        found = bank.calibrator.watch(camera.camera, camera.sigma)
         if bank.earlier is not None:
             found = reduce(Monitor.after, found.readings, bank.earlier)
         if found.lens and found.lens.confirmed and found.lens.since.of_this_drive:
@@ -398,7 +396,7 @@ class Learner:
                 # both have the same clock, whichever it is
                 bank.calibrator.sense(replace(stream.shifted(-found.start_s), absolute=False))
             calibration = bank.calibrator.calibrate(self._progress, final=False)
-            check = None if given is None else bank.questions.check(
+            check = None if given is None else bank.calibrator.check(
                 given.camera, calibration, self._progress)
             of_another = turns_of_another_camera(calibration.misfits, self._goal.config.verdict)
             bank.calibrator.scenes.exclude(dict.fromkeys(

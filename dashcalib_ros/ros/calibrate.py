@@ -12,7 +12,7 @@ from dashcalib_ros.errors import InputError, OutputError, coded
 from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge import Calibration
 from dashcalib_ros.judge.calibration import Mount
-from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.report.wording import mount_text, mounts_text
 from dashcalib_ros.ros.background import Goal, Result
 from dashcalib_ros.ros.car import Mounting
@@ -312,7 +312,4 @@ class Calibrating:
 
 def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:
     """Return the camera as a message; rectified: as ros_camera()'s."""
-    c = ros_camera(camera, rectified)
-    width, height = c.image_size
-    return CameraInfo(header=header, width=width, height=height,
-                      distortion_model=c.distortion_model, d=c.d, k=c.k, r=c.r, p=c.p)
+    return CameraInfo(header=header, **vars(ros_camera(camera, rectified)))

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -23,7 +22,7 @@ from sensor_msgs.msg import CompressedImage
 
 from dashcalib_ros.arrays import GreyImage, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.camera_info import rectified_matrix
+from dashcalib_ros.camera.remap import rectify
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.estimator import TrackedPoints
 from dashcalib_ros.ros.endpoints import Endpoints
@@ -42,8 +41,6 @@ TINT = (-80, -80, 60)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 # binary digits after the point that cv2 draws with
 SHIFT = 4
-# outside of the picture, for pixels that the camera does not see
-NOWHERE = -1e6
 
 
 @dataclass(frozen=True)
@@ -125,7 +122,7 @@ class Preview:
             self._send(self._overlay, picture, overlay(picture, text))
         fits = camera is not None and camera.image_size == picture.image.shape[::-1]
         if camera is not None and fits and self._rectified.get_subscription_count():
-            self._send(self._rectified, picture, rectified(picture.image, camera, self._view))
+            self._send(self._rectified, picture, rectify(picture.image, camera, self._view))
 
     def _send(self, publisher: Publisher, picture: Picture, drawn: npt.NDArray[np.uint8]) -> None:
         _, data = cv2.imencode('.jpg', drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
@@ -168,27 +165,3 @@ def _write(drawn: Any, text: str) -> None:
     drawn[height - bar:] //= 4
     cv2.putText(drawn, text, (margin, height - below - margin // 2), FONT, scale, INK, thickness,
                 cv2.LINE_AA)
-
-
-def rectified(image: GreyImage, camera: Camera, view: str) -> GreyImage:
-    """Return (h, w), as a camera with P of camera_info sees it; black where it sees nothing.
-
-    image: of the camera's size. view: what the picture shows, the setting `rectified`.
-    """
-    # cv2's stubs do not know that both maps may be in one
-    remap: Any = cv2.remap
-    return np.asarray(remap(image, _places(camera, view), None, cv2.INTER_LINEAR), np.uint8)
-
-
-@lru_cache(maxsize=1)
-def _places(camera: Camera, view: str) -> npt.NDArray[np.float32]:
-    """Return (h, w, 2): where each pixel of the rectified picture is in the image, px."""
-    matrix = rectified_matrix(camera, view)
-    width, height = camera.image_size
-    x = (np.arange(width) - matrix[0, 2]) / matrix[0, 0]
-    places = np.empty((height, width, 2), np.float32)
-    for row in range(height):  # rays of a whole large picture are some 100 MB
-        y = np.full(width, (row - matrix[1, 2]) / matrix[1, 1])
-        rays = np.stack([x, y, np.ones(width)], axis=-1)
-        places[row] = np.nan_to_num(camera.project(rays), nan=NOWHERE)
-    return places

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dashcalib_ros.errors import counted
-from dashcalib_ros.judge import Calibration
+from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import contradicted
 from dashcalib_ros.judge.verdict import STEADY
 from dashcalib_ros.report import NamedCamera
@@ -39,7 +39,7 @@ class Judgement:
     confirmed: bool = False
 
 
-def judge(new: Calibration, complete: bool, published: NamedCamera | None, contradictions: int,
+def judge(new: CalibrationData, complete: bool, published: NamedCamera | None, contradictions: int,
           limits: NodeConfig) -> Judgement:
     """Decide about a calibration.
 
@@ -88,7 +88,7 @@ def sigma_text(camera: NamedCamera) -> str:
     return ', '.join(parts)
 
 
-def outcome_text(calibration: Calibration, why: str) -> str:
+def outcome_text(calibration: CalibrationData, why: str) -> str:
     """Return a line about a calibration that is not adopted; why: the reasons."""
     level = calibration.verdict.level
     parts = [f'a calibration of {counted(calibration.turns_used, "turn")} is {level}'

@@ -19,18 +19,12 @@ import yaml
 
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.errors import InputError, OutputError
-from dashcalib_ros.judge import Calibration
+from dashcalib_ros.formats import calibrated_camera, calibration_yaml
+from dashcalib_ros.formats.load import parse_camera
+from dashcalib_ros.formats.ros import matrix_block, yaml_text
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
-from dashcalib_ros.report import (
-    NamedCamera,
-    calibrated_camera,
-    calibration_yaml,
-    set_aside,
-    write_text,
-)
-from dashcalib_ros.report.camera_file import parse_camera, read_mount
-from dashcalib_ros.report.result import matrix_block, yaml_text
+from dashcalib_ros.report import Calibration, NamedCamera, set_aside, write_text
 from dashcalib_ros.whole_files import remove_leftovers
 
 # camera_info_manager's
@@ -119,7 +113,7 @@ class Kept:
         edited = not older and own.get(CHECKSUM) != _checksum(content)
         return cls(camera, None if frame_id is None else str(frame_id), content,
                    count if type(count) is int and count > 0 else 0, edited,
-                   None if edited else read_mount(own.get('mount')))
+                   None if edited else camera.mount)
 
     @property
     def text(self) -> str:

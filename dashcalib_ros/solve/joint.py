@@ -117,7 +117,7 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
     unlike = misfits(per_turn, best.seen_by_lens, best.camera, config.scene.error_px)
     tests = fixed_camera_tests(best)
     if config.intrinsics.crop_rounds and moves(tests):
-        progress('looking how the picture moves', 0.0)
+        progress('testing whether the picture moves', 0.0)
         best = _steadied(best, measured, config)
         tests = fixed_camera_tests(best)
     return _solution(best, unlike, start.profile, tried, tests, progress)

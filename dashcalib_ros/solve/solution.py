@@ -40,8 +40,8 @@ class Solution:
     the kinds of lenses that were compared. fixed_camera: the tests whether it is one, the clearest
     that it is not first. crops: by turn (k, 2) px, how far a stabiliser moved each keyframe's
     picture; empty for a fixed picture. field_sigma: px, of the prior of the field's directions.
-    alone: the solution of the pictures alone, where a gyro's angles are in this one. px: of the
-    input's pictures, in one pixel of the scenes.
+    by_pictures: the solution of the pictures alone, where a gyro's angles are in this one. px: of
+    the input's pictures, in one pixel of the scenes.
     """
 
     written: Written
@@ -58,7 +58,7 @@ class Solution:
     fixed_camera: tuple[FixedCameraTest, ...] = ()
     crops: Mapping[TurnId, Floats] = default(default_factory=dict)
     field_sigma: float = 0.0
-    alone: Solution | None = None
+    by_pictures: Solution | None = None
     px: float = 1.0
 
     @property

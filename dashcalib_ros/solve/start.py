@@ -83,9 +83,9 @@ def retriangulate(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
     return retriangulated(scene, camera, config.error_px, config.min_angle_deg)
 
 
-def rechain(scene: Scene, camera: Camera, config: SceneConfig, seed: int) -> Scene | None:
+def rechain(scene: Scene, camera: Camera, config: Config) -> Scene | None:
     """Return the scene chained anew from its tracks, None if no pair of images starts a chain."""
-    return chain_scene(scene.tracks, scene.turn, camera, scene.profile, config, seed)
+    return chain_scene(scene.tracks, scene.turn, camera, scene.profile, config)
 
 
 def with_few_tracks(scene: Scene) -> Scene:
@@ -110,7 +110,7 @@ def is_far(scene: Scene, camera: Camera) -> bool:
 def adapted_to(scene: Scene, camera: Camera, config: Config) -> Scene:
     """Return the scene with this camera, chained anew if its own camera was far from it."""
     if is_far(scene, camera):
-        anew = rechain(scene, camera, config.scene, config.seed)
+        anew = rechain(scene, camera, config)
         if anew is not None:
             return anew
     return retriangulate(scene, camera, config.scene)
@@ -135,7 +135,7 @@ def explained_by(scenes: Sequence[Scene], measured: Mapping[TurnId, Scene], came
 
 def _rechained(scene: Scene, camera: Camera, config: Config) -> Scene:
     """Return the scene chained anew with a camera that is nearly right, else triangulated anew."""
-    anew = rechain(scene, camera, config.scene, config.seed)
+    anew = rechain(scene, camera, config)
     return (retriangulate(scene, camera, config.scene) if anew is None
             else _readjusted(anew, camera, config.scene))
 
@@ -209,7 +209,8 @@ def scene_with(camera: Camera, scene: Scene, config: Config) -> Scene | None:
     width = camera.image_size[0]
     generous = replace(config.scene, error_px=max(config.scene.error_px,
                                                   config.scene.chain_error * width))
-    anew = rechain(scene, camera, generous, config.seed) if is_far(scene, camera) else None
+    anew = (rechain(scene, camera, replace(config, scene=generous)) if is_far(scene, camera)
+            else None)
     found = [_with_fixed(camera, each, generous, config)
              for each in (scene, anew) if each is not None]
     return min((each for each in found if each is not None), default=None,
@@ -263,7 +264,8 @@ def _probed(scenes: Sequence[Scene], camera: Camera, coarse: Profile, config: Co
     if not PROBES[0] < coarse.best * width / camera.fx < PROBES[-1]:
         fixed = type(camera).centred(camera.image_size, coarse.best * width)
         settings = settings_at(fixed)
-        anew = [rechain(scene, fixed, settings, config.seed) or scene for scene in scenes]
+        anew = [rechain(scene, fixed, replace(config, scene=settings)) or scene
+                for scene in scenes]
         costs[coarse.best] = _cost_at(anew, fixed, settings)
     ratios = sorted(costs)
     observations = sum(int(scene.tracks.seen.sum()) for scene in scenes)

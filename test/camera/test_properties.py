@@ -49,7 +49,7 @@ def test_a_pixel_that_has_a_ray_is_where_the_ray_is_seen(model: type[Camera],
 def test_a_camera_is_the_same_after_ros(model: type[Camera], data: st.DataObject) -> None:
     camera = data.draw(cameras(model))
     told = ros_camera(camera)
-    again = camera_from_ros(told.image_size, told.distortion_model, told.k, told.d)
+    again = camera_from_ros((told.width, told.height), told.distortion_model, told.k, told.d)
     # the simplest model that has all of them
     assert np.array_equal(*(np.trim_zeros(each.ros_distortion(), 'b') for each in (again, camera)))
     assert np.array_equal(again.params[:4], camera.params[:4])

@@ -16,11 +16,10 @@ from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import command, main
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
+from dashcalib_ros.formats import result_json
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
 from dashcalib_ros.pipeline import Calibrator
-from dashcalib_ros.questions import Questions
-from dashcalib_ros.report import result_json
 from dashcalib_ros.solve.quadratic import Quadratic
 from dashcalib_ros.solve.spread import PictureSigma
 
@@ -30,6 +29,9 @@ class FakeCalibrator:
     """Answers at once with what the test wants."""
 
     mount = None
+    answer = 'right'
+    asked: object = None
+    fits = 5
 
     def __init__(self, config=None, mask=None, verbose=False):
         pass
@@ -43,44 +45,31 @@ class FakeCalibrator:
     def calibrate(self, progress=None):
         return make_calibration(warnings=('dark',), mount=self.mount)
 
-    def close(self):
-        pass
-
-
-@stands_in_for(Questions)
-class FakeQuestions:
-    """Answers at once with what the test wants."""
-
-    answer = 'right'
-    asked: object = None
-    fits = 5
-
-    def __init__(self, calibrator):
-        pass
-
     def check(self, given, calibration, progress=None, name='CALIBRATION'):
         type(self).asked = given
         return Check(self.answer, ('it is 0.2 px off',), 0.2, 0.5, PictureSigma(0.1, 0.2), 1.5,
                      4.7, 0.001)
 
-    def odometry(self, given, calibration, poses, progress=None):
+    def odometry(self, given, poses, progress=None):
         rotations, places = np.array([np.eye(3)] * 4), np.arange(12.0).reshape(4, 3)
         path = TurnPath(rotations, places)
         turn = TurnOdometry(TurnId.at(88), np.arange(4) * 10**8, path,
                             {'given': path, 'ours': path, 'guess': path})
         return Odometry(('given', 'ours', 'guess'), (turn,))
 
-    def watch(self, camera, sigma=None, progress=None):
+    def watch(self, camera, sigma=None):
         seen = [Reading(TurnId.at(n), Quadratic.prior(100 * np.eye(6)), None, n < self.fits)
                 for n in range(5)]
         return watch(seen, camera, sigma, Config().monitor)
+
+    def close(self):
+        pass
 
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     """Make a drive, a calibration and a file of poses; return the command's first arguments."""
     monkeypatch.setattr('dashcalib_ros.session.Calibrator', FakeCalibrator)
-    monkeypatch.setattr('dashcalib_ros.session.Questions', FakeQuestions)
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'drive').mkdir()
     for n in range(3):
@@ -94,17 +83,17 @@ def files(tmp_path, monkeypatch):
 @pytest.mark.parametrize(('answer', 'code'), [('right', 0), ('differs', 0), ('wrong', 1),
                                              ('cannot tell', 3)])
 def test_the_answer_is_shown_and_is_the_exit_code(files, monkeypatch, capfd, answer, code):
-    monkeypatch.setattr(FakeQuestions, 'answer', answer)
+    monkeypatch.setattr(FakeCalibrator, 'answer', answer)
     assert main(files) == code
     out, errors = capfd.readouterr()
     assert out.splitlines()[0] == f'answer: {answer}' and 'it is 0.2 px off' in out
-    assert 'dark' in errors and FakeQuestions.asked == TRUTH
+    assert 'dark' in errors and FakeCalibrator.asked == TRUTH
 
 
 def test_a_bag_s_own_calibration_is_checked(files, tmp_path, capfd):
     write_bag(tmp_path / 'bag', [*images(drive(3)), ('/camera_info', START, info_of(TRUTH))])
-    FakeQuestions.asked = None
-    assert main(['check', 'bag']) == 0 and FakeQuestions.asked == TRUTH
+    FakeCalibrator.asked = None
+    assert main(['check', 'bag']) == 0 and FakeCalibrator.asked == TRUTH
     assert main(['check', 'bag', '--topic', '/camera']) == 0
     write_bag(tmp_path / 'without', images(drive(3)))
     assert main(['check', 'without']) == 2
@@ -120,7 +109,7 @@ def test_a_calibration_of_the_stored_pictures_is_checked_as_it_is_shown(files, t
         (tmp_path / 'given.json').write_text(json.dumps(
             given.named | {'width': given.image_size[0], 'height': 64}))
         assert main(['check', 'given.json', 'wide.mp4']) == 0
-        assert FakeQuestions.asked == shown
+        assert FakeCalibrator.asked == shown
     assert 'not square' in capfd.readouterr().err
 
 
@@ -179,13 +168,13 @@ def test_wrong_motion_arguments_are_one_line(files, tmp_path, capfd, more, line)
 
 
 def test_a_change_during_the_drive_is_told(files, monkeypatch, capfd):
-    monkeypatch.setattr(FakeQuestions, 'fits', 3)
+    monkeypatch.setattr(FakeCalibrator, 'fits', 3)
     assert main(files) == 0
     assert 'since the turn at frame 3' in capfd.readouterr().out
 
 
 def test_a_calibration_that_never_fitted_has_not_changed(files, monkeypatch, capfd):
-    monkeypatch.setattr(FakeQuestions, 'fits', 0)
+    monkeypatch.setattr(FakeCalibrator, 'fits', 0)
     assert main(files) == 0
     assert 'since' not in capfd.readouterr().out
 
@@ -193,7 +182,7 @@ def test_a_calibration_that_never_fitted_has_not_changed(files, monkeypatch, cap
 def test_poses_are_compared_and_paths_are_written(files, tmp_path, capfd):
     assert main([*files, '--poses', 'poses.txt', '--out', 'paths']) == 0
     out = capfd.readouterr().out
-    assert 'rotation error' in out and 'paths/paths.svg' in out
+    assert 'rotation error' in out and 'written: paths' in out
     assert (tmp_path / 'paths' / 'turn_000088_ours.tum').exists()
 
 
@@ -213,7 +202,7 @@ def test_bad_input_is_one_line(files, capfd, arguments, match):
 def test_what_nobody_expected_is_no_answer(files, monkeypatch, capfd):
     def fail(*_):
         raise ZeroDivisionError('of a defect')
-    monkeypatch.setattr(FakeQuestions, 'check', fail)
+    monkeypatch.setattr(FakeCalibrator, 'check', fail)
     monkeypatch.setattr(sys, 'argv', ['dashcalib', *files, '--verbose'])
     # Python's own exit code, 1, would be "wrong"
     with pytest.raises(SystemExit) as ended:

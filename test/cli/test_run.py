@@ -20,7 +20,8 @@ from processes import processes_of
 from waiting import wait_for
 
 from dashcalib_ros.camera import Radial, camera_of
-from dashcalib_ros.report import NamedCamera, compare, load_camera
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.report import NamedCamera, compare
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
 COMMAND = (sys.executable, '-m', 'dashcalib_ros.cli')

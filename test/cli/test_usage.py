@@ -24,9 +24,10 @@ from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.cli import main
 from dashcalib_ros.cli.arguments import COMMANDS, JSON, KINDS, LENSES, MODELS
 from dashcalib_ros.cli.terminal import show, warn
+from dashcalib_ros.config import Config
 from dashcalib_ros.demo import DEMOS
+from dashcalib_ros.formats.export import EXPORTS
 from dashcalib_ros.report import write_results
-from dashcalib_ros.report.export import EXPORTS
 from dashcalib_ros.report.tables import line
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
@@ -155,7 +156,8 @@ def test_the_shell_completes(tmp_path, line, expected):
 
 def test_version():
     done = dashcalib('--version')
-    assert (done.returncode, done.stdout) == (0, f'dashcalib {dashcalib_ros.__version__}\n')
+    assert (done.returncode, done.stdout) == (
+        0, f'dashcalib {dashcalib_ros.__version__} (poses: {Config().reconstruct.used})\n')
     assert dashcalib('-V').stdout == done.stdout
 
 
@@ -262,7 +264,7 @@ def test_a_lens_profile_has_the_readout_time_of_its_rows(here, results, tmp_path
 def test_export_to_what_there_is_not(here, results):
     done = here('export', results / 'a', '--to', 'matlab')
     assert_one_line_error(done)
-    assert 'opencv, colmap, kalibr' in done.stderr
+    assert ', '.join(EXPORTS) in done.stderr
     assert_one_line_error(here('export', results / 'missing', '--to', 'ros'))
 
 

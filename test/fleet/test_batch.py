@@ -190,7 +190,7 @@ def test_a_clip_that_kills_its_worker_is_set_aside(manifest, tmp_path):
     class Deadly(Here):
         def call(self, function, *arguments, progress=None):
             if getattr(arguments[1], 'number', None) == 2:
-                raise WorkerDiedError('the worker died')
+                raise WorkerDiedError('E-WORKER-DIED', 'the worker died')
             return super().call(function, *arguments)
 
     for worker in (Deadly(), Here()):

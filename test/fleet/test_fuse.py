@@ -10,7 +10,7 @@ from synthetic import LENS
 
 from dashcalib_ros.fleet import solved
 from dashcalib_ros.fleet.fuse import fuse
-from dashcalib_ros.reconstruct.scene_file import Origin
+from dashcalib_ros.store.scene_file import Origin
 
 FEW = {'tracks': 80, 'keyframes': 8}
 CLIPS = {f'{n}.mp4': clip_of(yaws=YAWS[n:n + 1], world=n, **FEW) for n in range(4)}

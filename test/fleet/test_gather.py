@@ -13,7 +13,7 @@ from dashcalib_ros.fleet import clips
 from dashcalib_ros.fleet.clips import content_hash, gather, gather_clip, settings_hash
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.input import Frame
-from dashcalib_ros.reconstruct.scene_file import decoded, encoded
+from dashcalib_ros.store.scene_file import decoded, encoded
 
 
 def test_the_content_and_the_settings_are_the_identity(tmp_path):

@@ -19,7 +19,8 @@ from dashcalib_ros.fleet.lens_prior import (
     priors,
 )
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved, final_of, unit_of
-from dashcalib_ros.judge import Calibration, Verdict
+from dashcalib_ros.judge import Verdict
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.solve.spread import PictureSigma
 
 CONFIG = FleetConfig()

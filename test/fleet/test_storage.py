@@ -104,7 +104,7 @@ def test_what_is_no_regular_file_is_not_read(tmp_path):
     for place in ('m.csv', 'm.jsonl', 'm.parquet'):
         if place != 'm.csv':
             (tmp_path / place).symlink_to('/dev/zero')
-        with pytest.raises(InputError, match='no regular file'):
+        with pytest.raises(InputError, match='not a regular file'):
             read_manifest(str(tmp_path / place))
     pytest.importorskip('fsspec')
     with pytest.raises(InputError) as caught:

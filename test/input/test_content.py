@@ -24,8 +24,8 @@ from refused import refused
 from rosbags.rosbag2 import StoragePlugin
 
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.formats import load_camera
 from dashcalib_ros.input.inputs import fits_bag, is_video, open_frames
-from dashcalib_ros.report import load_camera
 
 ODD = ('VID_20260701_101010_00_001.insv', 'drive.dav', 'drive', 'drive.mp4.part', 'drive.mcap',
        'drive.jpg.bak')

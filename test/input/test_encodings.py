@@ -24,11 +24,10 @@ from rosbags.typesys import Stores
 from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.cli import main
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.formats import export, load_camera
 from dashcalib_ros.input.bag_write import check_bag, first_camera_info, write_bag
 from dashcalib_ros.input.encodings import message_of, types
 from dashcalib_ros.input.inputs import open_frames
-from dashcalib_ros.report import load_camera
-from dashcalib_ros.report.export import exported
 
 LENS = Radial(SIZE, 50.0, 51.0, 31.0, 23.0, -0.1, 0.01)
 FURTHER = types(Stores.ROS2_JAZZY)
@@ -277,7 +276,7 @@ def test_foxglove_s_calibrations_are_read(tmp_path, encoding, camera, model):
 
 @pytest.mark.parametrize('camera', [LENS, FISHEYE])
 def test_a_calibration_for_foxglove(tmp_path, camera):
-    text = exported(camera, 'foxglove')
+    text = export(camera, 'foxglove')
     found = json.loads(text)
     assert found['distortion_model'] == (
         'kannala_brandt' if camera is FISHEYE else 'plumb_bob')

@@ -97,6 +97,17 @@ def test_the_farther_off_the_graver_the_answer(solution, noise, way, sign):
                                               and each.bound_px <= SURE * limit)
 
 
+def test_a_small_difference_is_not_called_wrong_where_the_drive_knows_little():
+    # k1 is known well, and the focal length to 2 %: the difference is real, its size is not known
+    covariance = np.diag([0.02 * LENS.fx, 0.02 * LENS.fy, 0.3, 0.3, 0.0003, 0.0003])**2
+    given = replace(LENS, k1=LENS.k1 + 0.005)
+    found = Difference(given, LENS, given.params - LENS.params, covariance, apart(given, LENS),
+                       PictureSigma(5.0, 9.0))
+    assert found.told_apart and found.rms_px < found.limits_px['detection']
+    assert (found.answer, found.matters, found.good_for) == ('cannot tell', None, ())
+    assert 'may be too large' in answers_of(found, '')[0]
+
+
 def test_the_middle_answer_is_given(solution):
     found = ask(solution.camera.with_focal(1.006 * solution.camera.fx), solution)
     assert (found.answer, found.good_for, found.told_apart) == ('differs', ('detection',), True)

@@ -65,7 +65,7 @@ def test_another_distortion_is_not_told_as_a_focal_length(readings):
                 each.cost, score=each.cost.hessian @ (0, 0, 0, 0, 0.03, 0)))
             for each in readings['same'][:2]]
     [change] = watched(driven(*readings['same'], *bent)).changes
-    assert change.looks_like == ('its distortion were another',)
+    assert change.looks_like == ('its distortion were different',)
 
 
 def test_turns_that_cannot_tell_focal_length_from_distortion_leave_it_open(readings):
@@ -77,7 +77,7 @@ def test_turns_that_cannot_tell_focal_length_from_distortion_leave_it_open(readi
     after = [replace(each, cost=replace(each.cost, score=score)) for each in before[:2]]
     [change] = watched(driven(*before, *after)).changes
     assert change.looks_like == ('its focal length were 0.8 to 2.6 % too short',
-                                 'its distortion were another')
+                                 'its distortion were different')
 
 
 def test_turns_before_a_change_make_up_for_a_calibration_that_is_known_badly(readings):

@@ -14,13 +14,15 @@ from solving import LENS, scenes_of, solved, with_camera, with_covariance
 from synthetic import KEYFRAME_S
 
 from dashcalib_ros import judge
+from dashcalib_ros.camera.rotation import OPTICAL
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.straights import PAIRS, POINTS, StraightCollector, Straights
+from dashcalib_ros.formats import load_calibration
 from dashcalib_ros.input.scale import FULL_SIZE
 from dashcalib_ros.judge import conclude
-from dashcalib_ros.judge.calibration import OPTICAL, Mount
+from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.mount import mount_of
-from dashcalib_ros.report import load_calibration, write_results
+from dashcalib_ros.report import write_results
 
 HEIGHT_M, SPEED = 1.45, 12.0
 SPACING_S = 0.6

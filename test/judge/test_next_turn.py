@@ -32,7 +32,7 @@ def test_it_is_what_the_next_turns_bring(four, count, more):
 
 
 def test_a_single_turn_is_told_what_two_more_bring(four):
-    assert re.fullmatch(r'two more right angles: fx to about [\d.]+ %',
+    assert re.fullmatch(r'two more right-angle turns: fx known to about [\d.]+ %',
                         next_turn(first(four, 1)))
 
 
@@ -46,12 +46,13 @@ def test_where_nothing_is_known_nothing_is_told(four):
 def test_a_verdict_tells_it_with_the_first_cure(four):
     verdict = judge(four, NEEDS_MORE, outlook=True)
     assert verdict.level == 'weak'
-    assert re.search(r'one more right angle: fx to about [\d.]+ %\)$', verdict.reasons[0])
+    assert verdict.reasons[0].endswith(f' ({next_turn(four)})') and next_turn(four)
     assert verdict.reasons[0].endswith(': ' + verdict.cures[0])
 
 
 def test_where_something_contradicts_the_result_more_turns_are_no_cure(four):
     strange = dataclasses.replace(NEEDS_MORE, max_aspect=0.0)
     verdict = judge(four, strange, outlook=True)
-    assert len(verdict.reasons) == 2 and 'right angle' not in ' '.join(verdict.reasons)
+    assert verdict.codes == ('E-FEW-TURNS', 'E-PIXEL-ASPECT')
+    assert next_turn(four) not in ' '.join(verdict.reasons)
     assert judge(four, CONFIG.verdict, outlook=True).reasons == ()

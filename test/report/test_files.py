@@ -15,9 +15,9 @@ import yaml
 from made_calibration import TRUTH, make_calibration
 
 from dashcalib_ros.errors import OutputError
+from dashcalib_ros.formats import load_camera
 from dashcalib_ros.report import (
     check_writable,
-    load_camera,
     output_folder,
     set_aside,
     write_results,
@@ -104,8 +104,9 @@ def test_what_cannot_be_moved_is_an_error_and_leaves_no_empty_backup(tmp_path, m
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
     (tmp_path / 'camera.yaml').write_text('x')
     monkeypatch.setattr(Path, 'replace', refuse)
-    with pytest.raises(OutputError, match=r'camera\.yaml could not be moved aside.*move it'):
+    with pytest.raises(OutputError, match=r'camera\.yaml') as caught:
         set_aside(tmp_path / 'camera.yaml')
+    assert caught.value.code == 'E-FILE-NOT-MOVED'
     assert names(tmp_path) == ['camera.yaml']
 
 
@@ -162,8 +163,9 @@ def test_a_full_disk_changes_nothing(tmp_path, monkeypatch, failing):
         if len(calls) == failing:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     monkeypatch.setattr(os, 'fsync', full)
-    with pytest.raises(OutputError, match=r'No space left.*free some space'):
+    with pytest.raises(OutputError, match='No space left') as caught:
         write_results(make_calibration(), tmp_path)
+    assert caught.value.code == 'E-DISK-FULL'
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -178,17 +180,18 @@ def test_ctrl_c_while_writing_leaves_nothing(tmp_path, monkeypatch):
 
 def test_a_folder_in_the_way_is_told_and_nothing_is_written(tmp_path):
     (tmp_path / 'report.html').mkdir()
-    with pytest.raises(OutputError, match=r'report\.html.*move it'):
+    with pytest.raises(OutputError) as caught:
         write_results(make_calibration(), tmp_path)
+    assert caught.value.code == 'E-NAME-TAKEN'
     assert names(tmp_path) == ['report.html']
 
 
 def test_a_file_where_the_folder_should_be(tmp_path):
     (tmp_path / 'out').write_text('I was here')
-    with pytest.raises(OutputError, match='choose another output folder'):
-        check_writable(tmp_path / 'out')
-    with pytest.raises(OutputError, match='choose another output folder'):
-        check_writable(tmp_path / 'out' / 'deeper')
+    for folder in (tmp_path / 'out', tmp_path / 'out' / 'deeper'):
+        with pytest.raises(OutputError) as caught:
+            check_writable(folder)
+        assert caught.value.code == 'E-NAME-TAKEN' and str(folder) in str(caught.value)
     assert (tmp_path / 'out').read_text() == 'I was here'
 
 
@@ -196,8 +199,9 @@ def test_a_place_that_may_not_be_written(tmp_path, monkeypatch):
     def refuse(self, *args, **options):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
     monkeypatch.setattr(Path, 'open', refuse)
-    with pytest.raises(OutputError, match='you may write to'):
+    with pytest.raises(OutputError) as caught:
         check_writable(tmp_path)
+    assert caught.value.code == 'E-NOT-WRITABLE'
 
 
 def test_checking_leaves_an_empty_folder(tmp_path):

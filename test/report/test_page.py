@@ -14,6 +14,7 @@ from page_reader import Page
 from rich.console import Console
 
 from dashcalib_ros.config import Config
+from dashcalib_ros.judge.verdict import verdict_of, yaw_in_all
 from dashcalib_ros.report import report_html
 from dashcalib_ros.report.charts import log_ticks, magnitude_svg, mask_data_uri, ticks
 from dashcalib_ros.report.tables import summary
@@ -147,9 +148,12 @@ def test_settings_that_were_changed_are_named():
 
 @pytest.mark.parametrize('level', ['weak', 'refused'])
 def test_what_is_missing_is_told_in_numbers(level):
-    text = Page(report_html(make_calibration(level, turns=make_calibration().turns[1:]))).text
+    missing = dataclasses.replace(yaw_in_all(0.0, Config().verdict), level=level)
+    text = Page(report_html(make_calibration(
+        level, turns=make_calibration().turns[1:], verdict=verdict_of([missing])))).text
+    assert missing.what in text
     assert 'this drive has 0 and 0°' in text
-    assert re.search(r'yaw of these turns together\s+0°\s+at least 60°\s+✗', text)
+    assert re.search(r'yaw of these turns together\s+E-LITTLE-YAW\s+0°\s+at least 60°\s+✗', text)
 
 
 def test_the_mask_s_tint_is_the_mask():

@@ -5,14 +5,17 @@ import dataclasses
 import io
 import re
 
+import numpy as np
 import pytest
-from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_calibration
+from made_calibration import EACH_MODEL, MOUNT, SIGMA, TRUTH, calibration_of, make_calibration
+from page_reader import Page
 from rich.console import Console
 
 from dashcalib_ros.camera import Fisheye, Radial
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.judge import Verdict
-from dashcalib_ros.judge.calibration import Shutter, Stabiliser
-from dashcalib_ros.report import NamedCamera, compare
+from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser
+from dashcalib_ros.report import NamedCamera, compare, report_html
 from dashcalib_ros.report.tables import against_truth, comparison, conclusion, next_step, summary
 from dashcalib_ros.solve.spread import PictureSigma
 
@@ -55,7 +58,32 @@ def test_the_conclusion_is_verdict_reasons_and_what_to_do():
             '  the zoom changes', '  without cure']
     last = terminal(next_step(Verdict('accepted')))
     assert last.startswith('next: ') and 'calibration.yaml' in last
-    assert terminal(next_step(verdict)) == 'next: drive sharper turns'
+    assert terminal(next_step(verdict)).splitlines() == [
+        'next: drive sharper turns', 'also: fix the zoom']
+
+
+def test_a_reason_has_its_code():
+    verdict = Verdict('weak', ('few: drive', 'no code'), ('drive',), ('E-FEW-TURNS',))
+    assert terminal(conclusion(verdict)).splitlines()[1:] == ['  few [E-FEW-TURNS]', '  no code']
+
+
+def test_terminal_and_page_describe_a_mounting_alike():
+    mount = dataclasses.replace(MOUNT, verdict='weak', reasons=('the lens is weak',),
+                                yaw_left_deg=-2.0, pitch_up_deg=-1.0)
+    calibration = make_calibration(mount=mount)
+    shown = terminal(summary(calibration), 200), Page(report_html(calibration)).text
+    for text in shown:
+        assert 'weak (the lens is weak)' in text
+        for angle in ('yaw 2.00 ± 0.10° to the right', 'pitch 1.00 ± 0.10° down'):
+            assert angle in text.lower()
+        assert '-2.00' not in text and '-1.00' not in text
+
+
+def test_the_summary_says_that_a_field_is_used():
+    field = LensField(Field(TRUTH.image_size, np.zeros((2, 5))), True, 0.31, 0.7, 0.52)
+    text = terminal(summary(make_calibration(field=field)))
+    assert 'a smooth field of 0.3 px, below its sigma of 0.5 px' in text
+    assert 'field' not in terminal(summary(make_calibration()))
 
 
 @pytest.mark.parametrize(('level', 'colour'), [('accepted', '32'), ('weak', '33'),

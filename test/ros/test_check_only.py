@@ -70,6 +70,18 @@ class Core:
         return Calibration(Verdict('accepted'), (320, 240), FIRST, SIGMA, turns, 10, 0.3, {}, {},
                            Config())
 
+    def check(self, given, calibration, progress=None):
+        right = given.fx == calibration.camera.fx
+        if self.dark:
+            return Check('cannot tell', ('too dark',))
+        if self.near:
+            return Check('differs', ('differs by 1.0 px, good enough',), 1.0, 2.0)
+        return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
+
+    def watch(self, camera, sigma=None):
+        return watch((Reading(turn, KNOWS, None, turn not in self.strangers)
+                      for turn in self.ready), camera, sigma, Config().monitor)
+
     def close(self):
         pass
 
@@ -91,31 +103,10 @@ class Scenes:
         pass
 
 
-@stands_in_for(Questions)
-class Asked:
-    """In the Questions' place: answers with what the core's turns show."""
-
-    def __init__(self, calibrator):
-        self.core = calibrator
-
-    def check(self, given, calibration, progress=None):
-        right = given.fx == calibration.camera.fx
-        if self.core.dark:
-            return Check('cannot tell', ('too dark',))
-        if self.core.near:
-            return Check('differs', ('differs by 1.0 px, good enough',), 1.0, 2.0)
-        return Check('right' if right else 'wrong', (f'fx {given.fx:.0f}',), 0.5, 1.0)
-
-    def watch(self, camera, sigma=None):
-        return watch((Reading(turn, KNOWS, None, turn not in self.core.strangers)
-                      for turn in self.core.ready), camera, sigma, Config().monitor)
-
-
 @pytest.fixture
 def desk(make_desk, monkeypatch):
     """Make a node with such a core; with a driver and a reader of ~/check beside it."""
     monkeypatch.setattr(background, 'Calibrator', Core)
-    monkeypatch.setattr(background, 'Questions', Asked)
     monkeypatch.setattr(background, 'LOOK_S', 0.05)
     monkeypatch.setattr(drive_module, 'PERIOD_S', 0.1)
 

@@ -22,8 +22,8 @@ from shared_drive import ONE_TURN, OTHER_TURN
 from synthetic import LENS as SYNTHETIC_LENS
 from synthetic import synthetic_turn
 
-from dashcalib_ros.report import load_camera
-from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.store.turn_store import Origin, StoredTurn, TurnStore
 
 # few points: what is tested is the node, the core has tests of its own
 QUICK = {'turns__wanted': 2, 'scene__tracks': 200, 'scene__profile_tracks': 100,

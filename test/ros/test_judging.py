@@ -26,13 +26,14 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
+from dashcalib_ros.formats import load_camera
 from dashcalib_ros.input.scale import Scale
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Mount
-from dashcalib_ros.report import load_camera
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros.background import Moved, Result
 from dashcalib_ros.ros.store import Store, Whose
-from dashcalib_ros.turn_store import Origin, StoredTurn, TurnStore
+from dashcalib_ros.store.turn_store import Origin, StoredTurn, TurnStore
 
 MOUNT = Mount('accepted', (), 2.0, -1.0, None, None,
               {'yaw_left_deg': 0.1, 'pitch_up_deg': 0.1, 'roll_right_deg': None,
@@ -315,11 +316,11 @@ dashcalib:
 def test_a_camera_that_was_moved_since_the_last_calibration_is_told_once(make_desk, capfd):
     desk = make_desk()
     desk.give(mount=MOUNT)
-    desk.until(lambda: 'looks 2.00 ± 0.10 ° to the left' in desk.bench.values['mounting'])
+    desk.until(lambda: 'yaw 2.00 ± 0.10° to the left' in desk.bench.values['mounting'])
     desk.give(mount=dataclasses.replace(MOUNT, yaw_left_deg=2.4))
     assert 'the camera was moved' not in capfd.readouterr().err
     desk.give(mount=dataclasses.replace(MOUNT, yaw_left_deg=-1.0))
-    desk.until(lambda: 'looks 1.00 ± 0.10 ° to the right' in desk.bench.values['mounting'])
+    desk.until(lambda: 'yaw 1.00 ± 0.10° to the right' in desk.bench.values['mounting'])
     logged = capfd.readouterr().err
     assert logged.count('the camera was moved') == 1
     assert desk.show() == 400.0

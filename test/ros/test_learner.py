@@ -15,11 +15,10 @@ from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import WorkerError
-from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
+from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.judge.calibration import StoredTurnSummary
 from dashcalib_ros.pipeline import Calibrator, Status
-from dashcalib_ros.questions import Questions
-from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.ros import background as room
 from dashcalib_ros.ros.background import (
     Goal,
@@ -98,6 +97,21 @@ class Core:
         return Calibration(Verdict('weak'), (64, 48), None, None, turns, 1, None, {}, {}, CONFIG,
                            stored_turns=stored)
 
+    def watch(self, camera, sigma=None):
+        self.watched.append((camera, self.ready))
+        if Core.failures:
+            raise Core.failures.pop()
+        return watch((Reading(turn, ZERO, None, explained=turn not in self.strangers)
+                      for turn in self.ready), camera, sigma, CONFIG.monitor)
+
+    def moved(self, camera, newest):
+        self.asked.append(self.pairs)
+        return (12.0, np.array([-1.0, 0.2])) if self.pairs > 70 else None
+
+    def check(self, given, calibration, progress=None):
+        self.checked.append(given)
+        return Check('right', ('it fits',), 0.5, 1.0)
+
     def close(self):
         self.closed.set()
         self.done.append('close')
@@ -120,34 +134,10 @@ class Scenes:
         self.core.done.append('forget')
 
 
-@stands_in_for(Questions)
-class Asked:
-    """In the Questions' place: answers with the turns of such a core."""
-
-    def __init__(self, calibrator):
-        self.core = calibrator
-
-    def watch(self, camera, sigma=None):
-        self.core.watched.append((camera, self.core.ready))
-        if Core.failures:
-            raise Core.failures.pop()
-        return watch((Reading(turn, ZERO, None, explained=turn not in self.core.strangers)
-                      for turn in self.core.ready), camera, sigma, CONFIG.monitor)
-
-    def moved(self, camera, newest):
-        self.core.asked.append(self.core.pairs)
-        return (12.0, np.array([-1.0, 0.2])) if self.core.pairs > 70 else None
-
-    def check(self, given, calibration, progress=None):
-        self.core.checked.append(given)
-        return Check('right', ('it fits',), 0.5, 1.0)
-
-
 @pytest.fixture
 def desk(monkeypatch):
     """A learner over such cores, and all it tells."""
     monkeypatch.setattr(room, 'Calibrator', Core)
-    monkeypatch.setattr(room, 'Questions', Asked)
     Core.made, Core.failures = [], []
     heard = types.SimpleNamespace(results=[], troubles=[], statuses=[], turns=[], begun=[],
                                   shown=[], watched=[], moved=[])

@@ -102,7 +102,7 @@ def test_a_kept_mounting_is_published_and_kept(start_node, make_bench, tmp_path)
     np.testing.assert_allclose((turn.x, turn.y, turn.z, turn.w), MOUNT.quaternion)
     # roll is not known, yaw is
     assert covariance[21] > 1 and covariance[35] == pytest.approx(math.radians(0.1)**2)
-    camera.until(lambda: 'accepted: looks' in camera.values.get('mounting', ''), node=node)
+    camera.until(lambda: 'accepted: yaw' in camera.values.get('mounting', ''), node=node)
 
 
 def test_an_edited_mounting_is_not_believed(tmp_path):

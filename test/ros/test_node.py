@@ -36,7 +36,7 @@ from ros_bench import (
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from dashcalib_ros.camera import Fisheye, ros_camera
-from dashcalib_ros.report import load_camera
+from dashcalib_ros.formats import load_camera
 
 # -- the end ----------------------------------------------------------------------------------
 

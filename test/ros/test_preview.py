@@ -7,8 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from dashcalib_ros.camera import Fisheye, Radial
-from dashcalib_ros.camera.camera_info import rectified_matrix
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.estimator import TrackedPoints
 from dashcalib_ros.input import Frame
@@ -22,10 +20,8 @@ from sensor_msgs.msg import CompressedImage
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.ros import preview as room
-from dashcalib_ros.ros.preview import TRACK, Picture, overlay, rectified
+from dashcalib_ros.ros.preview import TRACK, Picture, overlay
 
-LENS = Radial((320, 240), 260.0, 261.0, 165.0, 118.0, -0.25, 0.05)
-WIDE = Fisheye((320, 240), 110.0, 111.0, 161.0, 118.0, -0.02, 0.003, -0.001, 0.0002)
 EMPTY = TrackedPoints(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
 
 
@@ -63,27 +59,6 @@ def test_the_state_is_written_on_a_bar_and_fits(size):
     assert len(bar) and bar[-1] == size[1] - 1
     ink = drawn[bar].max(axis=(0, 2)) > 60
     assert ink.any() and not ink[-2:].any()
-
-
-@pytest.mark.parametrize('view', ['same', 'crop', 'all'])
-def test_the_rectified_picture_is_what_opencv_makes_of_it(view):
-    image = texture()
-    matrix = rectified_matrix(LENS, view)
-    theirs = cv2.undistort(image, LENS.matrix, np.array(LENS.ros_distortion()),
-                           newCameraMatrix=matrix)
-    ours = rectified(image, LENS, view)
-    assert np.abs(ours.astype(int) - theirs)[8:-8, 8:-8].max() <= 4
-
-
-def test_a_fisheye_is_rectified_and_what_it_cannot_see_is_black():
-    image = np.full((240, 320), 255, np.uint8)
-    ours = rectified(image, WIDE, 'all')
-    theirs = cv2.fisheye.undistortImage(
-        image, WIDE.matrix, np.array(WIDE.ros_distortion()), Knew=rectified_matrix(WIDE, 'all'))
-    assert np.mean(np.abs(ours.astype(int) - theirs) > 4) < 0.02
-    assert ours[120, 160] == 255 and (ours == 0).any()
-    # another camera, another view
-    assert (rectified(image, LENS, 'all') != ours).any()
 
 
 def test_points_are_told_in_pixels_of_the_input():

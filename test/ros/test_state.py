@@ -8,10 +8,10 @@ import pytest
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.config import Config
-from dashcalib_ros.judge import Calibration, Verdict
+from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.difference import contradicted
 from dashcalib_ros.judge.verdict import STEADY
-from dashcalib_ros.report import NamedCamera
+from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.state import judge, sigma_text
 

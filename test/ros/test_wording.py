@@ -3,8 +3,9 @@ from __future__ import annotations
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.judge import Calibration, TurnSummary, Verdict
+from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.pipeline import Status
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros.background import beginning, new_turns
 from dashcalib_ros.ros.state import outcome_text
 

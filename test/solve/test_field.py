@@ -15,9 +15,9 @@ from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.cli import main
+from dashcalib_ros.formats import load_calibration, result_json
 from dashcalib_ros.judge.calibration import LensField
 from dashcalib_ros.reconstruct.scene import Profile, Start
-from dashcalib_ros.report import load_calibration, result_json
 from dashcalib_ros.solve.imaging import displacements, field_basis, imaging_with
 
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import signal
 import threading
@@ -9,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import child_tasks
 import cv2
@@ -26,7 +28,7 @@ from dashcalib_ros.workers import child as child_module
 from dashcalib_ros.workers import pool as pool_module
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ATTEMPTS, ScenePool
-from dashcalib_ros.workers.worker import THREAD_VARIABLES, InlineWorker, WorkerDiedError
+from dashcalib_ros.workers.worker import THREAD_VARIABLES, InlineWorker, Worker, WorkerDiedError
 
 at = TurnId.at
 
@@ -41,9 +43,15 @@ def trouble() -> list[str]:
     return []
 
 
+def make_pool(threads: int = 2, make_worker: Callable[[], Worker] = ChildWorker,
+              load: Callable[[], object] = child_tasks.pid, **options: Any) -> ScenePool:
+    """Make a pool whose workers load nothing large."""
+    return ScenePool(Config().replace({'threads': threads}), make_worker, load, **options)
+
+
 @pytest.fixture
 def pool(trouble) -> Iterator[ScenePool]:
-    pool = ScenePool(Config().replace({'threads': 2}), ChildWorker, on_trouble=trouble.append)
+    pool = make_pool(2, on_trouble=trouble.append)
     yield pool
     pool.close()
 
@@ -59,7 +67,13 @@ def wait_until_built(pool: ScenePool) -> None:
 
 
 def use(monkeypatch, function: Callable[..., object]) -> None:
+    """Have turns that are submitted from now on drafted so."""
     monkeypatch.setattr(reconstruct, 'draft', function)
+
+
+def waiting(pool: ScenePool) -> list[TurnId | None]:
+    """Return the turns whose calls no worker has now; None for each other call."""
+    return [call.turn and call.turn.id for call in pool._calls if not call.running]
 
 
 def test_turns_become_scenes_once(pool, monkeypatch):
@@ -86,7 +100,7 @@ def test_a_hopeless_turn_has_no_scene_and_verbose_tells_why(monkeypatch, capsys,
 
 def test_without_a_queue_the_longest_is_built_first(monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build_slowly)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker)
+    pool = make_pool(1)
     try:
         pool.submit(turn(10, tmp_path / 'flag'), None)
         wait_for((tmp_path / 'flag.10').exists)
@@ -112,11 +126,10 @@ def test_a_child_that_dies_loses_no_turn(pool, monkeypatch, tmp_path):
 
 def test_a_turn_whose_child_is_killed_from_outside_is_built_again(
         pool, monkeypatch, tmp_path):
-    use(monkeypatch, child_tasks.build_slowly)
+    use(monkeypatch, child_tasks.build_hangs_at_first)
     flag = tmp_path / 'flag.10'
     pool.submit(turn(10, tmp_path / 'flag'), None)
     wait_for(lambda: flag.exists() and flag.read_text())
-    use(monkeypatch, child_tasks.build)
     os.kill(int(flag.read_text()), signal.SIGKILL)
     wait_until_built(pool)
     assert pool.scenes() == {at(10): 'scene of 10'}
@@ -125,7 +138,7 @@ def test_a_turn_whose_child_is_killed_from_outside_is_built_again(
 def test_a_turn_that_kills_every_child_is_given_up_and_told(monkeypatch, tmp_path):
     log, told = tmp_path / 'log', []
     use(monkeypatch, child_tasks.build_dies)
-    pool = ScenePool(Config(), ChildWorker, on_lost=told.append)
+    pool = make_pool(on_lost=told.append)
     pool.submit(turn(10, log), None)
     wait_until_built(pool)
     assert pool.scenes() == {at(10): None}
@@ -142,15 +155,18 @@ def test_a_turn_that_kills_every_child_is_given_up_and_told(monkeypatch, tmp_pat
 def test_where_no_child_can_live_the_pictures_are_not_blamed(pool, monkeypatch):
     """A broken installation, say, or a library of another processor."""
     monkeypatch.setattr(pool_module, 'ATTEMPTS', 2)
-    monkeypatch.setattr(child_module, 'START', 'import sys; sys.exit(7)')
-    pool.submit(turn(10), None)
-    with pytest.raises(WorkerError, match='exit code 7') as caught:
-        wait_until_built(pool)
-    assert caught.value.code == 'E-WORKER-CANNOT-LOAD'
-    monkeypatch.undo()
     use(monkeypatch, child_tasks.build)
+    with monkeypatch.context() as broken:
+        broken.setattr(child_module, 'START', 'import sys; sys.exit(7)')
+        with pytest.raises(WorkerError, match='exit code 7') as caught:
+            pool.run(child_tasks.add, 1, 2)
+        assert caught.value.code == 'E-WORKER-CANNOT-LOAD'
+        pool.submit(turn(10), None)
+        with pytest.raises(WorkerError, match='exit code 7') as caught:
+            wait_until_built(pool)
+        assert caught.value.code == 'E-WORKER-CANNOT-LOAD'
     wait_until_built(pool)
-    assert pool.scenes() == {at(10): 'scene of 10'}
+    assert pool.scenes() == {at(10): 'scene of 10'} and pool.run(child_tasks.add, 1, 2) == 3
 
 
 def test_an_error_is_told_once_and_the_turn_tried_again(pool, monkeypatch, tmp_path):
@@ -183,7 +199,7 @@ def test_scenes_of_turns_that_left_are_dropped(pool, monkeypatch, tmp_path):
 
 def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build_slowly)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=2)
+    pool = make_pool(1, queue=2)
     try:
         pool.submit(turn(10, tmp_path / 'flag'), None)
         wait_for((tmp_path / 'flag.10').exists)
@@ -191,7 +207,7 @@ def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch,
         for center, prominence in ((20, 0.02), (30, 0.03), (40, 0.01), (50, 0.04)):
             pool.submit(replace(turn(center), prominence=prominence), None)
         # one is being built, two wait with their images
-        assert pool._jobs.turns() == {at(30), at(50)}
+        assert set(waiting(pool)) == {at(30), at(50)}
         assert pool.unbuilt() == {at(10), at(30), at(50)}
         assert pool.scenes() == {at(20): None, at(40): None}
         pool.keep_only({at(20), at(30), at(40), at(50)})
@@ -201,7 +217,7 @@ def test_the_most_prominent_is_built_first_and_the_queue_has_an_end(monkeypatch,
             (at(50), 'scene of 50'), (at(30), 'scene of 30')]
         pool.submit(turn(60), None)
         pool.keep_only(set())
-        assert not pool._jobs.turns() and len(pool.unbuilt()) == 0
+        assert not pool._calls and len(pool.unbuilt()) == 0
     finally:
         pool.close()
 
@@ -222,7 +238,7 @@ def test_a_turn_is_built_in_two_halves(monkeypatch, tmp_path, live, done):
     log, hold = tmp_path / 'log', tmp_path / 'hold'
     use(monkeypatch, child_tasks.build_slowly)
     monkeypatch.setattr(reconstruct, 'finish', child_tasks.finish)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, queue=9 if live else None)
+    pool = make_pool(1, queue=9 if live else None)
     try:
         pool.submit(turn(5, hold), None)
         wait_for(lambda: (tmp_path / 'hold.5').exists() and (tmp_path / 'hold.5').read_text())
@@ -255,22 +271,22 @@ def test_what_failed_is_not_kept_for_a_turn_that_left(pool, monkeypatch, tmp_pat
     monkeypatch.setattr(pool_module, 'BACK_OFF_S', 1000.0)
     use(monkeypatch, child_tasks.build_fails_at_first)
     pool.submit(turn(10, tmp_path / 'flag'), None)
-    wait_for(lambda: pool._jobs.turns() and pool._errors)
+    wait_for(lambda: waiting(pool) == [at(10)] and pool._calls[0].error is not None)
     pool.keep_only(set())
-    assert not pool._jobs.turns() and not pool._errors and not pool.unbuilt()
+    assert not pool._calls and not pool.unbuilt()
+    pool.wait(lambda: True)
 
 
 def test_a_lost_turn_is_tried_again_by_itself(pool, trouble, monkeypatch, tmp_path):
     """Killed at each start for a while and then left alone; nobody waits for it."""
     use(monkeypatch, child_tasks.build_dies)
-    monkeypatch.setattr(reconstruct, 'load', child_tasks.die)
+    pool._load = child_tasks.die
     pool.submit(turn(10, tmp_path / 'log'), None)
     wait_for(lambda: len(trouble) > ATTEMPTS)
+    (tmp_path / 'log.ended').touch()
     assert all('exit code 1' in line and 'turn at frame 10 is tried again' in line
                and '\n' not in line for line in trouble)
     assert sum('no reconstruction process can start' in line for line in trouble) == 1
-    assert pool.unbuilt() == {at(10)}
-    use(monkeypatch, child_tasks.build)
     wait_for(lambda: pool.scenes() == {at(10): 'scene of 10'})
     # what is over is not told to who waits now
     pool.wait(lambda: True)
@@ -286,11 +302,8 @@ def test_a_turn_that_raised_is_tried_again_by_itself(pool, trouble, monkeypatch,
 def test_a_hung_child_is_told_of_and_its_turn_tried_again(pool, trouble, monkeypatch, tmp_path):
     monkeypatch.setattr(child_module, 'LOOKS_TO_REPORT', 1)
     monkeypatch.setattr(child_module, 'LOOKS_TO_KILL', 2)
-    use(monkeypatch, child_tasks.build_slowly)
-    flag = tmp_path / 'flag.10'
+    use(monkeypatch, child_tasks.build_hangs_at_first)
     pool.submit(turn(10, tmp_path / 'flag'), None)
-    wait_for(lambda: flag.exists() and flag.read_text())
-    use(monkeypatch, child_tasks.build)
     wait_for(lambda: pool.scenes() == {at(10): 'scene of 10'})
     assert any('turn at frame 10 is tried again' in line for line in trouble)
 
@@ -300,24 +313,29 @@ def test_the_pauses_grow_and_have_an_end(monkeypatch):
     assert [pool_module.back_off_s(n) for n in (1, 2, 3, 4, 100, 2000)] == [1, 2, 4, 8, 60, 60]
 
 
-def test_a_job_that_failed_waits_while_others_do_not():
-    waiting = pool_module.Jobs(None)
-    first, second = pool_module.Job(turn(10), None), pool_module.Job(turn(20), None)
-    waiting.put(replace(first, not_before=time.monotonic() + 1000.0))
-    waiting.put(second)
-    assert waiting.take() == second and waiting.take() is None
-    assert 900.0 < waiting.pause_s() <= 1000.0 and waiting.turns() == {at(10)}
+def test_a_turn_that_failed_waits_while_others_do_not(monkeypatch, tmp_path):
+    monkeypatch.setattr(pool_module, 'BACK_OFF_S', 1000.0)
+    monkeypatch.setattr(pool_module, 'LONGEST_BACK_OFF_S', 1000.0)
+    use(monkeypatch, child_tasks.build_fails_at_first)
+    pool = make_pool(1)
+    with contextlib.closing(pool):
+        pool.submit(turn(10, tmp_path / 'flag'), None)
+        wait_for(lambda: waiting(pool) == [at(10)] and pool._calls[0].failures)
+        use(monkeypatch, child_tasks.build)
+        pool.submit(turn(20), None)
+        wait_for(lambda: pool.scenes() == {at(20): 'scene of 20'})
+        assert pool.unbuilt() == {at(10)} and 900.0 < pool._pause_s() <= 1000.0
 
 
 def test_who_runs_something_comes_before_the_turns(monkeypatch, tmp_path):
     use(monkeypatch, child_tasks.build_slowly)
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker)
+    pool = make_pool(1)
     try:
         pool.submit(turn(10, tmp_path / 'flag'), None)
         wait_for(lambda: (tmp_path / 'flag.10').exists())
         pool.submit(turn(20, tmp_path / 'flag'), None)
         with background(lambda: pool.run(os.path.exists, tmp_path / 'flag.20')) as ran:
-            wait_for(lambda: pool._calls)
+            wait_for(lambda: None in waiting(pool))
             pool.keep_only({at(20)})
             pool._workers[0].kill()
         assert ran == [False]
@@ -330,7 +348,7 @@ def test_inline_it_is_all_the_same(monkeypatch):
     for name in THREAD_VARIABLES:
         monkeypatch.setenv(name, '1')
     use(monkeypatch, child_tasks.build)
-    pool = ScenePool(Config().replace({'threads': 2}), InlineWorker)
+    pool = make_pool(2, InlineWorker)
     for center in (10, 50, 90):
         pool.submit(turn(center), None)
     wait_until_built(pool)
@@ -347,7 +365,7 @@ def test_pictures_are_kept_where_they_are_wanted_and_leave_with_their_turns(monk
     for name in THREAD_VARIABLES:
         monkeypatch.setenv(name, '1')
     use(monkeypatch, lambda turn, config, valid: None)
-    pool = ScenePool(Config(), InlineWorker, keep_pictures=kept)
+    pool = make_pool(2, InlineWorker, keep_pictures=kept)
     with contextlib.closing(pool):
         for center in (10, 50):
             pool.submit(replace(turn(center), frames=(
@@ -392,7 +410,7 @@ def test_who_waits_may_do_other_things_meanwhile(monkeypatch, tmp_path):
         pool.submit(turn(10), None)
         return True
 
-    pool = ScenePool(Config().replace({'threads': 1}), ChildWorker, on_wait=meanwhile)
+    pool = make_pool(1, on_wait=meanwhile)
     with contextlib.closing(pool):
         assert pool.run(child_tasks.add, 1, 2) == 3
         wait_until_built(pool)
@@ -418,10 +436,44 @@ def test_what_was_begun_runs_side_by_side_and_what_waits_can_be_dropped(pool, tm
     (tmp_path / 'go').touch()
     assert [pool.result(call) for call in begun] == ['seen', 'seen']
     told = []
-    assert pool.result(pool.begin(child_tasks.count, 2, tells=True),
+    assert pool.result(pool.begin(child_tasks.count, 2, reports=True),
                        lambda stage, done: told.append(stage)) == 2
     assert told == ['step 0', 'step 1'] and not dropped.done
     assert not (tmp_path / 'dropped').exists()
+
+
+def test_a_child_that_dies_before_its_first_call_is_not_missed(trouble, tmp_path):
+    pool = make_pool(1, load=child_tasks.die, on_trouble=trouble.append)
+    with contextlib.closing(pool):
+        pool.start()
+        assert pool.run(child_tasks.add, 1, 2) == 3 and not trouble
+
+
+def test_each_worker_begins_with_what_it_needs(tmp_path):
+    pool = make_pool(2, load=functools.partial(child_tasks.sleep, 0, tmp_path / 'loaded'))
+    with contextlib.closing(pool):
+        assert not pool.pids()
+        pool.start()
+        wait_for((tmp_path / 'loaded').exists)
+        wait_for(lambda: len(pool.pids()) == 2)
+        threads = list(pool._threads)
+        pool.start()
+        assert pool.run(child_tasks.add, 1, 2) == 3 and pool._threads == threads
+
+
+def test_what_was_dropped_is_not_tried_again(pool, trouble, tmp_path):
+    started = tmp_path / 'started'
+    call = pool.begin(child_tasks.sleep, 60, started)
+    wait_for(lambda: started.exists() and started.read_text())
+    pool.drop(call)
+    os.kill(int(started.read_text()), signal.SIGKILL)
+    # both workers are free again
+    go, paths = tmp_path / 'go', [tmp_path / name for name in ('first', 'second')]
+    begun = [pool.begin(child_tasks.until, go, path) for path in paths]
+    wait_for(lambda: all(path.exists() for path in paths))
+    go.touch()
+    assert [pool.result(each) for each in begun] == ['seen', 'seen']
+    assert not trouble and not call.done
 
 
 def test_close_while_others_wait(pool, monkeypatch, tmp_path):
@@ -436,7 +488,7 @@ def test_close_while_others_wait(pool, monkeypatch, tmp_path):
         wait_for(lambda: flag.exists() and flag.read_text())
         # all workers are busy
         queued = stack.enter_context(background(lambda: pool.run(child_tasks.add, 1, 2)))
-        wait_for(lambda: pool._calls)
+        wait_for(lambda: waiting(pool).count(None))
         pids = pool.pids()
         assert len(pids) == 2
         pool.close()

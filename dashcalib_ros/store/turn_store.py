@@ -1,4 +1,4 @@
-"""Reconstructed turns on disk, so that short trips add up (config: turns.store).
+"""A folder of reconstructed turns, so that short trips add up (config: turns.store).
 
 There is one file for each turn. It is written completely under a unique name, and never changed:
 any number of processes may share the folder. Files that are no turns of this camera are not used
@@ -18,7 +18,7 @@ from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import InputError, counted, one_line
 from dashcalib_ros.limits import read_file
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.reconstruct.scene_file import (
+from dashcalib_ros.store.scene_file import (
     LARGEST,
     SUFFIX,
     Origin,
@@ -64,9 +64,9 @@ class TurnStore:
         self._origin: Origin | None = None
         # by the turn's key: its file, '' if it was removed for more prominent ones, and the
         # prominence in it
-        self._own: dict[TurnId, tuple[str, float]] = {}
+        self._files: dict[TurnId, tuple[str, float]] = {}
         # origin and prominence by file; None for a file that cannot be used
-        self._known: dict[str, tuple[Origin, float] | None] = {}
+        self._headers: dict[str, tuple[Origin, float] | None] = {}
 
     def load(self, origin: Origin, use: bool = True) -> None:
         """Load the turns of this camera, the most prominent first.
@@ -79,15 +79,15 @@ class TurnStore:
         found: list[tuple[str, StoredTurn]] = []
         bad: list[str] = []
         others: list[Origin] = []
-        for name in self._listed():
+        for name in self._names():
             try:
                 of, turn = self._read(name)
             except InputError as error:
                 if os.path.lexists(self._folder / name):  # or another process removed it
                     bad.append(str(error))
-                    self._known[name] = None
+                    self._headers[name] = None
                 continue
-            self._known[name] = of, turn.prominence
+            self._headers[name] = of, turn.prominence
             if of.fits(origin):
                 found.append((name, turn))
             else:
@@ -101,7 +101,7 @@ class TurnStore:
             elif len(self.turns) < self._capacity:
                 key = TurnId.stored(len(self.turns))
                 self.turns[key] = replace(turn, scene=replace(turn.scene, turn=key))
-                self._own[key] = name, turn.prominence
+                self._files[key] = name, turn.prominence
 
     def drop_repeated(self, stamps_s: Iterable[float], scenes: Iterable[Scene] = ()) -> bool:
         """Drop turns that are also in this drive, by time or pictures: no turn may count twice.
@@ -129,23 +129,23 @@ class TurnStore:
         if self._off:
             return
         if self._origin is None:
-            self._own = {TurnId.stored(n): (name, 0.0) for n, name in enumerate(self._listed())
-                         if self._about(name) is not None}
+            self._files = {TurnId.stored(n): (name, 0.0) for n, name in enumerate(self._names())
+                         if self._header(name) is not None}
         self._write_all({})
         self._off = True
 
     def _write_all(self, turns: Mapping[TurnId, StoredTurn]) -> None:
-        for key in self._own.keys() - turns.keys():
-            self._remove(self._own.pop(key)[0])
+        for key in self._files.keys() - turns.keys():
+            self._remove(self._files.pop(key)[0])
         wrote = False
         for key, turn in turns.items():
-            name, prominence = self._own.get(key, (None, 0.0))
+            name, prominence = self._files.get(key, (None, 0.0))
             if name == '' or (name and prominence == turn.prominence):
                 continue
             try:
-                self._own[key] = self._write(turn), turn.prominence
+                self._files[key] = self._write(turn), turn.prominence
             except OSError as error:
-                self._fail(error)
+                self._warn_once(error)
                 return
             wrote = True
             if name:
@@ -153,7 +153,7 @@ class TurnStore:
         if wrote:
             self._remove_excess()
 
-    def _listed(self) -> list[str]:
+    def _names(self) -> list[str]:
         """Return the names of all files that may be turns."""
         remove_leftovers(self._folder, NAMES)
         try:
@@ -161,7 +161,7 @@ class TurnStore:
         except FileNotFoundError:
             return []
         except OSError as error:
-            self._fail(error)
+            self._warn_once(error)
             return []
 
     def _report(self, bad: list[str], others: list[Origin], origin: Origin) -> None:
@@ -185,38 +185,38 @@ class TurnStore:
                              f'{name} cannot be used ({one_line(error)})') from error
         return file.origin, turn
 
-    def _about(self, name: str) -> tuple[Origin, float] | None:
+    def _header(self, name: str) -> tuple[Origin, float] | None:
         """Return a file's origin and prominence, None if it is no stored turn."""
-        if name not in self._known:
+        if name not in self._headers:
             try:
                 origin, turn = self._read(name)
-                self._known[name] = origin, turn.prominence
+                self._headers[name] = origin, turn.prominence
             except InputError:
-                self._known[name] = None
-        return self._known[name]
+                self._headers[name] = None
+        return self._headers[name]
 
     def _write(self, turn: StoredTurn) -> str:
         assert self._origin is not None
         name = f'turn-{secrets.token_hex(8)}{SUFFIX}'
         self._folder.mkdir(parents=True, exist_ok=True)
         write_whole(self._folder / name, encoded(SceneFile(self._origin, (turn,), 1)))
-        self._known[name] = self._origin, turn.prominence
+        self._headers[name] = self._origin, turn.prominence
         return name
 
     def _remove_excess(self) -> None:
         """Remove the least prominent turns beyond the capacity, also those of other processes."""
         assert self._origin is not None
         ranked: list[tuple[float, str]] = []
-        for name in self._listed():
-            about = self._about(name)
+        for name in self._names():
+            about = self._header(name)
             if about is not None and about[0].fits(self._origin):
                 ranked.append((-about[1], name))
         ranked.sort()
         for _, name in ranked[self._capacity:]:
             self._remove(name)
-            for key, (own, prominence) in self._own.items():
+            for key, (own, prominence) in self._files.items():
                 if own == name:
-                    self._own[key] = '', prominence
+                    self._files[key] = '', prominence
 
     def _remove(self, name: str) -> None:
         if not name:
@@ -224,9 +224,9 @@ class TurnStore:
         try:
             (self._folder / name).unlink(missing_ok=True)
         except OSError as error:
-            self._fail(error)
+            self._warn_once(error)
 
-    def _fail(self, error: OSError) -> None:
+    def _warn_once(self, error: OSError) -> None:
         """Warn once: the same error will come for every turn."""
         if self._warned:
             return

@@ -1,4 +1,4 @@
-"""P of CameraInfo: what a rectified picture shows, checked by OpenCV's own rectification."""
+"""The rectified picture, and the P of CameraInfo for it, checked by OpenCV's rectification."""
 from __future__ import annotations
 
 import cv2
@@ -7,7 +7,8 @@ import pytest
 from refused import refused
 
 from dashcalib_ros.camera import RECTIFIED, Brown, Camera, Fisheye, Radial, ros_camera, ros_faults
-from dashcalib_ros.camera.camera_info import WIDEST, rectified_matrix
+from dashcalib_ros.camera.field import TERMS, Field
+from dashcalib_ros.camera.remap import OUTSIDE, WIDEST, rectified_matrix, rectify, source_map
 from dashcalib_ros.config import describe
 from dashcalib_ros.errors import ConfigError
 
@@ -72,8 +73,8 @@ def test_same_is_the_camera_s_own(name):
 def test_only_p_changes_and_its_pixels_are_square(name, rectified):
     camera = CAMERAS[name]
     ros, plain = ros_camera(camera, rectified), ros_camera(camera)
-    assert (ros.k, ros.d, ros.r, ros.image_size, ros.distortion_model) == (
-        plain.k, plain.d, plain.r, plain.image_size, plain.distortion_model)
+    assert (ros.k, ros.d, ros.r, ros.width, ros.height, ros.distortion_model) == (
+        plain.k, plain.d, plain.r, *camera.image_size, plain.distortion_model)
     p = np.reshape(ros.p, (3, 4))
     assert all(type(value) is float for value in ros.p)
     assert p[0, 0] == p[1, 1] > 0
@@ -170,3 +171,49 @@ def test_a_lens_that_folds_over_is_used_as_far_as_it_sees():
     assert everything[0, 0] == pytest.approx(359.5 / 0.7454, rel=0.04)
     found = sources(camera, crop)
     assert found.min() >= 0 and (found <= [1279, 719]).all()
+
+
+SMALL = (320, 240)
+LENS = Radial(SMALL, 260.0, 261.0, 165.0, 118.0, -0.25, 0.05)
+WIDE = Fisheye(SMALL, 110.0, 111.0, 161.0, 118.0, -0.02, 0.003, -0.001, 0.0002)
+
+
+def texture() -> np.ndarray:
+    noise = np.random.default_rng(3).integers(0, 256, (24, 32), np.uint8)
+    return np.asarray(cv2.resize(noise, SMALL, interpolation=cv2.INTER_CUBIC))
+
+
+@pytest.mark.parametrize('view', RECTIFIED)
+def test_a_rectified_picture_is_what_opencv_makes_of_it(view):
+    image = texture()
+    theirs = cv2.undistort(image, LENS.matrix, np.array(LENS.ros_distortion()),
+                           newCameraMatrix=rectified_matrix(LENS, view))
+    ours = rectify(image, LENS, view)
+    assert np.abs(ours.astype(int) - theirs)[8:-8, 8:-8].max() <= 4
+    np.testing.assert_array_equal(rectify(np.dstack([image] * 3), LENS, view)[..., 1], ours)
+
+
+def test_a_fisheye_is_rectified_and_what_it_cannot_see_is_black():
+    image = np.full((240, 320), 255, np.uint8)
+    ours = rectify(image, WIDE, 'all')
+    theirs = cv2.fisheye.undistortImage(
+        image, WIDE.matrix, np.array(WIDE.ros_distortion()), Knew=rectified_matrix(WIDE, 'all'))
+    assert np.mean(np.abs(ours.astype(int) - theirs) > 4) < 0.02
+    assert ours[120, 160] == 255 and (ours == 0).any()
+    # another camera, another view
+    assert (rectify(image, LENS, 'all') != ours).any()
+
+
+def test_what_folds_over_is_nowhere_in_the_image():
+    folded = Fisheye(SMALL, 110.0, 111.0, 161.0, 118.0, -0.5)  # at 47 degrees off the axis
+    places = source_map(folded)
+    assert (places == OUTSIDE).all(axis=-1).any() and np.isfinite(places).all()
+    assert rectify(np.full((240, 320), 255, np.uint8), folded)[0, 0] == 0
+
+
+def test_a_field_moves_what_is_seen():
+    moves = np.zeros((2, len(TERMS)))
+    moves[:, 0] = 3.0, -2.0
+    shifted, plain = source_map(LENS, field=Field(SMALL, moves)), source_map(LENS)
+    np.testing.assert_allclose(shifted - plain, np.broadcast_to([3.0, -2.0], plain.shape),
+                               atol=1e-4)

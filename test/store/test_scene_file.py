@@ -11,7 +11,7 @@ from fleet_made import clip_of
 
 from dashcalib_ros.camera import Fisheye
 from dashcalib_ros.reconstruct.scene import Start
-from dashcalib_ros.reconstruct.scene_file import decoded, encoded
+from dashcalib_ros.store.scene_file import decoded, encoded
 
 MADE = clip_of(yaws=(80.0, -70.0), tracks=60, keyframes=8)
 DATA = encoded(MADE)

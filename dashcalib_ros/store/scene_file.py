@@ -193,23 +193,23 @@ def _file(arrays: Arrays) -> SceneFile:
     for n, turn in enumerate(listed):
         # files of older versions list turns without a scene, too
         if turn.get('scene', True) is True:
-            scene = _scene(arrays, f'turn{n}.', origin, _whole(turn['center']))
+            scene = _scene(arrays, f'turn{n}.', origin, _count(turn['center']))
             turns.append(StoredTurn(scene, _real(turn['stamp_s'], LAST_S),
                                     _real(turn['prominence'])))
     _check(all(isinstance(line, str) for line in about['warnings']))
     _check(all(turn.prominence > 0 for turn in turns)
            and len({turn.scene.turn for turn in turns}) == len(turns))
     return SceneFile(
-        origin, tuple(turns), max(_whole(about.get('found', len(listed))), len(turns)),
-        _hexadecimal(about['content']), _hexadecimal(about['settings']), _whole(about['frames']),
+        origin, tuple(turns), max(_count(about.get('found', len(listed))), len(turns)),
+        _hexadecimal(about['content']), _hexadecimal(about['settings']), _count(about['frames']),
         _real(about['seconds'], LAST_S), tuple(
             shortened(line, 300) for line in about['warnings'][:MOST_WARNINGS]))
 
 
 def _origin(about: Mapping[str, Any]) -> Origin:
-    width, height = (_whole(side) for side in about['image_size'])
+    width, height = (_count(side) for side in about['image_size'])
     check_pixels(width, height, 'it')
-    shrink, enlarge = (_whole(about['scale'][name]) for name in ('shrink', 'enlarge'))
+    shrink, enlarge = (_count(about['scale'][name]) for name in ('shrink', 'enlarge'))
     _check(1 <= shrink <= width and 1 <= enlarge <= MOST and 1 in (shrink, enlarge))
     frame_id = about.get('frame_id', '')
     _check(isinstance(frame_id, str) and len(frame_id) <= 1000)
@@ -285,7 +285,7 @@ def _real(value: Any, most: float = 1e9) -> float:
     return float(value)
 
 
-def _whole(value: Any) -> int:
+def _count(value: Any) -> int:
     _check(type(value) is int and 0 <= value <= 10**9)
     return int(value)
 

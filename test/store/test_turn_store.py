@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from synthetic import LENS, synthetic_turn
 
-from dashcalib_ros import turn_store as room
 from dashcalib_ros.camera import Fisheye
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.input.scale import Scale
-from dashcalib_ros.reconstruct import scene_file
 from dashcalib_ros.reconstruct.scene import Scene, Start
-from dashcalib_ros.reconstruct.scene_file import Origin, StoredTurn
 from dashcalib_ros.solve.start import kinds_of_lenses
-from dashcalib_ros.turn_store import TurnStore
+from dashcalib_ros.store import scene_file
+from dashcalib_ros.store import turn_store as room
+from dashcalib_ros.store.scene_file import Origin, StoredTurn
+from dashcalib_ros.store.turn_store import TurnStore
 
 HALF_WIDTH_S = 3.0
 DATE_S = 1_767_614_400.0

@@ -14,10 +14,8 @@ from made_calibration import EACH_MODEL, SIGMA, TRUTH, calibration_of, make_cali
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError
-from dashcalib_ros.report import calibration_yaml, load_camera
-from dashcalib_ros.report.camera_file import load_with_faults
-from dashcalib_ros.report.export import exported
-from dashcalib_ros.report.result import camera_info_yaml
+from dashcalib_ros.formats import calibration_yaml, export, load_camera
+from dashcalib_ros.formats.load import load_with_faults
 from dashcalib_ros.ros.store import Kept, Whose
 
 PARSERS_KEYS = ['image_width', 'image_height', 'camera_name', 'camera_matrix',
@@ -146,7 +144,7 @@ def each_file(tmp_path_factory):
     texts = {name: calibration_yaml(calibration_of(lens, input_name=ODD), created='2026-11-22')
              for name, lens in EACH_MODEL.items()}
     texts['weak'] = calibration_yaml(make_calibration('weak', input_name='x' * 5000), '4k_front')
-    texts['alone'] = exported(TRUTH, 'ros')
+    texts['alone'] = export(TRUTH, 'ros')
     kept = Kept.of(make_calibration(input_name=ODD), Whose('360cam', '/image_raw'), 'front: #1')
     texts['kept'], texts['kept_with_p'] = kept.text, kept.rectified('all').text
     assert texts['kept'] != texts['kept_with_p']
@@ -258,8 +256,10 @@ def test_names_from_outside_cannot_break_the_file():
 
 @pytest.mark.parametrize('name', ['narrow_stereo', '', 'my cam', 'a:b', 'käm'])
 def test_camera_names_that_drivers_refuse_are_refused(name):
-    with pytest.raises(ConfigError, match='camera name'):
+    with pytest.raises(ConfigError) as caught:
         calibration_yaml(make_calibration(), name)
+    assert caught.value.code == (
+        'E-CAMERA-NAME-TAKEN' if name == 'narrow_stereo' else 'E-CAMERA-NAME')
 
 
 def test_a_camera_name_of_digits_stays_text():
@@ -325,7 +325,7 @@ def test_broken_files_are_refused_with_what_is_wrong(tmp_path, old, new, code, v
     ('projection_matrix', 2, 'P does not map the image')])
 def test_faults_beside_the_camera_are_read(tmp_path, key, place, words):
     path = tmp_path / 'calibration.yaml'
-    data = yaml.safe_load(camera_info_yaml(Radial((100, 60), 80.0, 80.0, 49.5, 29.5)))
+    data = yaml.safe_load(export(Radial((100, 60), 80.0, 80.0, 49.5, 29.5), 'ros'))
     path.write_text(yaml.safe_dump(data))
     assert load_camera(path).faults == ()
     data[key]['data'][place] += 50.0

@@ -1,23 +1,13 @@
-"""True poses from files, and how far cameras are from them."""
+"""True poses from files, and those of a GPS track."""
 from __future__ import annotations
-
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from solving import CONFIG
-from synthetic import LENS, rotation, synthetic_turn
+from synthetic import rotation
 
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.input.motion import Samples
-from dashcalib_ros.judge.odometry import (
-    Poses,
-    mounting,
-    odometry,
-    path_files,
-    read_poses,
-    track_poses,
-)
+from dashcalib_ros.input.poses import read_poses, track_poses
 
 STAMPS = np.array([10.0, 10.5, 11.0])
 
@@ -57,27 +47,29 @@ def test_tums_poses_are_interpolated_at_the_frames_stamps(tmp_path):
     np.testing.assert_allclose(found[1], rotation(1, np.pi / 8), atol=1e-6)
 
 
-@pytest.mark.parametrize(('text', 'match'), [
-    ('', 'no poses'), ('1 2 3\n4 5 6\n', 'no poses'), ('1 2\n' + '0 ' * 12 + '\n', 'no poses'),
-    (f'{"1 " * 12}\n' * 2, 'no rotations'), (f'{"a " * 12}\n' * 2, 'not all numbers'),
-    (f'{"nan " * 8}\n' * 2, 'not finite'),
-    ('2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n', 'do not ascend'),
-    ('1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 0\n', 'no rotations'),
-    ('1 0 0 0 9 9 9 9\n2 0 0 0 9 9 9 9\n', 'no rotations'),
-    ('1 1e300 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n', 'write metres'),
-    ('5e10 0 0 0 0 0 0 1\n6e10 0 0 0 0 0 0 1\n', 'write seconds'),
-    ('1e300 0 0 0 0 0 0 1\n2e300 0 0 0 0 0 0 1\n', 'write seconds'),
-    ('0 0 0 0 0 0 0 1\n1e300 0 0 0 0 0 0 1\n', 'write seconds'),
-    ('1 0 0 0 1e200 -1e200 0 1\n2 0 0 0 0 0 0 1\n', 'no rotations'),
-    (f'{"1e300 -1e300 " * 6}\n' * 2, 'no rotations'),
-    ('-1e308 0 0 0 0 0 0 1\n1e308 0 0 0 0 0 0 1\n', 'write seconds'),
-    ('t x y z qx qy qz qw\n' * 2, 'not all numbers')])
+@pytest.mark.parametrize(('text', 'code'), [
+    ('', 'E-POSES-FORMAT'), ('1 2 3\n4 5 6\n', 'E-POSES-FORMAT'),
+    ('1 2\n' + '0 ' * 12 + '\n', 'E-POSES-FORMAT'),
+    (f'{"1 " * 12}\n' * 2, 'E-POSES-ROTATION'), (f'{"a " * 12}\n' * 2, 'E-POSES-NUMBERS'),
+    (f'{"nan " * 8}\n' * 2, 'E-POSES-NOT-FINITE'),
+    ('2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n', 'E-POSES-ORDER'),
+    ('1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 0\n', 'E-POSES-QUATERNION'),
+    ('1 0 0 0 9 9 9 9\n2 0 0 0 9 9 9 9\n', 'E-POSES-QUATERNION'),
+    ('1 1e300 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n', 'E-POSES-UNIT'),
+    ('5e10 0 0 0 0 0 0 1\n6e10 0 0 0 0 0 0 1\n', 'E-STAMP-UNIT'),
+    ('1e300 0 0 0 0 0 0 1\n2e300 0 0 0 0 0 0 1\n', 'E-STAMP-UNIT'),
+    ('0 0 0 0 0 0 0 1\n1e300 0 0 0 0 0 0 1\n', 'E-STAMP-UNIT'),
+    ('1 0 0 0 1e200 -1e200 0 1\n2 0 0 0 0 0 0 1\n', 'E-POSES-QUATERNION'),
+    (f'{"1e300 -1e300 " * 6}\n' * 2, 'E-POSES-ROTATION'),
+    ('-1e308 0 0 0 0 0 0 1\n1e308 0 0 0 0 0 0 1\n', 'E-STAMP-UNIT'),
+    ('t x y z qx qy qz qw\n' * 2, 'E-POSES-NUMBERS')])
 @pytest.mark.filterwarnings('error')
-def test_what_is_no_file_of_poses_is_named(tmp_path, text, match):
+def test_what_is_no_file_of_poses_is_named(tmp_path, text, code):
     path = tmp_path / 'poses.txt'
     path.write_text(text)
-    with pytest.raises(InputError, match=match) as caught:
+    with pytest.raises(InputError) as caught:
         read_poses(path)
+    assert caught.value.code == code
     assert str(path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
 
 
@@ -97,7 +89,7 @@ def test_stamps_since_1970_may_be_of_any_unit_which_is_said(tmp_path, unit, digi
 def test_nanoseconds_since_a_computer_was_started_are_no_milliseconds_since_1970(tmp_path):
     path = tmp_path / 'poses.txt'
     path.write_text(''.join(f'{5 * 10**12 + n * 10**8} 0 0 0 0 0 0 1\n' for n in range(5)))
-    with pytest.raises(InputError, match='write seconds'):
+    with pytest.raises(InputError, match=r'poses\.txt'):
         read_poses(path)
 
 
@@ -143,72 +135,9 @@ def test_a_gps_that_comes_once_a_second_has_headings_between():
     assert known.all() and abs(places[0, 0] - 47.5) < 1e-6
 
 
-@pytest.mark.parametrize(('places', 'match'), [
-    (np.zeros((60, 3)), 'does not move'), (np.zeros((3, 3)), 'too short')])
-def test_a_track_without_headings_is_named(places, match):
-    with pytest.raises(InputError, match=match):
+@pytest.mark.parametrize(('places', 'code'), [
+    (np.zeros((60, 3)), 'E-GPS-STANDS'), (np.zeros((3, 3)), 'E-GPS-TOO-SHORT')])
+def test_a_track_without_headings_is_named(places, code):
+    with pytest.raises(InputError) as caught:
         track_poses(Samples(0.2 * np.arange(len(places)), places), 0.0)
-
-
-MOUNT = rotation(0, 0.3) @ rotation(2, -0.2)
-
-
-@pytest.fixture(scope='module')
-def motion():
-    """Return two turns beside their truth, which is given in the frame of another sensor."""
-    turns = [synthetic_turn(yaw_deg=yaw, keyframes=14, tracks=150, world=world)
-             for world, yaw in enumerate((80.0, -70.0))]
-    rotations = np.zeros((2000, 3, 3))
-    rotations[:] = np.eye(3)
-    positions = np.zeros((2000, 3))
-    scenes = []
-    for turn, center in zip(turns, (0, 1000), strict=True):
-        structure = turn.structure
-        frames = turn.tracks.frames + center
-        turned = structure.rotations.transpose(0, 2, 1)
-        positions[frames] = -np.einsum('kij,kj->ki', turned, structure.translations)
-        rotations[frames] = turned @ MOUNT
-        scene = turn.scene(LENS, center)
-        object.__setattr__(scene.tracks, 'frames', frames)
-        scenes.append(scene)
-    cameras = {'given': LENS.with_focal(1.05 * LENS.fx), 'ours': LENS}
-    return odometry(scenes, cameras, Poses(rotations, positions), CONFIG)
-
-
-def test_the_camera_that_is_right_finds_the_rotation(motion):
-    medians = motion.medians()
-    assert len(motion.turns) == 2 and motion.turns[0].angle_deg == pytest.approx(80.0, abs=2.0)
-    assert medians['rotation_deg']['ours'] < 0.1 < 1.0 < medians['rotation_deg']['given']
-    assert medians['scale_drift']['ours'] < 0.01 < medians['scale_drift']['given']
-    length = motion.turns[0].length_m
-    assert length == pytest.approx(26.0, abs=1.0)
-    assert medians['rotation_deg_per_100m']['given'] > 2 * medians['rotation_deg']['given']
-
-
-def test_where_the_other_sensor_sits_is_found_from_the_turns(motion):
-    # the axis that all turns share leaves one angle open: what is turned is what counts
-    found = mounting(motion)
-    for turn in motion.turns:
-        seen = turn.paths['ours'].rotations
-        own = found @ (seen[0].T @ seen[-1]) @ found.T
-        true = turn.true.rotations[0].T @ turn.true.rotations[-1]
-        np.testing.assert_allclose(own, true, atol=5e-3)
-
-
-def test_the_paths_are_plotted_and_written_for_evo(motion):
-    files = path_files(motion)
-    assert set(files) == {'paths.svg', *(f'turn_{center:06}_{name}.tum' for center in (0, 1000)
-                                         for name in ('poses', 'given', 'ours'))}
-    root = ElementTree.fromstring(files['paths.svg'])
-    assert sum(each.tag.endswith('polyline') for each in root.iter()) == 6
-    table = np.array([line.split() for line in files['turn_000000_ours.tum'].splitlines()], float)
-    assert table.shape == (14, 8)
-    np.testing.assert_allclose(table[:, 0], 0.3 * np.arange(14))
-    np.testing.assert_allclose(np.linalg.norm(table[:, 4:], axis=1), 1.0, atol=1e-6)
-
-
-def test_poses_of_another_time_are_refused(motion):
-    scene = synthetic_turn(keyframes=8, tracks=100).scene(LENS)
-    rotations, positions = three()
-    with pytest.raises(InputError, match='none of the turns has poses'):
-        odometry([scene], {'ours': LENS}, Poses(rotations, positions, STAMPS + 1e9), CONFIG)
+    assert caught.value.code == code

@@ -19,15 +19,9 @@ from dashcalib_ros.camera import camera_from_ros
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.errors import ConfigError, DashcalibError, InputError, OutputError
-from dashcalib_ros.report import NamedCamera, compare, load_camera, write_text
-from dashcalib_ros.report.export import (
-    EXPORTS,
-    SUFFIXES,
-    check_suffix,
-    cropped,
-    exported,
-    resized,
-)
+from dashcalib_ros.formats import export, load_camera
+from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
+from dashcalib_ros.report import NamedCamera, compare, write_text
 
 POINTS = np.array([[0.1, -0.05, 1.0], [-0.5, 0.1, 1.0], [0.6, 0.12, 1.0], [0.0, 0.0, 1.0]])
 
@@ -39,7 +33,7 @@ def lens(request):
 
 def test_opencv_reads_its_own(lens, tmp_path):
     path = tmp_path / 'camera.yaml'
-    path.write_text(exported(lens, 'opencv'))
+    path.write_text(export(lens, 'opencv'))
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     k, d = (file.getNode(name).mat() for name in ('camera_matrix', 'distortion_coefficients'))
     if file.getNode('camera_model').string() == 'fisheye':
@@ -52,7 +46,7 @@ def test_opencv_reads_its_own(lens, tmp_path):
 
 
 def test_colmap_projects_the_same_half_a_pixel_off(lens):
-    line = exported(lens, 'colmap').splitlines()[-1].split()
+    line = export(lens, 'colmap').splitlines()[-1].split()
     camera = pycolmap.Camera(model=line[1], width=int(line[2]), height=int(line[3]),
                              params=[float(value) for value in line[4:]])
     np.testing.assert_allclose(camera.img_from_cam(POINTS) - 0.5, lens.project(POINTS), atol=1e-6)
@@ -80,14 +74,14 @@ def lenses(*kinds):
 def written(lens, kind, folder):
     """Write an export, and return its path."""
     path = folder / {'rays': 'a.npz', 'maps': 'a.npz'}.get(kind, 'a.txt')
-    write_text(path, exported(lens, kind))
+    write_text(path, export(lens, kind))
     return path
 
 
 @pytest.mark.parametrize(('kind', 'model'), CANNOT)
 def test_a_lens_that_a_program_has_not_is_refused(kind, model):
     with pytest.raises(ConfigError, match=LACKS[kind][model]) as raised:
-        exported(EACH_MODEL[model], kind)
+        export(EACH_MODEL[model], kind)
     assert raised.value.code == 'E-EXPORT-LENS'
 
 
@@ -110,7 +104,7 @@ def test_each_export_is_read_back(lens, kind, tmp_path):
 @lenses('gyroflow')
 @pytest.mark.parametrize('readout_ms', [None, 21.5, -20.1])
 def test_a_lens_profile_has_what_gyroflow_needs(lens, kind, readout_ms, tmp_path):
-    profile = json.loads(exported(lens, kind, readout_ms=readout_ms))
+    profile = json.loads(export(NamedCamera('given', lens, readout_ms=readout_ms), kind))
     assert profile['calib_dimension'] == {'w': 1242, 'h': 375} == profile['orig_dimension']
     # it loads none without, and takes the middle for the principal point
     assert profile['calibrator_version'] and profile['asymmetrical'] is True
@@ -129,7 +123,7 @@ def test_a_lens_profile_has_what_gyroflow_needs(lens, kind, readout_ms, tmp_path
 def test_a_fisheye_without_coefficients_is_a_pinhole_to_gyroflow():
     ideal = replace(EACH_MODEL['fisheye'], k1=0.0, k2=0.0, k3=0.0, k4=0.0)
     with pytest.raises(ConfigError) as raised:
-        exported(ideal, 'gyroflow')
+        export(ideal, 'gyroflow')
     assert raised.value.code == 'E-EXPORT-FISHEYE-ZERO'
 
 
@@ -215,7 +209,8 @@ def bent(request):
     field = a_field(PART, 1.0)
     places = (np.append(np.arange(0.0, size - 1, 3), size - 1) for size in PART)
     pixels = np.stack(np.meshgrid(*places), -1).reshape(-1, 2)
-    return lens, exported(lens, 'mrcal', field), pixels, lens.rays(field.ideal(pixels))
+    text = export(NamedCamera('given', lens, field=field), 'mrcal')
+    return lens, text, pixels, lens.rays(field.ideal(pixels))
 
 
 def test_mrcal_s_spline_has_the_field(bent):
@@ -235,13 +230,14 @@ def test_mrcal_itself_sees_the_field(bent, tmp_path):
 
 def test_a_field_that_no_spline_has_is_refused():
     with pytest.raises(OutputError, match=r'0\.001 px') as raised:
-        exported(TRUTH.resized(1 / 3, (414, 125)), 'mrcal', a_field((414, 125), 5.0))
+        export(NamedCamera('given', TRUTH.resized(1 / 3, (414, 125)),
+                           field=a_field((414, 125), 5.0)), 'mrcal')
     assert raised.value.code == 'E-EXPORT-SPLINE'
 
 
 @lenses('kalibr')
 def test_kalibr(lens, kind):
-    cam = yaml.safe_load(exported(lens, kind))['cam0']
+    cam = yaml.safe_load(export(lens, kind))['cam0']
     assert cam['intrinsics'] == [lens.fx, lens.fy, lens.cx, lens.cy]
     assert cam['resolution'] == list(lens.image_size)
     model = {'radtan': 'plumb_bob', 'equidistant': 'equidistant'}[cam['distortion_model']]
@@ -251,7 +247,7 @@ def test_kalibr(lens, kind):
 
 @lenses('opensfm')
 def test_opensfm_s_units(lens, kind):
-    [(name, camera)] = json.loads(exported(lens, kind)).items()
+    [(name, camera)] = json.loads(export(lens, kind)).items()
     width, height = lens.image_size
     assert str(width) in name and (camera['width'], camera['height']) == lens.image_size
     # OpenSfM's own: normalised = (pixel + 0.5 - size / 2) / longer side
@@ -265,7 +261,7 @@ def test_opensfm_s_units(lens, kind):
 
 @lenses('nerfstudio')
 def test_nerfstudio_counts_from_the_corner(lens, kind):
-    camera = json.loads(exported(lens, kind))
+    camera = json.loads(export(lens, kind))
     assert camera['cx'] == lens.cx + 0.5 and camera['fl_y'] == lens.fy
     assert camera['k2'] == lens.k2 and camera['frames'] == []
     assert camera['camera_model'] == ('OPENCV_FISHEYE' if lens.model == 'fisheye' else 'OPENCV')
@@ -304,13 +300,13 @@ def test_a_part_that_is_none(lens, crop):
 
 def test_a_kind_that_there_is_not(lens):
     with pytest.raises(ConfigError, match=', '.join(EXPORTS)) as raised:
-        exported(lens, 'matlab')
+        export(lens, 'matlab')
     assert raised.value.code == 'E-EXPORT-KIND'
 
 
 @pytest.mark.parametrize('kind', EXPORTS)
 def test_a_file_s_name_says_what_it_has(kind):
-    known = SUFFIXES[kind]
+    known = EXPORTS[kind].suffixes
     for suffix in known:
         check_suffix(Path(f'a/camera{suffix.upper()}'), kind)
     for name in ('m.png', 'camera.v2', 'a.npz' if '.npz' not in known else 'a.txt'):

@@ -14,8 +14,8 @@ from rosbags.rosbag1 import Writer as Writer1
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.report import load_camera
-from dashcalib_ros.report.camera_file import load_with_faults
+from dashcalib_ros.formats import load_camera
+from dashcalib_ros.formats.load import load_with_faults
 
 BROWN, FISHEYE = EACH_MODEL['brown'], EACH_MODEL['fisheye']
 SMALL = (640, 480)
@@ -229,6 +229,7 @@ def test_the_readout_time_of_a_lens_profile(tmp_path, profile, readout_ms):
     (gyroflow([0.1], fisheye_params={**LENS, 'camera_matrix': [[5, 1, 3], [0, 5, 2], [0, 0, 1]]}),
      'E-CAMERA-FAULTS', 'K[1] is 1'),
     ({'images': []}, 'E-CALIBRATION-FORMAT', ''),
+    ({'frames': []}, 'E-CALIBRATION-FORMAT', ''),
     ([], 'E-CALIBRATION-FORMAT', ''),
     ('hello\n', 'E-CALIBRATION-FORMAT', ''),
     ('', 'E-CALIBRATION-FORMAT', ''),
@@ -407,7 +408,8 @@ def test_a_file_without_distortion_may_leave_it_out(tmp_path):
 
 def test_ros_writes_ini_files_too(tmp_path):
     path = tmp_path / 'ost.txt'
-    for text in (INI, INI.replace('\n', '\r\n'), INI.replace('width\n640', 'width = 640')):
+    for text in (INI, INI.replace('\n', '\r\n'), INI.replace('width\n640', 'width = 640'),
+                 INI.partition('\n\n\n')[2]):
         path.write_text(text)
         found = load_with_faults(path)
         assert found.camera == LENS5 and not found.faults

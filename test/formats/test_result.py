@@ -13,8 +13,9 @@ from rich.console import Console
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.formats import load_calibration, result_dict, result_json
+from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.calibration import StoredTurnSummary, Witness, Witnesses
-from dashcalib_ros.report import load_calibration, result_dict, result_json
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.report.tables import summary
 
@@ -44,7 +45,7 @@ def test_witnesses_are_written_and_read_and_told_in_one_line(tmp_path):
                               'fx_percent', 'fx_sigma_percent', 'agrees']
     (tmp_path / 'result.json').write_text(result_json(calibration))
     assert load_calibration(tmp_path).witnesses == calibration.witnesses
-    line = 'the gyro agrees: fx off by -0.13 ± 0.14 %, its stamps late by 40 ± 0.6 ms'
+    line = 'the gyro agrees: fx off by -0.13 ± 0.14 %, its time stamps late by 40 ± 0.6 ms'
     assert line in report_html(calibration)
     console = Console(width=200, file=io.StringIO())
     console.print(summary(calibration))
@@ -60,6 +61,7 @@ def strict(text):
 
 def test_result_has_the_contract_s_keys_and_values():
     result = strict(result_json(make_calibration()))
+    assert result['reason_codes'] == []
     contract = ['verdict', 'reasons', 'image_size', 'intrinsics', 'sigma', 'turns', 'frames',
                 'reprojection_error_px', 'timing', 'seed', 'versions', 'config']
     assert list(result)[:len(contract)] == contract
@@ -110,23 +112,36 @@ def test_a_result_reads_back(tmp_path):
     assert json.loads(path.read_text()) == result_dict(make_calibration('weak'))
 
 
-@pytest.mark.parametrize(('content', 'complaint'), [
-    (b'{"verdict": ', 'not valid JSON'),
-    (b'{"a": ' * 100000, 'not valid JSON'),
-    (b'[1, 2]', 'no calibration of dashcalib'),
-    (b'{"verdict": "weak", "image_size": [3, 2]}', "no 'intrinsics'"),
-    (b'\xff\xfe\x00junk', 'not a text file'),
-    (b'{"fx": ' + b'7' * 5000 + b'}', 'not valid JSON'),
-    (b'{"notes": "' + b' ' * 2**22 + b'"}', 'too large'),
+@pytest.mark.parametrize(('content', 'code'), [
+    (b'{"verdict": ', 'E-JSON-INVALID'), (b'{"a": ' * 100000, 'E-JSON-INVALID'),
+    (b'\xff\xfe\x00junk', 'E-FILE-NOT-TEXT'),
+    (b'{"fx": ' + b'7' * 5000 + b'}', 'E-JSON-INVALID'),
+    (b'{"notes": "' + b' ' * 2**22 + b'"}', 'E-FILE-TOO-LARGE'),
+    (b'[1, 2]', 'E-OTHER-CALIBRATION'),
+    (b'{"verdict": "weak", "image_size": [3, 2]}', 'E-NO-RESULT-FILE'),
 ])
-def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, complaint):
+def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, code):
     path = tmp_path / 'result.json'
     path.write_bytes(content)
-    with pytest.raises(InputError, match=complaint) as caught:
+    with pytest.raises(InputError) as caught:
         load_calibration(path)
-    assert '\n' not in str(caught.value)
+    assert caught.value.code == code
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_codes_of_reasons_are_written_and_read_back(tmp_path):
+    verdict = Verdict('weak', ('one: do', 'two: do'), ('do',), ('E-ONE-CODE', 'E-SECOND-CODE'))
+    calibration = make_calibration('weak', verdict=verdict)
+    assert strict(result_json(calibration))['reason_codes'] == list(verdict.codes)
+    calibration.save(tmp_path)
+    for name in ('result.json', 'calibration.weak.yaml'):
+        assert load_calibration(tmp_path / name).verdict.codes == verdict.codes
+    old = result_dict(calibration)
+    del old['reason_codes']
+    (tmp_path / 'result.json').write_text(json.dumps(old))
+    assert load_calibration(tmp_path).verdict.codes == ()
 
 
 def test_a_missing_result_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match='does not exist'):
+    with pytest.raises(InputError, match=r'none\.json'):
         load_calibration(tmp_path / 'none.json')

@@ -1,0 +1,65 @@
+"""The table of formats: how each is recognised, read and written.
+
+A new format is a module and a row here. A reader returns the cameras that a content has, by name;
+none where the content is of another format.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dashcalib_ros.formats import (
+    colmap,
+    foxglove,
+    gyroflow,
+    kalibr,
+    mrcal,
+    nerfstudio,
+    opencv,
+    opensfm,
+    ours,
+    pixel_arrays,
+    plain,
+    ros,
+)
+from dashcalib_ros.formats.values import Cameras
+from dashcalib_ros.judge.difference import NamedCamera
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format of camera files.
+
+    in_text: reads a file's text. in_data: reads what JSON, YAML, XML or an .npz have. write:
+    returns a file's content. suffixes: what the name of such a file may end with; the first is
+    offered. keeps: the fields of a NamedCamera that have a place in it, besides the camera.
+    """
+
+    in_text: Callable[[str, Path], Cameras] | None = None
+    in_data: Callable[[Any, Path], Cameras] | None = None
+    write: Callable[[NamedCamera], str | bytes] | None = None
+    suffixes: tuple[str, ...] = ()
+    keeps: tuple[str, ...] = ()
+
+
+# any text may be called so, or nothing
+TEXT = ('.txt', '')
+YAML, JSON = ('.yaml', '.yml', *TEXT), ('.json', *TEXT)
+# the first that has a camera in a content reads it: a lens profile of Gyroflow has a part that
+# looks like one of Kalibr, and opencv takes all with a camera matrix
+FORMATS = {
+    'plain': Format(in_data=plain.cameras),
+    'ours': Format(in_data=ours.cameras),
+    'colmap': Format(colmap.cameras, None, colmap.write, TEXT),
+    'gyroflow': Format(None, gyroflow.cameras, gyroflow.write, JSON, ('readout_ms',)),
+    'kalibr': Format(None, kalibr.cameras, kalibr.write, YAML),
+    'opensfm': Format(None, opensfm.cameras, opensfm.write, JSON),
+    'nerfstudio': Format(None, nerfstudio.cameras, nerfstudio.write, JSON),
+    'mrcal': Format(mrcal.cameras, None, mrcal.write, ('.cameramodel', *TEXT), ('field',)),
+    'foxglove': Format(write=foxglove.write, suffixes=JSON),
+    'ros': Format(ros.ini_cameras, ros.echoed_cameras, ros.write, YAML),
+    'opencv': Format(None, opencv.cameras, opencv.write, YAML),
+    'rays': Format(write=pixel_arrays.write_rays, suffixes=('.npz',), keeps=('field',)),
+    'maps': Format(write=pixel_arrays.write_maps, suffixes=('.npz',), keeps=('field',))}

@@ -1,0 +1,1 @@
+"""Scenes on disk, without pictures: a file of them, and the folder of a camera's turns."""
