@@ -72,8 +72,6 @@ from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.ros import camera_of_message
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion_files import read_motion
-from dashcalib_ros.report import load_camera
-from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.calibrate import camera_info
 from dashcalib_ros.ros.images import LASTING
 from dashcalib_ros.ros.settings import specs

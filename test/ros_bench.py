@@ -34,12 +34,12 @@ COMMAND = [sys.executable, '-m', 'dashcalib_ros.ros']
 # of them need
 QUICK_COMMAND = [sys.executable, '-c', """
 import sys
-from dashcalib_ros import selection
+from dashcalib_ros import pipeline
 from dataclasses import replace
 from dashcalib_ros.ros import drive, interface, main
 interface.SUBSCRIBED['image_raw'] = replace(interface.SUBSCRIBED['image_raw'], depth=50)
 drive.PERIOD_S = 0.1
-selection._load_judging = lambda: None
+pipeline._load_judging = lambda: None
 named = sys.argv[1] in interface.PROGRAMS
 sys.exit(main(sys.argv[1] if named else 'calibrator', sys.argv[1 + named:]))
 """]

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 
 import numpy as np
 import rclpy
@@ -11,7 +12,8 @@ from std_srvs.srv import Trigger
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
-from dashcalib_ros.judge import Calibration, Verdict
+from dashcalib_ros.judge import Verdict
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros import drive as drive_module
 from dashcalib_ros.ros.background import Result
 from dashcalib_ros.ros.node import CameraNode
@@ -108,6 +110,9 @@ class Desk:
             self.spinner.shutdown()
             self.node.close()
             rclpy.try_shutdown()
+            # rclpy keeps a lifecycle node in the graph until it is collected
+            self.node = self.spinner = None
+            gc.collect()
 
 
 def black():

@@ -287,7 +287,7 @@ class Learner:
             self._goal.config, mask=self._mask, live=True, use_stored=use_stored,
             warn=lambda text: self._hear(Trouble('store', text)),
             on_trouble=lambda text: self._hear(Trouble('workers', text)), on_wait=self._serve)
-        return _Bank(number, calibrator, Questions(calibrator))
+        return _Bank(number, calibrator)
 
     def _begin(self, new: _Bank, keep_stored: bool) -> None:
         old, self._now = self._now, new
@@ -344,7 +344,7 @@ class Learner:
         # a long drive thins them out
         if not bank.moved and not 0 <= pairs - bank.pairs < PAIRS_BETWEEN:
             bank.pairs = pairs
-            found = bank.questions.moved(camera.camera, PAIRS)
+            found = bank.calibrator.moved(camera.camera, PAIRS)
             if found is not None:
                 bank.moved = True
                 self._hear(Moved(camera, moved_text(f'than {found[0]:.0f} s ago', found[1])))

@@ -10,10 +10,10 @@ from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from dashcalib_ros.errors import InputError, coded
+from dashcalib_ros.formats.ros import camera_of_message
 from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge import Check, with_faults
 from dashcalib_ros.report import NamedCamera, answer_dict
-from dashcalib_ros.report.camera_file import camera_of_message
 from dashcalib_ros.ros.background import Goal, Result
 from dashcalib_ros.ros.diagnostics import OK, WARN, Health, diagnostic
 from dashcalib_ros.ros.drive import Drive

@@ -12,7 +12,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 
 from dashcalib_ros.errors import ConfigError, DashcalibError, coded
-from dashcalib_ros.report.result import check_camera_name
+from dashcalib_ros.formats.ros import check_camera_name
 from dashcalib_ros.ros.calibrate import Calibrating
 from dashcalib_ros.ros.check import Checking
 from dashcalib_ros.ros.diagnostics import Complaints, Log

@@ -20,7 +20,7 @@ from rclpy.parameter import Parameter
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError
-from dashcalib_ros.report.result import CAMERA_NAME
+from dashcalib_ros.formats.ros import CAMERA_NAME
 from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, Settings, specs, with_changes
 
 RELIABILITIES = ('best_effort', 'reliable')

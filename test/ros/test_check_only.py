@@ -24,10 +24,10 @@ from std_msgs.msg import Header
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.judge import Calibration, Check, Reading, TurnSummary, Verdict, watch
+from dashcalib_ros.formats.ros import camera_of_message
+from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.pipeline import Calibrator, Status
-from dashcalib_ros.questions import Questions
-from dashcalib_ros.report.camera_file import camera_of_message
+from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros import background
 from dashcalib_ros.ros import drive as drive_module
 from dashcalib_ros.ros.calibrate import camera_info

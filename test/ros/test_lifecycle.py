@@ -1,6 +1,7 @@
 """The lifecycle in this process: nothing is left behind, whatever the order of transitions."""
 from __future__ import annotations
 
+import gc
 import os
 import random
 import threading
@@ -42,9 +43,13 @@ def make_node(ros_context, tmp_path):
     try:
         yield make
     finally:
-        for node in made:
-            node.close()
+        for each in made:
+            each.close()
+        each = None
         rclpy.try_shutdown()
+        # rclpy keeps a lifecycle node in the graph until it is collected
+        made.clear()
+        gc.collect()
 
 
 def children():
