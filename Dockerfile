@@ -1,7 +1,7 @@
 # docker build -t dashcalib_ros .
 # docker run --rm dashcalib_ros dashcalib demo --out /tmp/demo
 # docker run --rm --network host --ipc host -v "$HOME/.ros:/root/.ros" dashcalib_ros \
-#     calibrator --ros-args -r image_raw:=/camera/image_raw -r camera_info:=/camera/camera_info
+#     dashcalib-calibrator --ros-args -r image_raw:=/camera/image_raw -r camera_info:=/camera/camera_info
 FROM ros:jazzy-ros-base
 
 RUN apt-get update \
@@ -20,4 +20,4 @@ RUN pip install --no-cache-dir 'numpy<2' /src/dashcalib_ros
 ENV AMENT_PREFIX_PATH="$VIRTUAL_ENV"
 WORKDIR /data
 # the base image's entry point sources /opt/ros/jazzy/setup.bash first
-CMD ["calibrator"]
+CMD ["dashcalib-calibrator"]

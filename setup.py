@@ -31,6 +31,8 @@ setup(
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/config', glob('config/*')),
         (f'share/{PACKAGE}/launch', glob('launch/*.launch.*')),
+        # where ros2 run and launch look, whoever installs it
+        (f'lib/{PACKAGE}', glob('scripts/*')),
     ],
     zip_safe=True,
     python_requires='>=3.10',
@@ -55,7 +57,9 @@ setup(
         'jinja2>=3.0',
     ],
     extras_require={
+        # one of the two: both have the same packages
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        'ros-kilted': ['ros-kilted-rclpy[fastrtps]', 'ros-kilted-common-interfaces'],
         'completion': ['argcomplete>=3'],
         'segmentation': ['onnxruntime>=1.17'],
         # its wheels end at Python 3.12
@@ -70,7 +74,8 @@ setup(
     entry_points={
         'console_scripts': [
             'dashcalib = dashcalib_ros.cli:command',
-            'calibrator = dashcalib_ros.ros:main',
+            'dashcalib-calibrator = dashcalib_ros.ros:calibrator',
+            'dashcalib-checker = dashcalib_ros.ros:checker',
         ],
     },
 )

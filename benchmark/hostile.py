@@ -72,7 +72,7 @@ from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.ros import camera_of_message
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion_files import read_motion
-from dashcalib_ros.ros.calibrator_node import camera_info
+from dashcalib_ros.ros.calibrate import camera_info
 from dashcalib_ros.ros.images import LASTING
 from dashcalib_ros.ros.settings import specs
 from dashcalib_ros.ros.store import Store, Whose
@@ -209,7 +209,7 @@ def parameter_types(folder: Path, tries: Sequence[int]) -> Iterator[None]:
 def transitions(folder: Path, tries: Sequence[int]) -> Iterator[None]:
     """Lifecycle transitions that there are not, in this state or at all."""
     valid = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
-    with running(folder, command=[*COMMAND, '--lifecycle']) as (node, camera):
+    with running(folder, autostart=False) as (node, camera):
         for n in tries:
             wrong = Transition(id=n) if n not in valid else Transition(label='nothing')
             assert not call(node, camera, ChangeState, 'change_state', transition=wrong).success
@@ -287,7 +287,7 @@ def other_sizes(folder: Path, tries: Sequence[int]) -> Iterator[None]:
 
 
 def camera_infos(_: Path, tries: Sequence[int]) -> Iterator[None]:
-    """With check_only, fields of a right camera_info that make its users see wrong."""
+    """For a checker: fields of a right camera_info that make its users see wrong."""
     lens = Radial((320, 240), 300.0, 301.0, 161.0, 118.0, -0.1)
     c = ros_camera(lens)
     for n in tries:
@@ -1122,7 +1122,7 @@ ATTACKS = [
     Attack('odd raw images', 41, 8, odd_images(Image, odd_image)),
     Attack('odd compressed images', 48, 12, odd_images(CompressedImage, compressed_odd)),
     Attack('damaged images of another size', 20, 3, other_sizes),
-    Attack('camera_info with check_only', 17, 17, camera_infos),
+    Attack('camera_info for a checker', 17, 17, camera_infos),
     Attack('stamps of frames', 8, 8, frames),
     Attack('calibration files', 127, 127, calibration_files),
     Attack('stored turns', 25, 25, stores),

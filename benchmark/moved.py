@@ -21,7 +21,7 @@ from test_mount import SPACING_S, SPEED, mounted, pairs_of
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.judge.mount import mount_of, moved
-from dashcalib_ros.ros.background import ASKED, ASKED_EACH
+from dashcalib_ros.ros.background import PAIRS, PAIRS_BETWEEN
 
 NOISE_PX, PLACE_DEG = 0.3, 0.15
 STREET_M, BEFORE_M = (20.0, 80.0), (200.0, 800.0)
@@ -51,8 +51,8 @@ def joined(parts: list[Straights]) -> Straights:
 
 def told_live(pairs: Straights) -> bool:
     """Return whether the node says that the camera was moved."""
-    for end in range(ASKED_EACH, len(pairs) + 1, ASKED_EACH):
-        newest = slice(max(0, end - ASKED), end)
+    for end in range(PAIRS_BETWEEN, len(pairs) + 1, PAIRS_BETWEEN):
+        newest = slice(max(0, end - PAIRS), end)
         if moved(Straights(pairs.before[newest], pairs.after[newest], pairs.stamps_s[newest],
                            pairs.apart_s[newest]), LENS):
             return True

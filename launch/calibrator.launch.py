@@ -8,6 +8,7 @@ from launch_ros.substitutions import FindPackageShare
 from launch import LaunchDescription
 
 ARGUMENTS = (
+    ('program', 'calibrator', 'calibrator, or checker for the calibration of a driver'),
     ('namespace', '', 'the namespace of the camera, which also gives it its name'),
     ('image', 'image_raw', 'the image topic, without /compressed'),
     ('camera_info', 'camera_info', 'the topic on which the calibration is published'),
@@ -23,15 +24,16 @@ PICTURES = ('calibrator/overlay/compressed', 'calibrator/rectified/compressed')
 
 
 def generate_launch_description():
-    """Start one calibrator; include this once for each camera."""
+    """Start one node, which configures and activates itself; include this for each camera."""
     value = {name: LaunchConfiguration(name) for name, _, _ in ARGUMENTS}
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=default, description=about)
           for name, default, about in ARGUMENTS),
         Node(
-            package='dashcalib_ros', executable='calibrator', name='calibrator',
+            package='dashcalib_ros', executable=value['program'], name=value['program'],
             namespace=value['namespace'], output='screen',
-            respawn=True, respawn_delay=2.0,
+            # a wrong parameter ends it each time
+            respawn=True, respawn_delay=2.0, respawn_max_retries=5,
             parameters=[value['config'], {'image_transport': value['image_transport'],
                                           'use_sim_time': value['use_sim_time']}],
             remappings=[('image_raw', value['image']), ('camera_info', value['camera_info'])]),

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
 from processes import processes_of
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -35,11 +35,13 @@ COMMAND = [sys.executable, '-m', 'dashcalib_ros.ros']
 QUICK_COMMAND = [sys.executable, '-c', """
 import sys
 from dashcalib_ros import pipeline
-from dashcalib_ros.ros import images, node, main
-images.DEPTH = 50
-node.PERIOD_S = 0.1
+from dataclasses import replace
+from dashcalib_ros.ros import drive, interface, main
+interface.SUBSCRIBED['image_raw'] = replace(interface.SUBSCRIBED['image_raw'], depth=50)
+drive.PERIOD_S = 0.1
 pipeline._load_judging = lambda: None
-sys.exit(main())
+named = sys.argv[1] in interface.PROGRAMS
+sys.exit(main(sys.argv[1] if named else 'calibrator', sys.argv[1 + named:]))
 """]
 
 
@@ -122,7 +124,7 @@ class Bench:
                     (CameraInfo, 'camera_info', self.on_info, 1000),
                     (CameraInfo, 'calibrator/calibration', self.latched.append, latched),
                     (DiagnosticArray, '/diagnostics', self._on_diagnostics, 10),
-                    (Float64, 'calibrator/turn_magnitude', self.magnitudes.append, 100)):
+                    (Vector3Stamped, 'calibrator/turn_magnitude', self.magnitudes.append, 100)):
                 self.node.create_subscription(kind, name, call, profile)
 
     def on_info(self, message):

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 
 import numpy as np
 import rclpy
@@ -13,12 +14,13 @@ from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.report import Calibration
-from dashcalib_ros.ros import node as node_module
+from dashcalib_ros.ros import drive as drive_module
 from dashcalib_ros.ros.background import Result
-from dashcalib_ros.ros.program import make_node
+from dashcalib_ros.ros.node import CameraNode
+from dashcalib_ros.ros.parameters import given_parameters
 
 # s; the tests wait for the diagnostics again and again
-node_module.PERIOD_S = 0.1
+drive_module.PERIOD_S = 0.1
 
 FIRST = Radial((320, 240), 400.0, 401.0, 320.0, 180.0, -0.3, 0.1)
 SIGMA = {'fx': 2.0, 'fy': 2.0, 'cx': 2.0, 'cy': 2.0, 'k1': 0.01, 'k2': 0.01}
@@ -28,7 +30,8 @@ STAMPS = iter(range(START, START + 10**12, 10**8))
 class Desk:
     """The node and a bench, spun in turns."""
 
-    def __init__(self, context, home, topic='image_raw', remapped='', **parameters):
+    def __init__(self, context, home, topic='image_raw', remapped='', program='calibrator',
+                 **parameters):
         """topic: of the images. remapped: where the node's set_camera_info is, if it is."""
         arguments = ['--ros-args', '-p', f'camera_info_url:={home}/camera.yaml']
         if topic != 'image_raw':
@@ -37,15 +40,29 @@ class Desk:
             arguments += ['-r', f'set_camera_info:={remapped}']
         for name, value in parameters.items():
             arguments += ['-p', f'{name}:={value}']
-        rclpy.init(args=['calibrator', *arguments])
+        rclpy.init(args=[program, *arguments])
         self.file, self.closed = home / 'camera.yaml', False
-        self.node = make_node(lifecycle=False)
+        self.program = program
+        try:
+            self.node = CameraNode(program, given_parameters(program))
+            self.node.start()
+        except BaseException:
+            rclpy.try_shutdown()
+            raise
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self.node)
         self.bench = Bench(context, topic=topic)
         self.until(lambda: self.bench.images.get_subscription_count() > 0
                    and self.bench.values.get('reliability') == 'reliable')
         self.show()
+
+    @property
+    def role(self):
+        return self.node.role
+
+    @property
+    def drive(self):
+        return self.node.role.drive
 
     def until(self, condition):
         def spun():
@@ -61,10 +78,10 @@ class Desk:
             Verdict(level, () if level == 'accepted' else ('few turns',)), (320, 240), camera,
             sigma if camera else None, turns, 10, 0.3, {}, {}, Config(), warnings=warnings,
             mount=mount)
-        result = Result(calibration, complete, self.node._learner.bank)
+        result = Result(calibration, complete, self.drive.learner.bank)
         done = []
-        self.node._later(lambda: self.node._on_result(result))
-        self.node._later(lambda: done.append(True))
+        self.drive._later(lambda: self.drive.on_result(result))
+        self.drive._later(lambda: done.append(True))
         self.until(lambda: done)
 
     def show(self):
@@ -78,7 +95,7 @@ class Desk:
 
     def call(self, name):
         """Call a service of the node."""
-        client = self.bench.node.create_client(Trigger, f'calibrator/{name}')
+        client = self.bench.node.create_client(Trigger, f'{self.program}/{name}')
         self.until(client.service_is_ready)
         future = client.call_async(Trigger.Request())
         self.until(future.done)
@@ -93,6 +110,9 @@ class Desk:
             self.spinner.shutdown()
             self.node.close()
             rclpy.try_shutdown()
+            # rclpy keeps a lifecycle node in the graph until it is collected
+            self.node = self.spinner = None
+            gc.collect()
 
 
 def black():

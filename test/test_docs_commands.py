@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from made_drives import (
     write_ros1,
     write_video,
 )
+from waiting import wait_for
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import main
@@ -50,7 +52,6 @@ CANNOT_RUN = {
     'colcon': 'test/ros/test_install.py builds with colcon, where it is',
     'pre-commit': "changes the clone's hooks",
     'docker': 'no container engine: test_packaging.py checks the Dockerfile as far as it can',
-    'calibrator --lifecycle': 'test/ros/test_around.py runs it',
     'ros2 launch': 'not on the package index; test/ros/test_install.py checks the launch files',
     'ros2': "needs apt's ROS: the package index has no ros2 command",
     'rviz2': "needs apt's ROS",
@@ -121,10 +122,11 @@ def reason(words):
 
 
 def node_arguments(words):
-    """Return what a command gives to the node; None if it does not start it."""
-    for start in (['calibrator'], ['ros2', 'run', 'dashcalib_ros', 'calibrator']):
-        if words[:len(start)] == start:
-            return words[len(start):]
+    """Return the program, and what a command gives to it; None if it starts no node."""
+    for program in ('calibrator', 'checker'):
+        for start in ([f'dashcalib-{program}'], ['ros2', 'run', 'dashcalib_ros', program]):
+            if words[:len(start)] == start:
+                return [program, *words[len(start):]]
     return None
 
 
@@ -172,7 +174,7 @@ def sandbox(inputs, monkeypatch):
 def test_the_command_runs(words, sandbox, capsys, request):
     words = bare(words)
     arguments = node_arguments(words)
-    if arguments is not None and '--lifecycle' not in arguments:
+    if arguments is not None:
         request.getfixturevalue('starts_and_stops')(arguments)
     elif reason(words) is not None:
         if words[:2] == ['dashcalib', 'demo']:
@@ -208,7 +210,10 @@ def starts_and_stops(tmp_path):
             if '--help' in arguments:
                 assert node.process.wait(SOON) == 0 and 'usage' in node.text.lower()
                 return
-            node.wait_for('from the turns seen on')
+            if 'autostart:=false' in arguments:
+                wait_for(lambda: node.catches(signal.SIGTERM))
+            else:
+                node.wait_for('the turns seen on')
             assert node.stop() == 0, node.text
         finally:
             node.kill()
@@ -225,7 +230,7 @@ def test_the_python_runs(text, sandbox, monkeypatch):
 def test_every_reason_is_of_a_command_in_the_documents():
     used = {reason(each.values[0]) for each in COMMANDS}
     unused = {key for key, why in CANNOT_RUN.items() if why not in used}
-    assert unused <= {'rviz2', 'ros2', 'calibrator --lifecycle'}, 'remove them from CANNOT_RUN'
+    assert unused <= {'rviz2', 'ros2'}, 'remove them from CANNOT_RUN'
 
 
 def test_commands_are_found_where_they_stand():
@@ -241,7 +246,7 @@ def test_a_command_that_nobody_knows_is_not_excused():
     assert reason(['dashcalibrate', 'demo']) is None
     assert reason(['sudo', 'apt', 'install', 'x']) and reason(['dashcalib', 'demo'])
     assert reason(['cdrom']) is None
-    assert node_arguments(['ros2', 'run', 'dashcalib_ros', 'calibrator', '-p']) == ['-p']
+    assert node_arguments(['ros2', 'run', 'dashcalib_ros', 'checker', '-p']) == ['checker', '-p']
     assert node_arguments(['ros2', 'topic', 'list']) is None
 
 

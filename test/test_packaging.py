@@ -79,6 +79,8 @@ def test_the_wheel_of_the_source_distribution_is_complete(unpacked, tmp_path):
     expected = {name for name in tracked_files() if name.startswith('dashcalib_ros/')}
     expected |= {f'{share}/dashcalib_ros/{name}' for name in tracked_files()
                  if name.startswith(('config/', 'launch/')) or name == 'package.xml'}
+    expected |= {f'{share.removesuffix("share")}lib/dashcalib_ros/{name}'
+                 for name in ('calibrator', 'checker')}
     expected.add(f'{share}/ament_index/resource_index/packages/dashcalib_ros')
     assert expected - set(names) == set()
     # neither tests nor documents become somebody's top-level package
@@ -96,7 +98,8 @@ def test_the_docker_image_gets_all_that_the_wheel_is_made_of():
     ignored = [line.strip() for line in (ROOT / '.dockerignore').read_text().splitlines()
                if line.strip() and not line.startswith('#')]
     needed = [name for name in tracked_files()
-              if name.startswith(('dashcalib_ros/', 'config/', 'launch/', 'resource/'))]
+              if name.startswith(('dashcalib_ros/', 'config/', 'launch/', 'resource/',
+                                  'scripts/'))]
     needed += ['setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'README.md', 'LICENSE']
     for name in needed:
         parts = [name, *map(str, Path(name).parents)]
@@ -111,6 +114,6 @@ def test_the_dockerfile_s_lines_are_instructions():
     assert lines[0].startswith('FROM ros:jazzy')
     assert {line.split()[0] for line in lines} <= {
         'FROM', 'RUN', 'ENV', 'COPY', 'WORKDIR', 'CMD', 'ARG', 'ENTRYPOINT', 'LABEL'}
-    command, = re.findall(r'^CMD \["(\w+)"', text, re.MULTILINE)
+    command, = re.findall(r'^CMD \["([\w-]+)"', text, re.MULTILINE)
     scripts = setup_keyword('entry_points')['console_scripts']
     assert command in {script.split(' = ')[0] for script in scripts}

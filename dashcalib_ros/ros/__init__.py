@@ -1,4 +1,4 @@
-"""The ROS 2 node; the only room that imports rclpy, and only when the node is started."""
+"""The ROS 2 nodes; the only room that imports rclpy, and only when a node is started."""
 from __future__ import annotations
 
 import signal
@@ -6,12 +6,13 @@ import sys
 from collections.abc import Sequence
 
 from dashcalib_ros.errors import ConfigError, DashcalibError, coded
+from dashcalib_ros.ros.interface import CALIBRATOR, CHECKER
 from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, write_stdout
 from dashcalib_ros.workers.worker import one_thread_for_numpy
 
 INSTALL = ("the Python package {name} is missing: source your ROS 2 installation "
-           "(. /opt/ros/jazzy/setup.sh), or pip install 'ros-jazzy-rclpy[fastrtps]' "
-           "ros-jazzy-common-interfaces")
+           "(. /opt/ros/jazzy/setup.sh), or pip install 'dashcalib_ros[ros]' (Jazzy) or "
+           "'dashcalib_ros[ros-kilted]'")
 ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
                 'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
                 'std_srvs')
@@ -19,10 +20,19 @@ ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the node until it is stopped; return its exit code. argv: without the program's name."""
-    # the handlers come first: Ctrl-C may be pressed while the imports still run, and again.
-    # rclpy's own handlers, installed later by rclpy.init, end the spinning and call these too
+def calibrator() -> int:
+    """Run the program calibrator."""
+    return main(CALIBRATOR)
+
+
+def checker() -> int:
+    """Run the program checker."""
+    return main(CHECKER)
+
+
+def main(program: str, argv: Sequence[str] | None = None) -> int:
+    """Run a program until it is stopped; return its exit code. argv: without its name."""
+    # the handlers come first: Ctrl-C may be pressed while the imports still run, and again
     signals: list[int] = []
     for each in SIGNALS:
         # nohup: the node outlives its terminal
@@ -33,27 +43,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         from dashcalib_ros.ros.settings import check_files, help_text, parse
         arguments = list(sys.argv[1:] if argv is None else argv)
-        wants_help, lifecycle = parse(arguments)
+        wants_help, required = parse(arguments)
         if wants_help:
-            write_stdout(help_text())
+            write_stdout(help_text(program))
             return 0
         check_files(arguments)
         from dashcalib_ros.ros.program import run
-        return run([each for each in arguments if each != '--lifecycle'], lifecycle,
-                   lambda: bool(signals))
+        return run(program, arguments, required, lambda: bool(signals))
     except DashcalibError as error:
-        return _fail(error)
+        return _fail(program, error)
     except ModuleNotFoundError as error:
         missing = (error.name or '').partition('.')[0]
         if missing not in ROS_PACKAGES:
             raise
-        return _fail(ConfigError('E-ROS-NOT-INSTALLED', INSTALL.format(name=missing)))
+        return _fail(program, ConfigError(
+            'E-ROS-NOT-INSTALLED', INSTALL.format(name=missing)))
     finally:
         # while the interpreter ends, they would kill it
         for each in SIGNALS:
             signal.signal(each, signal.SIG_IGN)
 
 
-def _fail(error: DashcalibError) -> int:
-    write_stderr(f'calibrator: error: {coded(error)}')
+def _fail(program: str, error: DashcalibError) -> int:
+    write_stderr(f'{program}: error: {coded(error)}')
     return 2

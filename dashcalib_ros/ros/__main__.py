@@ -1,6 +1,9 @@
-"""python -m dashcalib_ros.ros: the node, without the installed command."""
+"""python -m dashcalib_ros.ros [calibrator | checker] ...: without the installed commands."""
 import sys
 
 from dashcalib_ros.ros import main
+from dashcalib_ros.ros.interface import CALIBRATOR, PROGRAMS
 
-sys.exit(main())
+arguments = sys.argv[1:]
+named = arguments[0] if arguments[:1] and arguments[0] in PROGRAMS else ''
+sys.exit(main(named or CALIBRATOR, arguments[bool(named):]))

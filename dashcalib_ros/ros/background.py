@@ -28,9 +28,26 @@ LOOK_S = 0.25
 LONGEST_BACK_OFF_S = 60.0
 # pairs of images of straight driving, each 0.3 s: when they are asked whether the camera was moved
 # on the car, and how many of them
-ASKED_EACH, ASKED = 30, 120
+PAIRS_BETWEEN, PAIRS = 30, 120
 NOTHING = Status(0, 0, 0, 0.0, 0.0, False)
 Action = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What the background thread works for.
+
+    config: turns.wanted counts, from the next calibration on. turns: calibrations start by
+    themselves when so many are built, and again when others are among the best; None: only by
+    request. camera: one in use that each new turn is compared with, to find changes. check: one
+    that each calibration is compared with, at once where it is new. Cameras are told apart as
+    objects: news about one say which.
+    """
+
+    config: Config
+    turns: int | None = None
+    camera: NamedCamera | None = None
+    check: NamedCamera | None = None
 
 
 @dataclass(frozen=True)
@@ -40,6 +57,14 @@ class Activity:
     status: Status = NOTHING
     calibrating: bool = False
     stage: str = ''
+
+
+@dataclass(frozen=True)
+class Measured:
+    """An image was searched for turns. header: of its message."""
+
+    header: Any
+    status: Status
 
 
 @dataclass(frozen=True)
@@ -81,9 +106,9 @@ class Trouble:
 
 
 # a text is for the log
-News = Status | str | Trouble | Result | Watched | Moved
+News = Measured | str | Trouble | Result | Watched | Moved
 # takes an image with its message's header, and what was found so far; it must not wait
-Show = Callable[[Any, GreyImage, Detection], None]
+ShowImage = Callable[[Any, GreyImage, Detection], None]
 
 
 class Inbox:
@@ -129,7 +154,7 @@ class Inbox:
 class _Bank:
     """A Calibrator and what belongs to its turns only.
 
-    tried: the turns of the last calibration. told: those that the node knows of. requested: a
+    tried: the turns of the last calibration. logged: those that are in the log. requested: a
     calibration is to begin with the present turns. failures: of calibrations in a row.
     not_before: when the next one may begin, in s of time.monotonic(). read: the turns that were
     compared with the camera in use. earlier: what those of the banks before said of it. pairs: of
@@ -140,7 +165,7 @@ class _Bank:
     calibrator: Calibrator
     depth: BitDepth = field(default_factory=BitDepth)
     tried: frozenset[TurnId] = frozenset()
-    told: frozenset[TurnId] = frozenset()
+    logged: frozenset[TurnId] = frozenset()
     requested: bool = False
     failures: int = 0
     not_before: float = 0.0
@@ -153,31 +178,23 @@ class _Bank:
 class Learner:
     """Learns in the background. All methods are for the node's thread; none of them waits.
 
-    The node may set these at any time. config: turns.wanted counts, from the next calibration on.
-    goal: calibrations start by themselves when so many turns are built, and again when others are
-    among the best; None: only by request. watched: a camera that each new turn is compared with,
-    to find changes. checked: one that each calibration is compared with, at once where it is new.
-
     bank: the number of the present bank of turns; results of an older one are out of date.
     activity: what the background thread does now. inbox: what it is to do. sensors: what the car's
     own sensors say; it may be added to.
     """
 
-    def __init__(self, config: Config, queue_size: int, tell: Callable[[News], None],
-                 show: Show, mask: Mask | None = None) -> None:
-        """tell: called with all news, in any thread; it must neither wait nor raise.
+    def __init__(self, goal: Goal, queue_size: int, hear: Callable[[News], None],
+                 show: ShowImage, mask: Mask | None = None) -> None:
+        """hear: called with all news, in any thread; it must neither wait nor raise.
 
         show: called with each image in the background thread. mask: (h, w), False where the images
         are not to be used.
         """
-        self.config = config
-        self.goal: int | None = config.turns.wanted
-        self.watched: NamedCamera | None = None
-        self.checked: NamedCamera | None = None
         self.bank = 0
+        self._goal = goal
         # turns of this drive that are used beyond those wanted
         self._more = 0
-        self._tell = tell
+        self._hear = hear
         self._show = show
         self._mask = mask
         self.inbox = Inbox(queue_size)
@@ -191,6 +208,10 @@ class Learner:
         self._tried_with: NamedCamera | None = None
         self._thread = threading.Thread(target=self._run, name='learn', daemon=True)
         self._thread.start()
+
+    def watch(self, goal: Goal) -> None:
+        """Work for another goal from now on."""
+        self._goal = goal
 
     def offer(self, index: int, stamp_ns: int, message: Any, size: tuple[int, int],
               frame_id: str = '') -> None:
@@ -208,7 +229,7 @@ class Learner:
 
     def extend(self) -> bool:
         """Use one turn of this drive more with this bank; False where no more are kept."""
-        turns = self.config.turns
+        turns = self._goal.config.turns
         if turns.wanted + self._more >= turns.capacity:
             return False
         self._more += 1
@@ -258,14 +279,14 @@ class Learner:
         try:
             action()
         except Exception as error:
-            self._tell(Trouble('failed', f'an image or a request failed: {_named(error)}'))
+            self._hear(Trouble('failed', f'an image or a request failed: {_error_text(error)}'))
         return True
 
     def _bank(self, number: int, use_stored: bool) -> _Bank:
         calibrator = Calibrator(
-            self.config, mask=self._mask, live=True, use_stored=use_stored,
-            warn=lambda text: self._tell(Trouble('store', text)),
-            on_trouble=lambda text: self._tell(Trouble('workers', text)), on_wait=self._serve)
+            self._goal.config, mask=self._mask, live=True, use_stored=use_stored,
+            warn=lambda text: self._hear(Trouble('store', text)),
+            on_trouble=lambda text: self._hear(Trouble('workers', text)), on_wait=self._serve)
         return _Bank(number, calibrator)
 
     def _begin(self, new: _Bank, keep_stored: bool) -> None:
@@ -283,26 +304,26 @@ class Learner:
         """Search an image for turns, and hand it on to who watches."""
         bank = self._now
         try:
-            image = mapped_copy(whole(message, size, bank.depth))
+            image = mapped_copy(decode_checked(message, size, bank.depth))
             status = bank.calibrator.push(Frame(index, stamp_ns, image, frame_id))
         except InputError as error:
-            self._tell(Trouble('undecodable', coded(error)))
+            self._hear(Trouble('undecodable', coded(error)))
             return
         self._show(message.header, image, bank.calibrator.detection)
         self._note(bank, status)
-        self._tell(status)
+        self._hear(Measured(message.header, status))
 
     def _look(self, bank: _Bank) -> None:
         """See which turns are built now."""
         try:
-            bank.calibrator.scenes.want(self.config.turns.wanted, self._more)
+            bank.calibrator.scenes.want(self._goal.config.turns.wanted, self._more)
             status = bank.calibrator.status()
         except Exception as error:
-            self._tell(Trouble('failed', f'the turns could not be counted: {_named(error)}'))
+            self._hear(Trouble('failed', f'the turns could not be counted: {_error_text(error)}'))
             return
         self._note(bank, status)
-        if self._watching is not self.watched:
-            self._watching, self._monitor, bank.read = self.watched, None, frozenset()
+        if self._watching is not self._goal.camera:
+            self._watching, self._monitor, bank.read = self._goal.camera, None, frozenset()
             bank.moved = False
         if self._watching is None:
             return
@@ -310,9 +331,10 @@ class Learner:
             self._watch(bank, self._watching, frozenset(status.reconstructed))
         except Exception as error:
             if bank is self._now and not self._closed:
-                self._tell(Trouble('failed_watches', f'the drive could not be compared with the '
-                                                     f'calibration in use ({_named(error)}); this '
-                                                     f'is repeated at the next turn'))
+                self._hear(Trouble(
+                    'failed_watches', f'the drive could not be compared with the calibration in '
+                                      f'use ({_error_text(error)}); this is repeated at the next '
+                                      f'turn'))
 
     def _watch(self, bank: _Bank, camera: NamedCamera, turns: frozenset[TurnId]) -> None:
         """Compare what is new with the camera in use."""
@@ -320,12 +342,12 @@ class Learner:
             self._read(bank, camera, turns)
         pairs = bank.calibrator.detection.straight_pairs
         # a long drive thins them out
-        if not bank.moved and not 0 <= pairs - bank.pairs < ASKED_EACH:
+        if not bank.moved and not 0 <= pairs - bank.pairs < PAIRS_BETWEEN:
             bank.pairs = pairs
-            found = bank.calibrator.moved(camera.camera, ASKED)
+            found = bank.calibrator.moved(camera.camera, PAIRS)
             if found is not None:
                 bank.moved = True
-                self._tell(Moved(camera, moved_text(f'than {found[0]:.0f} s ago', found[1])))
+                self._hear(Moved(camera, moved_text(f'than {found[0]:.0f} s ago', found[1])))
 
     def _read(self, bank: _Bank, camera: NamedCamera, turns: frozenset[TurnId]) -> None:
         """Compare turns that are new with the camera in use.
@@ -344,27 +366,29 @@ class Learner:
             # those of earlier drives are of the camera before the change
             bank.calibrator.scenes.forget_stored()
         self._monitor = found
-        self._tell(Watched(camera, found))
+        self._hear(Watched(camera, found))
 
     def _note(self, bank: _Bank, status: Status) -> None:
         self.activity = replace(self.activity, status=status)
-        for line in new_turns(bank.told, status, self.config.turns.wanted,
-                              self.watched is not None):
-            self._tell(line)
-        bank.told |= set(status.ready)
+        for line in new_turns(bank.logged, status, self._goal.config.turns.wanted,
+                              self._goal.camera is not None):
+            self._hear(line)
+        bank.logged |= set(status.ready)
 
     def _due(self, bank: _Bank) -> bool:
-        if self.checked is not self._tried_with:
-            self._tried_with, bank.tried = self.checked, frozenset()
-        ready, goal = self.activity.status.ready, self.goal
-        news = goal is not None and len(ready) >= goal and not bank.tried.issuperset(ready)
+        goal = self._goal
+        if goal.check is not self._tried_with:
+            self._tried_with, bank.tried = goal.check, frozenset()
+        ready = self.activity.status.ready
+        news = (goal.turns is not None and len(ready) >= goal.turns
+                and not bank.tried.issuperset(ready))
         return (bank.number == self.bank and (bank.requested or news)
                 and time.monotonic() >= bank.not_before)
 
     def _calibrate(self, bank: _Bank) -> None:
-        bank.requested, given = False, self.checked
+        bank.requested, given = False, self._goal.check
         self.activity = replace(self.activity, calibrating=True)
-        self._tell(beginning(self.activity.status))
+        self._hear(beginning(self.activity.status))
         try:
             stream = self.sensors.stream()
             found = bank.calibrator.detection
@@ -383,8 +407,8 @@ class Learner:
         finally:
             self.activity = replace(self.activity, calibrating=False, stage='')
         bank.tried, bank.failures = frozenset(calibration.misfits), 0
-        complete = calibration.turns_used >= self.config.turns.wanted
-        self._tell(Result(calibration, complete, bank.number, given, check))
+        complete = calibration.turns_used >= self._goal.config.turns.wanted
+        self._hear(Result(calibration, complete, bank.number, given, check))
 
     def _progress(self, stage: str, share: float) -> None:
         self.activity = replace(self.activity, stage=stage)
@@ -397,12 +421,13 @@ class Learner:
         bank.not_before = time.monotonic() + delay
         # the same turns are tried again
         bank.requested = True
-        self._tell(Trouble('failed_calibrations', f'a calibration failed ({_named(error)}); the '
-                                                  f'turns are kept, and the next attempt is in '
-                                                  f'{delay:.0f} s'))
+        self._hear(Trouble(
+            'failed_calibrations', f'a calibration failed ({_error_text(error)}); the turns are '
+                                   f'kept, and the next attempt is in {delay:.0f} s'))
 
 
-def whole(message: Any, size: tuple[int, int], depth: BitDepth | None = None) -> GreyImage:
+def decode_checked(message: Any, size: tuple[int, int], depth: BitDepth | None = None
+                   ) -> GreyImage:
     """Decode a message whose header says this size; raises InputError if it is not so."""
     image = decode(message, depth)
     if image.shape[::-1] != size:
@@ -412,13 +437,13 @@ def whole(message: Any, size: tuple[int, int], depth: BitDepth | None = None) ->
     return image
 
 
-def new_turns(told: Set[TurnId], now: Status, wanted: int, checking: bool) -> list[str]:
+def new_turns(logged: Set[TurnId], now: Status, wanted: int, checking: bool) -> list[str]:
     """Return 'turn 2 of 5: 89°, 179° in all' for each turn that is ready now and was not logged.
 
     The total is that of the turns so far; a turn that replaces another has the last number.
     checking: the turns check a calibration in use.
     """
-    fresh = [place for place, turn in enumerate(now.ready) if turn not in told]
+    fresh = [place for place, turn in enumerate(now.ready) if turn not in logged]
     total = sum(now.yaws_deg) - sum(now.yaws_deg[place] for place in fresh)
     purpose = ' for the next check of the calibration' if checking else ''
     lines = []
@@ -439,7 +464,7 @@ def beginning(status: Status) -> str:
     return f'calibrating with {counted(status.built, "turn")}, {status.yaw_deg:.0f}° of yaw…'
 
 
-def _named(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     """Return an error in one line, with its code, or its type if it is not this project's."""
     if isinstance(error, DashcalibError):
         return coded(error, 500)

@@ -13,50 +13,44 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry
 from rclpy.exceptions import NameValidationException
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.input.motion import values_in
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report.wording import mount_text
-from dashcalib_ros.ros.parameters import OVERRIDES, latched
+from dashcalib_ros.ros.endpoints import Endpoints
+from dashcalib_ros.ros.interface import TF_STATIC
 from dashcalib_ros.ros.settings import NodeConfig
+from dashcalib_ros.ros.transforms import static_broadcaster
 
-# of all that publish static transforms
-STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-TOPIC = '/tf_static'
 # s; within this time others publish that they have the frame
 LISTEN_S = 2.0
 # variance of an angle of which nothing is known, rad^2
 UNKNOWN = math.pi**2 / 3
-# best effort also receives from reliable publishers; a second of a fast gyro
-SENSOR = QoSProfile(depth=400, reliability=ReliabilityPolicy.BEST_EFFORT)
-Take = Callable[[str, float, Sequence[float]], None]
+# as SensorBuffer.add(): with a kind, the stamp in s and the values
+AddMeasurement = Callable[[str, float, Sequence[float]], None]
 
 
 class Mounting:
     """Publishes the mounting on ~/mount, and with publish_tf once on /tf_static."""
 
-    def __init__(self, node: Node, own: NodeConfig, warn: Callable[[str], None]) -> None:
-        """warn: logs a line unless it was logged before."""
-        self._node, self._own, self._warn = node, own, warn
+    def __init__(self, endpoints: Endpoints, own: NodeConfig) -> None:
+        self._node, self._log, self._own = endpoints.node, endpoints.log, own
+        self._warn = endpoints.complaints.once
         # what was published last
         self.mount: Mount | None = None
-        self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/mount', latched(),
-                                           qos_overriding_options=OVERRIDES)
+        self._pose = endpoints.publisher('~/mount')
         self._sent: Mount | None = None
         self._waiting: tuple[Mount, str] | None = None
         self._since = time.monotonic()
         # the parent of each frame, as others publish it
         self._parents: dict[str, str] = {}
-        self._transforms: Any = None
-        if own.publish_tf:
-            self._prepare()
+        self._send = static_broadcaster(endpoints) if own.publish_tf else None
+        if self._send is not None:
+            endpoints.subscription(TF_STATIC, self._listen)
+            endpoints.timer(LISTEN_S / 2, self.tick)
 
     def show(self, mount: Mount | None, frame_id: str) -> None:
         """Publish a mounting; None: there is none. frame_id: of the images."""
@@ -64,7 +58,7 @@ class Mounting:
         if mount is None:
             return
         self._pose.publish(self._message(mount))
-        if self._transforms is not None and mount.verdict == 'accepted':
+        if self._send is not None and mount.verdict == 'accepted':
             self._waiting = mount, self._own.camera_frame or frame_id
 
     def tick(self) -> None:
@@ -81,21 +75,10 @@ class Mounting:
                        f'to false, or camera_frame to another name')
         elif self._sent is None or differs(mount, self._sent):
             self._sent = mount
-            self._transforms.publish(self._kind(transforms=[self._transform(mount, frame)]))
-            self._node.get_logger().info(f'static transform {self._own.base_frame} -> {frame}: '
-                                         f'{mount_text(mount)}')
-
-    def _prepare(self) -> None:
-        try:
-            # not on the package index: from the distribution, where it is
-            from tf2_msgs.msg import TFMessage
-        except ImportError:
-            self._warn('publish_tf needs tf2_msgs, which is not installed: apt install '
-                       'ros-jazzy-tf2-msgs; ~/mount has the pose')
-            return
-        self._kind = TFMessage
-        self._transforms = self._node.create_publisher(TFMessage, TOPIC, STATIC)
-        self._node.create_subscription(TFMessage, TOPIC, self._listen, STATIC)
+            assert self._send is not None
+            self._send(self._transform(mount, frame))
+            self._log.info(f'static transform {self._own.base_frame} -> {frame}: '
+                           f'{mount_text(mount)}')
 
     def _listen(self, message: Any) -> None:
         self._parents.update({each.child_frame_id.lstrip('/'): each.header.frame_id.lstrip('/')
@@ -136,30 +119,26 @@ def differs(mount: Mount, other: Mount) -> bool:
             or (mount.roll_right_deg is None) != (other.roll_right_deg is None))
 
 
-class Sensors:
-    """Subscribes to the sensors whose topics are set, and passes on what they measure."""
+def subscribe_sensors(endpoints: Endpoints, own: NodeConfig, add: AddMeasurement) -> None:
+    """Subscribe to the sensors whose topics are set, and pass on what they measure.
 
-    def __init__(self, node: Node, own: NodeConfig, take: Take) -> None:
-        """take: called as SensorBuffer.add(): with a kind, the stamp in s and the values.
-
-        Raises ConfigError for an invalid topic name.
-        """
-        for name, kind, option in (('imu_topic', Imu, 'imu'), ('odom_topic', Odometry, 'odom'),
-                                   ('fix_topic', NavSatFix, 'gps')):
-            topic = getattr(own, name)
-            if not topic:
-                continue
-            try:
-                node.create_subscription(kind, topic, partial(_pass_on, take, option), SENSOR)
-            except NameValidationException as error:
-                raise ConfigError('E-TOPIC-NAME-INVALID',
-                                  f'{name} {topic!r} is not a valid topic name: use a name such '
-                                  f'as /car/{option}') from error
+    Raises ConfigError for an invalid topic name.
+    """
+    for name, option in (('imu_topic', 'imu'), ('odom_topic', 'odom'), ('fix_topic', 'gps')):
+        topic = getattr(own, name)
+        if not topic:
+            continue
+        try:
+            endpoints.subscription(name, partial(_pass_on, add, option), topic)
+        except NameValidationException as error:
+            raise ConfigError('E-TOPIC-NAME-INVALID',
+                              f'{name} {topic!r} is not a valid topic name: use a name such '
+                              f'as /car/{option}') from error
 
 
-def _pass_on(take: Take, option: str, message: Any) -> None:
+def _pass_on(add: AddMeasurement, option: str, message: Any) -> None:
     stamp_s = float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
     for kind, values in values_in(message, option):
         # of odometry only the speed is used
         if kind != 'odom_rate':
-            take(kind, stamp_s, values)
+            add(kind, stamp_s, values)

@@ -4,12 +4,12 @@ from __future__ import annotations
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.impl.rcutils_logger import RcutilsLogger
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from std_msgs.msg import Header
 
 from dashcalib_ros.errors import one_line, visible
 from dashcalib_ros.report import NamedCamera
@@ -18,32 +18,27 @@ from dashcalib_ros.report import NamedCamera
 EVERY_S = 10.0
 # last lines that once() compares with
 REMEMBERED = 100
-OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR,
-                          DiagnosticStatus.STALE)
+# not STALE, which is for aggregators to say of a node that is silent
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
-class Log(RcutilsLogger):  # type: ignore[misc]
-    """rclpy's log, in which other people's names and texts cannot make lines of their own."""
+class Log:
+    """A node's log, in which other people's names and texts cannot make lines of their own."""
 
-    def info(self, message: str, **filters: Any) -> bool:
+    def __init__(self, node: Node) -> None:
+        self._log = node.get_logger()
+
+    def info(self, message: str) -> None:
         """Log for information."""
-        return bool(super().info(visible(message), **filters))
+        self._log.info(visible(message))
 
-    def warning(self, message: str, **filters: Any) -> bool:
+    def warning(self, message: str) -> None:
         """Log a warning."""
-        return bool(super().warning(visible(message), **filters))
+        self._log.warning(visible(message))
 
-    def error(self, message: str, **filters: Any) -> bool:
+    def error(self, message: str) -> None:
         """Log an error."""
-        return bool(super().error(visible(message), **filters))
-
-
-def log_line(log: RcutilsLogger, severe: bool, text: str) -> None:
-    """Log a text as a warning, or for information: rclpy takes one severity for each call."""
-    if severe:
-        log.warning(text)
-    else:
-        log.info(text)
+        self._log.error(visible(message))
 
 
 class Complaints:
@@ -59,7 +54,7 @@ class Complaints:
         self._logged: dict[str, tuple[float, int]] = {}
         # lines of code whose tracebacks were logged
         self._places: set[str] = set()
-        self._said: deque[str] = deque(maxlen=REMEMBERED)
+        self._logged_texts: deque[str] = deque(maxlen=REMEMBERED)
 
     def say(self, kind: str, text: str, times: int = 1) -> None:
         """Count a complaint, and log it unless its kind was logged in the last seconds."""
@@ -70,7 +65,7 @@ class Complaints:
             return
         unsaid = self.counts[kind] - before - 1
         self._logged[kind] = now, self.counts[kind]
-        self._said.append(text)
+        self._logged_texts.append(text)
         self._log(text + (f' ({unsaid} more like it)' if unsaid > 0 else ''))
 
     def failure(self, kind: str, error: Exception) -> None:
@@ -88,8 +83,8 @@ class Complaints:
 
     def once(self, text: str) -> None:
         """Log a line unless it was logged before."""
-        if text not in self._said:
-            self._said.append(text)
+        if text not in self._logged_texts:
+            self._logged_texts.append(text)
             self._log(text)
 
     def total(self, kind: str, count: int, text: str) -> None:
@@ -103,7 +98,7 @@ class Health:
     """What a node reports of its calibration.
 
     state: in one word. level, message: where nothing else is wrong. camera: the one in use.
-    values: further ones for /diagnostics, by their names.
+    values: further ones for /diagnostics, by their names. warnings: for the operator.
     """
 
     state: str
@@ -111,3 +106,15 @@ class Health:
     message: str
     camera: NamedCamera | None
     values: Mapping[str, object]
+    warnings: Sequence[str] = ()
+
+
+def diagnostic(node: Node, what: str, camera_name: str, level: bytes, message: str,
+               values: Mapping[str, object]) -> DiagnosticArray:
+    """Return what a node says of a camera, with the present time."""
+    return DiagnosticArray(
+        header=Header(stamp=node.get_clock().now().to_msg()),
+        status=[DiagnosticStatus(
+            level=level, message=message, hardware_id=camera_name,
+            name=f'{node.get_fully_qualified_name().strip("/")}: {what}',
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])

@@ -8,12 +8,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, Generic, Literal, TypeVar
 
-from rclpy.clock import Clock
-from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSPolicyKind, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
@@ -23,8 +20,10 @@ from dashcalib_ros.errors import InputError, coded, counted
 from dashcalib_ros.input.bag_write import TRANSPORTS
 from dashcalib_ros.input.decode import message_size
 from dashcalib_ros.input.stamps import StampGate
-from dashcalib_ros.ros.background import whole
+from dashcalib_ros.ros.background import decode_checked
 from dashcalib_ros.ros.diagnostics import Complaints
+from dashcalib_ros.ros.endpoints import Endpoints, message_class, profile
+from dashcalib_ros.ros.interface import SUBSCRIBED
 from dashcalib_ros.ros.parameters import RELIABILITIES
 from dashcalib_ros.ros.settings import NodeConfig
 
@@ -43,10 +42,8 @@ CURES = {
     'set_back': 'the stamps jumped back (as those of a bag that loops): tracking starts again, '
                 'and the turns are kept',
 }
-# images a subscription holds for a callback that is late; of a video, where a lost one costs more
-DEPTH, VIDEO_DEPTH = 5, 50
-# s between two checks of the publishers: images before the right subscription are lost
-LOOK_S = 0.25
+# packets that a subscription holds for a callback that is late; a lost one costs more images
+VIDEO_DEPTH = 50
 # s without an image before it is logged, and between two such lines
 SILENT_S, AGAIN_S = 4.0, 60.0
 # types of topics, and their transports
@@ -143,7 +140,7 @@ class Intake:
         self._last = time.monotonic()
         try:
             source = Source(message_size(message), message.header.frame_id)
-            what = self._watch.take(source, lambda: whole(message, source.size))
+            what = self._watch.take(source, lambda: decode_checked(message, source.size))
         except InputError as error:
             self._complaints.say('undecodable', coded(error))
             return None
@@ -193,24 +190,23 @@ class ImageInput:
     reliability: of the present subscription.
     """
 
-    def __init__(self, node: Node, config: NodeConfig, callback: Callable[[Any], None],
-                 clock: Clock) -> None:
-        self._node = node
+    def __init__(self, endpoints: Endpoints, config: NodeConfig,
+                 callback: Callable[[Any], None]) -> None:
+        self._node, self._log = endpoints.node, endpoints.log
         self._callback = callback
         self._kind: str | None = {'raw': IMAGE, 'compressed': COMPRESSED}.get(
             config.image_transport)
         # as image_transport does: remap the base topic, then append the transport
-        self.base = base = node.resolve_topic_name('image_raw')
+        self.base = base = self._node.resolve_topic_name('image_raw')
         self.topic = f'{base}/compressed' if self._kind == COMPRESSED else base
         self._is_video = self._kind is None
         self.publishers: tuple[str, ...] = ()
-        override = node._parameter_overrides.get(
-            f'qos_overrides.{self.topic}.subscription.reliability')
+        override = endpoints.given.get(f'qos_overrides.{self.topic}.subscription.reliability')
         # without an override, rclpy's parameter would hold the first value for each later one
         self._overridable = None if self._kind is None else QoSOverridingOptions(
             (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
              *([QoSPolicyKind.RELIABILITY] if override else [])))
-        self.reliability = override.value if override else config.reliability
+        self.reliability = override or config.reliability
         self._auto = self.reliability not in RELIABILITIES
         if self._auto:
             self.reliability = 'best_effort'
@@ -218,8 +214,15 @@ class ImageInput:
         self._active = False
         self._missing = ''
         self._started = time.monotonic()
-        self._said: float | None = None
-        self._timer = node.create_timer(LOOK_S, self._look, clock=clock)
+        self._logged: float | None = None
+        endpoints.at_end(self.stop)
+
+    @property
+    def override_names(self) -> frozenset[str]:
+        """Return the parameters that override the QoS; they are declared with the subscription."""
+        return frozenset() if self._is_video else frozenset(
+            f'qos_overrides.{self.topic}.subscription.{policy}'
+            for policy in ('history', 'depth', 'reliability'))
 
     @property
     def listening(self) -> bool:
@@ -240,9 +243,11 @@ class ImageInput:
             self._subscription = None
 
     def _subscribe(self, kind: str) -> Subscription:
-        profile = QoSProfile(depth=VIDEO_DEPTH if self._is_video else DEPTH,
-                             reliability=ReliabilityPolicy[self.reliability.upper()])
-        return self._node.create_subscription(_class(kind), self.topic, self._callback, profile,
+        qos = profile(SUBSCRIBED['image_raw'])
+        qos.reliability = ReliabilityPolicy[self.reliability.upper()]
+        if self._is_video:
+            qos.depth = VIDEO_DEPTH
+        return self._node.create_subscription(message_class(kind), self.topic, self._callback, qos,
                                               qos_overriding_options=self._overridable)
 
     def _find_video(self) -> None:
@@ -252,25 +257,26 @@ class ImageInput:
             if any(info.topic_type == kind
                    for info in self._node.get_publishers_info_by_topic(topic)):
                 try:
-                    _class(kind)
+                    message_class(kind)
                 except ImportError:
-                    self._tell_missing(topic, kind)
+                    self._log_missing(topic, kind)
                     continue
                 self.topic, self._kind = topic, kind
-                self._node.get_logger().info(f'the video is {kind} on {topic}')
+                self._log.info(f'the video is {kind} on {topic}')
                 if self._active:
                     self.start()
                 return
 
-    def _tell_missing(self, topic: str, kind: str) -> None:
+    def _log_missing(self, topic: str, kind: str) -> None:
         """Log once that a package is not installed."""
         if self._missing != kind:
             self._missing = kind
             package = kind.partition('/')[0].replace('_', '-')
-            self._node.get_logger().error(f'{topic} has {kind}, whose package is not installed: '
+            self._log.error(f'{topic} has {kind}, whose package is not installed: '
                                           f'apt install ros-$ROS_DISTRO-{package}')
 
-    def _look(self) -> None:
+    def look(self) -> None:
+        """Find out who publishes, and follow that: images before the right one are lost."""
         if self._kind is None:
             self._find_video()
         infos = self._node.get_publishers_info_by_topic(self.topic)
@@ -279,7 +285,7 @@ class ImageInput:
             return
         fitting = 'reliable' if all(map(_reliable, infos)) else 'best_effort'
         if fitting != self.reliability:
-            self._node.get_logger().info(f'{self.topic}: subscribing {fitting}, like its '
+            self._log.info(f'{self.topic}: subscribing {fitting}, like its '
                                          f'publishers')
             self.stop()
             self.reliability = fitting
@@ -302,15 +308,15 @@ class ImageInput:
         return ('either the camera driver skips images: check its rate; or the best-effort '
                 f'transport loses them: {", or ".join(cures)}')
 
-    def tell_silence(self, silent_s: float | None) -> None:
+    def log_silence(self, silent_s: float | None) -> None:
         """Log from time to time that images are missing; silent_s: since the last one."""
         now = time.monotonic()
         missing_s = now - self._started if silent_s is None else silent_s
         if missing_s < SILENT_S:
-            self._said = None
-        elif self._said is None or now - self._said >= AGAIN_S:
-            self._said = now
-            self._node.get_logger().info(f'no images on {self.topic} {since_text(silent_s)}; '
+            self._logged = None
+        elif self._logged is None or now - self._logged >= AGAIN_S:
+            self._logged = now
+            self._log.info(f'no images on {self.topic} {since_text(silent_s)}; '
                                          f'{self._reason()}')
 
     def _reason(self) -> str:
@@ -355,12 +361,6 @@ def _base(topic: str) -> str:
     """Return a topic without the transport that image_transport adds to its name."""
     base, _, last = topic.rpartition('/')
     return base if last in TRANSPORTS else topic
-
-
-def _class(kind: str) -> Any:
-    """Return the class of a message type; raises ImportError where its package is missing."""
-    package, _, name = kind.split('/')
-    return getattr(import_module(f'{package}.msg'), name)
 
 
 def since_text(silent_s: float | None) -> str:

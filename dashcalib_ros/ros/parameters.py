@@ -3,8 +3,9 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -13,85 +14,103 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
-from std_srvs.srv import Trigger
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.formats.ros import CAMERA_NAME
-from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, specs, with_changes
+from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, Settings, specs, with_changes
 
-# history, depth and reliability; not durability, as a latched topic that is not latched would
-# break its readers
-OVERRIDES = QoSOverridingOptions.with_default_policies()
 RELIABILITIES = ('best_effort', 'reliable')
 
 
-def latched() -> QoSProfile:
-    """Return the QoS of a topic that late subscribers get; rclpy writes overrides into it."""
-    return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+def given_parameters(program: str) -> dict[str, Any]:
+    """Return the parameters that a program's node is given at the start, known or not."""
+    make = functools.partial(Node, program, enable_rosout=False, start_parameter_services=False)
+    try:
+        probe = make(automatically_declare_parameters_from_overrides=True)
+    except ValueError:
+        # an empty list, maybe of another node, has no type: rclpy then takes none of them
+        probe = make()
+        for name in specs(program):
+            probe.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True))
+    try:
+        given = {name: probe.get_parameter(name).value for name in declared_names(probe)}
+    finally:
+        probe.destroy_node()
+    return {name: value for name, value in given.items() if value is not None}
 
 
-def declare(node: Node) -> tuple[Config, NodeConfig]:
-    """Declare the parameters on the node and return what was given.
+def declare(node: Node, program: str, given: Mapping[str, Any]) -> Settings:
+    """Declare the parameters on the node and return their values.
 
     Those for experts are declared where they are given, so that a list of all fits a screen.
-    Raises ConfigError, or rclpy's ParameterException for a value out of its range.
+    Raises ConfigError.
     """
-    given = node._parameter_overrides
-    for name, parameter in given.items():
+    for name, value in given.items():
         if name.startswith('qos_overrides.'):
-            _check_qos(name, parameter.value)
-    return with_changes(Config(), NodeConfig(), {
-        name: _declared(node, name, spec) for name, spec in specs().items()
-        if not spec.metadata['expert'] or name in CHANGEABLE or name in given})
+            _check_qos(name, value)
+    if given.get('check_only') is True:
+        raise ConfigError('E-CHECK-ONLY-REMOVED',
+                          'check_only is a program of its own now: start checker instead of '
+                          'calibrator, without this parameter')
+    known = specs(program)
+    core, own = with_changes(Config(), NodeConfig(), {
+        name: value for name, value in given.items() if name in known})
+    values = {**core.flat(), **dataclasses.asdict(own)}
+    for name, spec in known.items():
+        if not spec.metadata['expert'] or name in given:
+            # the checked value, which rclpy would refuse itself where 3 stands for 3.0
+            value = values[name]
+            node.declare_parameter(
+                name, float(value) if isinstance(spec.default, float) else value,
+                _descriptor(name, spec), ignore_override=True)
+    return Settings(core, own)
 
 
-def check_known(names: Iterable[str], declared: Iterable[str]) -> None:
-    """Check that each parameter that was given is one of this node.
-
-    Raises ConfigError with the nearest name.
-    """
-    known = [*declared, *specs()]
-    for name in names:
-        if name in known:
-            continue
+def unknown_text(node: Node, program: str, names: Collection[str]) -> str:
+    """Return a line about parameters that the node does not have; '' where it has all."""
+    known = {*declared_names(node), *specs(program)}
+    found = []
+    for name in sorted(set(names) - known):
         near = difflib.get_close_matches(name, known, 1)
-        raise ConfigError('E-PARAMETER-UNKNOWN', f'there is no parameter {name!r}' + (
-            f': did you mean {near[0]}?' if near else
-            ': remove it; if it is for another node, name that node in the parameter file instead '
-            'of /**'))
+        found.append(name + (f' (did you mean {near[0]}?)' if near else ''))
+    return f'there is no parameter {", ".join(found)}' if found else ''
 
 
-def check_changeable(node: Node, names: Iterable[str]) -> None:
+def declared_names(node: Node) -> list[str]:
+    """Return the names of all parameters of a node."""
+    return list(node.list_parameters([], ListParameters.Request.DEPTH_RECURSIVE).names)
+
+
+def check_changeable(node: Node, program: str, names: Iterable[str]) -> None:
     """Check that parameters exist and may be changed while the node runs; raises ConfigError."""
-    names = tuple(names)
-    check_known(names, node._parameters)
     for name in names:
+        if text := unknown_text(node, program, [name]):
+            raise ConfigError('E-PARAMETER-UNKNOWN', text)
         # those for experts are not declared unless they were given
         if not node.has_parameter(name) or node.describe_parameter(name).read_only:
+            changeable = ', '.join(each for each in CHANGEABLE if node.has_parameter(each))
             raise ConfigError('E-PARAMETER-READ-ONLY',
                               f'{name} is read-only while the node runs: start the node with '
-                              f'-p {name}:=VALUE. These can be changed: {", ".join(CHANGEABLE)}')
+                              f'-p {name}:=VALUE. These can be changed: {changeable}')
 
 
-def changed(core: Config, own: NodeConfig, parameters: Iterable[Parameter], most_turns: int
-            ) -> tuple[Config, NodeConfig]:
+def changed(settings: Settings, parameters: Iterable[Parameter], most_turns: int) -> Settings:
     """Return the changed settings; raises ConfigError.
 
     most_turns: how many turns the learner was made for.
     """
-    new = with_changes(core, own, {
-        each.name: each.value for each in parameters if each.name in CHANGEABLE})
-    if new[0].turns.wanted > most_turns:
+    new = Settings(*with_changes(settings.core, settings.own, {
+        each.name: each.value for each in parameters if each.name in CHANGEABLE}))
+    wanted = new.core.turns.wanted
+    if wanted > most_turns:
         raise ConfigError('E-TURNS-ABOVE-CAPACITY',
                           f'turns.wanted can be at most {most_turns} while the node runs, which '
                           f'keeps {most_turns} turns; for more, start the node with '
-                          f'-p turns.wanted:={new[0].turns.wanted}')
+                          f'-p turns.wanted:={wanted}')
     return new
 
 
@@ -102,8 +121,6 @@ def refusal(request: Any, response: Any, reason: str) -> Any:
         response.results += [failed] * (len(request.parameters) - len(response.results))
     elif isinstance(response, SetParametersAtomically.Response):
         response.result = failed
-    elif isinstance(response, Trigger.Response):
-        response.success, response.message = False, reason
     return response
 
 
@@ -113,13 +130,11 @@ def camera_name(config: NodeConfig, topic: str) -> str:
     return config.camera_name or re.sub(r'[^A-Za-z0-9_]', '_', namespace) or CAMERA_NAME
 
 
-def _declared(node: Node, name: str, spec: dataclasses.Field[Any]) -> Any:
+def _descriptor(name: str, spec: dataclasses.Field[Any]) -> ParameterDescriptor:
     about = spec.metadata
     descriptor = ParameterDescriptor(
         description=about['reason'] + (' (for experts)' if about['expert'] else ''),
         read_only=name not in CHANGEABLE,
-        # the config checks the types: it accepts 3 for 3.0, and its messages name the cure
-        dynamic_typing=True,
         additional_constraints=f'one of {", ".join(about["choices"])}' if about['choices'] else '')
     low, high = about['minimum'], about['maximum']
     if low is not None and isinstance(spec.default, float):
@@ -127,7 +142,7 @@ def _declared(node: Node, name: str, spec: dataclasses.Field[Any]) -> Any:
             FloatingPointRange(from_value=float(low), to_value=float(high))]
     elif low is not None:
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
-    return node.declare_parameter(name, spec.default, descriptor).value
+    return descriptor
 
 
 def _check_qos(name: str, value: Any) -> None:

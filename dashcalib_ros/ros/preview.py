@@ -17,7 +17,6 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage
 
@@ -26,7 +25,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.remap import rectify
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.estimator import TrackedPoints
-from dashcalib_ros.ros.parameters import OVERRIDES
+from dashcalib_ros.ros.endpoints import Endpoints
 from dashcalib_ros.ros.settings import NodeConfig
 
 # of the pictures as JPEG; 95 takes twice the space
@@ -64,14 +63,12 @@ class Preview:
     take(), nor the image callback ever waits for it. published: how many pictures, of both kinds.
     """
 
-    def __init__(self, node: Node, config: NodeConfig, view: str,
+    def __init__(self, endpoints: Endpoints, config: NodeConfig, view: str,
                  failed: Callable[[Exception], None]) -> None:
         """view: the setting `rectified`. failed: called with what a drawing raised."""
         self.published = 0
         self._overlay, self._rectified = (
-            node.create_publisher(CompressedImage, f'~/{name}/compressed', 1,
-                                  qos_overriding_options=OVERRIDES)
-            for name in ('overlay', 'rectified'))
+            endpoints.publisher(f'~/{name}/compressed') for name in ('overlay', 'rectified'))
         self._period_s = (1 - EARLY) / config.preview_rate
         self._failed = failed
         self._view = view
@@ -81,6 +78,7 @@ class Preview:
         self._waiting: queue.Queue[Picture | None] = queue.Queue(1)
         self._state: tuple[str, Camera | None] = ('', None)
         self._thread = threading.Thread(target=self._draw, name='preview', daemon=True)
+        endpoints.at_end(self.close)
 
     def take(self, header: Any, image: GreyImage, found: Detection) -> None:
         """Have an image drawn if someone subscribes and it is due; one that waits is dropped."""
@@ -93,7 +91,7 @@ class Preview:
                 self._thread.start()
             self._put(Picture(header, image, found.points(), found.valid()))
 
-    def tell(self, text: str, camera: Camera | None) -> None:
+    def show_state(self, text: str, camera: Camera | None) -> None:
         """Take the state that the overlay shows, and the camera in use."""
         self._state = text, camera
 

@@ -16,7 +16,7 @@ from dashcalib_ros.ros.store import camera_info_path
 LIMIT = 60.0
 # ROS is not there, and nothing of it may be needed
 CODE = ("import sys; sys.modules['rclpy'] = None\n"
-        'from dashcalib_ros.ros import main; sys.exit(main(sys.argv[1:]))')
+        'from dashcalib_ros.ros import calibrator; sys.exit(calibrator())')
 
 
 def started(*arguments):
@@ -29,23 +29,28 @@ def started(*arguments):
 def test_help_needs_no_ros_and_ends_with_0(flag):
     done = started(flag)
     assert (done.returncode, done.stderr) == (0, '')
-    assert done.stdout.rstrip() == help_text().rstrip()
+    assert done.stdout.rstrip() == help_text('calibrator').rstrip()
 
 
-def test_help_has_what_a_user_needs_in_80_columns():
-    text = help_text()
-    assert text.startswith('usage: ros2 run dashcalib_ros calibrator')
-    for words in ('image_raw', 'camera_info', '~/overlay/compressed', '/diagnostics', '~/save',
-                  'turns.wanted *', 'camera_info_url', 'example:', '--ros-args'):
+@pytest.mark.parametrize('program', ['calibrator', 'checker'])
+def test_help_has_what_a_user_needs_in_80_columns(program):
+    text = help_text(program)
+    assert text.startswith(f'usage: ros2 run dashcalib_ros {program}\n')
+    assert f'dashcalib-{program} --ros-args' in text
+    for words in ('image_raw', 'camera_info', '~/overlay/compressed', '/diagnostics', '~/reset',
+                  'turns.wanted *', 'mask_file', 'autostart', 'example:'):
         assert words in text
+    own = {'~/check '} if program == 'checker' else {'~/mount ', 'commit *'}
+    assert {words for words in ('~/check ', '~/mount ', 'commit *') if words in text} == own
     assert max(map(len, text.splitlines())) <= 80
 
 
 def test_arguments():
-    assert parse([]) == (False, False)
-    assert parse(['--lifecycle', '--ros-args', '-p', 'a:=b']) == (False, True)
-    assert parse(['--ros-args', '-p', 'help:=x', '--', '--help']) == (True, False)
-    for wrong in (['image_raw:=/camera'], ['--ros-args', '-r', 'a:=b', '--', '/camera']):
+    assert parse([]) == (False, set())
+    assert parse(['--ros-args', '-p', 'a.b:=c', '--param', 'node:d:=e']) == (False, {'a.b', 'd'})
+    assert parse(['--ros-args', '-p', 'help:=x', '--', '--help']) == (True, {'help'})
+    for wrong in (['image_raw:=/camera'], ['--ros-args', '-r', 'a:=b', '--', '/camera'],
+                  ['--lifecycle']):
         with pytest.raises(ConfigError, match='--ros-args') as raised:
             parse(wrong)
         assert raised.value.code == 'E-ARGUMENT-UNKNOWN'

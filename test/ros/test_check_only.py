@@ -4,7 +4,6 @@ The real node in this process, between real publishers; turns, and what they say
 """
 from __future__ import annotations
 
-import json
 import re
 from types import SimpleNamespace
 from typing import ClassVar
@@ -15,24 +14,25 @@ from fakes import stands_in_for
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_desk import FIRST, SIGMA
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.errors import ConfigError, InputError
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats.ros import camera_of_message
 from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.report import Calibration
-from dashcalib_ros.ros import background, node
-from dashcalib_ros.ros.calibrator_node import camera_info
-from dashcalib_ros.ros.check_node import NOT_YET
+from dashcalib_ros.ros import background
+from dashcalib_ros.ros import drive as drive_module
+from dashcalib_ros.ros.calibrate import camera_info
+from dashcalib_ros.ros.check import NOT_YET, flat_texts
 from dashcalib_ros.ros.images import LASTING
-from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.selection import SceneSelection
 from dashcalib_ros.solve.quadratic import Quadratic
 
@@ -108,7 +108,7 @@ def desk(make_desk, monkeypatch):
     """Make a node with such a core; with a driver and a reader of ~/check beside it."""
     monkeypatch.setattr(background, 'Calibrator', Core)
     monkeypatch.setattr(background, 'LOOK_S', 0.05)
-    monkeypatch.setattr(node, 'PERIOD_S', 0.1)
+    monkeypatch.setattr(drive_module, 'PERIOD_S', 0.1)
 
     def make(**parameters):
         desk = make_desk(**{'turns.wanted': 2, **parameters})
@@ -146,39 +146,44 @@ def other(fx):
 
 
 def answers(desk):
-    """Return what a reader that comes now hears on ~/check, decoded."""
+    """Return the values that a reader that comes now hears on ~/check, by name."""
     heard = []
-    desk.bench.node.create_subscription(
-        String, 'calibrator/check', lambda message: heard.append(json.loads(message.data)),
-        LATCHED)
+
+    def hear(message):
+        assert message.header.stamp.sec > 0
+        status, = message.status
+        heard.append({pair.key: pair.value for pair in status.values}
+                     | {'level': status.level, 'message': status.message})
+
+    desk.bench.node.create_subscription(DiagnosticArray, 'checker/check', hear, LATCHED)
     return heard
 
 
 def test_a_right_calibration_is_called_right_and_nothing_else_is_done(desk, capfd):
-    desk = desk(check_only='true')
+    desk = desk(program='checker')
     Core.newest.ready = turns(10, 20)
     desk.until(lambda: f'no camera_info on {TOPIC} yet' in desk.bench.status.message)
     assert desk.bench.status.level == b'\x01' and desk.bench.values['state'] == 'checking'
-    assert not desk.call('calibrate').success and not desk.call('save').success
+    assert not desk.call('calibrate').success
     drive(desk, info_of(), lambda: desk.bench.values['check'] == 'right')
     desk.until(lambda: desk.bench.status.level == b'\x00')
     heard = answers(desk)
     desk.until(lambda: heard)
-    assert heard[-1]['answer'] == 'right' and heard[-1]['changes'] == []
-    assert (heard[-1]['reasons'], heard[-1]['rms_px']) == (['fx 400'], 0.5)
+    assert heard[-1]['answer'] == 'right' and heard[-1]['changes'] == ''
+    assert (heard[-1]['reasons'], heard[-1]['rms_px']) == ('fx 400', '0.5')
     assert f'the calibration on {TOPIC} is right: fx 400' in capfd.readouterr().err
     published = {name for name, _ in desk.bench.node.get_publisher_names_and_types_by_node(
-        'calibrator', '/')}
-    assert '/calibrator/check' in published
-    assert not {TOPIC, '/calibrator/calibration'} & published
+        'checker', '/')}
+    assert '/checker/check' in published
+    assert not {TOPIC, '/checker/calibration'} & published
     assert not desk.file.exists() and 'published' not in desk.bench.values
 
 
 def test_a_wrong_one_warns_until_the_driver_has_another(desk, capfd):
-    desk = desk(check_only='true')
+    desk = desk(program='checker')
     heard = answers(desk)
     drive(desk, other(440.0), lambda: heard)
-    assert heard[-1]['answer'] == 'cannot tell' and heard[-1]['reasons'] == list(NOT_YET.reasons)
+    assert heard[-1]['answer'] == 'cannot tell' and heard[-1]['reasons'] == NOT_YET.reasons[0]
     Core.newest.ready = turns(10, 20)
     desk.until(lambda: desk.bench.values['check'] == 'wrong')
     desk.until(lambda: heard[-1]['answer'] == 'wrong')
@@ -198,7 +203,7 @@ def test_a_wrong_one_warns_until_the_driver_has_another(desk, capfd):
 
 
 def test_one_that_differs_and_is_good_enough_is_no_warning(desk, monkeypatch, capfd):
-    desk = desk(check_only='true')
+    desk = desk(program='checker')
     monkeypatch.setattr(Core, 'near', True)
     Core.newest.ready = turns(10, 20)
     drive(desk, other(404.0), lambda: desk.bench.values['check'] == 'differs')
@@ -209,22 +214,22 @@ def test_one_that_differs_and_is_good_enough_is_no_warning(desk, monkeypatch, ca
 
 
 def test_it_answers_as_soon_as_the_turns_can_tell(desk, monkeypatch):
-    desk = desk(check_only='true', **{'turns.wanted': 4})
+    desk = desk(program='checker', **{'turns.wanted': 4})
     heard = answers(desk)
     monkeypatch.setattr(Core, 'dark', True)
     Core.newest.ready = turns(10, 20)
-    drive(desk, info_of(), lambda: heard and heard[-1]['reasons'] == ['too dark'])
+    drive(desk, info_of(), lambda: heard and heard[-1]['reasons'] == 'too dark')
     monkeypatch.setattr(Core, 'dark', False)
     Core.newest.ready = turns(10, 20, 30)
     desk.until(lambda: heard[-1]['answer'] == 'right')
-    bank = desk.node._learner.bank
+    bank = desk.drive.learner.bank
     Core.newest.ready = turns(10, 20, 30, 40)
-    desk.until(lambda: desk.node._learner._now.number > bank)
+    desk.until(lambda: desk.drive.learner._now.number > bank)
     # few turns that cannot tell do not take back what more could
     heard.clear()
     monkeypatch.setattr(Core, 'dark', True)
     Core.newest.ready = turns(50, 60)
-    desk.until(lambda: desk.node._learner._now.tried == set(turns(50, 60)))
+    desk.until(lambda: desk.drive.learner._now.tried == set(turns(50, 60)))
     monkeypatch.setattr(Core, 'dark', False)
     Core.newest.ready = turns(50, 60, 70)
     desk.until(lambda: heard)
@@ -250,20 +255,20 @@ def test_what_stands_beside_the_camera_is_checked_too(changes, words):
 
 
 def test_a_fault_beside_a_right_camera_is_wrong_before_and_after_the_turns(desk, capfd):
-    desk = desk(check_only='true')
+    desk = desk(program='checker')
     heard = answers(desk)
     drive(desk, info_of(r=FAULTS[2][0]['r']), lambda: heard)
-    assert heard[-1]['answer'] == 'wrong' and 'R rotates' in heard[-1]['reasons'][0]
+    assert heard[-1]['answer'] == 'wrong' and 'R rotates' in heard[-1]['reasons']
     assert 'is wrong: R rotates' in capfd.readouterr().err
     Core.newest.ready = turns(10, 20)
     desk.until(lambda: 'fx 400' in heard[-1]['reasons'])
-    assert heard[-1]['answer'] == 'wrong' and 'R rotates' in heard[-1]['reasons'][0]
+    assert heard[-1]['answer'] == 'wrong' and 'R rotates' in heard[-1]['reasons']
     # each field counts as a change
     drive(desk, info_of(), lambda: heard[-1]['answer'] == 'cannot tell')
 
 
 def test_a_calibration_for_other_images_is_told_and_checked(desk, capfd):
-    desk = desk(check_only='true')
+    desk = desk(program='checker')
     drive(desk, info_of(width=640, height=480),
           lambda: 'is for 640x480, and the images are 320x240' in desk.bench.status.message)
     assert desk.bench.status.level == b'\x01' and '640x480' in capfd.readouterr().err
@@ -273,25 +278,25 @@ def test_a_calibration_for_other_images_is_told_and_checked(desk, capfd):
 
 
 def test_a_camera_that_is_exchanged_is_told(desk, capfd):
-    desk = desk(check_only='true', **{'turns.wanted': 5})
+    desk = desk(program='checker', **{'turns.wanted': 5})
     heard = answers(desk)
     drive(desk, info_of(), lambda: heard)
     core = Core.newest
     core.strangers = turns(20, 30)
     core.ready = turns(10, 20)
     desk.until(lambda: 'does not explain' in desk.bench.values['suspected change'])
-    assert desk.bench.values['change'] == '' and heard[-1]['changes'] == []
+    assert desk.bench.values['change'] == '' and heard[-1]['changes'] == ''
     assert 'does not explain' not in capfd.readouterr().err
     core.ready = turns(10, 20, 30)
     desk.until(lambda: heard[-1]['changes'])
-    text, = heard[-1]['changes']
+    text = heard[-1]['changes']
     assert 'does not explain the pictures since the turn at frame 20' in text
     desk.until(lambda: desk.bench.values['change'] == text)
     assert desk.bench.status.level == b'\x01' and desk.bench.status.message == text
     assert capfd.readouterr().err.count(text) == 1
     # after a reset, one turn is a suspicion again
     assert desk.call('reset').success
-    desk.until(lambda: heard[-1]['changes'] == [] and Core.newest is not core)
+    desk.until(lambda: heard[-1]['changes'] == '' and Core.newest is not core)
     Core.newest.strangers = turns(50)
     Core.newest.ready = turns(40, 50)
     desk.until(lambda: 'frame 50' in desk.bench.values['suspected change'])
@@ -329,23 +334,23 @@ def test_a_calibration_that_cannot_be_used_is_refused_in_one_line(changes, words
 
 
 def test_an_uncalibrated_driver_is_told(desk):
-    desk = desk(check_only='true')
+    desk = desk(program='checker')
     heard = answers(desk)
     drive(desk, CameraInfo(), lambda: heard)
-    assert heard[-1]['answer'] == 'cannot tell' and 'uncalibrated' in heard[-1]['reasons'][0]
+    assert heard[-1]['answer'] == 'cannot tell' and 'uncalibrated' in heard[-1]['reasons']
     desk.until(lambda: 'uncalibrated' in desk.bench.status.message)
     Core.newest.ready = turns(10, 20)
     drive(desk, info_of(), lambda: heard[-1]['answer'] == 'right')
 
 
-def test_it_is_fixed_at_the_start_and_no_calibration_is_committed(desk):
-    with pytest.raises(ConfigError) as raised:
-        NodeConfig(check_only=True, commit=True)
-    assert raised.value.code == 'E-COMMIT-WITH-CHECK-ONLY'
-    desk = desk(check_only='true')
-    refused = desk.node.set_parameters_atomically([Parameter('commit', value=True)])
-    assert not refused.successful and '[E-COMMIT-WITH-CHECK-ONLY]' in refused.reason
+def test_parameters_that_a_checker_does_not_change_say_so(desk):
+    desk = desk(program='checker')
     # one for experts is not declared, but known
-    for name, value in (('check_only', False), ('scene.tracks', 500)):
+    for name, value in (('image_transport', 'raw'), ('scene.tracks', 500)):
         refused = desk.node.set_parameters_atomically([Parameter(name, value=value)])
         assert not refused.successful and '[E-PARAMETER-READ-ONLY]' in refused.reason
+
+
+def test_nested_values_become_texts_by_their_path():
+    assert flat_texts({'answer': 'right', 'a': {'b': 1.5, 'c': None}, 'reasons': ['x', 'y']}) == {
+        'answer': 'right', 'a.b': '1.5', 'reasons': 'x; y'}

@@ -4,6 +4,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,14 +17,25 @@ import yaml
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
+import rclpy
 from ament_index_python import get_package_prefix, get_package_share_directory
-from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
 from rclpy.node import Node
-from ros_bench import REPOSITORY, SOON, Bench, NodeProcess
+from ros_bench import QUICK_COMMAND, REPOSITORY, SOON, Bench, NodeProcess
 
-from dashcalib_ros.config import Config, describe
-from dashcalib_ros.ros.parameters import declare
-from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, sample
+from dashcalib_ros.config import Config
+from dashcalib_ros.ros.interface import (
+    CALIBRATOR,
+    OF_RCLPY,
+    PROGRAMS,
+    PUBLISHED,
+    SERVICES,
+    SUBSCRIBED,
+)
+from dashcalib_ros.ros.page import page
+from dashcalib_ros.ros.parameters import declare, declared_names, given_parameters
+from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, sample, specs
 
 COLCON = shutil.which('colcon')
 # one drive, and the node, have no use for a fleet's settings
@@ -50,29 +62,49 @@ def test_the_shipped_parameters_are_the_defaults():
     assert text == sample()
     values = yaml.safe_load(text)['/**']['ros__parameters']
     own = {spec.name: spec.default for spec in dataclasses.fields(NodeConfig)}
-    assert values == {**CORE, **own}
+    experts = {name for name, spec in specs().items() if spec.metadata['expert']}
+    assert values == {name: value for name, value in {**CORE, **own}.items()
+                      if name not in experts}
+    # those for experts are lines that are commented out
+    commented = dict(re.findall(r'^    # ([a-z_.0-9]+): (\S+)$', text, re.MULTILINE))
+    assert set(commented) == experts and 2 * len(values) < len(experts)
+    assert float(commented['scene.loss_px']) == 0.5 and commented['queue_size'] == '10'
 
 
-def test_the_shipped_parameters_list_what_users_set_first():
-    users, experts = sample().split('For experts')
-    assert 'turns.wanted: 5' in users and 'camera_name:' in users
-    assert 'scene.loss_px: 0.5' in experts and 'queue_size: 10' in experts
-    both = [spec.metadata['expert'] for _, spec in describe()]
-    both += [spec.metadata['expert'] for spec in dataclasses.fields(NodeConfig)]
-    values = yaml.safe_load(users.removesuffix('# '))['/**']['ros__parameters']
-    assert len(values) == both.count(False) <= 25 < both.count(True)
+def read(arguments):
+    """Return the settings, and the names of parameters, of a node with these arguments."""
+    rclpy.init(args=['calibrator', '--ros-args', *arguments])
+    node = Node('read')
+    try:
+        return declare(node, CALIBRATOR, given_parameters('calibrator')), declared_names(node)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 def test_a_file_may_have_full_names_or_sections(tmp_path, ros_context):
     path = tmp_path / 'parameters.yaml'
     path.write_text('/**:\n  ros__parameters:\n    turns.wanted: 3\n    motion.rate: 8.0\n'
                     '    turns:\n      at_most: 4\n')
-    node = Node('read', context=ros_context, cli_args=['--ros-args', '--params-file', str(path)])
-    try:
-        core, _ = declare(node)
-    finally:
-        node.destroy_node()
-    assert core == Config().replace({'turns.wanted': 3, 'motion.rate': 8.0, 'turns.at_most': 4})
+    settings, _ = read(['--params-file', str(path)])
+    assert settings.core == Config().replace(
+        {'turns.wanted': 3, 'motion.rate': 8.0, 'turns.at_most': 4})
+
+
+def test_an_empty_list_of_another_node_is_left_alone(ros_context):
+    settings, _ = read(['-p', 'filters:=[]', '-p', 'turns.wanted:=3', '-p', 'mount_x:=1'])
+    assert settings.core.turns.wanted == 3 and settings.own.mount_x == 1.0
+
+
+def test_a_file_of_all_nodes_may_have_their_parameters(tmp_path, start_node):
+    path = tmp_path / 'parameters.yaml'
+    path.write_text('/**:\n  ros__parameters:\n    turns.wanted: 3\n    max_speed: 8.0\n'
+                    '    turns.at_mots: 4\n    qos_overrides./cmd_vel.publisher.depth: 3\n')
+    node = start_node('--params-file', str(path))
+    node.wait_for('learning the camera')
+    line, = [line for line in node.text.splitlines() if 'WARN' in line]
+    assert 'max_speed' in line and '/cmd_vel.' in line and 'turns.at_most?' in line
+    assert node.stop() == 0
 
 
 def test_the_node_takes_the_shipped_parameters(node_and_bench):
@@ -80,46 +112,79 @@ def test_the_node_takes_the_shipped_parameters(node_and_bench):
     assert 'WARN' not in node.text and 'learning the camera' in node.text
 
 
-def test_every_parameter_is_declared_with_its_reason_and_range(node_and_bench):
-    node, bench = node_and_bench
+def test_parameters_are_declared_with_type_reason_and_range(start_node, make_bench):
+    node, bench = start_node('-r', '__node:=typed', scene__loss_px=0.6, mount_x=1), make_bench()
     request = ListParameters.Request(depth=0)
-    names = list(ask(bench, node, ListParameters, 'list_parameters', request).result.names)
-    assert set(CORE) <= set(names)
+    names = list(ask(bench, node, ListParameters, '/typed/list_parameters', request).result.names)
+    users = {name for name, spec in specs().items() if not spec.metadata['expert']}
+    assert users < set(names)
     request = DescribeParameters.Request(names=names)
     about = {each.name: each for each in ask(
-        bench, node, DescribeParameters, 'describe_parameters', request).descriptors}
-    assert all(about[name].description for name in CORE)
+        bench, node, DescribeParameters, '/typed/describe_parameters', request).descriptors}
+    kinds = {bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,
+             float: ParameterType.PARAMETER_DOUBLE, str: ParameterType.PARAMETER_STRING}
+    for name in users:
+        assert about[name].description and not about[name].dynamic_typing
+        assert about[name].type == kinds[type(specs()[name].default)], name
     assert {name for name in about if not about[name].read_only} - {'use_sim_time'} == set(
         CHANGEABLE)
     assert about['scene.loss_px'].description.endswith('(for experts)')
     assert 'experts' not in about['turns.wanted'].description
-    half_width = about['turns.half_width'].floating_point_range[0]
-    assert (half_width.from_value, half_width.to_value) == (0.5, 10.0)
+    speed = about['mount.speed_kmh'].floating_point_range[0]
+    assert (speed.from_value, speed.to_value) == (0.0, 300.0)
     wanted = about['turns.wanted'].integer_range[0]
     assert (wanted.from_value, wanted.to_value) == (1, 20)
-    assert 'best_effort' in about['reliability'].additional_constraints
     assert 'crop' in about['rectified'].additional_constraints
     assert 'fisheye' in about['model'].description
 
 
 def test_what_users_set_fits_a_screen(ros_context):
     """Settings for experts are parameters where they are given."""
-    node = Node('read', context=ros_context, cli_args=['--ros-args', '-p', 'scene.loss_px:=0.6'])
-    try:
-        core, _ = declare(node)
-        names = set(node._parameters)
-    finally:
-        node.destroy_node()
-    assert core.scene.loss_px == 0.6 and 'scene.loss_px' in names
-    assert {name for name, spec in describe() if not spec.metadata['expert']} < names
+    settings, names = read(['-p', 'scene.loss_px:=0.6'])
+    assert settings.core.scene.loss_px == 0.6 and 'scene.loss_px' in names
+    assert {name for name, spec in specs().items() if not spec.metadata['expert']} < set(names)
     assert len(names) <= 50 and 'scene.error_px' not in names
+
+
+@pytest.mark.parametrize('program', ['calibrator', 'checker'])
+def test_the_page_of_the_interface_is_that_of_a_running_node(start_node, make_bench, program):
+    """If this fails: python -m dashcalib_ros.ros.page > docs/ros_interface.md."""
+    assert (REPOSITORY / 'docs' / 'ros_interface.md').read_text() == page()
+    node, bench = start_node(command=[*QUICK_COMMAND, program]), make_bench(listen=False)
+    bench.until(lambda: bench.images.get_subscription_count() > 0
+                and program in bench.node.get_node_names(), node=node)
+    # the node's own list comes a moment later
+    bench.spin(0.5)
+
+    def full(name):
+        return '/' + name.replace('~', program).lstrip('/')
+
+    def found(kind):
+        return dict(getattr(bench.node, f'get_{kind}_names_and_types_by_node')(program, '/'))
+
+    def expected(table):
+        # tf2 and the sensors: with parameters; of a video, the type is another
+        return {full(name): [topic.type] for name, topic in table.items()
+                if program in topic.programs and name != '/tf_static' and '_topic' not in name}
+
+    of_rclpy = {full(name) for name in OF_RCLPY['topics']}
+    said, heard = found('publisher'), found('subscriber')
+    assert of_rclpy < set(said)
+    assert {name: said[name] for name in set(said) - of_rclpy} == expected(PUBLISHED)
+    heard.pop('/parameter_events', None)
+    assert heard == expected(SUBSCRIBED)
+    names = set(ask(bench, node, ListParameters, f'/{program}/list_parameters',
+                    ListParameters.Request(depth=0)).result.names)
+    for kind, topics in (('publisher', expected(PUBLISHED)), ('subscription', heard)):
+        for topic in topics:
+            assert f'qos_overrides.{topic}.{kind}.depth' in names
+    assert set(found('service')) == {
+        full(each.name) for each in SERVICES if program in each.programs} | {
+        full(name) for name in OF_RCLPY['services']}
 
 
 def test_parameters_that_may_not_change_say_so(node_and_bench):
     node, bench = node_and_bench
-    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-    from rcl_interfaces.srv import SetParameters
-
     def set_to(name, **value):
         request = SetParameters.Request(parameters=[Parameter(
             name=name, value=ParameterValue(**value))])
@@ -130,7 +195,7 @@ def test_parameters_that_may_not_change_say_so(node_and_bench):
     assert not refused.successful and '-p turns.at_most:=VALUE' in refused.reason
     assert refused.reason.endswith('[E-PARAMETER-READ-ONLY]')
     # the same as at the start
-    for name, near in (('turns.wnted', 'turns.wanted'), ('of_another_node', '/**')):
+    for name, near in (('turns.wnted', 'turns.wanted?'), ('of_another_node', 'no parameter')):
         refused = set_to(name, type=whole, integer_value=3)
         assert not refused.successful and name in refused.reason and near in refused.reason
         assert refused.reason.endswith('[E-PARAMETER-UNKNOWN]')
@@ -148,46 +213,51 @@ def test_parameters_that_may_not_change_say_so(node_and_bench):
         assert not refused.successful and '[E-PARAMETER-READ-ONLY]' in refused.reason
         assert '\n' not in refused.reason
     refused = set_to('commit', type=whole, integer_value=3)
-    assert not refused.successful and 'E-CONFIG-TYPE' in refused.reason
+    assert not refused.successful and 'type' in refused.reason
     assert set_to('commit', type=ParameterType.PARAMETER_BOOL, bool_value=True).successful
     assert set_to('commit', type=ParameterType.PARAMETER_BOOL, bool_value=False).successful
 
 
 def ask(bench, node, kind, name, request):
-    client = bench.node.create_client(kind, f'calibrator/{name}')
+    client = bench.node.create_client(
+        kind, name if name.startswith('/') else f'calibrator/{name}')
     bench.until(client.service_is_ready, what=name, node=node)
     future = client.call_async(request)
     bench.until(future.done, what=name, node=node)
     return future.result()
 
 
-def test_the_permissions_are_what_the_node_uses(node_and_bench):
-    """No more than the live node's own endpoints, and no less, the optional ones aside."""
-    _, bench = node_and_bench
+def test_the_permissions_are_what_the_nodes_use():
+    """No more than the table of the interface, which is compared with running nodes, and no less.
+
+    The video's topics and the sensors' depend on parameters.
+    """
     policy = ElementTree.parse(REPOSITORY / 'config' / 'sros2_policy.xml')
-    seen = bench.node
+    rest = {'/clock', 'image_raw/compressed'}
+    for program in PROGRAMS:
+        profile = policy.find(f".//profile[@node='{program}']")
 
-    def allowed(kind, access):
-        found = policy.findall(f".//{kind}s[@{access}='ALLOW']/{kind}")
-        return {'/' + each.text.replace('~', 'calibrator').lstrip('/') for each in found}
+        def allowed(kind, access, profile=profile):
+            return {each.text for each in profile.findall(f"{kind}s[@{access}='ALLOW']/{kind}")}
 
-    def used(function):
-        return {name for name, _ in getattr(seen, function)('calibrator', '/')}
+        def of(table, program=program):
+            return {name for name, topic in table.items()
+                    if program in topic.programs and '_topic' not in name}
 
-    # ~/check: with check_only, test_check_only.py has it; /tf_static: with publish_tf
-    assert used('get_publisher_names_and_types_by_node') == (
-        allowed('topic', 'publish') - {'/calibrator/check', '/tf_static'})
-    heard = used('get_subscriber_names_and_types_by_node')
-    assert heard <= allowed('topic', 'subscribe') and '/image_raw' in heard
-    assert used('get_service_names_and_types_by_node') == allowed('service', 'reply')
-    assert used('get_client_names_and_types_by_node') <= allowed('service', 'request')
+        assert allowed('topic', 'publish') == of(PUBLISHED) | set(OF_RCLPY['topics'])
+        assert allowed('topic', 'subscribe') == of(SUBSCRIBED) | rest
+        assert allowed('service', 'reply') == set(OF_RCLPY['services']) | {
+            each.name for each in SERVICES if program in each.programs}
+        assert allowed('service', 'request') == (
+            {'set_camera_info'} if program == 'calibrator' else set())
 
 
 def test_the_permissions_have_the_form_that_sros2_takes():
     """Its schema: policy 0.2.0, enclaves, profiles, then lists of names with one access each."""
     policy = ElementTree.parse(REPOSITORY / 'config' / 'sros2_policy.xml').getroot()
     assert (policy.tag, policy.attrib) == ('policy', {'version': '0.2.0'})
-    enclave, = policy.findall('enclaves/enclave')
+    enclave, checker = policy.findall('enclaves/enclave')
+    assert checker.get('path') == '/dashcalib_ros/checker'
     assert [each.tag for each in policy.iter()][:5] == [
         'policy', 'enclaves', 'enclave', 'profiles', 'profile']
     assert enclave.get('path').startswith('/')
@@ -231,25 +301,39 @@ bench.spin(2)
     bench.until(lambda: bench.count('received') - before >= 45, what='45 of 60 images', node=node)
 
 
-def test_launch_files_start_the_node_with_the_same_arguments():
-    tree = ElementTree.parse(REPOSITORY / 'launch' / 'calibrator.launch.xml')
-    root = tree.getroot()
-    code = ast.parse((REPOSITORY / 'launch' / 'calibrator.launch.py').read_text())
-    table = next(each.value for each in code.body if isinstance(each, ast.Assign)
-                 and each.targets[0].id == 'ARGUMENTS')
-    names = [row.elts[0].value for row in table.elts]
-    assert names == [each.get('name') for each in root.findall('arg')]
-    start = root.find('node')
-    assert (start.get('pkg'), start.get('exec')) == ('dashcalib_ros', 'calibrator')
-    # a node that crashed comes back, from either file
-    assert (start.get('respawn'), start.get('respawn_delay')) == ('true', '2.0')
+@pytest.mark.parametrize(('name', 'kind'), [
+    ('calibrator', 'Node'), ('calibrator_lifecycle', 'LifecycleNode')])
+def test_launch_files_start_a_crashed_node_again_with_a_limit(name, kind):
+    """They are read, not run: launch is not on the package index."""
+    code = ast.parse((REPOSITORY / 'launch' / f'{name}.launch.py').read_text())
     call = next(each for each in ast.walk(code) if isinstance(each, ast.Call)
-                and isinstance(each.func, ast.Name) and each.func.id == 'Node')
+                and isinstance(each.func, ast.Name) and each.func.id == kind)
     given = {each.arg: each.value for each in call.keywords}
-    assert (given['respawn'].value, given['respawn_delay'].value) == (True, 2.0)
+    assert given['package'].value == 'dashcalib_ros'
+    assert (given['respawn'].value, given['respawn_delay'].value,
+            given['respawn_max_retries'].value) == (True, 2.0, 5)
+    managed = any(isinstance(each, ast.Constant) and each.value == 'autostart'
+                  for each in ast.walk(given['parameters']))
+    assert managed is (kind == 'LifecycleNode')
 
 
-@pytest.mark.parametrize('command', ['dashcalib', 'calibrator'])
+def test_the_launch_file_in_xml_is_the_other_one():
+    root = ElementTree.parse(REPOSITORY / 'launch' / 'calibrator.launch.xml').getroot()
+    include, = root
+    assert include.get('file').endswith('/launch/calibrator.launch.py')
+
+
+def test_programs_are_where_ros2_run_looks():
+    for program in PROGRAMS:
+        path = REPOSITORY / 'scripts' / program
+        assert os.access(path, os.X_OK)
+        done = subprocess.run([sys.executable, str(path), '--help'], capture_output=True,
+                              text=True, timeout=SOON, env={
+                                  **os.environ, 'PYTHONPATH': str(REPOSITORY)})
+        assert done.stdout.startswith(f'usage: ros2 run dashcalib_ros {program}\n')
+
+
+@pytest.mark.parametrize('command', ['dashcalib', 'dashcalib-calibrator', 'dashcalib-checker'])
 def test_pip_puts_the_commands_beside_python(command):
     """An old pip without pyproject.toml puts them where setup.cfg tells colcon to."""
     places = [Path(str(each.locate_file('')))
@@ -261,7 +345,7 @@ def test_pip_puts_the_commands_beside_python(command):
 
 @pytest.mark.skipif(COLCON is None, reason='no colcon: pip install colcon-ros and friends')
 def test_colcon_builds_it_and_ros2_run_would_find_it(tmp_path, monkeypatch):
-    for name in ('dashcalib_ros', 'config', 'launch', 'resource'):
+    for name in ('dashcalib_ros', 'config', 'launch', 'resource', 'scripts'):
         shutil.copytree(REPOSITORY / name, tmp_path / 'src' / name,
                         ignore=shutil.ignore_patterns('__pycache__'))
     for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'README.md'):
@@ -279,7 +363,7 @@ def test_colcon_builds_it_and_ros2_run_would_find_it(tmp_path, monkeypatch):
         'calibrator.yaml', 'dashcalib.rviz', 'fastdds_large_images.xml', 'foxglove_layout.json',
         'sros2_policy.xml']
     assert sorted(path.name for path in (share / 'launch').iterdir()) == [
-        'calibrator.launch.py', 'calibrator.launch.xml']
+        'calibrator.launch.py', 'calibrator.launch.xml', 'calibrator_lifecycle.launch.py']
     executable = prefix / 'lib' / 'dashcalib_ros' / 'calibrator'
     assert os.access(executable, os.X_OK)
     site = next(prefix.glob('lib/python*/site-packages'))

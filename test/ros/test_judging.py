@@ -84,10 +84,10 @@ def test_images_of_two_cameras_get_nothing(make_desk, monkeypatch):
         assert desk.show() is None
         desk.give(fx=402.0, sigma={**SIGMA, 'fx': 1.0})
         assert not desk.call('save').success and load_camera(desk.file).camera.fx == 400.0
-    bank = desk.node._learner.bank
+    bank = desk.drive.learner.bank
     desk.until(lambda: not desk.bench.values['warnings'])
     # the turns of the time with two cameras are dropped, what was known before is used again
-    assert desk.node._learner.bank == bank + 1 and desk.show() == 400.0
+    assert desk.drive.learner.bank == bank + 1 and desk.show() == 400.0
 
 
 def test_each_outcome_is_one_line_that_says_what_comes_next(make_desk, capfd):
@@ -118,23 +118,23 @@ def test_a_contradicted_one_goes_on_where_that_is_wanted(make_desk):
 
 def test_results_of_forgotten_turns_are_not_used(make_desk):
     desk = make_desk()
-    result_of_old_bank = desk.node._learner.bank
+    result_of_old_bank = desk.drive.learner.bank
     assert desk.call('reset').success
-    assert desk.node._learner.bank == result_of_old_bank + 1
+    assert desk.drive.learner.bank == result_of_old_bank + 1
     calibration = Calibration(Verdict('accepted'), (320, 240), FIRST, SIGMA, (), 10, 0.3, {}, {},
                               Config())
-    desk.node._on_result(Result(calibration, True, result_of_old_bank))
+    desk.drive.on_result(Result(calibration, True, result_of_old_bank))
     assert desk.show() is None
 
 
 def test_a_disk_that_takes_nothing_is_counted_and_the_calibration_published(make_desk, tmp_path):
     (tmp_path / 'plain').write_text('a file, no folder')
     desk = make_desk()
-    desk.node._store.path = tmp_path / 'plain' / 'camera.yaml'
+    desk.role._store.path = tmp_path / 'plain' / 'camera.yaml'
     desk.give()
     assert desk.show() == 400.0
     assert desk.bench.values['unsaved'] == '1'
-    saved, why = desk.node._save()
+    saved, why = desk.role.save()
     assert not saved and 'camera_info_url' in why
 
 
@@ -179,7 +179,7 @@ def test_a_reset_on_a_disk_that_is_read_only_does_not_say_it_was_done(make_desk,
     assert desk.file.exists() and desk.show() is None
     desk.until(lambda: 'could not be moved aside' in desk.bench.values['warnings'])
     # this process trusts it no more, whatever makes it look again
-    desk.node._load()
+    desk.role._load()
     assert desk.show() is None
     desk.file.unlink()
     desk.until(lambda: desk.bench.values['warnings'] == '')
@@ -194,7 +194,7 @@ def test_one_that_is_given_up_on_a_read_only_disk_is_told(make_desk, request, ca
     assert desk.show() is None and desk.file.exists()
     assert 'could not be moved aside' in capfd.readouterr().err
     desk.until(lambda: 'could not be moved aside' in desk.bench.values['warnings'])
-    desk.node._load()
+    desk.role._load()
     assert desk.show() is None
 
 
@@ -230,7 +230,7 @@ def test_news_that_fail_do_not_hold_back_the_others_and_are_counted(make_desk, c
     def fail():
         raise ZeroDivisionError('odd news')
     for _ in range(3):
-        desk.node._later(fail)
+        desk.drive._later(fail)
     desk.give()
     assert desk.show() == 400.0
     desk.until(lambda: desk.bench.count('failed_callbacks') == 3)
@@ -242,7 +242,7 @@ def test_a_service_that_fails_answers(make_desk, monkeypatch):
 
     def fail(*args):
         raise ZeroDivisionError('odd')
-    monkeypatch.setattr(desk.node._learner, 'restart', fail)
+    monkeypatch.setattr(desk.drive.learner, 'restart', fail)
     answer = desk.call('reset')
     assert not answer.success and 'odd' in answer.message
     desk.until(lambda: desk.bench.count('failed_callbacks') == 1)
@@ -325,8 +325,8 @@ def test_a_camera_that_was_moved_since_the_last_calibration_is_told_once(make_de
     assert logged.count('the camera was moved') == 1
     assert desk.show() == 400.0
     # straight stretches have told it already
-    trusted = desk.node._trusted()
-    desk.node._learner._tell(Moved(trusted, 'the camera points elsewhere'))
+    trusted = desk.role._trusted()
+    desk.drive.learner._hear(Moved(trusted, 'the camera points elsewhere'))
     desk.until(lambda: desk.bench.values['change'] == 'the camera points elsewhere')
     desk.give(mount=MOUNT)
     desk.until(lambda: desk.bench.values['change'] == '')
@@ -367,12 +367,12 @@ def test_a_confirmation_is_kept_on_disk_too(make_desk):
 def test_complete_turns_that_contradict_it_are_kept_and_counted_on(make_desk):
     desk = make_desk()
     desk.give()
-    bank = desk.node._learner.bank
+    bank = desk.drive.learner.bank
     for _ in range(2):
         desk.give(fx=420.0)
-        assert desk.node._learner.bank == bank and desk.show() == 400.0
+        assert desk.drive.learner.bank == bank and desk.show() == 400.0
     desk.give(fx=420.0)
-    assert desk.node._learner.bank == bank + 1 and desk.show() == 420.0
+    assert desk.drive.learner.bank == bank + 1 and desk.show() == 420.0
 
 
 def test_the_same_turns_count_once(make_desk):

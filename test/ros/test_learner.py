@@ -21,7 +21,9 @@ from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.ros import background as room
 from dashcalib_ros.ros.background import (
+    Goal,
     Learner,
+    Measured,
     Moved,
     Result,
     Trouble,
@@ -147,11 +149,18 @@ def desk(monkeypatch):
             case str():
                 (heard.begun if 'calibrating' in news else heard.turns).append(news)
             case _:
-                {Result: heard.results, Status: heard.statuses,
+                {Result: heard.results, Measured: heard.statuses,
                  Watched: heard.watched, Moved: heard.moved}[type(news)].append(news)
-    heard.learner = Learner(CONFIG, 10, hear, lambda *shown: heard.shown.append(shown))
+    heard.goal = Goal(CONFIG, 2)
+    heard.learner = Learner(heard.goal, 10, hear, lambda *shown: heard.shown.append(shown))
     yield heard
     heard.learner.close()
+
+
+def aim(desk, **changes):
+    """Change the goal of the learner."""
+    desk.goal = dataclasses.replace(desk.goal, **changes)
+    desk.learner.watch(desk.goal)
 
 
 def at(*centers):
@@ -226,8 +235,7 @@ def test_each_turn_and_each_calibration_is_told_once(desk):
 def test_other_numbers_of_turns_can_be_wanted_while_it_runs(desk):
     core = Core.made[0]
     core.ready = at(10)
-    desk.learner.config = CONFIG.replace({'turns.wanted': 1})
-    desk.learner.goal = 1
+    aim(desk, config=CONFIG.replace({'turns.wanted': 1}), turns=1)
     until(lambda: desk.results)
     assert core.wanted == 1 and desk.results[0].complete
     desk.learner.restart()
@@ -235,7 +243,7 @@ def test_other_numbers_of_turns_can_be_wanted_while_it_runs(desk):
 
 
 def test_a_bank_is_extended_turn_by_turn_as_far_as_turns_are_kept(desk):
-    desk.learner.config = CONFIG.replace({'turns.wanted': 9})
+    aim(desk, config=CONFIG.replace({'turns.wanted': 9}))
     assert desk.learner.extend()
     until(lambda: getattr(Core.made[0], 'wanted', None) == 10)
     assert not desk.learner.extend()
@@ -254,7 +262,7 @@ def test_images_are_shown_with_what_was_found(desk):
 
 
 def test_a_lower_goal_calibrates_sooner_but_not_completely(desk):
-    desk.learner.goal = 1
+    aim(desk, turns=1)
     Core.made[0].ready = at(10)
     until(lambda: desk.results)
     assert not desk.results[0].complete
@@ -386,14 +394,14 @@ def test_a_failing_core_ends_no_thread(desk, monkeypatch):
 
 def test_new_turns_are_compared_with_the_camera_in_use_once(desk):
     core = Core.made[0]
-    desk.learner.goal = None
+    aim(desk, turns=None)
     core.ready = at(10)
     time.sleep(2 * room.LOOK_S)
     assert core.watched == []  # there is none in use
-    desk.learner.watched = CAMERA
+    aim(desk, camera=CAMERA)
     until(lambda: desk.watched)
     time.sleep(2 * room.LOOK_S)
-    desk.learner.watched = CAMERA
+    aim(desk, camera=CAMERA)
     core.ready = at(10, 20)
     until(lambda: len(desk.watched) == 2)
     time.sleep(2 * room.LOOK_S)
@@ -402,8 +410,7 @@ def test_new_turns_are_compared_with_the_camera_in_use_once(desk):
 
 
 def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
-    desk.learner.goal = None
-    desk.learner.watched = CAMERA
+    aim(desk, turns=None, camera=CAMERA)
     Core.made[0].strangers = Core.made[0].ready = at(10, 20)
     until(lambda: desk.watched)
     assert desk.watched[-1].monitor.lens.confirmed
@@ -415,7 +422,7 @@ def test_what_turns_of_an_earlier_bank_showed_is_kept(desk):
     until(lambda: len(desk.watched) == 2)
     assert desk.watched[-1].monitor.lens.confirmed
     # not with another calibration
-    desk.learner.watched = dataclasses.replace(CAMERA, name='another')
+    aim(desk, camera=dataclasses.replace(CAMERA, name='another'))
     until(lambda: len(desk.watched) == 3)
     assert desk.watched[-1].monitor.lens is None
 
@@ -425,7 +432,7 @@ def test_a_camera_that_is_moved_on_a_straight_road_is_told_once(desk):
     core.pairs = 40
     time.sleep(2 * room.LOOK_S)
     assert not core.asked
-    desk.learner.watched = CAMERA
+    aim(desk, camera=CAMERA)
     for pairs in (41, 75, 80, 200):
         core.pairs = pairs
         time.sleep(2 * room.LOOK_S)
@@ -434,14 +441,13 @@ def test_a_camera_that_is_moved_on_a_straight_road_is_told_once(desk):
     assert told.camera is CAMERA and told.text.startswith(
         'the camera points elsewhere than 12 s ago: by 1.0 degrees to the right and 0.2 up')
     # another camera in use is asked anew
-    desk.learner.watched = dataclasses.replace(CAMERA, name='another')
+    aim(desk, camera=dataclasses.replace(CAMERA, name='another'))
     core.pairs = 300
     until(lambda: len(desk.moved) == 2)
 
 
 def test_turns_that_could_not_be_compared_are_told_and_tried_with_the_next(desk):
-    desk.learner.goal = None
-    desk.learner.watched = CAMERA
+    aim(desk, turns=None, camera=CAMERA)
     Core.failures = [WorkerError('E-WORKER-DIED', 'exit code 7')]
     core = Core.made[0]
     core.ready = at(10)
@@ -456,29 +462,28 @@ def test_turns_that_could_not_be_compared_are_told_and_tried_with_the_next(desk)
 
 def test_each_calibration_is_compared_with_a_camera_that_is_to_be_checked(desk):
     core = Core.made[0]
-    desk.learner.goal = None
+    aim(desk, turns=None)
     core.ready = at(10, 20)
     time.sleep(2 * room.LOOK_S)
     assert core.calls == 0
-    desk.learner.goal = 2
-    desk.learner.checked = CAMERA
+    aim(desk, turns=2, check=CAMERA)
     until(lambda: desk.results)
     assert desk.results[0].given is CAMERA and desk.results[0].check.answer == 'right'
     time.sleep(2 * room.LOOK_S)
     assert core.calls == 1
     # another one: the same turns are used again
     other = dataclasses.replace(CAMERA, name='another')
-    desk.learner.checked = other
+    aim(desk, check=other)
     until(lambda: len(desk.results) == 2)
     assert desk.results[1].given is other and core.watched == []
 
 
 def test_a_camera_that_changes_during_a_calibration_is_checked_by_the_next(desk):
     core = Core.made[0]
-    desk.learner.checked = CAMERA
+    aim(desk, check=CAMERA)
     held(desk, core)
     other = dataclasses.replace(CAMERA, name='another')
-    desk.learner.checked = other
+    aim(desk, check=other)
     core.hold.set()
     until(lambda: len(desk.results) == 2)
     assert [result.given for result in desk.results] == [CAMERA, other]

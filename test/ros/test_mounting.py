@@ -2,20 +2,26 @@
 from __future__ import annotations
 
 import math
+import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
+from fakes import stands_in_for
+from geometry_msgs.msg import TransformStamped
 from made_calibration import make_calibration
 from nav_msgs.msg import Odometry
 from ros_bench import keep_file
 from sensor_msgs.msg import Imu, NavSatFix
+from std_msgs.msg import Header
 
 from dashcalib_ros.input.motion import SensorBuffer
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.ros import car
-from dashcalib_ros.ros.car import Mounting, Sensors, differs
+from dashcalib_ros.ros.car import Mounting, differs, subscribe_sensors
 from dashcalib_ros.ros.diagnostics import Complaints
+from dashcalib_ros.ros.endpoints import Endpoints
 from dashcalib_ros.ros.settings import NodeConfig
 from dashcalib_ros.ros.store import Kept, Whose
 
@@ -24,47 +30,58 @@ MOUNT = Mount('accepted', (), 2.0, -1.0, None, None, SIGMA, (600.0, 170.0), 0.5,
 WHOSE = Whose('dashcam', '/image_raw')
 
 
-class FakeNode:
-    """Keeps what is published, and the callbacks of subscriptions."""
+@stands_in_for(Endpoints)
+class FakeEndpoints:
+    """Keeps what is published, and the callbacks of subscriptions and timers."""
 
-    def __init__(self):
-        self.published, self.heard, self.lines = [], {}, []
+    def __init__(self, node, log, complaints, given):
+        self.published, self.heard, self.lines, self.ends = [], {}, [], []
+        self.complaints = Complaints(self.lines.append)
+        self.log = SimpleNamespace(warning=self.lines.append, info=self.lines.append)
+        self.node = SimpleNamespace(
+            get_clock=lambda: SimpleNamespace(now=lambda: SimpleNamespace(to_msg=Time)),
+            destroy_publisher=lambda publisher: True)
 
-    def create_publisher(self, kind, topic, profile, **options):
-        return SimpleNamespace(publish=lambda message: self.published.append((topic, message)))
+    def publisher(self, name):
+        return SimpleNamespace(publish=lambda message: self.published.append((name, message)))
 
-    def create_subscription(self, kind, topic, callback, profile, **options):
-        self.heard[topic] = callback
+    def overridden(self, name):
+        return f'QoS of {name}'
 
-    def get_logger(self):
-        return SimpleNamespace(warning=self.lines.append, info=self.lines.append)
+    def subscription(self, name, callback, topic=''):
+        self.heard[topic or name] = callback
 
-    def get_clock(self):
-        from builtin_interfaces.msg import Time
-        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=Time))
+    def timer(self, period_s, callback):
+        pass
 
-    def transforms(self):
-        return [message.transforms[0] for topic, message in self.published
-                if topic == '/tf_static']
+    def at_end(self, function, *arguments):
+        self.ends.append(function)
 
 
 @pytest.fixture
 def tf2(monkeypatch):
-    """Stand in for tf2_msgs, which is not on the package index."""
-    class TFMessage(SimpleNamespace):
-        pass
+    """Stand in for tf2_ros, which is not on the package index, with the real messages."""
+    class StaticTransformBroadcaster:
+        def __init__(self, node, qos=None):
+            assert qos == 'QoS of /tf_static'
+            self.pub_tf = object()
 
-    module = SimpleNamespace(TFMessage=TFMessage)
-    monkeypatch.setitem(__import__('sys').modules, 'tf2_msgs', SimpleNamespace(msg=module))
-    monkeypatch.setitem(__import__('sys').modules, 'tf2_msgs.msg', module)
+        def sendTransform(self, transform):  # noqa: N802
+            assert isinstance(transform, TransformStamped)
+            FakeEndpoints.newest.published.append(('/tf_static', transform))
+
+    monkeypatch.setitem(sys.modules, 'tf2_ros', SimpleNamespace(
+        StaticTransformBroadcaster=StaticTransformBroadcaster))
     monkeypatch.setattr(car, 'LISTEN_S', 0.0)
-    return TFMessage
+
+
+def transforms(endpoints):
+    return [message for topic, message in endpoints.published if topic == '/tf_static']
 
 
 def made(**settings):
-    node = FakeNode()
-    complaints = Complaints(node.lines.append)
-    return node, Mounting(node, NodeConfig(publish_tf=True, **settings), complaints.once)
+    endpoints = FakeEndpoints.newest = FakeEndpoints(None, None, None, {})
+    return endpoints, Mounting(endpoints, NodeConfig(publish_tf=True, **settings))
 
 
 def test_a_kept_mounting_is_published_and_kept(start_node, make_bench, tmp_path):
@@ -100,33 +117,33 @@ def test_one_static_transform_and_again_only_when_it_moved(tf2):
         output.show(Mount('accepted', (), angle, -1.0, None, None, SIGMA, (6.0, 7.0), 0.5, 300.0),
                     'camera')
         output.tick()
-    first, second = node.transforms()
+    first, second = transforms(node)
     assert (first.header.frame_id, first.child_frame_id) == ('base_link', 'camera')
     assert first.transform.translation.z == 1.2 and second.transform.rotation != (
         first.transform.rotation)
     output.show(Mount('weak', ('thin',), 9.0, -1.0, None, None, SIGMA, (6.0, 7.0), 0.5, 30.0),
                 'camera')
     output.tick()
-    assert len(node.transforms()) == 2
+    assert len(transforms(node)) == 2
 
 
 def test_a_frame_never_gets_a_second_parent(tf2):
     node, output = made()
-    other = SimpleNamespace(child_frame_id='camera', header=SimpleNamespace(frame_id='rig'))
-    node.heard['/tf_static'](tf2(transforms=[other]))
+    other = TransformStamped(child_frame_id='camera', header=Header(frame_id='rig'))
+    node.heard['/tf_static'](SimpleNamespace(transforms=[other]))
     output.show(MOUNT, 'camera')
     output.tick()
     output.show(MOUNT, 'camera')
     output.tick()
-    assert node.transforms() == []
+    assert transforms(node) == []
     assert len(node.lines) == 1 and 'camera' in node.lines[0] and 'rig' in node.lines[0]
     output.show(MOUNT, '')
     output.tick()
     assert 'set camera_frame' in node.lines[1]
 
 
-def test_without_tf2_msgs_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(__import__('sys').modules, 'tf2_msgs', None)
+def test_without_tf2_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_ros', None)
     node, output = made()
     output.show(MOUNT, 'camera')
     output.tick()
@@ -150,8 +167,9 @@ def stamped(kind, second):
 
 
 def test_sensors_are_kept_as_streams():
-    node, buffer = FakeNode(), SensorBuffer()
-    Sensors(node, NodeConfig(imu_topic='/imu', odom_topic='/odom', fix_topic='/fix'), buffer.add)
+    node, buffer = FakeEndpoints(None, None, None, {}), SensorBuffer()
+    own = NodeConfig(imu_topic='/imu', odom_topic='/odom', fix_topic='/fix')
+    subscribe_sensors(node, own, buffer.add)
     for second in range(100, 130):
         imu, odometry, fix = (stamped(kind, second) for kind in (Imu, Odometry, NavSatFix))
         imu.angular_velocity.y = 0.01 * second
@@ -175,6 +193,6 @@ def test_sensors_are_kept_as_streams():
 
 
 def test_sensors_that_are_not_named_are_not_listened_to():
-    node = FakeNode()
-    Sensors(node, NodeConfig(), print)
+    node = FakeEndpoints(None, None, None, {})
+    subscribe_sensors(node, NodeConfig(), print)
     assert node.heard == {}

@@ -103,9 +103,9 @@ def drawings(monkeypatch):
 
 def publish(desk, count):
     """Publish images, each when the node has taken the one before."""
-    for received in range(desk.node._intake.received, desk.node._intake.received + count):
+    for received in range(desk.drive._intake.received, desk.drive._intake.received + count):
         desk.bench.images.publish(image_message(texture(), next(STAMPS), 'camera'))
-        desk.until(lambda received=received: desk.node._intake.received > received)
+        desk.until(lambda received=received: desk.drive._intake.received > received)
         # as a camera does: time for the detection
         desk.bench.spin(0.02)
 
@@ -121,7 +121,7 @@ def subscribe(desk, name):
 def test_they_are_published_only_while_someone_subscribes(make_desk, drawings):
     desk = make_desk(preview_rate=30.0)
     publish(desk, 10)
-    assert (drawings.count, drawings.views, desk.node._preview.published) == (0, 0, 0)
+    assert (drawings.count, drawings.views, desk.drive._preview.published) == (0, 0, 0)
     overlays, subscription = subscribe(desk, 'overlay')
     desk.until(lambda: publish(desk, 1) or len(overlays) >= 3)
     assert drawings.count >= 3
@@ -137,7 +137,7 @@ def test_they_are_published_only_while_someone_subscribes(make_desk, drawings):
     picture = cv2.imdecode(np.frombuffer(flat[-1].data, np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (240, 320)
     desk.bench.node.destroy_subscription(subscription)
-    desk.until(lambda: desk.node._preview._overlay.get_subscription_count() == 0)
+    desk.until(lambda: desk.drive._preview._overlay.get_subscription_count() == 0)
     publish(desk, 1)
     before = drawings.count
     publish(desk, 5)
@@ -151,11 +151,11 @@ def test_a_drawing_that_takes_long_holds_up_nothing(make_desk, drawings):
     desk.until(lambda: publish(desk, 1) or overlays)
     drawings.hold.clear()
     before, infos = drawings.count, len(desk.bench.infos)
-    searched = desk.node._learner.activity.status.frames
+    searched = desk.drive.learner.activity.status.frames
     publish(desk, 20)
     desk.until(lambda: len(desk.bench.infos) == infos + 20)
-    desk.until(lambda: desk.node._learner.activity.status.frames >= searched + 20)
-    assert desk.node._learner.inbox.dropped == 0
+    desk.until(lambda: desk.drive.learner.activity.status.frames >= searched + 20)
+    assert desk.drive.learner.inbox.dropped == 0
     # one is being drawn all the time, and only the newest waits
     assert drawings.count <= before + 1
     drawings.hold.set()

@@ -1,8 +1,8 @@
-"""The executor: signals that come while rclpy starts, and what a callback costs."""
+"""How the spinning ends, and that nothing of rclpy but its public interface is used."""
 from __future__ import annotations
 
-import gc
-import sys
+import ast
+import re
 import threading
 import time
 
@@ -11,12 +11,14 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
 import rclpy
-from rclpy import executors
+from ros_bench import REPOSITORY
 
-from dashcalib_ros.ros.program import Executor, spin
+from dashcalib_ros.ros.program import spin
+
+ROOM = REPOSITORY / 'dashcalib_ros' / 'ros'
 
 
-def test_a_signal_that_rclpy_did_not_hear_ends_the_spinning(make_desk):
+def test_a_signal_ends_the_spinning_and_leaves_rclpy_as_it_was(make_desk):
     desk, stopped = make_desk(), threading.Event()
     desk.spinner.remove_node(desk.node)
     thread = threading.Thread(target=spin, args=(desk.node, stopped.is_set), daemon=True)
@@ -28,32 +30,16 @@ def test_a_signal_that_rclpy_did_not_hear_ends_the_spinning(make_desk):
     assert not thread.is_alive() and rclpy.ok()
 
 
-def test_an_executor_that_cannot_be_made_leaves_no_traceback(monkeypatch):
-    told = []
-    monkeypatch.setattr(sys, 'unraisablehook', told.append)
-    context = rclpy.Context()
-    # of a context without a handle; Python 3.10 names the method that it has not
-    with pytest.raises((AttributeError, TypeError), match=r'context|__enter__'):
-        Executor(context=context)
-    gc.collect()
-    assert told == []
-
-
-def test_a_callback_costs_one_look_at_the_entities(ros_context, monkeypatch):
-    node, called, looks = rclpy.create_node('few', context=ros_context), [], []
-    guard = node.create_guard_condition(lambda: called.append(True))
-    executor = Executor(context=ros_context)
-    executor.add_node(node)
-    executor.spin_once(0.1)
-    wait_set = executors._rclpy.WaitSet
-    monkeypatch.setattr(executors._rclpy, 'WaitSet',
-                        lambda *counts: looks.append(True) or wait_set(*counts))
-    try:
-        for _ in range(3):
-            # while it waits, as images do
-            threading.Timer(0.1, guard.trigger).start()
-            executor.spin_once(5.0)
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-    assert len(called) == len(looks) == 3
+@pytest.mark.parametrize('path', sorted(ROOM.glob('*.py')), ids=lambda path: path.stem)
+def test_only_the_public_interface_of_rclpy_is_used(path):
+    tree = ast.parse(path.read_text('utf-8'))
+    # a class that inherits from rclpy's may have private names of its own, but not read others'
+    own = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)
+           and isinstance(node.ctx, ast.Store)}
+    own |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('rclpy'):
+            names = [*node.module.split('.'), *(each.name for each in node.names)]
+            assert not any(re.match('_|impl$|experimental$', name) for name in names), names
+        if isinstance(node, ast.Attribute) and re.match('_[a-z]', node.attr):
+            assert node.attr in own, f'{path.name}:{node.lineno}: {node.attr}'

@@ -1,49 +1,50 @@
-"""The node that calibrates: what is accepted is published beside the images and kept on disk."""
+"""The program that calibrates: what is accepted is published beside the images, and kept."""
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
 
-from rclpy.clock import Clock
-from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
-from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
 
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError, coded
+from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.report.wording import mount_text, mounts_text
-from dashcalib_ros.ros.background import Result, Watched
+from dashcalib_ros.ros.background import Goal, Result
 from dashcalib_ros.ros.car import Mounting
-from dashcalib_ros.ros.diagnostics import ERROR, OK, WARN, Health, log_line
-from dashcalib_ros.ros.images import ImageInput, Source
-from dashcalib_ros.ros.node import CameraNode
-from dashcalib_ros.ros.parameters import latched
+from dashcalib_ros.ros.commit import Commit, driver_services
+from dashcalib_ros.ros.diagnostics import ERROR, OK, WARN, Health
+from dashcalib_ros.ros.drive import Drive
+from dashcalib_ros.ros.endpoints import Endpoints
+from dashcalib_ros.ros.images import Source
+from dashcalib_ros.ros.settings import Settings
 from dashcalib_ros.ros.state import Judgement, judge, outcome_text, sigma_text
 from dashcalib_ros.ros.store import Kept, Store, Whose, camera_info_path
 
-# s between two looks whether the driver has answered
-LOOK_S = 0.1
 
+class Calibrating:
+    """At most one calibration is in use; its topics and its file are always changed together.
 
-class CalibratorNode(CameraNode):
-    """At most one calibration is in use; its topics and its file are always changed together."""
+    drive: gives it results. summary: what it does, for the log.
+    """
 
-    doing = 'learning'
-
-    def _open(self, topic: str) -> None:
-        plain = topic == f'{self.get_namespace().rstrip("/")}/image_raw'
-        self._whose = Whose(self._name, topic, plain)
-        self._store = Store(camera_info_path(self._own.camera_info_url, self._name), self._whose)
+    def __init__(self, endpoints: Endpoints, settings: Settings, camera_name: str) -> None:
+        """Raises DashcalibError for settings that cannot be used."""
+        self._endpoints, self._log = endpoints, endpoints.log
+        self._core, self._own = settings.core, settings.own
+        own = settings.own
+        node, topic = endpoints.node, endpoints.node.resolve_topic_name('image_raw')
+        plain = topic == f'{node.get_namespace().rstrip("/")}/image_raw'
+        self._whose = Whose(camera_name, topic, plain)
+        self._store = Store(camera_info_path(own.camera_info_url, camera_name), self._whose)
+        endpoints.at_end(self._store.close)
         self._commit: Commit | None = None
-        # a reliable publisher reaches reliable and best-effort subscribers alike
-        self._beside = self._publisher(CameraInfo, 'camera_info', 10)
-        self._latched = self._publisher(CameraInfo, '~/calibration', latched())
-        self._mounting = Mounting(self, self._own, self._complaints.once)
+        self._beside = endpoints.publisher('camera_info')
+        self._latched = endpoints.publisher('~/calibration')
+        self._mounting = Mounting(endpoints, own)
         # what is published now, and how many were published beside images
         self._info: CameraInfo | None = None
         self._sent = 0
@@ -54,11 +55,19 @@ class CalibratorNode(CameraNode):
         self._confirmed = True
         # turns of this drive, with their bank, that were in a contradiction that was counted
         self._counted: frozenset[tuple[int, TurnId]] = frozenset()
+        mask = read_mask(Path(own.mask_file)) if own.mask_file else None
+        self.drive = Drive(endpoints, settings, camera_name, mask, self)
+        for name, action in (('calibrate', self.drive.calibrate), ('reset', self.reset),
+                             ('save', self.save)):
+            endpoints.service(f'~/{name}', action)
+        self._load()
+        self.summary = (f'learning the camera {camera_name!r} from the turns seen on '
+                        f'{self.drive.images.topic}')
 
-    def close(self) -> None:
-        """End it, and leave the calibration's file to other nodes."""
-        self._store.close()
-        super().close()
+    def change(self, settings: Settings) -> None:
+        """Use other settings from now on: those of CHANGEABLE."""
+        self._core, self._own = settings.core, settings.own
+        self._watch()
 
     @property
     def _contradictions(self) -> int:
@@ -69,15 +78,17 @@ class CalibratorNode(CameraNode):
         """Return the camera that is published, None if it is stale."""
         return None if self._kept is None or self._stale else self._kept.camera
 
-    def _goal(self) -> int:
-        """Return how many turns the next calibration needs.
+    def _watch(self) -> None:
+        """Let the drive work for the camera in use, or for a first one.
 
         The first one needs all turns wanted; to check a published one, a few are enough.
         """
-        wanted = self._core.turns.wanted
-        return wanted if self._trusted() is None else min(self._core.verdict.min_turns, wanted)
+        core, trusted = self._core, self._trusted()
+        wanted = core.turns.wanted
+        self.drive.watch(Goal(
+            core, wanted if trusted is None else min(core.verdict.min_turns, wanted), trusted))
 
-    def _accompany(self, header: Header, size: tuple[int, int]) -> None:
+    def accompany(self, header: Header, size: tuple[int, int]) -> None:
         """Publish the camera_info of an image, if the camera has such images."""
         if self._info is not None and (self._info.width, self._info.height) == size:
             self._info.header = header
@@ -102,7 +113,12 @@ class CalibratorNode(CameraNode):
         self._log.info(f'loaded {self._store.path}: {sigma_text(kept.camera)}; unconfirmed until '
                        f'turns agree with it')
 
-    def _fit(self, source: Source) -> None:
+    def begin_anew(self) -> None:
+        """Drop the calibration in use, and begin with the file's."""
+        self._drop()
+        self._load()
+
+    def fit(self, source: Source) -> None:
         """Stop using it if it is for other images than these; the file stays where it is."""
         kept = self._kept
         if kept is None:
@@ -114,12 +130,10 @@ class CalibratorNode(CameraNode):
                               f'{source}')
             self._drop()
 
-    def _on_watched(self, watched: Watched) -> None:
-        super()._on_watched(watched)
-        if watched.camera is self._trusted() and watched.monitor.agrees:
-            self._confirmed = True
+    def show_changes(self) -> None:
+        """Do nothing: /diagnostics has the changes."""
 
-    def _judge(self, result: Result) -> None:
+    def judge(self, result: Result) -> None:
         """Adopt a new calibration, or not: state.py has the reasons."""
         calibration = result.calibration
         turns = frozenset((result.bank, turn) for turn in calibration.misfits
@@ -133,40 +147,42 @@ class CalibratorNode(CameraNode):
                 if judged.action == 'replace':
                     self._log.warning(f'the calibration is replaced: {judged.why}')
                 self._adopt(calibration)
-                self._learner.restart()
+                self.drive.learner.restart()
             case 'give_up':
                 self._log.error(f'the published calibration is withdrawn: {judged.why}')
                 self._give_up()
                 # the turns that contradict it stay, and are used for the next one
-                self._learner.forget_stored(calibration.used_turns)
+                self.drive.learner.forget_stored(calibration.used_turns)
             case 'wait' | 'keep' if not again:
                 if judged.contradictions > self._contradictions:
                     self._counted |= turns
                 if judged.action == 'keep':
                     self._count(judged, calibration)
-                log_line(self._log, judged.contradictions > 0,
-                         outcome_text(calibration, judged.why))
+                log = self._log.warning if judged.contradictions else self._log.info
+                log(outcome_text(calibration, judged.why))
         # turns that do not confirm it may be all that is known of another camera: they stay
         if judged.action == 'keep' and result.complete and (
-                judged.confirmed or not self._learner.extend()):
+                judged.confirmed or not self.drive.learner.extend()):
             # the next calibration must be independent: it uses new turns only
-            self._learner.restart()
+            self.drive.learner.restart()
 
     def _adopt(self, calibration: Calibration) -> None:
-        frame_id = self._intake.source.frame_id if self._intake.source else ''
-        kept = Kept.of(calibration, self._whose, frame_id, *self._images.publishers)
+        source = self.drive.source
+        kept = Kept.of(calibration, self._whose, source.frame_id if source else '',
+                       *self.drive.images.publishers)
         info = self._use(kept)
-        self._log.info(f'accepted: {sigma_text(kept.camera)}; {self._save()[1]}')
+        self._log.info(f'accepted: {sigma_text(kept.camera)}; {self.save()[1]}')
         if self._own.commit:
             if self._commit is not None:
                 self._commit.end()
-            self._commit = Commit(self, info, self._own.commit_timeout, self._steady,
-                                  driver_services(self, self._images))
+            self._commit = Commit(self._endpoints, info, self._own.commit_timeout,
+                                  driver_services(self._endpoints.node, self.drive.images))
 
     def _give_up(self) -> None:
         self._retire()
         if self._own.publish_stale and self._kept is not None:
             self._stale, self._kept = True, self._kept.contradicted(0)
+            self._watch()
         else:
             self._drop()
 
@@ -179,7 +195,7 @@ class CalibratorNode(CameraNode):
             try:
                 self._store.update(self._kept)
             except OutputError as error:
-                self._complaints.say('unsaved', coded(error))
+                self._endpoints.complaints.say('unsaved', coded(error))
         if judged.confirmed:
             self._confirmed = True
             if calibration.mount is not None:
@@ -192,14 +208,15 @@ class CalibratorNode(CameraNode):
                                  self._core.rectified)
         self._latched.publish(self._info)
         self._show_mount(kept.mount, kept.frame_id or '')
+        self._watch()
         return self._info
 
     def _show_mount(self, mount: Mount | None, frame_id: str) -> None:
         """Publish a mounting, and log where it is another one than the last, once."""
         before = self._mounting.mount
-        if before and mount and mount.moved_from(before) and 'mount' not in self._changes():
+        if before and mount and mount.moved_from(before) and 'mount' not in self.drive.changes():
             self._log.info(mounts_text(mount, before))
-        self._moved = ''
+        self.drive.forget_moved()
         self._mounting.show(mount, frame_id)
 
     def _drop(self) -> None:
@@ -209,6 +226,7 @@ class CalibratorNode(CameraNode):
             self._latched.publish(CameraInfo(header=self._header(self._info.header.frame_id)))
         self._kept, self._stale, self._info = None, False, None
         self._mounting.show(None, '')
+        self._watch()
 
     def _retire(self) -> tuple[bool, str]:
         """Move the file aside; return whether it is out of the way, and a line about it."""
@@ -218,16 +236,18 @@ class CalibratorNode(CameraNode):
             self._log.error(coded(error))
             return False, coded(error)
 
-    def _reset(self) -> tuple[bool, str]:
+    def reset(self) -> tuple[bool, str]:
+        """Begin anew, without the file; return whether it is out of the way, and a message."""
         self._log.warning('reset by request: the turns and the calibration are dropped')
-        self._forget()
+        self.drive.forget()
+        self._drop()
         moved, text = self._retire()
         return moved, f'collecting; {text}'
 
-    def _save(self) -> tuple[bool, str]:
+    def save(self) -> tuple[bool, str]:
         """Write the file; return whether it was written, and a line about it."""
-        if self._held:
-            return False, self._held
+        if self.drive.held:
+            return False, self.drive.held
         if self._kept is None:
             return False, 'there is no accepted calibration yet'
         if self._stale:
@@ -235,7 +255,7 @@ class CalibratorNode(CameraNode):
         try:
             return True, self._store.save(self._kept)
         except OutputError as error:
-            self._complaints.say('unsaved', coded(error))
+            self._endpoints.complaints.say('unsaved', coded(error))
             return False, f'not saved: {coded(error)}'
 
     def _warnings(self) -> list[str]:
@@ -249,12 +269,15 @@ class CalibratorNode(CameraNode):
             found.append(f'{self._store.path} was edited since a node wrote it: unconfirmed until '
                          f'turns agree with it')
         beside = self._beside.topic_name
-        if self.count_publishers(beside) > 1:
+        if self._endpoints.node.count_publishers(beside) > 1:
             found.append(f'another node also publishes {beside}: remap one of the two topics')
         return found
 
-    def _health(self, turns: str) -> Health:
-        verdict, activity = self._verdict, self._learner.activity
+    def health(self) -> Health:
+        """Return the state of the calibration."""
+        verdict, activity = self.drive.verdict, self.drive.learner.activity
+        turns, monitor = self.drive.turns_text, self.drive.monitor
+        self._confirmed |= monitor is not None and monitor.agrees
         camera = self._kept.camera if self._kept else None
         known = 'confirmed' if self._confirmed else 'unconfirmed'
         state, level, message = 'collecting', WARN, f'not calibrated yet: {turns}'
@@ -280,76 +303,10 @@ class CalibratorNode(CameraNode):
             'file': self._store.path,
             'camera_info published': self._sent,
             'contradictions': self._contradictions,
-            'mounting': mount_text(mount) if mount else 'unknown'})
-
-    def _on_tick(self) -> None:
-        super()._on_tick()
-        self._mounting.tick()
+            'mounting': mount_text(mount) if mount else 'unknown'}, self._warnings())
 
     def _header(self, frame_id: str) -> Header:
-        return Header(stamp=self.get_clock().now().to_msg(), frame_id=frame_id)
-
-
-class Commit:
-    """Sends a calibration to the driver's service without waiting for it; logs the outcome.
-
-    There is one warning if the driver has no service, does not answer, or dies meanwhile.
-    """
-
-    def __init__(self, node: Node, info: CameraInfo, timeout_s: float, clock: Clock,
-                 names: Sequence[str]) -> None:
-        """names: of services, of which the first that there is is called."""
-        self._node, self._info, self._timeout_s = node, info, timeout_s
-        self._clients = {name: node.create_client(SetCameraInfo, name) for name in names}
-        self._name = ' or '.join(names)
-        self._answer: Any = None
-        self._deadline = time.monotonic() + timeout_s
-        self._timer = node.create_timer(LOOK_S, self._look, clock=clock)
-
-    def end(self) -> None:
-        """Wait for an answer no longer."""
-        self._node.destroy_timer(self._timer)
-        for client in self._clients.values():
-            self._node.destroy_client(client)
-
-    def _look(self) -> None:
-        for name, client in self._clients.items():
-            if self._answer is None and client.service_is_ready():
-                self._name = name
-                self._answer = client.call_async(SetCameraInfo.Request(camera_info=self._info))
-        answered = self._answer is not None and self._answer.done()
-        if not answered and time.monotonic() < self._deadline:
-            return
-        self.end()
-        log, name = self._node.get_logger(), self._name
-        if self._answer is None:
-            trouble = f'there is no service {name}'
-        elif not answered:
-            trouble = f'{name} did not answer within {self._timeout_s:g} s'
-        elif self._answer.exception() is not None:
-            trouble = f'{name} failed: {self._answer.exception()}'
-        elif self._answer.result().success:
-            log.info(f'{name} accepted the calibration')
-            return
-        else:
-            trouble = f'{name} refused: {self._answer.result().status_message}'
-        log.warning(f'{trouble}: the camera driver does not have the calibration; start a driver '
-                    f'with that service, or set commit to false')
-
-
-def driver_services(node: Node, images: ImageInput) -> tuple[str, ...]:
-    """Return where the driver's set_camera_info may be: where it was remapped to, if it was.
-
-    Else the publisher's own, as camera_info_manager names it, the one beside the images, and that
-    of this node's namespace.
-    """
-    name = 'set_camera_info'
-    own = node.resolve_service_name(name)
-    if own != node.resolve_service_name(name, only_expand=True):
-        return (own,)
-    drivers = [f'{each}/{name}' for each in images.publishers if each.startswith('/')]
-    beside = f'{images.base.rpartition("/")[0]}/{name}'
-    return tuple(dict.fromkeys((*drivers, beside, own)))
+        return Header(stamp=self._endpoints.node.get_clock().now().to_msg(), frame_id=frame_id)
 
 
 def camera_info(camera: Camera, header: Header, rectified: str) -> CameraInfo:

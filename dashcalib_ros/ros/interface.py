@@ -1,0 +1,110 @@
+"""The topics and services of both programs, each in one place; no ROS is imported.
+
+The endpoints are made from these tables, and --help and docs/ros_interface.md are written from
+them.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+CALIBRATOR, CHECKER = 'calibrator', 'checker'
+PROGRAMS = (CALIBRATOR, CHECKER)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic. name: as the code has it, before remapping; type: of its messages.
+
+    about: what it has, for users. depth, latched, reliable: the quality of service; all are kept
+    last. programs: that have it.
+    """
+
+    name: str
+    type: str
+    about: str
+    depth: int = 10
+    latched: bool = False
+    reliable: bool = True
+    programs: tuple[str, ...] = PROGRAMS
+
+    @property
+    def qos(self) -> str:
+        """Return its quality of service in words."""
+        return (f'{"reliable" if self.reliable else "best effort"}, depth {self.depth}'
+                f'{", latched" if self.latched else ""}')
+
+
+def _by_name(*topics: Topic) -> dict[str, Topic]:
+    return {topic.name: topic for topic in topics}
+
+
+TF_STATIC = '/tf_static'
+PUBLISHED = _by_name(
+    Topic('camera_info', 'sensor_msgs/msg/CameraInfo',
+          'one for each image, with its header; none before a calibration is accepted',
+          programs=(CALIBRATOR,)),
+    Topic('~/calibration', 'sensor_msgs/msg/CameraInfo',
+          'the calibration in use; K[0] = 0 after it was withdrawn', 1, latched=True,
+          programs=(CALIBRATOR,)),
+    Topic('~/check', 'diagnostic_msgs/msg/DiagnosticArray',
+          "whether the driver's calibration is right: values answer, reasons, changes, rms_px, …; "
+          'WARN where it is wrong', 1, latched=True, programs=(CHECKER,)),
+    Topic('~/mount', 'geometry_msgs/msg/PoseWithCovarianceStamped',
+          'how the camera sits in base_frame (REP-103)', 1, latched=True, programs=(CALIBRATOR,)),
+    Topic(TF_STATIC, 'tf2_msgs/msg/TFMessage',
+          'with publish_tf: one transform from base_frame to camera_frame when the mounting is '
+          'accepted, and again after it moved', 1, latched=True, programs=(CALIBRATOR,)),
+    Topic('~/turn_magnitude', 'geometry_msgs/msg/Vector3Stamped',
+          'x: how much the car turns, relative to the image width; for plots'),
+    Topic('~/overlay/compressed', 'sensor_msgs/msg/CompressedImage',
+          'tracked points, ego vehicle and state, while someone subscribes', 1),
+    Topic('~/rectified/compressed', 'sensor_msgs/msg/CompressedImage',
+          'the picture that P of camera_info describes, while someone subscribes', 1),
+    Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray',
+          'the state and what is missing, once a second'))
+
+# the names of the last three are those of parameters, which name the topics
+SENSORS = ('imu_topic', 'odom_topic', 'fix_topic')
+SUBSCRIBED = _by_name(
+    Topic('image_raw', 'sensor_msgs/msg/Image',
+          'or image_raw/compressed with image_transport:=compressed; with video the first of '
+          'image_raw/ffmpeg, image_raw/foxglove, image_raw, image_raw/compressed that has one', 5,
+          reliable=False),
+    Topic('camera_info', 'sensor_msgs/msg/CameraInfo',
+          "the driver's, which is checked", 5, reliable=False, programs=(CHECKER,)),
+    Topic(TF_STATIC, 'tf2_msgs/msg/TFMessage',
+          'with publish_tf: a frame that has another parent gets none', 100, latched=True,
+          programs=(CALIBRATOR,)),
+    # best effort also receives from reliable publishers; a second of a fast gyro
+    Topic('imu_topic', 'sensor_msgs/msg/Imu', 'independent evidence for fx', 400, reliable=False),
+    Topic('odom_topic', 'nav_msgs/msg/Odometry', 'the speed, for the height of the camera', 400,
+          reliable=False),
+    Topic('fix_topic', 'sensor_msgs/msg/NavSatFix', 'independent evidence for fx', 400,
+          reliable=False))
+
+# what rclpy publishes and offers for each node with a lifecycle and parameters
+OF_RCLPY = {
+    'topics': ('/parameter_events', '/rosout', '~/transition_event'),
+    'services': ('~/change_state', '~/get_state', '~/get_available_states',
+                 '~/get_available_transitions', '~/get_transition_graph',
+                 '~/describe_parameters', '~/get_parameter_types', '~/get_parameters',
+                 '~/get_type_description', '~/list_parameters', '~/set_parameters',
+                 '~/set_parameters_atomically')}
+
+
+@dataclass(frozen=True)
+class Service:
+    """A service, of type std_srvs/srv/Trigger. about: what it does, for users."""
+
+    name: str
+    about: str
+    programs: tuple[str, ...] = PROGRAMS
+
+
+SERVICES = (
+    Service('~/calibrate', 'calibrates with the turns that exist; the result is in the log and in '
+                           '/diagnostics'),
+    Service('~/reset', 'forgets the turns, also stored ones, and moves the calibration aside'),
+    Service('~/save', 'writes the file of the calibration again', (CALIBRATOR,)))
+# that a calibrator calls with commit
+SET_CAMERA_INFO = 'set_camera_info'
