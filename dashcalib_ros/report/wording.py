@@ -89,7 +89,8 @@ def mount_text(mount: Mount) -> str:
     height = mount.sigma['height_m']
     parts.append('height unknown without a speed' if mount.height_m is None or height is None
                  else f'{mount.height_m:.2f} ± {height:.2f} m above the road')
-    return (f'{verdict_text(mount)}: {", ".join(parts)}; the car travels towards pixel '
+    way = 'comes from' if mount.rear else 'travels towards'
+    return (f'{verdict_text(mount)}: {", ".join(parts)}; the car {way} pixel '
             f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± {mount.travel_sigma_px:.1f} px')
 
 
