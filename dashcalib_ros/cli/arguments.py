@@ -38,7 +38,7 @@ BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera was refused;
 # names of models, exports and demos; to take them from their tables would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
 KINDS = ('colmap', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove', 'ros',
-         'opencv', 'rays', 'maps')
+         'opencv', 'rays', 'maps', 'urdf', 'tf')
 LENSES = ('radial', 'brown', 'fisheye', 'windscreen', 'shutter', 'stabilised', 'straight')
 # files that no command takes as a drive
 NO_DRIVES = ('.yaml', '.yml', '.json', '.xml', '.txt', '.csv', '.npz')
