@@ -294,6 +294,8 @@ COMMANDS = {
                    'help': 'the reference: the same kinds of files'}),
             ('--html', {'type': path_or('use the name of a file'), 'metavar': 'FILE',
                         'help': 'write a page with maps of the difference, in px and in sigmas'}),
+            ('--rig', {**FLAG, 'help': 'A and B are two cameras of one car: show how B is '
+                                       'mounted against A, and whether both saw one drive'}),
             JSON)),
     'export': Command(
         'dashcalib_ros.cli.cameras', "write a calibration as another program's camera file",
