@@ -228,6 +228,11 @@ class Scene:
         """Return by how much the camera turned about the axis of the turn, in degrees."""
         return float(np.ptp(self.yaws_deg))
 
+    @property
+    def right_deg(self) -> float:
+        """Return the heading at its end against that at its start, positive to the right."""
+        return float(self.yaws_deg[-1] - self.yaws_deg[0])
+
     @cached_property
     def yaws_deg(self) -> Floats:
         """Return the yaw of each registered keyframe since the first one, degrees."""

@@ -230,11 +230,9 @@ def _axes(rotations: Floats) -> Floats:
 
 def direction(scene: Scene) -> str:
     """Return where the turn goes: 'to the right', 'to the left', or 'one way and back'."""
-    yaws = scene.yaws_deg
-    net = float(yaws[-1] - yaws[0])
-    if abs(net) < 0.5 * scene.yaw_deg:
+    if abs(scene.right_deg) < 0.5 * scene.yaw_deg:
         return 'one way and back'
-    return 'to the right' if net > 0 else 'to the left'
+    return 'to the right' if scene.right_deg > 0 else 'to the left'
 
 
 def focal_by_turn(c: CalibrationData) -> str:

@@ -363,7 +363,8 @@ def test_colcon_builds_it_and_ros2_run_would_find_it(tmp_path, monkeypatch):
         'calibrator.yaml', 'dashcalib.rviz', 'fastdds_large_images.xml', 'foxglove_layout.json',
         'sros2_policy.xml']
     assert sorted(path.name for path in (share / 'launch').iterdir()) == [
-        'calibrator.launch.py', 'calibrator.launch.xml', 'calibrator_lifecycle.launch.py']
+        'calibrator.launch.py', 'calibrator.launch.xml', 'calibrator_lifecycle.launch.py',
+        'cameras.launch.py']
     executable = prefix / 'lib' / 'dashcalib_ros' / 'calibrator'
     assert os.access(executable, os.X_OK)
     site = next(prefix.glob('lib/python*/site-packages'))
