@@ -2,8 +2,8 @@
 
 Run it with the Python of an environment that has only this package:
 
-    python3 -m venv light && light/bin/pip install .
-    light/bin/python benchmark/size.py --results
+    python3 -m venv light && . light/bin/activate && pip install .
+    python benchmark/size.py --results
 """
 from __future__ import annotations
 
