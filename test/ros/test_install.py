@@ -302,7 +302,7 @@ bench.spin(2)
 
 
 @pytest.mark.parametrize(('name', 'kind'), [
-    ('calibrator', 'Node'), ('calibrator_lifecycle', 'LifecycleNode')])
+    ('calibrator', 'Node'), ('cameras', 'Node'), ('calibrator_lifecycle', 'LifecycleNode')])
 def test_launch_files_start_a_crashed_node_again_with_a_limit(name, kind):
     """They are read, not run: launch is not on the package index."""
     code = ast.parse((REPOSITORY / 'launch' / f'{name}.launch.py').read_text())
