@@ -26,7 +26,7 @@ from dashcalib_ros.judge.agreement import (
 )
 from dashcalib_ros.judge.calibration import Condition, Level, Verdict, Witnesses
 from dashcalib_ros.judge.mount import roll_of_path
-from dashcalib_ros.reconstruct.heading import roll_deg
+from dashcalib_ros.reconstruct.heading import off_axis_deg, roll_deg
 from dashcalib_ros.solve.evidence import LEAST_GAIN, FixedCameraTest, largest_crop
 from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Solution
 
@@ -365,6 +365,21 @@ def _turned_pictures(grounds: Grounds) -> Finding | None:
                    cause=True)
 
 
+# degrees; turns of five real drives have 1 to 17, a car that turns on the spot 86
+MAX_OFF_AXIS_DEG = 60.0
+
+
+def _moves_sideways(grounds: Grounds) -> Finding:
+    """A car drives where it points; what turns on the spot shows the depth of points badly."""
+    angle = float(np.median([off_axis_deg(scene) for scene in grounds.solution.scenes]))
+    return Finding('E-MOVES-SIDEWAYS', _graded(angle > MAX_OFF_AXIS_DEG, False),
+                   f'the camera moves at {angle:.0f}° to its axis in the turns, as where a car '
+                   f'turns on the spot: its focal length cannot be determined from that',
+                   'drive through turns at town speed, with the camera looking ahead or back',
+                   cause=True).measured('angle between the axis of the camera and its motion',
+                                        f'{angle:.0f}°', f'at most {MAX_OFF_AXIS_DEG:.0f}°')
+
+
 def _strange_aspect(grounds: Grounds) -> Finding | None:
     """A rolling shutter that was not removed changes fy first; so does a stretched picture."""
     camera = grounds.solution.camera
@@ -521,6 +536,6 @@ ENOUGH: tuple[Rule, ...] = (
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
     turns_disagree, other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,
-    _folds_over, _other_model, _other_kind, _turned_pictures, _lines_disagree, _sensors_disagree,
-    _two_cameras)
+    _folds_over, _other_model, _other_kind, _moves_sideways, _turned_pictures, _lines_disagree,
+    _sensors_disagree, _two_cameras)
 RULES = (*ENOUGH, *SOUND)

@@ -75,6 +75,18 @@ def _trimmed_mean(values: Floats) -> float:
 OPEN = 0.4
 
 
+def off_axis_deg(scene: Scene) -> float:
+    """Return the median angle of the camera's axis to its own motion, degrees: 90 is sideways.
+
+    A camera that looks back counts like one that looks ahead.
+    """
+    rotations, centres = scene.structure.path()
+    steps = np.diff(centres, axis=0)
+    along = np.abs(np.einsum('kj,kj->k', rotations[:-1, 2], steps))
+    lengths = np.maximum(np.linalg.norm(steps, axis=1), np.finfo(float).tiny)
+    return float(np.median(np.degrees(np.arccos(np.clip(along / lengths, 0, 1)))))
+
+
 def roll_deg(scenes: Sequence[Scene]) -> float:
     """Return by how much the pictures of these turns are turned against the upright, degrees.
 

@@ -131,8 +131,8 @@ def test_help_imports_nothing_heavy():
 def test_numpy_gets_one_thread_unless_more_are_asked_for(of, asked, threads):
     if of == 'ros':
         pytest.importorskip('rclpy')
-    code = (f'import os, sys; from dashcalib_ros.{of} import main; before = "numpy" in '
-            'sys.modules; main(["--help"]); print(before, os.environ["OPENBLAS_NUM_THREADS"])')
+    code = (f'import os, sys; from dashcalib_ros.{of} import *; from dashcalib_ros.{of} import main; before = "numpy" in '
+            f'sys.modules; main({"" if of == "cli" else "CALIBRATOR, "}["--help"]); print(before, os.environ["OPENBLAS_NUM_THREADS"])')
     env = {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES}
     env |= {} if asked is None else {'OPENBLAS_NUM_THREADS': asked}
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, env=env)
