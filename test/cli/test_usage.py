@@ -127,12 +127,13 @@ def test_help_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize(('asked', 'threads'), [(None, '1'), ('2', '2')])
-@pytest.mark.parametrize('of', ['cli', 'ros'])
-def test_numpy_gets_one_thread_unless_more_are_asked_for(of, asked, threads):
+@pytest.mark.parametrize(('of', 'call'), [
+    ('cli', 'main(["--help"])'), ('ros', 'main("calibrator", ["--help"])')], ids=['cli', 'ros'])
+def test_numpy_gets_one_thread_unless_more_are_asked_for(of, call, asked, threads):
     if of == 'ros':
         pytest.importorskip('rclpy')
-    code = (f'import os, sys; from dashcalib_ros.{of} import *; from dashcalib_ros.{of} import main; before = "numpy" in '
-            f'sys.modules; main({"" if of == "cli" else "CALIBRATOR, "}["--help"]); print(before, os.environ["OPENBLAS_NUM_THREADS"])')
+    code = (f'import os, sys; from dashcalib_ros.{of} import main; before = "numpy" in '
+            f'sys.modules; {call}; print(before, os.environ["OPENBLAS_NUM_THREADS"])')
     env = {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES}
     env |= {} if asked is None else {'OPENBLAS_NUM_THREADS': asked}
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, env=env)
