@@ -58,6 +58,7 @@ CANNOT_RUN = {
     'ROS_SECURITY_ENABLE=true': 'needs keys that ros2 security makes',
     'jupyter execute': 'takes a minute, and writes into examples/',
     'python benchmark/': 'takes minutes to hours: test_benchmark.py starts each with --help',
+    'benchmark/': 'takes half an hour: it emulates another processor',
     'dashcalib batch s3://': 'needs a bucket and a cluster: test/fleet has both in memory',
     'dashcalib demo': 'takes a minute: test/cli/test_run.py runs it with two turns',
 }
