@@ -1,7 +1,4 @@
-# docker build -t dashcalib_ros .
-# docker run --rm dashcalib_ros dashcalib demo --out /tmp/demo
-# docker run --rm --network host --ipc host -v "$HOME/.ros:/root/.ros" dashcalib_ros \
-#     dashcalib-calibrator --ros-args -r image_raw:=/camera/image_raw -r camera_info:=/camera/camera_info
+# For amd64 and arm64, as its base. See "In a container" in docs/usage.md.
 FROM ros:jazzy-ros-base
 
 RUN apt-get update \
@@ -15,6 +12,13 @@ ENV PATH="$VIRTUAL_ENV/bin:$PATH"
 
 COPY . /src/dashcalib_ros
 RUN pip install --no-cache-dir 'numpy<2' /src/dashcalib_ros
+
+# no root; with `docker run --user` it is the caller, who may write into this home and /data too
+RUN useradd --create-home dashcalib \
+ && mkdir -p /data /home/dashcalib/.ros \
+ && chmod 1777 /data /home/dashcalib /home/dashcalib/.ros
+USER dashcalib
+ENV HOME=/home/dashcalib
 
 # the package index, config/ and launch/ are under the virtual environment's share/
 ENV AMENT_PREFIX_PATH="$VIRTUAL_ENV"

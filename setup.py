@@ -1,15 +1,18 @@
 from glob import glob
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
 PACKAGE = 'dashcalib_ros'
+ROOT = Path(__file__).parent
 
 setup(
     name=PACKAGE,
-    version='0.2.0',
+    # ROS's tools read package.xml: the version stands there and nowhere else
+    version=ElementTree.parse(ROOT / 'package.xml').findtext('version'),
     description='Calibrates a dashcam from the turns the car takes anyway',
-    long_description=Path(__file__).with_name('README.md').read_text('utf-8'),
+    long_description=(ROOT / 'README.md').read_text('utf-8'),
     long_description_content_type='text/markdown',
     keywords=['camera calibration', 'dashcam', 'ROS 2', 'structure from motion'],
     classifiers=[
@@ -18,6 +21,7 @@ setup(
         'Intended Audience :: Science/Research',
         'Operating System :: POSIX :: Linux',
         'Programming Language :: Python :: 3',
+        *(f'Programming Language :: Python :: 3.{minor}' for minor in range(10, 15)),
         'Topic :: Scientific/Engineering :: Image Processing',
         'Typing :: Typed',
     ],
@@ -68,7 +72,9 @@ setup(
         'test': ['pytest>=8', 'pytest-xdist>=3', 'hypothesis>=6', 'ruff', 'mypy', 'types-PyYAML',
                  'onnxruntime>=1.17', 'onnx>=1.16', 'argcomplete>=3', 'wheel', 'nbclient>=0.10',
                  'ipykernel>=6', 'matplotlib>=3.8', 'ray>=2.40', 'pyarrow>=15',
-                 'fsspec>=2024.2'],
+                 'fsspec>=2024.2', 'twine>=5'],
+        'docs': ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26', 'mike>=2.1',
+                 'latex2mathml>=3.77'],
         'benchmark': ['matplotlib>=3.8'],
     },
     entry_points={

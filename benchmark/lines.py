@@ -64,7 +64,7 @@ def each_second(drive: Drive, cache: Path) -> Iterator[Frame]:
 
 def found_lines(frames: Iterable[Frame], config: Config) -> tuple[Lines, float]:
     """Return the lines of frames as they are resized, and the seconds that finding them took."""
-    collector, seconds = LineCollector(config.lines), 0.0
+    collector, seconds = LineCollector(), 0.0
     for frame in frames:
         small = Scale.of(frame.size, config).frame(frame)
         started = time.perf_counter()
@@ -82,7 +82,7 @@ def rendered_row(name: str, seed: int, cache: Path) -> dict[str, Any]:
     lines = lines.within(scale.mask(~drive.overlay.mask))
     small = camera.resized(1 / scale.px, scale.size(camera.image_size))
     k1 = small.named['k1']
-    return {name: _plain(bend(lines, replace(small, k1=k1 + off), config.lines))
+    return {name: _plain(bend(lines, replace(small, k1=k1 + off)))
             for name, off in (('true', 0.0), ('more', SPOILED), ('less', -SPOILED))}
 
 
@@ -111,7 +111,7 @@ def kitti_rows(data: Path, config: Config) -> dict[str, Any]:
     cameras = {"KITTI's K": theirs, 'ours': found.camera,
                **{f'ours, k1 {off:+.2f}': replace(found.camera, k1=k1 + off)
                   for off in (SPOILED, -SPOILED)}}
-    rows = {name: _plain(bend(lines, camera, config.lines)) for name, camera in cameras.items()}
+    rows = {name: _plain(bend(lines, camera)) for name, camera in cameras.items()}
     return {'cameras': rows, 'verdict': found.verdict.level, 'seconds': seconds,
             'total': found.timing['total'], 'sigmas': found.straight_lines.sigmas,
             'camera_sigma': found.straight_lines.camera_sigma}
@@ -130,7 +130,7 @@ def other_rows(data: Path, config: Config) -> dict[str, Any]:
         plain = camera.without_distortion()
         for text, each in (('as measured', camera), ('no distortion', plain)):
             small = each.resized(1 / scale.px, scale.size(size))
-            rows[f'{name}, {text}'] = _plain(bend(lines, small, config.lines))
+            rows[f'{name}, {text}'] = _plain(bend(lines, small))
     return rows
 
 

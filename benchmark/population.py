@@ -62,7 +62,7 @@ def calibrated(case: Case) -> Calibration:
         if scenes:
             evidence = replace(evidence, left_out={
                 **evidence.left_out,
-                **contradicting_turns(scenes, solution, case.config.verdict)})
+                **contradicting_turns(scenes, solution)})
         found = conclude(solution, evidence, case.config)
         if found.verdict.level != 'weak' or scenes is case.more or not case.more:
             return found

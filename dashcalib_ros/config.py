@@ -62,9 +62,6 @@ class MotionConfig:
         0.0, 1.0)
     standing_px: float = expert(
         0.3, 'px at the working width; the car stands if the median point moves less', 0.0, 5.0)
-    spacing_s: float = expert(
-        0.3, 's between the images of a triplet; few points stay visible in a sharp turn',
-        0.05, 2.0)
 
 
 @dataclass(frozen=True)
@@ -81,11 +78,6 @@ class MaskConfig:
     segmentation_classes: str = expert(
         '63,64', 'classes of the ego vehicle; here: car mount, ego vehicle of Mapillary Vistas',
         pattern=r'\d{1,4}(, ?\d{1,4})*')
-    segmentation_images: int = expert(
-        15, 'images that are combined by voting; the mask is available after the first one',
-        1, 1000)
-    segmentation_period_s: float = expert(
-        2.0, 's of driving between two voting images, so that the traffic has changed', 0.0, 600.0)
 
 
 @dataclass(frozen=True)
@@ -103,9 +95,6 @@ class TurnsConfig:
     store: str = setting(
         '', 'folder for reconstructed turns of one camera: short trips add up; empty: none')
     capacity: int = expert(10, 'maximum number of turns kept: twice turns.wanted', 1, 50)
-    min_prominence: float = expert(
-        0.0025, 'fraction of the image width; lower peaks of the turning magnitude are ignored',
-        0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -158,21 +147,13 @@ class SceneConfig:
     keyframes: int = expert(
         30, 'maximum number per turn; more take longer and do not change the result', 5, 1000)
     profile_keyframes: int = expert(12, 'maximum number per turn, for the focal profile', 5, 1000)
-    min_images: int = expert(
-        6, 'minimum number of keyframes of a turn; with fewer it is not reconstructed', 4, 100)
     error_px: float = expert(
         2.0, 'px; observations with a larger reprojection error are not used', 0.2, 20.0)
-    chain_error: float = expert(
-        0.004, 'fraction of the image width; the same limit while the lens is still unknown',
-        0.0005, 0.05)
     min_angle_deg: float = expert(
         0.3, 'degrees; minimum triangulation angle of a point; far points show rotation best',
         0.01, 10.0)
     loss_px: float = expert(
         0.5, 'px; scale of the Cauchy loss of the reprojection errors', 0.05, 10.0)
-    iterations: int = expert(
-        12, 'maximum number per adjustment; 60 change fx by 0.03 % and take twice the time',
-        5, 500)
     min_explained: float = expert(
         0.3, "minimum fraction of a turn's observations that the camera must explain",
         0.0, 0.9)
@@ -205,18 +186,6 @@ class MountConfig:
 
 
 @dataclass(frozen=True)
-class LinesConfig:
-    """Upright lines of the world: poles and the edges of houses, a second witness."""
-
-    images: int = expert(
-        300, 'maximum number searched for lines; of more, every second one is dropped',
-        10, 10000)
-    group_s: float = expert(
-        5.0, 's; images within this time may show the same line and count as one measurement',
-        0.1, 600.0)
-
-
-@dataclass(frozen=True)
 class VerdictConfig:
     """When a result is weak or refused."""
 
@@ -229,17 +198,11 @@ class VerdictConfig:
         60.0, 'degrees; minimum sum of the yaw angles of all turns; below: weak', 0.0, 1000.0)
     refused_yaw_deg: float = expert(
         10.0, 'degrees; minimum sum of the yaw angles of all turns; below: refused', 0.0, 1000.0)
-    min_contrast: float = expert(
-        0.05, 'minimum relative increase of the error with fx 20 % off; below: weak',
-        0.0, 10.0)
     max_roll_deg: float = expert(
         45.0, 'degrees; maximum roll of the images; above: weak; 180: for a rotated camera',
         0.0, 180.0)
     max_aspect: float = expert(
         0.015, 'maximum difference of fy / fx from 1; above: weak; 20 ms rolling shutter: 0.04',
-        0.0, 1.0)
-    max_disagreement: float = expert(
-        0.03, 'maximum weighted scatter of fx between turns, as a fraction of fx; above: weak',
         0.0, 1.0)
     max_leverage: float = expert(
         0.9, 'maximum share of one turn in the information about fx; above: weak',
@@ -247,9 +210,6 @@ class VerdictConfig:
     max_line_sigmas: float = expert(
         4.0, 'sigmas; maximum difference from the k1 of straight lines; above: weak',
         1.0, 1e6)
-    max_misfit: float = expert(
-        2.0, "maximum ratio of a turn's cost to that with its own camera; above: weak",
-        1.0, 1e4)
     max_crop_sigmas: float = expert(
         2.0, 'sigmas over the image; maximum motion by a stabiliser; above: weak', 0.0, 1e6)
 
@@ -270,9 +230,6 @@ class FleetConfig:
     least_units: int = expert(
         8, 'minimum number of other cameras of the same model, for a prior of one camera',
         3, 10**6)
-    other_mode: float = expert(
-        3.0, 'sigmas; a camera farther from the fx of its model uses another sensor mode',
-        1.0, 1e3)
 
 
 @dataclass(frozen=True)
@@ -324,7 +281,6 @@ class Config:
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
-    lines: LinesConfig = field(default_factory=LinesConfig)
     mount: MountConfig = field(default_factory=MountConfig)
     verdict: VerdictConfig = field(default_factory=VerdictConfig)
     monitor: MonitorConfig = field(default_factory=MonitorConfig)

@@ -16,7 +16,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.poses import Poses
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading
 from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
 from dashcalib_ros.judge.check import CALIBRATION
@@ -164,10 +164,10 @@ class Calibrator:
     def _calibrate(self, progress: Progress, final: bool, started: float) -> Calibration:
         scenes, solution = self._solve(progress, final)  # scenes -> one camera
         sensors = self._compare_sensors(solution, progress)
-        solution, limits = sensors.solution, self.scenes.config.verdict
+        solution = sensors.solution
         # these do not count in the next calibration; files of another camera's turns stay
         self.scenes.exclude(turns_of_earlier_cameras(scenes, solution), keep_files=True)
-        self.scenes.exclude(contradicting_turns(scenes, solution, limits))
+        self.scenes.exclude(contradicting_turns(scenes, solution))
         self.solution = solution
         return self._judge(sensors, started)  # one camera -> verdict
 
@@ -180,7 +180,7 @@ class Calibrator:
                 self.scenes.exclude(stood)
                 continue
             # the search for repeated pictures takes a second and hardly ever finds some
-            search = self.workers.begin(without_repeated, scenes, config.scene.min_images)
+            search = self.workers.begin(without_repeated, scenes)
             solving = self.workers.begin(solve, scenes, config, reports=True)
             kept, repeated = self.workers.result(search)
             if repeated:
@@ -297,7 +297,8 @@ class Calibrator:
         if camera.image_size != size:
             raise InputError('E-CALIBRATION-SIZE',
                              f'the given camera is for pictures of another size: '
-                             f'{by(camera.image_size)}; resize it with dashcalib export --size')
+                             f'{size_text(camera.image_size)}; resize it with dashcalib export '
+                             f'--size')
         return camera.resized(1 / scale.px, scale.size(size))
 
     # what is known so far ---------------------------------------------------------------------

@@ -19,7 +19,7 @@ from dashcalib_ros.workers.worker import Progress
 # why a turn is not used, in words
 NO_SCENE = ('its pictures gave no scene: too dark, blurred or empty to follow enough points, or '
             'the car hardly moved')
-ALONE = 'this drive has no turn that could agree with it'
+UNCONFIRMED = 'this drive has no turn that could agree with it'
 # turns that wait for better ones; of KITTI 03 five are reconstructed then, not eight
 WAITING = 3
 
@@ -112,7 +112,7 @@ class SceneSelection:
         """Return why turns that were tried are without a scene now, in words."""
         built = self._workers.scenes()
         failed = {turn: NO_SCENE for turn, scene in built.items() if scene is None}
-        alone = {} if len(failed) < len(built) else dict.fromkeys(self._store.turns, ALONE)
+        alone = {} if len(failed) < len(built) else dict.fromkeys(self._store.turns, UNCONFIRMED)
         return failed | alone | self._excluded
 
     def chosen(self) -> list[Scene]:

@@ -25,7 +25,7 @@ from dashcalib_ros.input.inputs import Paths, as_list, fits_bag, open_frames
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
 from dashcalib_ros.input.poses import Poses, track_poses
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.pipeline import Calibrator
 from dashcalib_ros.report import Calibration, NamedCamera
@@ -232,8 +232,8 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
     if stored:
         values = ', '.join(f'{name} {value:.2f}' for name, value in zip(
             ('fx', 'fy', 'cx', 'cy'), stored.params, strict=False))
-        new += (f'for the pictures as they are stored ({by(stored.image_size)}): {values}, and '
-                f'the same distortion',)
+        new += (f'for the pictures as they are stored ({size_text(stored.image_size)}): '
+                f'{values}, and the same distortion',)
     return replace(calibration, verdict=verdict, material=material,
                    input_name=calibration.input_name or source.name,
                    warnings=(*new, *calibration.warnings))

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # not in the source distribution
 BENCHMARK = ROOT / 'benchmark'
-DOCUMENTS = ['README.md', 'CONTRIBUTING.md', 'CHANGELOG.md',
+DOCUMENTS = ['README.md', 'CONTRIBUTING.md', 'CHANGELOG.md', 'SECURITY.md',
              *sorted(str(path.relative_to(ROOT)) for folder in ('docs', 'benchmark')
                      for path in (ROOT / folder).rglob('*.md'))]
 
@@ -30,6 +31,22 @@ def test_links_lead_somewhere(name):
         target = (document.parent / link).resolve()
         assert (link.startswith('http') or target.exists()
                 or (target.is_relative_to(BENCHMARK) and not BENCHMARK.exists())), link
+
+
+def test_the_site_is_built_without_a_warning(tmp_path):
+    """Warnings are links and anchors that lead nowhere, and names that have no docstring."""
+    for library in ('material', 'mkdocstrings', 'mike', 'latex2mathml'):
+        pytest.importorskip(library, reason='no mkdocs-material: pip install the docs extra')
+    if not BENCHMARK.exists():
+        pytest.skip('the source distribution lacks documents of the site')
+    done = subprocess.run([sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir',
+                           str(tmp_path / 'site')], cwd=ROOT, capture_output=True, text=True,
+                          timeout=200)
+    assert done.returncode == 0, done.stdout + done.stderr
+    page = (tmp_path / 'site' / 'docs' / 'api' / 'index.html').read_text()
+    assert 'open_frames' in page
+    assert (tmp_path / 'site' / 'docs' / 'how_it_works' / 'index.html').read_text().count('<math')
+    assert list((tmp_path / 'site' / 'assets' / 'stylesheets').glob('*.css'))
 
 
 def test_the_files_that_contributors_are_sent_to_exist():

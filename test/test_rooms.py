@@ -217,7 +217,7 @@ from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.formats import result_json
 from dashcalib_ros.report.page import report_html
 from dashcalib_ros.solve import solve
-scenes, repeated = without_repeated(scenes_of(3), 6)
+scenes, repeated = without_repeated(scenes_of(3))
 points = np.random.default_rng(0).uniform(50, 250, (12, 60, 2)).astype(np.float32)
 found = conclude(solve(scenes, CONFIG), Evidence(
     SIZE, 300, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {},

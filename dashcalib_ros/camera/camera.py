@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # COLMAP has the centre of the first pixel at (0.5, 0.5)
 HALF_PIXEL = 0.5
 # a coefficient below this moves no pixel, and as a polynomial's highest one it spoils the roots
-NOTHING = 1e-30
+TINY = 1e-30
 # the families of lenses: distortion of the tangent of a ray's angle to the axis, or of the angle
 PINHOLE, FISHEYE = 'pinhole', 'fisheye'
 

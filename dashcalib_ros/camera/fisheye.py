@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera.camera import FISHEYE, NOTHING, Camera, ColmapModel
+from dashcalib_ros.camera.camera import FISHEYE, TINY, Camera, ColmapModel
 
 # radians (120 degrees): the corners of a picture that is 190 degrees wide see to 110
 WIDEST = 2.1
@@ -114,7 +114,7 @@ class Fisheye(Camera):
     def fold(self) -> float:
         """Return the angle at which the model folds over, WIDEST at the most; radians."""
         slope = np.array([9 * self.k4, 7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
-        roots = np.roots(np.where(np.abs(slope) < NOTHING, 0.0, slope))
+        roots = np.roots(np.where(np.abs(slope) < TINY, 0.0, slope))
         squares = roots[np.abs(roots.imag) < 1e-9].real
         return float(min([WIDEST, *np.sqrt(squares[squares > 0])]))
 

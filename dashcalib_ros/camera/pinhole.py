@@ -15,7 +15,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera.camera import NOTHING, PINHOLE, Camera, ColmapModel
+from dashcalib_ros.camera.camera import PINHOLE, TINY, Camera, ColmapModel
 
 # tangent of 85 degrees: no pinhole camera sees farther out
 WIDEST = 11.4
@@ -214,7 +214,7 @@ class Rational(Brown):
         square = Polynomial([0.0, 1.0])
         # of radius times above / below: where its slope is 0, by the squared radius
         slope = (above + 2 * square * above.deriv()) * below - 2 * square * above * below.deriv()
-        roots = np.concatenate([each.trim(NOTHING).roots() for each in (slope, below)])
+        roots = np.concatenate([each.trim(TINY).roots() for each in (slope, below)])
         real = roots[np.abs(roots.imag) < 1e-9].real
         return float(np.sqrt(min([WIDEST**2, *real[real > 0]])))
 

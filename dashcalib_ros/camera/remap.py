@@ -30,7 +30,7 @@ HALVINGS = 30
 # in the search for the largest view; about 30 are needed
 SEARCH_STEPS = 300
 # of a shift; a view that is no larger elsewhere stays in the middle
-STAYS = 0.001
+LEAST_SHIFT = 0.001
 # px; outside of the picture, for what the lens does not see: cv2.remap leaves it black
 OUTSIDE = -1.0
 
@@ -153,7 +153,7 @@ def _largest_inside(camera: Camera, outline: Floats) -> tuple[Floats, float]:
         return np.asarray(away.max(axis=-1).min(axis=-1))
 
     def worth(centres: Floats) -> Floats:
-        return np.asarray(width(centres) - STAYS * np.linalg.norm(centres, axis=-1))
+        return np.asarray(width(centres) - LEAST_SHIFT * np.linalg.norm(centres, axis=-1))
 
     around = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), -1).reshape(-1, 2)
     low, high = outline.min(axis=0), outline.max(axis=0)

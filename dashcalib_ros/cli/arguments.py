@@ -38,7 +38,7 @@ BATCH_EXIT_HELP = ('exit codes: 0 every clip was read and no camera was refused;
 # names of models, exports and demos; to take them from their tables would load OpenCV
 MODELS = ('auto', 'radial', 'brown', 'fisheye')
 KINDS = ('colmap', 'gyroflow', 'kalibr', 'opensfm', 'nerfstudio', 'mrcal', 'foxglove', 'ros',
-         'opencv', 'rays', 'maps')
+         'opencv', 'rays', 'maps', 'urdf', 'tf')
 LENSES = ('radial', 'brown', 'fisheye', 'windscreen', 'shutter', 'stabilised', 'straight')
 # files that no command takes as a drive
 NO_DRIVES = ('.yaml', '.yml', '.json', '.xml', '.txt', '.csv', '.npz')
@@ -225,7 +225,7 @@ MOTION: tuple[Argument, ...] = (
 # what the shell may complete: argcomplete looks for it
 COMPLETED = {'--model': MODELS, '--to': KINDS}
 # a command takes only one of these
-ALONE = ('--size', '--crop', '--workers', '--address', '--shard')
+EXCLUSIVE = ('--size', '--crop', '--workers', '--address', '--shard')
 
 
 def out_folder(default: str, cure: str = '') -> Argument:
@@ -294,6 +294,8 @@ COMMANDS = {
                    'help': 'the reference: the same kinds of files'}),
             ('--html', {'type': path_or('use the name of a file'), 'metavar': 'FILE',
                         'help': 'write a page with maps of the difference, in px and in sigmas'}),
+            ('--rig', {**FLAG, 'help': 'A and B are two cameras of one car: show how B is '
+                                       'mounted against A, and whether both saw one drive'}),
             JSON)),
     'export': Command(
         'dashcalib_ros.cli.cameras', "write a calibration as another program's camera file",
@@ -366,9 +368,9 @@ def make_parser() -> Parser:
             name, help=command.summary, description=command.description,
             epilog=f'example: {command.example}\n{command.exit_codes}')
         alone = (own.add_mutually_exclusive_group()
-                 if any(flag in ALONE for flag, _ in command.arguments) else own)
+                 if any(flag in EXCLUSIVE for flag, _ in command.arguments) else own)
         for flag, options in command.arguments:
-            action = (alone if flag in ALONE else own).add_argument(flag, **options)
+            action = (alone if flag in EXCLUSIVE else own).add_argument(flag, **options)
             if flag in COMPLETED:
                 names = COMPLETED[flag]
                 action.completer = lambda n=names, **_: n  # type: ignore[attr-defined]

@@ -6,23 +6,29 @@ import json
 from dataclasses import replace
 
 import numpy as np
+from rich.console import Group
 
 from dashcalib_ros.camera.mapping import rayless_share
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
 from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.formats import export as exported
-from dashcalib_ros.formats import load_camera
+from dashcalib_ros.formats import load_calibration, load_camera
 from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
-from dashcalib_ros.input.source import by
+from dashcalib_ros.formats.ours import plain_values
+from dashcalib_ros.input.source import size_text
+from dashcalib_ros.judge.rig import rig_of
 from dashcalib_ros.report import compare as compare_cameras
 from dashcalib_ros.report import write_text
 from dashcalib_ros.report.page import difference_html
-from dashcalib_ros.report.tables import comparison
+from dashcalib_ros.report.tables import comparison, line
+from dashcalib_ros.report.wording import mount_text, rig_texts, verdict_text
 from dashcalib_ros.standard_streams import write_stdout
 
 
 def compare(args: argparse.Namespace) -> int:
     """Show how far A differs from B, and for which uses A is good enough."""
+    if args.rig:
+        return _rig(args)
     found = compare_cameras(load_camera(args.a), load_camera(args.b))
     if args.html is not None:
         write_text(args.html, difference_html(found))
@@ -32,6 +38,23 @@ def compare(args: argparse.Namespace) -> int:
         show(comparison(found))
         if args.html is not None:
             write_stdout(f'written: {args.html}, a map of the difference')
+    return ACCEPTED
+
+
+def _rig(args: argparse.Namespace) -> int:
+    """Show how the cameras A and B of one car are turned against each other."""
+    if args.html is not None:
+        raise UsageError('E-RIG-HTML', '--html maps the difference of two calibrations of one '
+                                       'camera; omit it with --rig')
+    a, b = load_calibration(args.a), load_calibration(args.b)
+    found = rig_of(a, b)
+    if args.json:
+        write_stdout(json.dumps(plain_values(found) | {'agrees': found.agrees}, indent=2))
+        return ACCEPTED
+    for side, path, calibration in (('A', args.a, a), ('B', args.b, b)):
+        if calibration.mount is not None:
+            show(line(f'{side}: {path}: {mount_text(calibration.mount)}'))
+    show(Group(*map(line, rig_texts(found))))
     return ACCEPTED
 
 
@@ -54,12 +77,14 @@ def export(args: argparse.Namespace) -> int:
     if readout_ms is None and 'readout_ms' in keeps:
         warn([f'{found.name} has no readout time of a rolling shutter: set it in {args.to}, '
               f'unless the shutter is global'])
-    if found.field is not None and 'field' not in keeps:
+    if 'mount' in keeps and found.mount is not None and found.mount.verdict == 'weak':
+        warn([f'{found.name}: its mounting is {verdict_text(found.mount)}'])
+    if found.field is not None and not {'field', 'mount'} & set(keeps):
         lost = found.field.over(found.camera)
         others = ', '.join(kind for kind, form in EXPORTS.items() if 'field' in form.keeps)
         warn([f'{found.name} has a field over the picture, for which {args.to} has no place: '
               f'without it pixels are off by {np.sqrt(np.mean(lost**2)):.2f} px RMS and '
-              f'{lost.max():.2f} px at the worst (of {by(found.image_size)}); export to '
+              f'{lost.max():.2f} px at the worst (of {size_text(found.image_size)}); export to '
               f'{others} to keep it'])
     unseen = rayless_share(camera)
     if unseen:

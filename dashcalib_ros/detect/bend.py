@@ -15,7 +15,6 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.config import LinesConfig
 from dashcalib_ros.detect.edges import Lines
 from dashcalib_ros.robust import cauchy_fit, jackknife, weighted_median
 
@@ -78,14 +77,18 @@ SYSTEMATIC_PX = 0.01
 # with fewer lines, or groups of images, their own scatter is unknown
 LEAST_LINES, LEAST_GROUPS = 20, 4
 
+# s; see bend()
+GROUP_S = 5.0
 
-def bend(lines: Lines, camera: Camera, config: LinesConfig | None = None,
-         covariance: Floats | None = None) -> Bend | None:
+
+def bend(lines: Lines, camera: Camera, covariance: Floats | None = None,
+         group_s: float = GROUP_S) -> Bend | None:
     """Return how the camera bends the lines; None where there are too few.
 
     lines: in pixels of the camera's pictures. covariance: (p, p) of the camera's parameters.
+    group_s: images within this time may show the same line, and count as one measurement.
     """
-    measured = _sensitive(_measured(lines, camera, (config or LinesConfig()).group_s))
+    measured = _sensitive(_measured(lines, camera, group_s))
     groups = int(measured.group.max(initial=-1)) + 1
     if len(measured.group) < LEAST_LINES or groups < LEAST_GROUPS:
         return None

@@ -53,7 +53,7 @@ class Detection:
         self.standing = False
         self._config = config
         self._motion = MotionEstimator(config.motion, config.mask, mask)
-        self._lines = LineCollector(config.lines, beside)
+        self._lines = LineCollector(beside=beside)
         # more turns than wanted replace those without a scene; --turns may be above the capacity
         self._turns = TurnDetector(replace(
             config.turns, capacity=max(config.turns.capacity, config.turns.wanted)))

@@ -15,6 +15,8 @@ from dashcalib_ros.detect.peaks import Peak, PeakFinder, StreamingMedian
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
 
+# of the image width; kitti03's sharp turn has 0.050, its bends of 0.4 to 0.6 deg a frame 0.005
+MIN_PROMINENCE = 0.0025
 # ns; header stamps are rounded: an image exactly half a width away belongs to the turn
 ROUNDING = 1_000_000
 # least prominences; where the magnitude is higher at an edge of the drive, that may be a turn:
@@ -113,7 +115,7 @@ class TurnDetector:
     def _begin(self) -> None:
         """Begin a stretch without gaps."""
         self._median = StreamingMedian(self.config.half_width)
-        self._peaks = PeakFinder(self.config.min_prominence, 2 * self._half_ns)
+        self._peaks = PeakFinder(MIN_PROMINENCE, 2 * self._half_ns)
         self._filtered_ns: int | None = None
         # the images that a candidate, or a peak still to come, may need
         self._recent: deque[Frame] = deque()
@@ -140,7 +142,7 @@ class TurnDetector:
 
     def _beyond(self, value: float) -> float:
         """Return what the signal counts as beyond an edge of the stretch; value: at the edge."""
-        return value - SEEN * max(value - CUT_OFF * self.config.min_prominence, 0.0)
+        return value - SEEN * max(value - CUT_OFF * MIN_PROMINENCE, 0.0)
 
     def _find(self, stamp_ns: int, value: float) -> None:
         """Take the next sample; the peak that it ends is a candidate unless a higher one is near.
@@ -162,7 +164,7 @@ class TurnDetector:
     def _drop_impossible(self) -> None:
         """Drop the candidates that ended below the least prominence."""
         self._candidates = [each for each in self._candidates
-                            if each.peak.limit >= self.config.min_prominence]
+                            if each.peak.limit >= MIN_PROMINENCE]
 
     def _collect(self, now_ns: int | None) -> None:
         """Give the candidates their images, and free the images that no turn needs.
@@ -185,7 +187,7 @@ class TurnDetector:
         """Return whether no peak can come that hides a candidate."""
         return (bool(self._candidates)
                 and self._peaks.earliest_ns - self._candidates[-1].peak.stamp_ns > self._reach_ns
-                and all(each.peak.prominence >= self.config.min_prominence
+                and all(each.peak.prominence >= MIN_PROMINENCE
                         for each in self._candidates))
 
     def _judge(self, final: bool) -> None:
@@ -196,7 +198,7 @@ class TurnDetector:
         """
         turns: list[_Candidate] = []
         for each in reversed(self._candidates):
-            ready = each.frames and each.peak.prominence >= self.config.min_prominence
+            ready = each.frames and each.peak.prominence >= MIN_PROMINENCE
             if ready and not (turns and self._near(each.peak, turns[-1].peak)):
                 turns.append(each)
         self.bank.set_newest([(each.peak, each.frames) for each in reversed(turns)], final)

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask, Pixels
-from dashcalib_ros.config import LinesConfig
 from dashcalib_ros.robust import EvenlySpaced
 
 # points of an edge: means over as many equal parts of it
@@ -155,15 +154,18 @@ def _longest_edges(image: GreyImage) -> Floats32:
     height = points[:, -1, 1] - points[:, 0, 1]
     return points[np.sort(np.argsort(-height, kind='stable')[:MOST])]
 
+# pictures that are searched at the most; of more, every second one is dropped
+IMAGES = 300
+
 
 class LineCollector:
     """Searches a picture every period; keeps points of edges only, never a picture."""
 
-    def __init__(self, config: LinesConfig, beside: bool = False) -> None:
-        """beside: a thread searches a picture until the next one comes."""
+    def __init__(self, images: int = IMAGES, beside: bool = False) -> None:
+        """images: that are searched at the most. beside: a thread searches until the next one."""
         self._thread = ThreadPoolExecutor(1) if beside else None
         # what returns the points, once they are found
-        self._found: EvenlySpaced[Callable[[], Floats32]] = EvenlySpaced(PERIOD_S, config.images)
+        self._found: EvenlySpaced[Callable[[], Floats32]] = EvenlySpaced(PERIOD_S, images)
 
     def push(self, image: GreyImage, stamp_ns: int) -> None:
         """Take a picture of the moving car; it is searched if the last one is long enough ago."""

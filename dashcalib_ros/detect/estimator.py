@@ -23,6 +23,9 @@ from dashcalib_ros.input.decode import check_mask
 from dashcalib_ros.input.scale import shrink_image
 from dashcalib_ros.input.stamps import EARLY, Looks, least_step_ns
 
+# s between the images of a triplet: rotation adds up over it and vibration does not; farther apart
+# few points stay visible in a sharp turn
+SPACING_S = 0.3
 # px; smaller pictures have no room for points
 LEAST_SIDE = 20
 # times standing_px; a standing car's points move at most so far over a triplet, at night
@@ -204,7 +207,7 @@ class MotionEstimator:
 
     def _reset(self) -> None:
         """Drop all points: the next image does not continue the last one."""
-        keep = math.ceil(2 * self.config.spacing_s * self.config.rate / (1 - EARLY)) + 3
+        keep = math.ceil(2 * SPACING_S * self.config.rate / (1 - EARLY)) + 3
         self._seen: deque[_Seen] = deque(maxlen=keep)
         self._pairs: dict[tuple[int, int], Floats | None] = {}
         self._turning = -math.inf, math.nan
@@ -293,7 +296,7 @@ class MotionEstimator:
 
     def _look_for_ego(self, image: GreyImage, middle: _Seen, now: _Seen) -> None:
         epipoles = self._pairs.get((middle.index, now.index))
-        early = abs(now.stamp_ns - self._ego_ns) < 0.9e9 * self.config.spacing_s
+        early = abs(now.stamp_ns - self._ego_ns) < 0.9e9 * SPACING_S
         if self._ego is None or epipoles is None or early:
             return
         self._ego_ns = now.stamp_ns
@@ -370,7 +373,7 @@ class MotionEstimator:
         first, middle, last = triplet.first, triplet.middle, triplet.last
         # triplets at each image cost three times as much and add nothing; a slow camera has few,
         # and each counts
-        spacing_ns = 1e9 * self.config.spacing_s
+        spacing_ns = 1e9 * SPACING_S
         fast = last.stamp_ns - self._seen[-2].stamp_ns < 0.4 * spacing_ns
         if fast and last.stamp_ns - self._turning[0] < spacing_ns - 0.5 * self._period_ns:
             return self._turning[1]
@@ -385,7 +388,7 @@ class MotionEstimator:
 
     def _earlier(self, seen: _Seen) -> _Seen | None:
         """Return the image that is nearest to one spacing earlier, None if there is none."""
-        target = seen.stamp_ns - self.config.spacing_s * 1e9
+        target = seen.stamp_ns - SPACING_S * 1e9
         before = [other for other in self._seen if other.stamp_ns < seen.stamp_ns]
         if not before or before[0].stamp_ns > target + 0.5 * self._period_ns:
             return None

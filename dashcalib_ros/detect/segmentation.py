@@ -21,6 +21,10 @@ from dashcalib_ros.detect.mask import LARGEST
 from dashcalib_ros.errors import ConfigError, InputError, one_line
 from dashcalib_ros.limits import MODEL_BYTES, check_file
 
+# images that vote; the mask is available after the first one
+IMAGES = 15
+# s of driving between two of them, so that the traffic has changed
+PERIOD_S = 2.0
 # (width, height) px for models that take any size: nearly 16:9 like dashcams, multiples of 64
 SIZE = 1024, 576
 # of the picture's width, added to the mask: its outline is blurred, and has strong corners
@@ -101,8 +105,8 @@ class SegmentationMask:
 
     def push(self, image: GreyImage, stamp_ns: int) -> bool:
         """Take an image (height, width) of the moving car; return whether it was segmented."""
-        early = abs(stamp_ns - self._sampled_ns) < 1e9 * self._config.segmentation_period_s
-        if early or self._count == self._config.segmentation_images:
+        early = abs(stamp_ns - self._sampled_ns) < 1e9 * PERIOD_S
+        if early or self._count == IMAGES:
             return False
         self._sampled_ns = stamp_ns
         vehicle = self._model.vehicle(image).astype(np.float32)

@@ -36,7 +36,7 @@ from dashcalib_ros.whole_files import temporary_folder
 
 
 @dataclass(frozen=True)
-class Own:
+class CameraResult:
     """What the fleet needs of a camera's own result. file: has the result.
 
     shares: by clip. unit: what the camera adds to the prior of its model. again: this was known
@@ -62,7 +62,7 @@ class Camera:
     make: str
     rows: Sequence[Row]
     results: dict[int, ClipResult] = field(default_factory=dict)
-    own: Own | None = None
+    own: CameraResult | None = None
     verdict: str = 'refused'
     clips: Sequence[Mapping[str, Any]] = ()
     row: Mapping[str, Any] = field(default_factory=dict)
@@ -74,7 +74,7 @@ class Camera:
 
 
 # called for each clip, and, without one, for each camera that is solved
-Told = Callable[[Camera, ClipResult | None], None]
+OnProgress = Callable[[Camera, ClipResult | None], None]
 
 
 def cameras_of(rows: Sequence[Row], shard: tuple[int, int] = (1, 1)) -> list[Camera]:
@@ -95,7 +95,7 @@ def cameras_of(rows: Sequence[Row], shard: tuple[int, int] = (1, 1)) -> list[Cam
 
 
 def batch(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
-          whole: bool = True, tell: Told = lambda camera, clip: None) -> tuple[str, ...]:
+          whole: bool = True, tell: OnProgress = lambda camera, clip: None) -> tuple[str, ...]:
     """Calibrate cameras; return the files about all of them.
 
     out: the folder for everything. whole: they are all of the manifest; of a part there is no
@@ -110,7 +110,7 @@ def batch(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
 
 
 def _gather_and_solve(cameras: Sequence[Camera], out: str, config: Config, engine: Engine,
-                      tell: Told) -> None:
+                      tell: OnProgress) -> None:
     known: list[tuple[tuple[Camera, Row], ClipResult]] = []
     for camera in cameras:
         for row in camera.rows:
@@ -153,7 +153,7 @@ def _failed(camera: Camera, error: Exception) -> None:
     camera.row = tables.failed_row(camera.name, camera.make, camera.clips, coded(error, LONGEST))
 
 
-def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.OfMake], out: str,
+def _publish(cameras: Sequence[Camera], found: Mapping[str, lens_prior.ModelPrior], out: str,
              engine: Engine) -> None:
     for camera in cameras:
         if camera.own is not None:
@@ -195,7 +195,7 @@ def problems(cameras: Sequence[Camera]) -> Iterator[tuple[Row, str]]:
 
 
 def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]], out: str,
-                 config: Config) -> Own:
+                 config: Config) -> CameraResult:
     """Solve a camera from its gathered clips, unless that was done."""
     # a clip that the manifest names twice counts once
     used = {row.name: (result.file, f'{result.content}{row.topic or ""}')
@@ -216,8 +216,8 @@ def solve_camera(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]]
         data = solved.encoded(fuse(camera, make, loaded, config))
         write(joined(out, name), data)
     result = solved.decoded(data, name)
-    return Own(name, result.calibration.verdict.level, result.shares, solved.unit_of(result),
-               again)
+    return CameraResult(name, result.calibration.verdict.level, result.shares,
+                        solved.unit_of(result), again)
 
 
 def solved_file(camera: str, make: str, clips: Sequence[tuple[str, str, str]], config: Config
@@ -232,8 +232,8 @@ def solved_file(camera: str, make: str, clips: Sequence[tuple[str, str, str]], c
     return f'solved/{key[:2]}/{key}.json'
 
 
-def publish_camera(name: str, found: lens_prior.OfMake | None, clips: Sequence[Mapping[str, Any]],
-                   out: str) -> dict[str, Any]:
+def publish_camera(name: str, found: lens_prior.ModelPrior | None,
+                   clips: Sequence[Mapping[str, Any]], out: str) -> dict[str, Any]:
     """Write calibration.yaml, result.json and report.html of a camera; return its row.
 
     name: the file of its own result. found: the prior of its model. clips: the rows of its clips.

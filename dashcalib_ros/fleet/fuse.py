@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dashcalib_ros.config import Config, VerdictConfig
+from dashcalib_ros.config import Config
 from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import counted
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.agreement import focal_of, turns_of_another_camera
 from dashcalib_ros.judge.conclude import Evidence, conclude
@@ -57,7 +57,7 @@ def fuse(camera: str, make: str, clips: Clips, config: Config) -> Solved:
         scenes, repeated = _chosen(turns, left_out, config)
         solution = solve(scenes, config) if scenes else None
         own = shares_of(solution, turns, origin.scale.px)
-        of_another = contradicting(solution, turns, own, config.verdict)
+        of_another = contradicting(solution, turns, own)
         if not (of_another and further):
             break
         left_out.update(of_another)
@@ -113,8 +113,8 @@ def _other_origins(clips: Clips) -> dict[str, str]:
         return sum(map(bool, turns)), sum(turns), len(turns), str(origin)
 
     main = max({clip.origin for clip in clips.values()}, key=weight, default=Origin((0, 0)))
-    return {name: f'is {by(clip.origin.image_size)}, and most clips of this camera are '
-                  f'{by(main.image_size)}'
+    return {name: f'is {size_text(clip.origin.image_size)}, and most clips of this camera are '
+                  f'{size_text(main.image_size)}'
             if clip.origin.image_size != main.image_size else
             'was gathered with another max_width or min_width than most clips of this camera'
             for name, clip in clips.items() if clip.origin != main}
@@ -147,8 +147,7 @@ def _chosen(turns: Mapping[TurnId, ClipTurn], left_out: Mapping[str, str], confi
     repeated: dict[TurnId, TurnId] = {}
     while True:
         best = [key for key in ranked if key not in repeated][:config.fleet.turns]
-        scenes, more = without_repeated([turns[key].stored.scene for key in best],
-                                        config.scene.min_images)
+        scenes, more = without_repeated([turns[key].stored.scene for key in best])
         if not more:
             return scenes, repeated
         repeated.update(more)
@@ -180,14 +179,14 @@ def _nothing_found(clips: Clips) -> str:
 
 
 def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn],
-                  shares: Mapping[str, ClipShare], config: VerdictConfig) -> dict[str, str]:
+                  shares: Mapping[str, ClipShare]) -> dict[str, str]:
     """Return the clips, less than half of all, that are of another camera, and why.
 
     Two things show it: the cost of a clip's turns, and the fx of these turns alone.
     """
     if solution is None:
         return {}
-    of_another = turns_of_another_camera(solution.misfits, config)
+    of_another = turns_of_another_camera(solution.misfits)
     used = Counter(turns[key].clip for key in solution.misfits)
     against = Counter(turns[key].clip for key in of_another)
     found = {clip: f'shows another camera: the cost of its turns is {worst:.1f} times as high '

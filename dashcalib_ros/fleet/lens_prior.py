@@ -25,7 +25,10 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import FleetConfig
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
+
+# sigmas; a camera farther from the fx of its model uses another mode of the sensor
+OTHER_MODE = 3.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class LensPrior:
 
 
 @dataclass(frozen=True)
-class OfMake:
+class ModelPrior:
     """A unit's prior; None with the reason, which may be that it is in another mode."""
 
     prior: LensPrior | None
@@ -73,9 +76,9 @@ class OfMake:
 FOLDS = 40
 
 
-def priors(units: Sequence[Unit], config: FleetConfig) -> dict[str, OfMake]:
+def priors(units: Sequence[Unit], config: FleetConfig) -> dict[str, ModelPrior]:
     """Return each unit's prior, from the other units of its make."""
-    found: dict[str, OfMake] = {}
+    found: dict[str, ModelPrior] = {}
     ordered = sorted(units, key=lambda unit: (unit.make, unit.name))
     for _, group in groupby(ordered, key=lambda unit: unit.make):
         of_make = list(group)
@@ -102,19 +105,20 @@ def focal_length(curvature: Floats) -> Floats:
 LEAST_ODDS = 3.0
 
 
-def _of_make(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> OfMake:
+def _of_make(unit: Unit, prior: LensPrior | None, others: int, config: FleetConfig) -> ModelPrior:
     if prior is None:
-        return OfMake(None, f'its model has {others} other usable cameras; a prior needs '
+        return ModelPrior(None, f'its model has {others} other usable cameras; a prior needs '
                             f'{config.least_units} that agree')
-    if off_by(unit, prior) > config.other_mode:
+    if off_by(unit, prior) > OTHER_MODE:
         percent = 100 * (focal_length(unit.lens[0]) / focal_length(prior.mean[0]) - 1)
-        return OfMake(None, f'its fx differs by {percent:+.1f} % from the prior of its model, or '
+        return ModelPrior(None, f'its fx differs by {percent:+.1f} % from the prior of its '
+                                f'model, or '
                             f'its distortion differs: another mode of the sensor, or another '
                             f'device', True)
     if odds_of_mode(unit, prior) < LEAST_ODDS:
-        return OfMake(None, 'its own turns cannot show whether its sensor is in the usual mode of '
-                            'its model')
-    return OfMake(prior)
+        return ModelPrior(None, 'its own turns cannot show whether its sensor is in the usual '
+                                'mode of its model')
+    return ModelPrior(prior)
 
 
 def odds_of_mode(unit: Unit, prior: LensPrior) -> float:
@@ -148,7 +152,7 @@ def lens_prior(units: Sequence[Unit], config: FleetConfig) -> LensPrior | None:
     agree = _densest(focal, np.array([unit.covariance[0, 0] for unit in units]), config)
     prior = _fitted([unit for unit, kept in zip(units, agree, strict=True) if kept], config)
     for _ in range(ROUNDS):
-        now = np.array([off_by(unit, prior) <= config.other_mode for unit in units])
+        now = np.array([off_by(unit, prior) <= OTHER_MODE for unit in units])
         if now.sum() < config.least_units:
             return None
         if np.array_equal(now, agree):
@@ -174,9 +178,9 @@ def _densest(focal: Floats, variance: Floats, config: FleetConfig) -> Mask:
     weight = spread / total
     # the candidates are the best known units
     best = np.argsort(-weight, kind='stable')[:CANDIDATES]
-    near = np.abs(focal[best, None] - focal) < config.other_mode / 2 * np.sqrt(total)
+    near = np.abs(focal[best, None] - focal) < OTHER_MODE / 2 * np.sqrt(total)
     middle = focal[best[int(np.argmax(near @ weight))]]
-    return np.asarray(np.abs(focal - middle) < config.other_mode * np.sqrt(total))
+    return np.asarray(np.abs(focal - middle) < OTHER_MODE * np.sqrt(total))
 
 
 # of the change of B; EM has ended
@@ -230,7 +234,8 @@ def unit_of(name: str, make: str, camera: Camera, covariance: Floats, one_turn: 
     values, slopes = _in_curvatures(camera)
     which = _lens_places(len(values))
     spread = (covariance * np.outer(slopes, slopes))[np.ix_(which, which)]
-    return Unit(name, (make, by(camera.image_size), camera.model), values[which], spread, one_turn)
+    return Unit(name, (make, size_text(camera.image_size), camera.model), values[which], spread,
+                one_turn)
 
 
 def conditioned(camera: Camera, covariance: Floats, prior: LensPrior) -> tuple[Camera, Floats]:

@@ -13,7 +13,7 @@ from dashcalib_ros.camera import Camera, camera_of
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.errors import InputError, one_line
 from dashcalib_ros.fleet import lens_prior
-from dashcalib_ros.fleet.lens_prior import LensPrior, OfMake, Unit, conditioned
+from dashcalib_ros.fleet.lens_prior import LensPrior, ModelPrior, Unit, conditioned
 from dashcalib_ros.formats import result_dict
 from dashcalib_ros.formats.ours import calibration_of
 from dashcalib_ros.judge import CalibrationData, Verdict
@@ -151,7 +151,7 @@ def unit_of(solved: Solved) -> Unit | None:
                               sum(share.used for share in solved.shares.values()) == 1)
 
 
-def final_of(solved: Solved, found: OfMake | None) -> Final:
+def final_of(solved: Solved, found: ModelPrior | None) -> Final:
     """Return the camera's result with the prior that was found for its model."""
     own = solved.calibration
     if found is None:

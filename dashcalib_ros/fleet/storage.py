@@ -210,8 +210,8 @@ def needs(library: str, what: str) -> ModuleType:
         return import_module(library)
     except ImportError as error:
         raise ConfigError('E-EXTRA-NOT-INSTALLED',
-                          f"{what} need {library}: install it with pip install "
-                          f"'dashcalib_ros[fleet]' ({one_line(error)})") from error
+                          f"{what} need {library}: pip install '.[fleet]' in the folder of "
+                          f'this package ({one_line(error)})') from error
 
 
 def has(library: str) -> bool:

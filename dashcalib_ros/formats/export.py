@@ -8,7 +8,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.formats.load import Given, given_camera
 from dashcalib_ros.formats.table import FORMATS
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge.check import same_shape
 from dashcalib_ros.limits import check_pixels
 
@@ -20,12 +20,12 @@ def export(calibration: Given, kind: str) -> str | bytes:
 
     calibration: a Calibration, what load_camera() returns, a camera, or the path of a file that
     load_camera() reads. kind: colmap, gyroflow, kalibr, opensfm, nerfstudio, mrcal, foxglove, ros,
-    opencv, rays or maps. What the kind has no place for (the field over the picture, the readout
-    time of a rolling shutter) is omitted.
+    opencv, rays or maps; urdf or tf for how the camera sits on the car. What the kind has no place
+    for (the field over the picture, the readout time of a rolling shutter) is omitted.
 
     Returns the file's text; the bytes of an .npz for rays and maps. Raises InputError for a file
-    that cannot be read, ConfigError for an unknown kind or a lens that it cannot describe, and
-    OutputError for one that mrcal's spline cannot.
+    that cannot be read, ConfigError for an unknown kind, a lens that it cannot describe, or a
+    mounting that is not known, and OutputError for a lens that mrcal's spline cannot describe.
     """
     write = EXPORTS[kind].write if kind in EXPORTS else None
     if write is None:
@@ -51,11 +51,13 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     """
     if min(size) < 1:
         raise ConfigError('E-SIZE-NOT-POSITIVE',
-                          f'{by(size)} is no size of a picture; write its width and height in px')
+                          f'{size_text(size)} is no size of a picture; write its width and '
+                          f'height in px')
     check_pixels(*size, 'the resized picture')
     if not same_shape(camera.image_size, size):
         raise ConfigError('E-SIZE-SHAPE',
-                          f'{by(size)} has another shape than the {by(camera.image_size)} of the '
+                          f'{size_text(size)} has another shape than the '
+                          f'{size_text(camera.image_size)} of the '
                           f'calibration; if the picture was cropped, use --crop')
     x, y = (new / old for new, old in zip(size, camera.image_size, strict=True))
     return camera.resized(x, size, y)
@@ -67,6 +69,6 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
             or top + height > camera.image_size[1]):
         raise ConfigError('E-CROP-OUTSIDE',
                           f'{left},{top},{width},{height} is no part of a picture of '
-                          f'{by(camera.image_size)}; write X,Y,W,H in px: the top left corner of '
-                          f'the part, and its size')
+                          f'{size_text(camera.image_size)}; write X,Y,W,H in px: the top left '
+                          f'corner of the part, and its size')
     return replace(camera, image_size=(width, height), cx=camera.cx - left, cy=camera.cy - top)

@@ -20,7 +20,7 @@ from dashcalib_ros.formats.ours import calibrated_camera
 from dashcalib_ros.formats.table import FORMATS
 from dashcalib_ros.formats.values import Cameras, Data, numbers_in
 from dashcalib_ros.input.inputs import fits_bag
-from dashcalib_ros.input.source import by, os_error
+from dashcalib_ros.input.source import os_error, size_text
 from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import (
@@ -69,7 +69,7 @@ def load_with_faults(path: str | os.PathLike[str], name: str | None = None) -> N
     if rayless_share(found.camera) == 1:
         raise InputError('E-CALIBRATION-NO-RAY',
                          f'{found.name} is of a lens that sees no ray in its picture of '
-                         f'{by(found.image_size)}; calibrate the camera again')
+                         f'{size_text(found.image_size)}; calibrate the camera again')
     return found
 
 

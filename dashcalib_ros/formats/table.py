@@ -23,6 +23,7 @@ from dashcalib_ros.formats import (
     pixel_arrays,
     plain,
     ros,
+    urdf,
 )
 from dashcalib_ros.formats.values import Cameras
 from dashcalib_ros.judge.difference import NamedCamera
@@ -62,4 +63,6 @@ FORMATS = {
     'ros': Format(ros.ini_cameras, ros.echoed_cameras, ros.write, YAML),
     'opencv': Format(None, opencv.cameras, opencv.write, YAML),
     'rays': Format(write=pixel_arrays.write_rays, suffixes=('.npz',), keeps=('field',)),
-    'maps': Format(write=pixel_arrays.write_maps, suffixes=('.npz',), keeps=('field',))}
+    'maps': Format(write=pixel_arrays.write_maps, suffixes=('.npz',), keeps=('field',)),
+    'urdf': Format(write=urdf.write, suffixes=('.urdf', '.xml', *TEXT), keeps=('mount',)),
+    'tf': Format(write=urdf.write_transform, suffixes=('.sh', *TEXT), keeps=('mount',))}

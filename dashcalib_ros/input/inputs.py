@@ -23,12 +23,12 @@ from dashcalib_ros.input.source import (
     FrameSource,
     Picture,
     Reading,
-    by,
     by_name,
     cameras_named,
     first_of,
     is_bag_file,
     os_error,
+    size_text,
 )
 from dashcalib_ros.limits import PICTURE_BYTES, check_file, read_file
 
@@ -424,9 +424,10 @@ class JoinedSource(FrameSource):
         for name, size in sized:
             if size != sized[0][1]:
                 raise InputError(
-                    'E-IMAGE-SIZE-CHANGES', f'{name} has {by(size)} pixels and {sized[0][0]} has '
-                    f'{by(sized[0][1])}: a calibration is valid for one image size; calibrate '
-                    f'each size separately')
+                    'E-IMAGE-SIZE-CHANGES',
+                    f'{name} has {size_text(size)} pixels and {sized[0][0]} has '
+                    f'{size_text(sized[0][1])}: a calibration is valid for one image size; '
+                    f'calibrate each size separately')
         if sized and len(stored := {part.stored_size for part in self._parts}) == 1:
             self.size, [self.stored_size] = sized[0][1], stored
         counts = [part.count for part in self._parts]

@@ -233,7 +233,8 @@ def _inside_video(path: Path) -> SensorStream:
     except ImportError as error:
         raise InputError('E-MOTION-PARSER',
                          f'{path} is a video, and telemetry-parser is needed to '
-                         f"read its gyro and GPS: pip install 'dashcalib_ros[motion]'") from error
+                         f"read its gyro and GPS: pip install '.[motion]' in the folder "
+                         'of this package') from error
     values: dict[str, tuple[Floats, Floats]] = {}
     try:
         parser = telemetry_parser.Parser(str(path))

@@ -62,7 +62,7 @@ def cameras_named(names: Sequence[str]) -> int:
     return max(map(len, cameras.values()), default=0)
 
 
-def by(size: tuple[int, int]) -> str:
+def size_text(size: tuple[int, int]) -> str:
     """Return (width, height) as messages have it."""
     return f'{size[0]}x{size[1]}'
 
@@ -287,9 +287,10 @@ class FrameSource(ABC):
                 if frame.size != size:
                     raise InputError(
                         'E-IMAGE-SIZE-CHANGES', f'{picture.file or self.name}: image '
-                        f'{frame.index} has {by(frame.size)} pixels and the images before it have '
-                        f'{by(size)}: a calibration is valid for one image size; split the drive '
-                        f'there')
+                        f'{frame.index} has {size_text(frame.size)} pixels and the images before '
+                        f'it have '
+                        f'{size_text(size)}: a calibration is valid for one image size; split '
+                        f'the drive there')
                 after_gap = perhaps = False
                 yield frame
         if size is None:

@@ -20,7 +20,7 @@ from av.video.reformatter import ColorRange, VideoReformatter
 
 from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError, shortened
-from dashcalib_ros.input.source import FrameSource, Picture, Reading, by
+from dashcalib_ros.input.source import FrameSource, Picture, Reading, size_text
 from dashcalib_ros.input.stamps import SECOND_NS, StampGate
 from dashcalib_ros.limits import check_pixels
 
@@ -86,8 +86,9 @@ class VideoSource(FrameSource):
             self._created = container.metadata.get('creation_time', '')
         if self.size != stored:
             self.stored_size = stored
-            warnings.append(f'{path} has pixels that are not square: its images of {by(stored)} '
-                            f'pixels are scaled to {by(self.size)}, as players show them')
+            warnings.append(f'{path} has pixels that are not square: its images of '
+                            f'{size_text(stored)} '
+                            f'pixels are scaled to {size_text(self.size)}, as players show them')
         if turn:
             warnings.append(f'{path} has a rotation flag of {turn} degrees: the calibration is '
                             f'valid for the rotated images')
@@ -257,7 +258,7 @@ def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[str]]:
     """
     with _opened(path) as (container, best):
         streams = _streams(container)
-        there = ', '.join(f'{n}: {by((each.width, each.height))}'
+        there = ', '.join(f'{n}: {size_text((each.width, each.height))}'
                           for n, each in enumerate(streams, 1))
         if topic is None:
             taken = next((n for n, each in enumerate(streams, 1) if each.index == best.index), 1)

@@ -6,23 +6,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.robust import weighted_mean
 from dashcalib_ros.solve.solution import Solution
 
+# times a turn's cost with a camera of its own; sound turns have 0.5 to 1.5, turns of another
+# lens in the same drive 4.6 to 25
+MAX_MISFIT = 2.0
 # why turns do not count
 CONTRADICTS = 'the camera of the other turns does not explain it'
 OTHER_CAMERA = 'the turns of this drive are of another camera'
 
 
-def turns_of_another_camera(misfits: Mapping[TurnId, float], config: VerdictConfig) -> set[TurnId]:
+def turns_of_another_camera(misfits: Mapping[TurnId, float]) -> set[TurnId]:
     """Return the turns that their own camera explains far better than the shared one.
 
     The robust loss gives such turns so little weight that they cause no scatter between turns.
     """
-    return {turn for turn, misfit in misfits.items() if not misfit <= config.max_misfit}
+    return {turn for turn, misfit in misfits.items() if not misfit <= MAX_MISFIT}
 
 
 def turns_of_earlier_cameras(scenes: Sequence[Scene], solution: Solution | None
@@ -34,8 +36,8 @@ def turns_of_earlier_cameras(scenes: Sequence[Scene], solution: Solution | None
             if not scene.turn.of_this_drive and scene.turn not in solution.misfits}
 
 
-def contradicting_turns(scenes: Sequence[Scene], solution: Solution | None,
-                        config: VerdictConfig) -> dict[TurnId, str]:
+def contradicting_turns(scenes: Sequence[Scene], solution: Solution | None
+                        ) -> dict[TurnId, str]:
     """Return the turns that no common camera explains, and why they do not count any more.
 
     Turns of another camera count on: without them the next verdict would not mention that the
@@ -44,7 +46,7 @@ def contradicting_turns(scenes: Sequence[Scene], solution: Solution | None,
     keep = set(turns_of_earlier_cameras(scenes, solution))
     if solution is not None:
         keep |= {scene.turn for scene in solution.scenes}
-        keep |= turns_of_another_camera(solution.misfits, config)
+        keep |= turns_of_another_camera(solution.misfits)
     return {scene.turn: CONTRADICTS for scene in scenes if scene.turn not in keep}
 
 

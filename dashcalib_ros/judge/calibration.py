@@ -65,7 +65,8 @@ class TurnSummary:
     """How one turn was used. center, first, last count the input's frames from 0.
 
     misfit: its cost with the shared camera, divided by that with its own: about 1, or less.
-    unused_because: why it is not used, in words.
+    unused_because: why it is not used, in words. right_deg: the heading at its end against that at
+    its start, positive to the right.
     """
 
     center: int
@@ -80,6 +81,7 @@ class TurnSummary:
     reprojection_error_px: float | None = None
     misfit: float | None = None
     unused_because: str | None = None
+    right_deg: float | None = None
 
     @property
     def id(self) -> TurnId:
@@ -185,12 +187,13 @@ MOVED_DEG, MOVED_SIGMAS = 0.5, 3.0
 class Mount:
     """How the camera sits on the car, relative to the direction of travel and to the road.
 
-    yaw_left_deg, pitch_up_deg: where the optical axis points; roll_right_deg: by how much the
-    camera is turned clockwise, as seen from behind; None where it is not known. height_m: above
-    the road; None where the speed is not known. sigma: by these four names. travel_px: the pixel
-    (u, v) in which the car travels, with its sigma: less than that of the angles, which have the
-    centre's, too. straight_m: of straight driving. moved_s: stamp after which the camera was
-    moved, so that only what came later counts; None where it was not.
+    yaw_left_deg, pitch_up_deg: where the optical axis points, about 180 and upwards for a camera
+    that looks back; roll_right_deg: by how much the camera is turned clockwise, as seen from
+    behind it; None where it is not known. height_m: above the road; None where the speed is not
+    known. sigma: by these four names. travel_px: the pixel (u, v) in which the car travels, or
+    from which it comes where the camera looks back, with its sigma: less than that of the angles,
+    which have the centre's, too. straight_m: of straight driving. moved_s: stamp after which the
+    camera was moved, so that only what came later counts; None where it was not.
     """
 
     verdict: Literal['accepted', 'weak']
@@ -204,6 +207,11 @@ class Mount:
     travel_sigma_px: float
     straight_m: float
     moved_s: float | None = None
+
+    @property
+    def rear(self) -> bool:
+        """Return whether the camera looks back."""
+        return abs(self.yaw_left_deg) > 90
 
     @property
     def rotation(self) -> Floats:
@@ -229,8 +237,8 @@ class Mount:
         for name in ANGLES:
             sigma, its_sigma = self.sigma[name], other.sigma[name]
             if sigma is not None and its_sigma is not None:
-                found[name] = (getattr(self, name) - getattr(other, name),
-                               math.hypot(sigma, its_sigma))
+                degrees = math.remainder(getattr(self, name) - getattr(other, name), 360)
+                found[name] = degrees, math.hypot(sigma, its_sigma)
         return found
 
     def moved_from(self, other: Mount) -> bool:

@@ -227,7 +227,7 @@ def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int,
     if given.image_size != image_size:
         return found
     scale = Scale.of(image_size, config)
-    bent = bend(lines, given.resized(1 / scale.px, scale.size(image_size)), config.lines)
+    bent = bend(lines, given.resized(1 / scale.px, scale.size(image_size)))
     if bent is None:
         return found
     bent = bent.resized(scale.px)

@@ -203,7 +203,7 @@ def _straight_lines(solution: Solution | None, evidence: Evidence, config: Confi
     if field is not None:
         ideal = field.ideal(lines.points.astype(np.float64))
         lines = replace(lines, points=ideal.astype(np.float32))
-    return bend(lines, solution.camera, config.lines, solution.covariance)
+    return bend(lines, solution.camera, covariance=solution.covariance)
 
 
 def _mount(solution: Solution, evidence: Evidence, level: str, config: Config) -> Mount | None:
@@ -284,7 +284,8 @@ def _summary(turn: Turn, scene: Scene | None, evidence: Evidence, solution: Solu
         center=turn.center, first=turn.first, last=turn.last, stamp_s=turn.stamp_s,
         prominence=turn.prominence, images=len(scene.tracks.frames) if scene else turn.images,
         registered=int(scene.structure.registered.sum()) if scene else 0,
-        yaw_deg=scene.yaw_deg if scene else None, **_use(turn.id, scene, evidence, solution))
+        yaw_deg=scene.yaw_deg if scene else None, right_deg=scene.right_deg if scene else None,
+        **_use(turn.id, scene, evidence, solution))
 
 
 def _stored_summary(turn: StoredTurn, scene: Scene, evidence: Evidence, solution: Solution | None

@@ -19,6 +19,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, MonitorConfig
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.judge.agreement import MAX_MISFIT
 from dashcalib_ros.judge.difference import CONTRADICTION, LEAST_SIGMA, RELEVANT, Way, limit_of
 from dashcalib_ros.reconstruct.heading import Heading, heading
 from dashcalib_ros.reconstruct.scene import Scene
@@ -65,7 +66,7 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
     found = scene_with(camera, scene, config)
     misfit = np.inf if found is None else misfits(
         [scene], [found], camera, config.scene.error_px)[scene.turn]
-    if found is None or misfit > config.verdict.max_misfit:
+    if found is None or misfit > MAX_MISFIT:
         nothing = Quadratic.prior(np.zeros((count, count)))
         return Reading(scene.turn, nothing, None, False, misfit)
     loss_px, alone = loss_px_of([found], camera, config.intrinsics), lens_alone(camera)

@@ -4,10 +4,12 @@ Yaw and pitch are those of the direction of travel: of pairs of images on straig
 of each turn's path where it does not bend. Roll is that of the plane of the path where it does
 not bend (a body leans in bends), and of upright lines. Height is that of a turn's path above the
 points over which the car drives, where speed is known. What the sources say is averaged; sigma
-grows where they differ.
+grows where they differ. A camera that looks back is measured against where the car comes from;
+which of both it looks to, most pairs and turns decide, for a car seldom drives backwards.
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -37,11 +39,16 @@ Speed = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class _Pairs:
-    """What n pairs say. ahead: (n, 3) direction of travel halfway; sigma_deg, rate_deg_s: (n,)."""
+    """What n pairs say. ahead: (n, 3) direction of travel halfway; sigma_deg, rate_deg_s: (n,).
+
+    rear: (n,) where the car moves away from what the camera sees; ahead is the opposite of its
+    direction then.
+    """
 
     ahead: Floats
     sigma_deg: Floats
     rate_deg_s: Floats
+    rear: Mask
 
 
 # m/s^2; a body that brakes or gathers speed nods: where the speed is known, it is left out
@@ -50,6 +57,9 @@ MAX_ACCELERATION_M_S2 = 1.0
 HEADING_FLOOR_DEG, ROLL_FLOOR_DEG = 0.1, 0.3
 # m above the road, and m/s: where speed is unknown, straight_m assumes a camera that high
 USUAL_HEIGHT_M, USUAL_SPEED = 1.4, 10.0
+# of pairs and turns; fewer do not decide which way the camera looks. KITTI's are unanimous,
+# forwards and played backwards
+MAJORITY = 0.75
 
 
 def mount_of(straights: Straights, lines: Lines | None, solution: Solution, level: str,
@@ -80,7 +90,8 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
     found = _heading(pairs, kept, scenes, turned)
     if found is None:
         return None
-    angles, sigma = found
+    angles, sigma, backwards = found
+    rear = backwards > 0.5
     ahead = _direction(angles, turned)
     travel = resized_pixels(camera.project(ahead[None])[0], solution.px)
     own = np.degrees(solution.sigma[2:4] / solution.camera.params[:2])
@@ -91,9 +102,12 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
         metres *= USUAL_SPEED if height is None else USUAL_HEIGHT_M / height[0]
         height = None
     reasons = _reasons(level, total, own, metres)
+    if max(backwards, 1 - backwards) < MAJORITY:
+        reasons += ('the car drove forwards and backwards, or stood, too often to tell whether '
+                    'the camera looks ahead or back: drive straight on for longer',)
     return Mount(
         verdict='weak' if reasons else 'accepted', reasons=reasons,
-        yaw_left_deg=float(angles[0]), pitch_up_deg=float(angles[1]),
+        yaw_left_deg=math.remainder(angles[0] + 180 * rear, 360), pitch_up_deg=float(angles[1]),
         roll_right_deg=None if roll is None else roll[0],
         height_m=None if height is None else height[0],
         sigma={'yaw_left_deg': float(total[0]), 'pitch_up_deg': float(total[1]),
@@ -167,6 +181,7 @@ def _poses_of_pairs(camera: Camera, straights: Straights) -> _Pairs:
     # where the first image was taken, in the second one's frame
     back = np.tile((0.0, 0.0, -1.0), (count, 1))
     hessian, errors = np.tile(np.eye(5), (count, 1, 1)), np.zeros(seen.shape)
+    weights = np.zeros(seen.shape)
     for step in range(STEPS):
         errors, slopes, tangents = _epipolar(turned, back, first, second)
         loss = unit * max(LAST_PX, FIRST_PX * NARROWING**step)
@@ -185,8 +200,12 @@ def _poses_of_pairs(camera: Camera, straights: Straights) -> _Pairs:
     variance = np.linalg.inv(hessian)[:, [3, 4], [3, 4]].mean(axis=1)
     vector = rotation_vectors(turned)
     ahead = -(rotation_matrices(-vector / 2) @ back[:, :, None])[:, :, 0]
+    # no epipolar plane tells forwards from backwards: with the wrong one, points are behind
+    moved = first @ turned.transpose(0, 2, 1)
+    depth = np.sum(np.cross(back[:, None], moved) * np.cross(second, moved), axis=-1)
+    rear = ahead[:, 2] * np.sum(weights * depth, axis=1) < 0
     return _Pairs(ahead * np.sign(ahead[:, 2:]), np.degrees(noise * np.sqrt(variance)),
-                  np.degrees(vector[:, 1]) / straights.apart_s)
+                  np.degrees(vector[:, 1]) / straights.apart_s, np.asarray(rear, bool))
 
 
 def _epipolar(turned: Floats, back: Floats, first: Floats, second: Floats
@@ -215,9 +234,13 @@ BLOCKS, LEAST_PAIRS = 12, 8
 
 
 def _heading(pairs: _Pairs, kept: Mask, scenes: Sequence[Scene], roll: float
-             ) -> tuple[Floats, Floats] | None:
-    """Return (2,) yaw and pitch, degrees, and their sigmas without those of the lens."""
-    values, sigmas = [], []
+             ) -> tuple[Floats, Floats, float] | None:
+    """Return (2,) yaw and pitch, degrees, and their sigmas without those of the lens.
+
+    And the share of pairs and turns in which the car moves away from what the camera sees: beyond
+    a half the angles are against where the car comes from.
+    """
+    values, sigmas, rear = [], [], list(pairs.rear[kept])
     if kept.sum() >= LEAST_PAIRS:
         value, sigma = _heading_of_pairs(pairs, kept, roll)
         values.append(value)
@@ -228,13 +251,15 @@ def _heading(pairs: _Pairs, kept: Mask, scenes: Sequence[Scene], roll: float
             level = _angles(_direction(np.array([found.yaw_deg, found.pitch_deg]), 0.0)[None],
                             roll)[0]
             values.append(level)
+            rear.append(found.rear)
             sigmas.append(np.hypot([found.yaw_sigma_deg, found.pitch_sigma_deg],
                                    [HEADING_SIGMA_DEG, PITCH_SIGMA_DEG]))
     if not values:
         return None
     both = [_averaged(np.array(values)[:, n], np.array(sigmas)[:, n], HEADING_FLOOR_DEG)
             for n in range(2)]
-    return np.array([value for value, _ in both]), np.array([sigma for _, sigma in both])
+    return (np.array([value for value, _ in both]), np.array([sigma for _, sigma in both]),
+            float(np.mean(rear)))
 
 
 # degrees; pairs that know their direction worse are left out, and what varies from pair to pair:

@@ -12,6 +12,8 @@ from dashcalib_ros.config import SceneConfig
 from dashcalib_ros.reconstruct.bundle import Lens, Observed, adjusted
 from dashcalib_ros.reconstruct.scene import Scene, projected_px, retriangulated
 
+# steps of one adjustment at the most; 60 move fx by 0.03 % at the most, at twice the time
+MAX_ITERATIONS = 12
 # no lens has a coefficient beyond this: the scene has diverged
 MAX_DISTORTION = 1.0
 # relative change of the cost that ends an adjustment which another one follows, or whose cost is
@@ -77,7 +79,7 @@ def _lens(camera: Camera, free: Free, focal_range: tuple[float, float] | None) -
 def refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | None,
             tolerance: float = ROUGH) -> Scene:
     """Return the scene after an adjustment and triangulation."""
-    solver = Solver(config.loss_px, config.iterations, tolerance)
+    solver = Solver(config.loss_px, MAX_ITERATIONS, tolerance)
     free: Free = 'first distortion' if reach is None else 'one focal length'
     [scene], camera = adjust([scene], scene.camera, solver, free, reach)
     return retriangulated(scene, camera, config.error_px, config.min_angle_deg)

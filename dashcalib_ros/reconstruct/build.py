@@ -12,6 +12,7 @@ from dashcalib_ros.reconstruct.chain import chain_scene
 from dashcalib_ros.reconstruct.focal_profile import best_trial
 from dashcalib_ros.reconstruct.register import register_tracks
 from dashcalib_ros.reconstruct.scene import (
+    MIN_KEYFRAMES,
     Draft,
     Profile,
     Scene,
@@ -34,7 +35,7 @@ def draft_scene(turn: Turn, config: Config, valid: Mask | None = None) -> Draft 
     valid: (h, w), False where the ego vehicle is.
     """
     tracks, settings = track_turn(turn, config.tracks, valid), config.scene
-    if tracks.xy.shape[1] < MIN_TRACKS or len(tracks.frames) < settings.min_images:
+    if tracks.xy.shape[1] < MIN_TRACKS or len(tracks.frames) < MIN_KEYFRAMES:
         return None
     found: list[Scene] = []
     for model in searched(config.model):

@@ -16,6 +16,8 @@ from dashcalib_ros.reconstruct.geometry import Engine, engine_named
 from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure, rays_of, triangulate
 from dashcalib_ros.reconstruct.tracks import Tracks
 
+# of the image width; the limit of a reprojection error while the lens is still unknown
+CHAIN_ERROR = 0.004
 # points that both images of the first pair see, at the least
 MIN_SHARED = 40
 # points that an image must see to be tried; inliers it must have, in number and as a share
@@ -77,7 +79,7 @@ def chain_scene(tracks: Tracks, turn: TurnId, camera: Camera, profile: Profile,
                 config: Config) -> Scene | None:
     """Return a first scene with a camera that is known roughly; None if no pair starts a chain."""
     limits = config.scene
-    generous = max(limits.error_px, limits.chain_error * tracks.image_size[0])
+    generous = max(limits.error_px, CHAIN_ERROR * tracks.image_size[0])
     structure = chain(tracks, camera, generous, limits.min_angle_deg, config.seed,
                       engine_named(config.reconstruct.used))
     if structure is None:

@@ -23,13 +23,15 @@ class Heading:
     """The car's direction of travel, as the camera sees it, degrees, with standard deviations.
 
     yaw_deg: positive where the car goes to the right of the optical axis. pitch_deg: positive
-    where it goes below the axis.
+    where it goes below the axis. rear: the camera looks back, and the angles are of the direction
+    that the car comes from.
     """
 
     yaw_deg: float
     pitch_deg: float
     yaw_sigma_deg: float
     pitch_sigma_deg: float
+    rear: bool = False
 
 
 # keyframes; a line needs more steps between them than it has parameters
@@ -47,13 +49,16 @@ def heading(scene: Scene) -> Heading | None:
     steps = np.diff(centres, axis=0)
     lengths = np.maximum(np.linalg.norm(steps, axis=1), np.finfo(float).tiny)
     ahead = np.einsum('kij,kj->ki', halfway, steps) / lengths[:, None]
+    rear = bool(np.median(ahead[:, 2]) < 0)
+    if rear:
+        ahead = -ahead
     curvature = turned[:, 1] / lengths
     curvature /= max(float(np.abs(curvature).max()), np.finfo(float).tiny)
     yaw = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 2]))
     pitch = np.degrees(np.arcsin(np.clip(ahead[:, 1], -1, 1)))
     yaw_deg, yaw_sigma = _at_no_curvature(curvature, yaw)
     return Heading(yaw_deg, _trimmed_mean(pitch), yaw_sigma,
-                   float(np.std(pitch) / np.sqrt(len(pitch))))
+                   float(np.std(pitch) / np.sqrt(len(pitch))), rear)
 
 
 # of the steps at either end, left out of a mean: bumps and bad poses
@@ -68,6 +73,18 @@ def _trimmed_mean(values: Floats) -> float:
 
 # of the logarithm; the turns of six upright drives have -4.9 to -0.7
 OPEN = 0.4
+
+
+def off_axis_deg(scene: Scene) -> float:
+    """Return the median angle of the camera's axis to its own motion, degrees: 90 is sideways.
+
+    A camera that looks back counts like one that looks ahead.
+    """
+    rotations, centres = scene.structure.path()
+    steps = np.diff(centres, axis=0)
+    along = np.abs(np.einsum('kj,kj->k', rotations[:-1, 2], steps))
+    lengths = np.maximum(np.linalg.norm(steps, axis=1), np.finfo(float).tiny)
+    return float(np.median(np.degrees(np.arccos(np.clip(along / lengths, 0, 1)))))
 
 
 def roll_deg(scenes: Sequence[Scene]) -> float:

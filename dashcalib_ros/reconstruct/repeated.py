@@ -15,7 +15,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.reconstruct.scene import Scene
+from dashcalib_ros.reconstruct.scene import MIN_KEYFRAMES, Scene
 
 # s between the offsets in time that are tried; neighbouring tracks forgive half of it
 OFFSET_S = 0.05
@@ -39,11 +39,10 @@ MOST_TRACKS, FEWEST_NEAR = 60, 8
 LEAST_NEW = 0.75
 
 
-def without_repeated(scenes: Sequence[Scene], min_images: int
-                     ) -> tuple[list[Scene], dict[TurnId, TurnId]]:
+def without_repeated(scenes: Sequence[Scene]) -> tuple[list[Scene], dict[TurnId, TurnId]]:
     """Return the scenes without those that repeat an earlier one, and which turn each repeats.
 
-    A scene of which most is new is cut to that. min_images: least keyframes of a scene.
+    A scene of which most is new is cut to that.
     """
     kept: list[Scene] = []
     repeated: dict[TurnId, TurnId] = {}
@@ -55,7 +54,7 @@ def without_repeated(scenes: Sequence[Scene], min_images: int
             new = scene.structure.registered & ~again
             if not again.any():
                 continue
-            if new.sum() < max(min_images, LEAST_NEW * whole):
+            if new.sum() < max(MIN_KEYFRAMES, LEAST_NEW * whole):
                 repeated[scene.turn] = repeated.get(other.turn, other.turn)
                 break
             scene = _cut(scene, new)

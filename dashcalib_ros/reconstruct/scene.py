@@ -25,6 +25,9 @@ PICTURE_WIDTH = 720
 # world to camera: rotation (3, 3), translation (3,)
 Pose = tuple[Floats, Floats]
 
+# of a turn at the least; with fewer it is not reconstructed
+MIN_KEYFRAMES = 6
+
 
 @dataclass(frozen=True)
 class Structure:
@@ -224,6 +227,11 @@ class Scene:
     def yaw_deg(self) -> float:
         """Return by how much the camera turned about the axis of the turn, in degrees."""
         return float(np.ptp(self.yaws_deg))
+
+    @property
+    def right_deg(self) -> float:
+        """Return the heading at its end against that at its start, positive to the right."""
+        return float(self.yaws_deg[-1] - self.yaws_deg[0])
 
     @cached_property
     def yaws_deg(self) -> Floats:

@@ -12,7 +12,7 @@ from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats import Given, given_camera
 from dashcalib_ros.formats.ours import plain_values
-from dashcalib_ros.input.source import by
+from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.judge.check import export_command, same_shape
@@ -124,10 +124,11 @@ def compare(a: Given, b: Given) -> Comparison:
 
 
 def _sizes_text(a: NamedCamera, b: NamedCamera) -> str:
-    text = (f'{a.name} is for pictures of {by(a.image_size)} and {b.name} for {by(b.image_size)}, '
-            f'and only calibrations of one size can be compared; ')
+    text = (f'{a.name} is for pictures of {size_text(a.image_size)} and {b.name} for '
+            f'{size_text(b.image_size)}, and only calibrations of one size can be compared; ')
     if same_shape(a.image_size, b.image_size):
-        return text + f'resize the first: {export_command(a.name, f"--size {by(b.image_size)}")}'
+        command = export_command(a.name, f'--size {size_text(b.image_size)}')
+        return f'{text}resize the first: {command}'
     return text + 'crop one of them with dashcalib export --crop X,Y,W,H'
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import remainder
 
 import numpy as np
 
@@ -336,10 +337,12 @@ def mounting_of(c: CalibrationData) -> list[Drawing]:
     if c.mount is None or c.camera is None:
         return []
     mount = c.mount
+    left_deg = remainder(180 - mount.yaw_left_deg, 360) if mount.rear else mount.yaw_left_deg
     drawings = [
-        Drawing('From the side', _car(SIDE, CAMERA_SIDE, -mount.pitch_up_deg, 'from the side'),
+        Drawing('From the side',
+                _car(SIDE, CAMERA_SIDE, mount, -mount.pitch_up_deg, 'from the side'),
                 _angle('pitch_up_deg', mount)),
-        Drawing('From above', _car(ABOVE, CAMERA_ABOVE, -mount.yaw_left_deg, 'from above'),
+        Drawing('From above', _car(ABOVE, CAMERA_ABOVE, mount, -left_deg, 'from above'),
                 _angle('yaw_left_deg', mount))]
     return [*drawings, _horizon(c, mount, c.camera)]
 
@@ -368,16 +371,18 @@ def field_of(c: CalibrationData) -> list[Drawing]:
         f'is {longest:.2f} px.')]
 
 
-def _car(side: Floats, camera: tuple[float, float], turned_deg: float, label: str) -> str:
-    """Return a car that drives to the right; turned_deg: of the camera's axis, clockwise."""
-    angle = np.radians(ENLARGED * turned_deg)
-    end = np.array(camera) + AXIS * np.array([np.cos(angle), np.sin(angle)])
+def _car(side: Floats, camera: tuple[float, float], mount: Mount, down_deg: float, label: str
+         ) -> str:
+    """Return a car that drives to the right; down_deg: of the camera's axis, in the drawing."""
+    angle, way = np.radians(ENLARGED * down_deg), -1 if mount.rear else 1
+    dashed = 'where the car comes from' if mount.rear else 'direction of travel'
+    end = np.array(camera) + AXIS * np.array([way * np.cos(angle), np.sin(angle)])
     return svg(WIDTH, HEIGHT, f'the car {label}', ''.join([
         strokes([side], 'camera'),
-        line(*camera, camera[0] + AXIS, camera[1], 'unused'),
+        line(*camera, camera[0] + way * AXIS, camera[1], 'unused'),
         line(*camera, float(end[0]), float(end[1]), 'all-turns'),
         strokes([np.array([camera])], 'dot all'),
-        text(20, HEIGHT - 8, 'dashed: direction of travel')]))
+        text(20, HEIGHT - 8, f'dashed: {dashed}')]))
 
 
 def _horizon(c: CalibrationData, mount: Mount, camera: Camera) -> Drawing:
@@ -393,11 +398,12 @@ def _horizon(c: CalibrationData, mount: Mount, camera: Camera) -> Drawing:
     pictures = {} if c.material is None else c.material.pictures
     shown = next((pictures[turn.id].image for turn in c.turns if turn.id in pictures), None)
     below = '' if shown is None else picture(data_uri(shown), WIDTH, height * small)
+    way = 'from which the car comes' if mount.rear else 'towards which the car travels'
     u, v = small * mount.travel_px[0], small * mount.travel_px[1]
     marks = (strokes([small * seen[inside]], 'ruler') + line(u - 9, v, u + 9, v, 'residual')
              + line(u, v - 9, u, v + 9, 'residual'))
     return Drawing('In the picture',
                    svg(WIDTH, height * small, 'horizon and point of travel', below + marks, 'map'),
-                   f'The horizon of a flat road, and the pixel towards which the car travels: '
+                   f'The horizon of a flat road, and the pixel {way}: '
                    f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± '
                    f'{mount.travel_sigma_px:.1f} px.')

@@ -12,6 +12,7 @@ import numpy as np
 
 from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect.detector import MIN_PROMINENCE
 from dashcalib_ros.formats import calibrated_camera
 from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import NamedCamera
@@ -72,6 +73,7 @@ def report_html(calibration: CalibrationData, truth: NamedCamera | None = None,
         truth_px='' if against is None else optional(against.mapping_px, 2, ' px'),
         snippets=_snippets(c, calibration_file),
         uncertainty=uncertainty_of(c), slider=slider_of(c),
+        min_prominence=MIN_PROMINENCE,
         drive='' if c.magnitudes is None else magnitude_svg(c.magnitudes, c.turns,
                                                             c.start_s or None),
         turns=turn_sections(c, mask_id), rows=turn_rows(c),

@@ -117,7 +117,7 @@ def _facts(turn: AnySummary, scene: Scene | None, c: CalibrationData) -> tuple[s
     if turn.yaw_deg is not None:
         way = '' if scene is None else ' ' + direction(scene)
         facts.append(f'{turn.yaw_deg:.0f}°{way}')
-    if turns_of_another_camera({turn.id: turn.misfit or 0.0}, c.config.verdict):
+    if turns_of_another_camera({turn.id: turn.misfit or 0.0}):
         facts.append(f'fits another camera: {turn.misfit:.1f} times the error of its own')
     return tuple(facts)
 
@@ -230,11 +230,9 @@ def _axes(rotations: Floats) -> Floats:
 
 def direction(scene: Scene) -> str:
     """Return where the turn goes: 'to the right', 'to the left', or 'one way and back'."""
-    yaws = scene.yaws_deg
-    net = float(yaws[-1] - yaws[0])
-    if abs(net) < 0.5 * scene.yaw_deg:
+    if abs(scene.right_deg) < 0.5 * scene.yaw_deg:
         return 'one way and back'
-    return 'to the right' if net > 0 else 'to the left'
+    return 'to the right' if scene.right_deg > 0 else 'to the left'
 
 
 def focal_by_turn(c: CalibrationData) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Condition, Mount, Witnesses
+from dashcalib_ros.judge.rig import Rig
 
 ADVICE = {
     'accepted': 'Good to use.',
@@ -78,6 +79,19 @@ def mounts_text(mount: Mount, other: Mount) -> str:
     return f'mounting: differs by {", ".join(parts)}: {moved}'
 
 
+def rig_texts(rig: Rig) -> list[str]:
+    """Return how camera B is turned against camera A, and whether both saw one drive."""
+    parts = [angle_text(name, *rig.angles.get(name, (None, None))) for name in WAYS]
+    turns = ', '.join(f'{turn.a_right_deg:+.1f}° and {turn.b_right_deg:+.1f}° at '
+                      f'{turn.a_stamp_s:.1f} s' for turn in rig.turns)
+    return [f'B against A on the car: {", ".join(parts)}', {
+        None: 'no turn at the same time: nothing shows that both are of one drive',
+        True: f'both took the same turns, to the right: {turns}',
+        False: f'CONTRADICTION: in turns at the same time the car turns, to the right: {turns}; '
+               f'the pictures of one camera are mirrored or upside down, or its clock is wrong, '
+               f'or it is of another drive'}[rig.agrees]]
+
+
 def verdict_text(mount: Mount) -> str:
     """Return a mounting's verdict, and why it is weak."""
     return mount.verdict + (f' ({"; ".join(mount.reasons)})' if mount.reasons else '')
@@ -89,7 +103,8 @@ def mount_text(mount: Mount) -> str:
     height = mount.sigma['height_m']
     parts.append('height unknown without a speed' if mount.height_m is None or height is None
                  else f'{mount.height_m:.2f} ± {height:.2f} m above the road')
-    return (f'{verdict_text(mount)}: {", ".join(parts)}; the car travels towards pixel '
+    way = 'comes from' if mount.rear else 'travels towards'
+    return (f'{verdict_text(mount)}: {", ".join(parts)}; the car {way} pixel '
             f'{mount.travel_px[0]:.1f}, {mount.travel_px[1]:.1f} ± {mount.travel_sigma_px:.1f} px')
 
 

@@ -11,8 +11,8 @@ from dashcalib_ros.standard_streams import open_closed_streams, write_stderr, wr
 from dashcalib_ros.workers.worker import one_thread_for_numpy
 
 INSTALL = ("the Python package {name} is missing: source your ROS 2 installation "
-           "(. /opt/ros/jazzy/setup.sh), or pip install 'dashcalib_ros[ros]' (Jazzy) or "
-           "'dashcalib_ros[ros-kilted]'")
+           "(. /opt/ros/jazzy/setup.sh), or pip install '.[ros]' (Jazzy) or '.[ros-kilted]' in "
+           "the sources")
 ROS_PACKAGES = ('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
                 'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
                 'std_srvs')

@@ -398,7 +398,7 @@ class Learner:
             calibration = bank.calibrator.calibrate(self._progress, final=False)
             check = None if given is None else bank.calibrator.check(
                 given.camera, calibration, self._progress)
-            of_another = turns_of_another_camera(calibration.misfits, self._goal.config.verdict)
+            of_another = turns_of_another_camera(calibration.misfits)
             bank.calibrator.scenes.exclude(dict.fromkeys(
                 outdated(of_another | calibration.used_turns, of_another), CONTRADICTS))
         except Exception as error:

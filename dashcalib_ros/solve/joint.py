@@ -10,6 +10,7 @@ import numpy as np
 from dashcalib_ros.camera import AUTO, Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.reconstruct.chain import CHAIN_ERROR
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.reconstruct.scene import Profile, Scene
 from dashcalib_ros.solve.evidence import (
@@ -220,7 +221,7 @@ def _with_all_tracks(found: Estimate, per_turn: Mapping[TurnId, Scene], config: 
     generous = replace(
         found, imaging=replace(found.imaging, readout_s=0.0),
         scenes=tuple(with_poses_of(per_turn[scene.turn], scene) for scene in found.scenes)
-    ).retriangulated(config.scene.chain_error * found.camera.image_size[0])
+    ).retriangulated(CHAIN_ERROR * found.camera.image_size[0])
     seen = replace(generous, imaging=found.imaging).retriangulated().seen_by_lens
     kept = explained_by(seen, {scene.turn: scene for scene in seen}, found.camera, config)
     kept = with_better_poses(kept, list(per_turn.values()), found.camera, config.scene)

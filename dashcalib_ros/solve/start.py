@@ -15,8 +15,8 @@ import numpy as np
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, SceneConfig
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.reconstruct.adjust import ROUGH, Solver, adjust
-from dashcalib_ros.reconstruct.chain import chain_scene
+from dashcalib_ros.reconstruct.adjust import MAX_ITERATIONS, ROUGH, Solver, adjust
+from dashcalib_ros.reconstruct.chain import CHAIN_ERROR, chain_scene
 from dashcalib_ros.reconstruct.scene import (
     Profile,
     Scene,
@@ -161,7 +161,7 @@ def with_better_poses(scenes: Sequence[Scene], per_turn: Sequence[Scene], camera
 def _readjusted(scene: Scene, camera: Camera, config: SceneConfig) -> Scene:
     """Return the scene adjusted to a camera that is nearly right."""
     # the focal length is fixed; the distortion that is found is not used
-    solver = Solver(0.01 * camera.image_size[0], config.iterations)
+    solver = Solver(0.01 * camera.image_size[0], MAX_ITERATIONS)
     [moved], _ = adjust([retriangulate(scene, camera, config)], camera, solver, 'distortion')
     return retriangulate(moved, camera, config)
 
@@ -208,7 +208,7 @@ def scene_with(camera: Camera, scene: Scene, config: Config) -> Scene | None:
     """
     width = camera.image_size[0]
     generous = replace(config.scene, error_px=max(config.scene.error_px,
-                                                  config.scene.chain_error * width))
+                                                  CHAIN_ERROR * width))
     anew = (rechain(scene, camera, replace(config, scene=generous)) if is_far(scene, camera)
             else None)
     found = [_with_fixed(camera, each, generous, config)
@@ -286,7 +286,7 @@ def _cost_at(scenes: Sequence[Scene], camera: Camera, config: SceneConfig) -> fl
     costs = [cost(moved, camera)]
     # the first residuals are large: the loss must be as wide, or it ignores them
     for loss_px in (0.01 * camera.image_size[0], config.loss_px):
-        solver = Solver(loss_px, config.iterations, ROUGH)
+        solver = Solver(loss_px, MAX_ITERATIONS, ROUGH)
         moved, camera = adjust(moved, camera, solver, 'distortion')
         moved = [retriangulate(scene, camera, config) for scene in moved]
         costs.append(cost(moved, camera))

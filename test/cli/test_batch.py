@@ -70,4 +70,4 @@ def test_only_a_cluster_needs_ray(tmp_path, capsys, monkeypatch, options, expect
     (tmp_path / 'm.csv').write_text('clip\na.avi\n')
     code, _, err = run(capsys, tmp_path / 'm.csv', '--out', tmp_path / 'out', *options)
     assert code == expected
-    assert ("pip install 'dashcalib_ros[fleet]'" in err) == (expected == 2)
+    assert ("pip install '.[fleet]'" in err) == (expected == 2)

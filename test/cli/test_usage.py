@@ -12,11 +12,12 @@ import shutil
 import subprocess
 import sys
 import unicodedata
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from made_calibration import TRUTH, make_calibration
+from made_calibration import MOUNT, TRUTH, make_calibration
 
 import dashcalib_ros
 from dashcalib_ros.camera import AUTO, calibrated_models
@@ -126,12 +127,13 @@ def test_help_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize(('asked', 'threads'), [(None, '1'), ('2', '2')])
-@pytest.mark.parametrize('of', ['cli', 'ros'])
-def test_numpy_gets_one_thread_unless_more_are_asked_for(of, asked, threads):
+@pytest.mark.parametrize(('of', 'call'), [
+    ('cli', 'main(["--help"])'), ('ros', 'main("calibrator", ["--help"])')], ids=['cli', 'ros'])
+def test_numpy_gets_one_thread_unless_more_are_asked_for(of, call, asked, threads):
     if of == 'ros':
         pytest.importorskip('rclpy')
     code = (f'import os, sys; from dashcalib_ros.{of} import main; before = "numpy" in '
-            'sys.modules; main(["--help"]); print(before, os.environ["OPENBLAS_NUM_THREADS"])')
+            f'sys.modules; {call}; print(before, os.environ["OPENBLAS_NUM_THREADS"])')
     env = {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES}
     env |= {} if asked is None else {'OPENBLAS_NUM_THREADS': asked}
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, env=env)
@@ -202,6 +204,34 @@ def test_compare_as_json(here, results):
     assert data['parameters']['fx']['z'] == pytest.approx(2)
     assert 0 < data['mapping_px'] < 7
     assert data['a']['verdict'] == 'accepted'
+
+
+def test_two_cameras_of_one_car(here, results):
+    for name, mount in (('front', MOUNT), ('rear', replace(MOUNT, yaw_left_deg=179.0))):
+        turn = replace(make_calibration().turns[0], right_deg=88.0)
+        write_results(make_calibration(mount=mount, turns=(turn,)), results / name)
+        urdf = here('export', results / name, '--to', 'urdf', '--out', results / f'{name}.urdf')
+        assert (urdf.returncode, urdf.stdout, urdf.stderr) == (0, '', '')
+    told = here('compare', results / 'front', results / 'rear', '--rig')
+    assert (told.returncode, told.stderr) == (0, '')
+    assert 'yaw 177.00 ± 0.14° to the left' in ' '.join(told.stdout.split())
+    data = json.loads(here('compare', results / 'front', results / 'rear/result.json', '--rig',
+                           '--json').stdout)
+    assert data['agrees'] is True and data['angles']['yaw_left_deg'][0] == pytest.approx(177.0)
+    assert np.shape(data['rotation']) == (3, 3) and data['turns'][0]['b_right_deg'] == 88.0
+    for code, *args in (('E-RIG-NO-MOUNTING', 'a', '--rig'),
+                        ('E-RIG-HTML', 'rear', '--rig', '--html', results / 'page.html')):
+        refused = here('compare', results / 'front', results / args[0], *args[1:])
+        assert_one_line_error(refused)
+        assert f'[{code}]' in refused.stderr
+    refused = here('export', results / 'a', '--to', 'urdf')
+    assert_one_line_error(refused)
+    assert '[E-EXPORT-NO-MOUNTING]' in refused.stderr
+    write_results(make_calibration(mount=replace(MOUNT, verdict='weak', reasons=('so',))),
+                  results / 'weak')
+    warned = here('export', results / 'weak', '--to', 'tf')
+    assert warned.returncode == 0 and 'weak_optical_frame' in warned.stdout
+    assert 'mounting is weak (so)' in warned.stderr
 
 
 def test_export_prints_or_writes_a_camera_file(here, results):

@@ -9,7 +9,6 @@ from made_calibration import EACH_MODEL
 from made_lines import made_lines
 
 from dashcalib_ros.camera import Radial
-from dashcalib_ros.config import LinesConfig
 from dashcalib_ros.detect import Bend, Lines, bend
 from dashcalib_ros.detect.edges import KNOTS
 
@@ -131,5 +130,5 @@ def test_a_long_drive_has_no_more_groups():
 
 def test_longer_groups_are_fewer():
     lines = made_lines(CAMERA)
-    long, short = (bend(lines, CAMERA, LinesConfig(group_s=s)) for s in (5.0, 1.0))
+    long, short = (bend(lines, CAMERA, group_s=s) for s in (5.0, 1.0))
     assert short.groups > 3 * long.groups

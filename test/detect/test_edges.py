@@ -5,11 +5,9 @@ import cv2
 import numpy as np
 import pytest
 
-from dashcalib_ros.config import LinesConfig
 from dashcalib_ros.detect import LineCollector, Lines, edges
 from dashcalib_ros.detect.edges import ENDS, KNOTS, upright_edges
 
-CONFIG = LinesConfig()
 FINE = 8
 
 
@@ -68,7 +66,7 @@ def test_lines_on_the_own_car_are_left_out():
 
 
 def collected(count, step_s=0.1, beside=False, **changes):
-    collector = LineCollector(LinesConfig(**changes), beside)
+    collector = LineCollector(beside=beside, **changes)
     images = [picture(lambda y, x=x: x + 0 * y) for x in (100.0, 130.0, 160.0)]
     for n in range(count):
         collector.push(images[n % 3], round(n * step_s * 1e9))
@@ -101,14 +99,14 @@ def test_a_long_drive_has_no_more_lines_than_a_short_one():
 
 
 def test_a_clock_that_is_set_back_does_not_stop_the_search():
-    collector, image = LineCollector(CONFIG), picture(lambda y: 150.0 + 0 * y)
+    collector, image = LineCollector(), picture(lambda y: 150.0 + 0 * y)
     for stamp_s in (100.0, 100.5, 3.0, 3.2, 3.5):
         collector.push(image, round(stamp_s * 1e9))
     assert collector.lines().stamps_s.tolist() == [100.0, 100.5, 3.0, 3.5]
 
 
 def test_nothing_found_is_no_error():
-    lines = LineCollector(CONFIG).lines()
+    lines = LineCollector().lines()
     assert len(lines) == 0 and lines.points.shape == (0, KNOTS, 2)
     assert len(lines.within(np.ones((5, 5), bool))) == 0
 
@@ -116,6 +114,6 @@ def test_nothing_found_is_no_error():
 def test_a_fence_has_its_longest_posts_only():
     x = np.arange(1280)
     image = np.tile(np.where(x % 8 < 4, 60, 180).astype(np.uint8), (120, 1))
-    collector = LineCollector(CONFIG)
+    collector = LineCollector()
     collector.push(image, 0)
     assert len(upright_edges(image)) > 300 and len(collector.lines()) == 50

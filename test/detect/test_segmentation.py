@@ -16,6 +16,8 @@ from dashcalib_ros.cli import main
 from dashcalib_ros.config import MaskConfig, MotionConfig
 from dashcalib_ros.detect import MotionEstimator
 from dashcalib_ros.detect.segmentation import (
+    IMAGES,
+    PERIOD_S,
     SegmentationMask,
     SegmentationModel,
     open_segmentation,
@@ -100,9 +102,8 @@ def test_cars_that_pass_are_outvoted_and_the_last_vote_is_final(dark):
             picture[100:150, 200:300] = 0
         if mask.push(picture, k * SECOND // 4):
             asked.append(k)
-    config = MaskConfig()
-    apart = round(4 * config.segmentation_period_s)
-    assert asked == [apart * n for n in range(config.segmentation_images)]
+    apart = round(4 * PERIOD_S)
+    assert asked == [apart * n for n in range(IMAGES)]
     hidden = mask.hidden((HEIGHT, WIDTH))
     assert hidden[230:].all() and not hidden[:220].any()
 

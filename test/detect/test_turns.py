@@ -12,7 +12,7 @@ from scipy.signal import find_peaks
 
 from dashcalib_ros.config import TurnsConfig
 from dashcalib_ros.detect import TurnDetector
-from dashcalib_ros.detect.detector import CUT_OFF, SEEN, History
+from dashcalib_ros.detect.detector import CUT_OFF, MIN_PROMINENCE, SEEN, History
 from dashcalib_ros.detect.estimator import Motion
 from dashcalib_ros.detect.peaks import PeakFinder, StreamingMedian
 from dashcalib_ros.input import Frame
@@ -292,9 +292,9 @@ def offline(values: np.ndarray, config: TurnsConfig, index: int
     signal = np.array([np.median(values[max(i - reach, 0):i + reach + 1])
                        for i in range(len(values))])
     # whatever is beyond the edges
-    first, last = (value - SEEN * max(value - CUT_OFF * config.min_prominence, 0.0)
+    first, last = (value - SEEN * max(value - CUT_OFF * MIN_PROMINENCE, 0.0)
                    for value in (signal[0], signal[-1]))
-    peaks, about = find_peaks([first, *signal, last], prominence=config.min_prominence)
+    peaks, about = find_peaks([first, *signal, last], prominence=MIN_PROMINENCE)
     prominence = dict(zip((peaks - 1).tolist(), about['prominences'], strict=True))
     kept: list[int] = []
     for peak in sorted(prominence, key=lambda peak: (-signal[peak], peak)):

@@ -10,7 +10,7 @@ from dashcalib_ros.camera import Radial
 from dashcalib_ros.config import FleetConfig
 from dashcalib_ros.fleet.lens_prior import (
     LensPrior,
-    OfMake,
+    ModelPrior,
     Unit,
     conditioned,
     curvature,
@@ -162,7 +162,7 @@ PRIOR = LensPrior(np.array([curvature(520 / 800), -0.28, 0.09]),
 
 @pytest.mark.parametrize('level', ['weak', 'refused'])
 def test_a_prior_decides_and_the_verdict_says_so(level):
-    final = final_of(solved_unit(level), OfMake(PRIOR))
+    final = final_of(solved_unit(level), ModelPrior(PRIOR))
     found = final.calibration
     assert found.verdict.level == 'weak'
     assert 'acme (20 other cameras)' in found.verdict.reasons[0]
@@ -178,7 +178,7 @@ def test_a_prior_decides_and_the_verdict_says_so(level):
 
 
 def test_an_accepted_camera_stays_accepted_and_hardly_moves():
-    final = final_of(solved_unit('accepted', sigma=1.0), OfMake(PRIOR))
+    final = final_of(solved_unit('accepted', sigma=1.0), ModelPrior(PRIOR))
     assert final.calibration.verdict.level == 'accepted' and final.prior_share < 0.1
     assert abs(final.calibration.camera.fx - 540) < 1
 
@@ -186,7 +186,7 @@ def test_an_accepted_camera_stays_accepted_and_hardly_moves():
 def test_where_there_is_no_prior_it_says_why():
     assert unit_of(solved_unit(make='')) is None and unit_of(solved_unit(sound=False)) is None
     assert 'unknown' in final_of(solved_unit(make=''), None).prior_note
-    thrown = final_of(solved_unit(), OfMake(None, 'its fx is off: another mode', True))
+    thrown = final_of(solved_unit(), ModelPrior(None, 'its fx is off: another mode', True))
     assert thrown.other_mode and 'another mode' in thrown.calibration.warnings[0]
     assert thrown.calibration.camera.fx == 540.0
 

@@ -74,7 +74,7 @@ def test_result_has_the_contract_s_keys_and_values():
     assert result['turns'][0] == {
         'center': 88, 'first': 58, 'last': 118, 'stamp': 8.8, 'prominence': 0.061,
         'images': 31, 'registered': 30, 'used': True, 'yaw_deg': 91.5,
-        'reprojection_error_px': 0.46, 'misfit': 1.1, 'unused_because': None}
+        'reprojection_error_px': 0.46, 'misfit': 1.1, 'unused_because': None, 'right_deg': None}
     assert result['masked_fraction'] == pytest.approx(75 / 375)
 
 

@@ -219,7 +219,7 @@ def test_a_video_without_motion_data_is_named(tmp_path, content):
 
 def test_without_its_reader_the_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'telemetry_parser', None)
-    with refused(InputError, 'E-MOTION-PARSER', 'drive.mp4', 'dashcalib_ros[motion]'):
+    with refused(InputError, 'E-MOTION-PARSER', 'drive.mp4', '.[motion]'):
         read_motion(write(tmp_path / 'drive.mp4', 'x'))
 
 

@@ -60,6 +60,14 @@ def test_turned_pictures_are_named_first_with_the_way_back(solution, degrees, ba
     assert judge(found, mounted_so).level == 'accepted'
 
 
+@pytest.mark.parametrize(('degrees', 'refused'), [(0, False), (40, False), (90, True),
+                                                  (180, False)])
+def test_a_camera_that_moves_sideways_is_refused(solution, degrees, refused):
+    """A car that turns on the spot moves it so; a camera may look back."""
+    verdict = judge(turned(solution, 1, degrees), CONFIG.verdict)
+    assert ('E-MOVES-SIDEWAYS' in verdict.codes) == refused == (verdict.level == 'refused')
+
+
 def test_turns_of_little_yaw_do_not_show_which_way_up_pictures_are(solution):
     """Bumps and the lean of a two-wheeler turn the camera as much."""
     bumps = narrow(solution, 0.2, axis=0)

@@ -81,6 +81,30 @@ def test_straights_tell_where_it_points(solution, angles):
     assert np.hypot(*(ahead - found.travel_px)) < 3 * found.travel_sigma_px
 
 
+@pytest.mark.parametrize('angles', [(0.0, 0.0, 0.0), (3.5, -2.0, 0.0)])
+def test_a_camera_that_looks_back_is_half_a_turn_about_the_vertical(solution, angles):
+    known = replace(with_camera(solution, LENS), scenes=())
+    pairs = pairs_of(mounted(*angles))
+    ahead = mount_of(pairs, None, known, 'accepted', None)
+    played_backwards = replace(pairs, before=pairs.after, after=pairs.before)
+    back = mount_of(played_backwards, None, known, 'accepted', None)
+    assert not ahead.rear and back.rear
+    np.testing.assert_allclose(back.rotation, np.diag([-1, -1, 1]) @ ahead.rotation, atol=2e-3)
+    assert back.verdict == ahead.verdict
+    np.testing.assert_allclose(back.travel_px, ahead.travel_px, atol=1)
+
+
+def test_a_car_that_drives_both_ways_does_not_say_where_it_looks(solution):
+    known = replace(with_camera(solution, LENS), scenes=())
+    pairs = pairs_of(mounted(1.0, 0.0, 0.0))
+    turned = (np.arange(len(pairs)) % 5 < 2)[:, None, None]
+    both = replace(pairs, before=np.where(turned, pairs.after, pairs.before),
+                   after=np.where(turned, pairs.before, pairs.after))
+    found = mount_of(both, None, known, 'accepted', None)
+    assert found.verdict == 'weak' and any('backwards' in each for each in found.reasons)
+    assert mount_of(pairs, None, known, 'accepted', None).reasons == ()
+
+
 def test_points_that_stay_do_not_spoil_it(solution):
     known = replace(with_camera(solution, LENS), scenes=())
     found = mount_of(pairs_of(mounted(2.0, 1.0, 0.0), still=0.2), None, known, 'accepted',

@@ -35,7 +35,7 @@ def rows(scene: Scene, chosen, number: int, later_s: float = 0.0) -> Scene:
 
 def test_other_turns_are_kept():
     scenes = [scene_of(yaw, world) for world, yaw in enumerate((80.0, -75.0, 82.0, -88.0))]
-    kept, repeated = without_repeated(scenes, 6)
+    kept, repeated = without_repeated(scenes)
     assert kept == scenes and not repeated
 
 
@@ -44,14 +44,14 @@ def test_a_turn_shown_again_counts_once(chosen):
     first = scene_of(80.0, 0)
     # the same place and path, tracked anew: other noise
     again = rows(scene_of(80.0, 0, seed=5), chosen, 99, later_s=40.0)
-    kept, repeated = without_repeated([first, scene_of(-70.0, 1), again], 6)
+    kept, repeated = without_repeated([first, scene_of(-70.0, 1), again])
     assert len(kept) == 2 and repeated == {TurnId.at(99): TurnId.at(0)}
 
 
 def test_what_repeats_a_repetition_repeats_the_first():
     first = scene_of(80.0, 0)
     others = [rows(scene_of(80.0, 0, seed=n), np.arange(24), 90 + n) for n in (1, 2)]
-    kept, repeated = without_repeated([first, *others], 6)
+    kept, repeated = without_repeated([first, *others])
     assert kept == [first] and set(repeated.values()) == {first.turn}
 
 
@@ -79,25 +79,25 @@ def test_other_corners_of_the_same_pictures_count_once(chosen):
     # the path there and back has its own times
     times = np.arange(len(chosen)) * (first.tracks.stamps_ns[1] - first.tracks.stamps_ns[0])
     again = replace(again, tracks=replace(again.tracks, stamps_ns=times))
-    kept, repeated = without_repeated([first, again], 6)
+    kept, repeated = without_repeated([first, again])
     assert kept == [first] and repeated == {TurnId.at(99): TurnId.at(0)}
 
 
 def test_a_second_drive_through_the_same_bend_is_another_turn():
     first = scene_of(80.0, 0)
     second = seen_anew(first, 99, scatter_m=0.15, aside_m=0.5)
-    assert len(without_repeated([first, second], 6)[0]) == 2
+    assert len(without_repeated([first, second])[0]) == 2
 
 
 def test_a_turn_of_which_a_little_was_shown_is_cut():
     whole = scene_of(85.0, 3)
     first, second = rows(whole, np.arange(9), 1), rows(whole, np.arange(4, 24), 2)
-    kept, repeated = without_repeated([first, second], 6)
+    kept, repeated = without_repeated([first, second])
     assert not repeated and len(kept) == 2
     assert kept[0] is first and 14 <= len(kept[1].tracks.frames) <= 17
     assert kept[1].structure.used.shape == kept[1].tracks.seen.shape
     # where more was shown, one place counts once
-    kept, repeated = without_repeated([rows(whole, np.arange(14), 1), second], 6)
+    kept, repeated = without_repeated([rows(whole, np.arange(14), 1), second])
     assert len(kept) == 1 and TurnId.at(2) in repeated
 
 

@@ -407,7 +407,7 @@ def test_a_turn_of_another_camera_is_not_outvoted_in_silence(no_profile, factor,
               [*scenes_of(3, start=LENS), *scenes_of(4, other, start=other)[3:]]]
     solution = solved(scenes, CONFIG.replace({'scene.min_explained': least}))
     assert len(solution.scenes) == used
-    assert turns_of_another_camera(solution.misfits, CONFIG.verdict) == {at(3)}
+    assert turns_of_another_camera(solution.misfits) == {at(3)}
     assert max(solution.misfits[at(center)] for center in range(3)) < 1.5
     level, reasons = levels(solution)
     assert level != 'accepted' and 'the turn at frame 3 ' in reasons['E-ANOTHER-CAMERA']

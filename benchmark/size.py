@@ -1,0 +1,85 @@
+"""What takes the room of an environment: the size of each installed package, and what needs it.
+
+Run it with the Python of an environment that has only this package:
+
+    python3 -m venv light && . light/bin/activate && pip install .
+    python benchmark/size.py --results
+"""
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+from collections import defaultdict
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
+
+from result_tables import write_table
+
+PACKAGE = 'dashcalib_ros'
+# why a light use needs it, or what is lost without it
+REASONS = {
+    'scipy': 'rotations, splines, sparse solvers: everywhere in the solution',
+    'opencv-python-headless': 'tracks, pictures, poses without pycolmap',
+    'pycolmap': 'poses; without it (`pip uninstall pycolmap`) OpenCV estimates them, as on arm64',
+    'av': "videos, also in bags, with each picture's own time",
+    'numpy': 'everything',
+    'zstandard': 'mcap requires it',
+    'apsw': 'bags in SQLite; rosbags requires it, too',
+    'pip': 'made with the environment',
+    'setuptools': "made with the environment up to Python 3.11; ROS's tools want it",
+    'pygments': 'rich requires it',
+    PACKAGE: 'this package',
+}
+
+
+def normal(name: str) -> str:
+    """Return a package's name as package indexes compare it."""
+    return re.sub(r'[-_.]+', '-', name).lower()
+
+
+def sizes(package: Distribution) -> tuple[int, int]:
+    """Return the bytes of a package's files, and how many of them are compiled Python."""
+    files = [(name, Path(str(package.locate_file(name)))) for name in package.files or []]
+    found = [(name.suffix == '.pyc', path.stat().st_size) for name, path in files
+             if path.is_file()]
+    return sum(size for _, size in found), sum(size for compiled, size in found if compiled)
+
+
+def table() -> str:
+    """Return the table of this environment: what is 2 MB or more, and the rest as one row."""
+    packages = {normal(each.name): each for each in distributions()}
+    reasons = {normal(name): reason for name, reason in REASONS.items()}
+    needed_by = defaultdict(set)
+    for name, package in packages.items():
+        for line in package.requires or []:
+            if 'extra ==' not in line:
+                needed_by[normal(re.split(r'[^\w.-]', line)[0])].add(name)
+    found = {name: sizes(package) for name, package in packages.items()}
+    whole, compiled = (sum(column) for column in zip(*found.values(), strict=True))
+    rows = [f'| all | {whole / 1e6:.0f} | | {compiled / 1e6:.0f} MB of it is compiled Python, '
+            'of which `pip install --no-compile` makes only what is used |']
+    large = sorted((name for name in found if found[name][0] >= 2e6), key=found.get, reverse=True)
+    for name in large:
+        rows.append(f'| {name} | {found[name][0] / 1e6:.0f} | '
+                    f'{", ".join(sorted(needed_by[name]))} | {reasons.get(name, "")} |')
+    rest = sum(size for name, (size, _) in found.items() if name not in large)
+    rows.append(f'| {len(found) - len(large)} others | {rest / 1e6:.0f} | | |')
+    return '\n'.join(['| package | MB | required by | why |', '|---|---|---|---|', *rows])
+
+
+def main() -> None:
+    """Print the table, or write it."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--results', action='store_true', help='write benchmark/results/size.md')
+    if not parser.parse_args().results:
+        sys.exit(print(table()))
+    commit = subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=7'], check=True,
+                            cwd=Path(__file__).parent, capture_output=True, text=True).stdout
+    print(write_table('size', table(), [commit.strip()]))
+
+
+if __name__ == '__main__':
+    main()
