@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import time
 
 import numpy as np
 import rclpy
@@ -52,9 +53,17 @@ class Desk:
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self.node)
         self.bench = Bench(context, topic=topic)
-        self.until(lambda: self.bench.images.get_subscription_count() > 0
-                   and self.bench.values.get('reliability') == 'reliable')
-        self.show()
+        try:
+            self.until(lambda: self.bench.images.get_subscription_count() > 0
+                       and self.bench.values.get('reliability') == 'reliable')
+            # the camera matches the new subscription a moment after the old one is gone
+            settled = time.monotonic() + 0.3
+            self.until(lambda: time.monotonic() > settled)
+            self.show()
+        except BaseException:
+            # the tests after this one have a node of their own
+            self.close()
+            raise
 
     @property
     def role(self):
