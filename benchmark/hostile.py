@@ -75,7 +75,7 @@ from dashcalib_ros.input.motion_files import read_motion
 from dashcalib_ros.ros.calibrate import camera_info
 from dashcalib_ros.ros.images import LASTING
 from dashcalib_ros.ros.settings import specs
-from dashcalib_ros.ros.store import Store, Whose
+from dashcalib_ros.ros.store import CameraIdentity, Store
 
 KEPT = CAMERA_FILE.format(width=320) + OURS
 FX = 200.0
@@ -400,7 +400,7 @@ def damaged(text: str, n: int) -> bytes:
 
 def kept(path: Path) -> Any:
     """Return what a node would use of a file."""
-    store = Store(path, Whose('dashcam', '/image_raw'))
+    store = Store(path, CameraIdentity('dashcam', '/image_raw'))
     try:
         return store.load()
     finally:

@@ -29,7 +29,7 @@ LONGEST_BACK_OFF_S = 60.0
 # pairs of images of straight driving, each 0.3 s: when they are asked whether the camera was moved
 # on the car, and how many of them
 PAIRS_BETWEEN, PAIRS = 30, 120
-NOTHING = Status(0, 0, 0, 0.0, 0.0, False)
+NO_STATUS = Status(0, 0, 0, 0.0, 0.0, False)
 Action = Callable[[], None]
 
 
@@ -54,7 +54,7 @@ class Goal:
 class Activity:
     """What the background thread does now. stage: of the calibration that runs."""
 
-    status: Status = NOTHING
+    status: Status = NO_STATUS
     calibrating: bool = False
     stage: str = ''
 
@@ -291,7 +291,7 @@ class Learner:
 
     def _begin(self, new: _Bank, keep_stored: bool) -> None:
         old, self._now = self._now, new
-        self.activity = replace(self.activity, status=NOTHING)
+        self.activity = replace(self.activity, status=NO_STATUS)
         old.calibrator.close()
         if not keep_stored:
             old.calibrator.scenes.clear_store()

@@ -22,7 +22,7 @@ from dashcalib_ros.ros.endpoints import Endpoints
 from dashcalib_ros.ros.images import Source
 from dashcalib_ros.ros.settings import Settings
 from dashcalib_ros.ros.state import Judgement, judge, outcome_text, sigma_text
-from dashcalib_ros.ros.store import Kept, Store, Whose, camera_info_path
+from dashcalib_ros.ros.store import CameraIdentity, Store, StoredCalibration, camera_info_path
 
 
 class Calibrating:
@@ -38,7 +38,7 @@ class Calibrating:
         own = settings.own
         node, topic = endpoints.node, endpoints.node.resolve_topic_name('image_raw')
         plain = topic == f'{node.get_namespace().rstrip("/")}/image_raw'
-        self._whose = Whose(camera_name, topic, plain)
+        self._whose = CameraIdentity(camera_name, topic, plain)
         self._store = Store(camera_info_path(own.camera_info_url, camera_name), self._whose)
         endpoints.at_end(self._store.close)
         self._commit: Commit | None = None
@@ -48,7 +48,7 @@ class Calibrating:
         # what is published now, and how many were published beside images
         self._info: CameraInfo | None = None
         self._sent = 0
-        self._kept: Kept | None = None
+        self._kept: StoredCalibration | None = None
         # given up, and published only because of publish_stale
         self._stale = False
         # False for one of a file until turns of this drive agree with it
@@ -168,7 +168,7 @@ class Calibrating:
 
     def _adopt(self, calibration: Calibration) -> None:
         source = self.drive.source
-        kept = Kept.of(calibration, self._whose, source.frame_id if source else '',
+        kept = StoredCalibration.of(calibration, self._whose, source.frame_id if source else '',
                        *self.drive.images.publishers)
         info = self._use(kept)
         self._log.info(f'accepted: {sigma_text(kept.camera)}; {self.save()[1]}')
@@ -202,7 +202,7 @@ class Calibrating:
                 # the newest, as a camera may have been pushed
                 self._show_mount(calibration.mount, self._kept.frame_id or '')
 
-    def _use(self, kept: Kept, confirmed: bool = True) -> CameraInfo:
+    def _use(self, kept: StoredCalibration, confirmed: bool = True) -> CameraInfo:
         self._kept, self._stale, self._confirmed = kept, False, confirmed
         self._info = camera_info(kept.camera.camera, self._header(kept.frame_id or ''),
                                  self._core.rectified)

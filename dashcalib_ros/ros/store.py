@@ -45,7 +45,7 @@ CHECKSUM, COUNT = 'checksum', 'contradictions'
 
 
 @dataclass(frozen=True)
-class Whose:
+class CameraIdentity:
     """Which camera a node has: its name and the topic of its images.
 
     plain: the topic is image_raw, not remapped: all that a file of an older version can be of.
@@ -57,7 +57,7 @@ class Whose:
 
 
 @dataclass(frozen=True)
-class Kept:
+class StoredCalibration:
     """An accepted calibration: the camera, the frame its images were in, and the file's content.
 
     frame_id: None where the file does not say it. contradictions: how many calibrations in a row
@@ -73,8 +73,8 @@ class Kept:
     mount: Mount | None = None
 
     @classmethod
-    def of(cls, calibration: Calibration, whose: Whose, frame_id: str, publisher: str = ''
-           ) -> Kept:
+    def of(cls, calibration: Calibration, whose: CameraIdentity, frame_id: str, publisher: str = ''
+           ) -> StoredCalibration:
         """Make it of a calibration that was accepted just now; publisher: the images' node."""
         now = datetime.now(timezone.utc).isoformat(timespec='seconds')
         content = yaml.safe_load(calibration_yaml(calibration, whose.name, now))
@@ -85,7 +85,7 @@ class Kept:
                    mount=calibration.mount)
 
     @classmethod
-    def read(cls, text: str, path: Path, whose: Whose) -> Kept:
+    def read(cls, text: str, path: Path, whose: CameraIdentity) -> StoredCalibration:
         """Read a file's text; raises InputError unless it is of this node's camera.
 
         Whether it is plausible is not asked.
@@ -120,7 +120,7 @@ class Kept:
         """Return the file's text."""
         return yaml_text(self.content)
 
-    def rectified(self, rectified: str) -> Kept:
+    def rectified(self, rectified: str) -> StoredCalibration:
         """Return it with the P of a setting, itself where the file has that already.
 
         P is no measurement but the user's choice: the present one counts, not the file's.
@@ -131,7 +131,7 @@ class Kept:
                 return self
         return replace(self, content={**self.content, 'projection_matrix': matrix_block(3, 4, p)})
 
-    def contradicted(self, times: int) -> Kept:
+    def contradicted(self, times: int) -> StoredCalibration:
         """Return it with another number of contradictions in a row."""
         own = {**self.content['dashcalib'], COUNT: times}
         return replace(self, content={**self.content, 'dashcalib': own}, contradictions=times)
@@ -143,7 +143,7 @@ class Store:
     While a node has it, no other node reads or writes it: a file beside it is locked.
     """
 
-    def __init__(self, path: Path, whose: Whose) -> None:
+    def __init__(self, path: Path, whose: CameraIdentity) -> None:
         self.path = path
         self._whose = whose
         self._lock: int | None = None
@@ -199,7 +199,7 @@ class Store:
         return (f'{self.path} was withdrawn, but could not be moved aside: remove it, or the next '
                 f'start of the node publishes it again')
 
-    def load(self) -> Kept | None:
+    def load(self) -> StoredCalibration | None:
         """Return the calibration, None if there is no file.
 
         Raises InputError when it is damaged, was given up, is another node's, another tool's (that
@@ -212,7 +212,7 @@ class Store:
             if not (self.path.exists() or self.path.is_symlink()):
                 return None
             text = read_text(self.path, YAML_BYTES)
-            kept = Kept.read(text, self.path, self._whose)
+            kept = StoredCalibration.read(text, self.path, self._whose)
         except InputError as error:
             raise InputError(error.code, f'{self.path} is ignored: {error}') from error
         except (OSError, ValueError, OverflowError) as error:
@@ -229,7 +229,7 @@ class Store:
         # its sigma may be what was edited
         return replace(kept, camera=replace(kept.camera, sigma=None)) if kept.edited else kept
 
-    def save(self, kept: Kept) -> str:
+    def save(self, kept: StoredCalibration) -> str:
         """Write it, completely or not at all; return a line about it. Raises OutputError."""
         if self.taken:
             raise OutputError('E-KEPT-IN-USE', self.taken)
@@ -245,7 +245,7 @@ class Store:
         return f'saved to {self.path}' + (
             f'; what another program wrote there is now {moved}' if moved else '')
 
-    def update(self, kept: Kept) -> None:
+    def update(self, kept: StoredCalibration) -> None:
         """Write it where the file is still what this node read or wrote. Raises OutputError."""
         if self._ours and self.claim():
             self._write(kept)
@@ -271,7 +271,7 @@ class Store:
     def _ours(self) -> bool:
         return self._text is not None and self._read() == self._text
 
-    def _write(self, kept: Kept) -> None:
+    def _write(self, kept: StoredCalibration) -> None:
         text = kept.text
         write_text(self.path, text)
         self._text = text

@@ -16,7 +16,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError, InputError
 from dashcalib_ros.formats import calibration_yaml, export, load_camera
 from dashcalib_ros.formats.load import load_with_faults
-from dashcalib_ros.ros.store import Kept, Whose
+from dashcalib_ros.ros.store import CameraIdentity, StoredCalibration
 
 PARSERS_KEYS = ['image_width', 'image_height', 'camera_name', 'camera_matrix',
                 'distortion_model', 'distortion_coefficients', 'rectification_matrix',
@@ -145,7 +145,8 @@ def each_file(tmp_path_factory):
              for name, lens in EACH_MODEL.items()}
     texts['weak'] = calibration_yaml(make_calibration('weak', input_name='x' * 5000), '4k_front')
     texts['alone'] = export(TRUTH, 'ros')
-    kept = Kept.of(make_calibration(input_name=ODD), Whose('360cam', '/image_raw'), 'front: #1')
+    kept = StoredCalibration.of(make_calibration(input_name=ODD),
+                                CameraIdentity('360cam', '/image_raw'), 'front: #1')
     texts['kept'], texts['kept_with_p'] = kept.text, kept.rectified('all').text
     assert texts['kept'] != texts['kept_with_p']
     for name, text in texts.items():

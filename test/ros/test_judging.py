@@ -32,7 +32,7 @@ from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros.background import Moved, Result
-from dashcalib_ros.ros.store import Store, Whose
+from dashcalib_ros.ros.store import CameraIdentity, Store
 from dashcalib_ros.store.turn_store import Origin, StoredTurn, TurnStore
 
 MOUNT = Mount('accepted', (), 2.0, -1.0, None, None,
@@ -419,7 +419,7 @@ def test_a_file_that_another_node_has_is_neither_published_nor_written(make_desk
     desk.give()
     desk.close()
     text = desk.file.read_text()
-    other = Store(desk.file, Whose('dashcam', '/image_raw'))
+    other = Store(desk.file, CameraIdentity('dashcam', '/image_raw'))
     assert other.claim()
     desk = make_desk()
     desk.until(lambda: 'another node uses' in desk.bench.status.message)

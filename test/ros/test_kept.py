@@ -10,9 +10,9 @@ from made_calibration import EACH_MODEL, calibration_of
 from dashcalib_ros.errors import InputError, OutputError
 from dashcalib_ros.ros.parameters import camera_name
 from dashcalib_ros.ros.settings import NodeConfig
-from dashcalib_ros.ros.store import Kept, Store, Whose, implausible
+from dashcalib_ros.ros.store import CameraIdentity, Store, StoredCalibration, implausible
 
-FRONT = Whose('front', '/front/image_raw')
+FRONT = CameraIdentity('front', '/front/image_raw')
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ LENSES = {**EACH_MODEL, 'brown': dataclasses.replace(EACH_MODEL['brown'], k3=0.0
 
 
 def kept_of(model='radial', whose=FRONT, frame_id='camera'):
-    return Kept.of(calibration_of(LENSES[model]), whose, frame_id)
+    return StoredCalibration.of(calibration_of(LENSES[model]), whose, frame_id)
 
 
 def edit(path, *keys, value=None):
@@ -67,18 +67,18 @@ def test_what_is_kept_comes_back_whole_and_says_whose_it_is(store, model):
             document['dashcalib']['frame_id']) == ('front', '/front/image_raw', 'camera')
     first = store()
     first.close()
-    found = Kept.read(kept.text, first.path, FRONT)
+    found = StoredCalibration.read(kept.text, first.path, FRONT)
     assert found.camera.camera == LENSES[model] and not found.edited
     assert found.camera.sigma == kept.camera.sigma and not implausible(found.camera)
     # the user's P and the count are no edits
     other = found.rectified('crop').contradicted(2)
-    again = Kept.read(other.text, first.path, FRONT)
+    again = StoredCalibration.read(other.text, first.path, FRONT)
     assert other.text != kept.text and not again.edited and again.contradictions == 2
 
 
 @pytest.mark.parametrize(('whose', 'code', 'value'), [
-    (Whose('front', '/rear/image_raw'), 'E-KEPT-OF-OTHER-TOPIC', '/front/image_raw'),
-    (Whose('rear', '/front/image_raw'), 'E-KEPT-OF-OTHER-CAMERA', 'camera front')])
+    (CameraIdentity('front', '/rear/image_raw'), 'E-KEPT-OF-OTHER-TOPIC', '/front/image_raw'),
+    (CameraIdentity('rear', '/front/image_raw'), 'E-KEPT-OF-OTHER-CAMERA', 'camera front')])
 def test_the_file_of_another_camera_is_neither_used_nor_lost(store, whose, code, value):
     first = store()
     first.save(kept_of())

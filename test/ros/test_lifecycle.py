@@ -19,7 +19,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.ros.node import CameraNode
 from dashcalib_ros.ros.parameters import given_parameters
-from dashcalib_ros.ros.store import Store, Whose
+from dashcalib_ros.ros.store import CameraIdentity, Store
 
 UNCONFIGURED, INACTIVE, ACTIVE = (
     State.PRIMARY_STATE_UNCONFIGURED, State.PRIMARY_STATE_INACTIVE, State.PRIMARY_STATE_ACTIVE)
@@ -64,7 +64,7 @@ def children():
 
 def left(node, path):
     """Return the threads, children and endpoints of a node, and whether another gets its file."""
-    other = Store(path, Whose('dashcam', '/image_raw'))
+    other = Store(path, CameraIdentity('dashcam', '/image_raw'))
     free = other.claim()
     other.close()
     endpoints = {kind: len(list(getattr(node, kind))) for kind in (

@@ -23,11 +23,11 @@ from dashcalib_ros.ros.car import Mounting, differs, subscribe_sensors
 from dashcalib_ros.ros.diagnostics import Complaints
 from dashcalib_ros.ros.endpoints import Endpoints
 from dashcalib_ros.ros.settings import NodeConfig
-from dashcalib_ros.ros.store import Kept, Whose
+from dashcalib_ros.ros.store import CameraIdentity, StoredCalibration
 
 SIGMA = {'yaw_left_deg': 0.1, 'pitch_up_deg': 0.15, 'roll_right_deg': None, 'height_m': None}
 MOUNT = Mount('accepted', (), 2.0, -1.0, None, None, SIGMA, (600.0, 170.0), 0.5, 300.0)
-WHOSE = Whose('dashcam', '/image_raw')
+IDENTITY = CameraIdentity('dashcam', '/image_raw')
 
 
 @stands_in_for(Endpoints)
@@ -87,8 +87,8 @@ def made(**settings):
 def test_a_kept_mounting_is_published_and_kept(start_node, make_bench, tmp_path):
     from geometry_msgs.msg import PoseWithCovarianceStamped
     from ros_bench import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-    kept = Kept.of(make_calibration(mount=MOUNT), WHOSE, 'camera')
-    assert Kept.read(kept.text, tmp_path / 'dashcam.yaml', WHOSE).mount == MOUNT
+    kept = StoredCalibration.of(make_calibration(mount=MOUNT), IDENTITY, 'camera')
+    assert StoredCalibration.read(kept.text, tmp_path / 'dashcam.yaml', IDENTITY).mount == MOUNT
     keep_file(tmp_path, kept.text)
     node, camera = start_node(mount_x=1.5, base_frame='car'), make_bench()
     poses = []
@@ -106,9 +106,10 @@ def test_a_kept_mounting_is_published_and_kept(start_node, make_bench, tmp_path)
 
 
 def test_an_edited_mounting_is_not_believed(tmp_path):
-    text = Kept.of(make_calibration(mount=MOUNT), WHOSE, 'camera').text
+    text = StoredCalibration.of(make_calibration(mount=MOUNT), IDENTITY, 'camera').text
     edited = text.replace('yaw_left_deg: 2.0', 'yaw_left_deg: 20.0')
-    assert edited != text and Kept.read(edited, tmp_path / 'dashcam.yaml', WHOSE).mount is None
+    found = StoredCalibration.read(edited, tmp_path / 'dashcam.yaml', IDENTITY)
+    assert edited != text and found.mount is None
 
 
 def test_one_static_transform_and_again_only_when_it_moved(tf2):
