@@ -101,7 +101,7 @@ def test_a_turn_that_contradicts_the_others_says_so():
 
 def test_every_objection_is_a_row_that_failed_and_they_come_first(drawn):
     rows = drawn.verdict.conditions
-    assert len(rows) == 7 and all(row.met and row.value and row.limit for row in rows)
+    assert len(rows) == 8 and all(row.met and row.value and row.limit for row in rows)
     # the first objection has no number
     long = dataclasses.replace(solution(), readout_s=0.09, readout_sigma_s=0.001)
     limits = dataclasses.replace(CONFIG.verdict, max_sigma=0.001, min_turns=4)
