@@ -103,7 +103,8 @@ def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
     """
     grounds = Grounds(solution, config, lines, witnesses or Witnesses(), other_camera)
     findings = [found for rule in RULES if (found := rule(grounds)) is not None]
-    findings.sort(key=lambda found: (not found.objects, not found.cause, found.level != 'refused'))
+    findings.sort(key=lambda found: (not found.objects, found.objects and not found.cause,
+                                     found.level != 'refused'))
     if outlook and findings[0].objects and lacks_knowledge_only(grounds):
         first, more = findings[0].cure, next_turn(solution)
         findings = [replace(found, cure=first + (more and f' ({more})')) if found.cure == first

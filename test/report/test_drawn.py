@@ -108,7 +108,7 @@ def test_every_objection_is_a_row_that_failed_and_they_come_first(drawn):
     verdict = judge(long, limits)
     assert verdict.codes == ('E-FEW-TURNS', 'E-LARGE-SIGMA', 'E-LONG-READOUT')
     rows = verdict.conditions
-    assert [row.met for row in rows] == [False] * 3 + [True] * 5
+    assert [row.met for row in rows] == [False] * 3 + [True] * 6
     assert tuple(row.code for row in rows[:3]) == verdict.codes
     assert [(row.value, row.limit) for row in rows[:3]] == [
         ('3', 'at least 4'), ('0.39 %', 'at most 0.1 %'), ('', '')]
