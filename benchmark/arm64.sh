@@ -27,7 +27,7 @@ step() {  # NAME COMMAND...: run it, and print the seconds
 make_root() {
     rm -rf "$root"
     debootstrap --foreign --arch=arm64 --variant=minbase \
-        --include=python3,python3-venv,python3-pip bookworm "$root" http://deb.debian.org/debian
+        --include=python3,python3-venv,python3-pip bookworm "$root"
     # in a container, debootstrap makes a link of it, which is a loop in the root
     rm -f "$root/proc"
     mkdir -p "$root/proc"
