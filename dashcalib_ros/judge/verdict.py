@@ -366,7 +366,8 @@ def _turned_pictures(grounds: Grounds) -> Finding | None:
                    cause=True)
 
 
-# degrees; turns of five real drives have 1 to 17, a car that turns on the spot 86
+# degrees; the medians of 82 rendered drives are 13 at most, turns of real ones have 1 to 17, a car
+# that turns on the spot has 86
 MAX_OFF_AXIS_DEG = 60.0
 
 
