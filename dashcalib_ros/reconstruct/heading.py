@@ -40,15 +40,9 @@ LEAST_KEYFRAMES = 6
 
 def heading(scene: Scene) -> Heading | None:
     """Return the heading in a turn, None where too few keyframes are registered."""
-    rotations, centres = scene.structure.path()
-    if len(rotations) < LEAST_KEYFRAMES:
+    if scene.structure.registered.sum() < LEAST_KEYFRAMES:
         return None
-    turned = rotation_vectors(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
-    # the direction of a step, in the camera's frame halfway through it
-    halfway = rotation_matrices(turned / 2) @ rotations[:-1]
-    steps = np.diff(centres, axis=0)
-    lengths = np.maximum(np.linalg.norm(steps, axis=1), np.finfo(float).tiny)
-    ahead = np.einsum('kij,kj->ki', halfway, steps) / lengths[:, None]
+    turned, lengths, ahead = _steps(scene)
     rear = bool(np.median(ahead[:, 2]) < 0)
     if rear:
         ahead = -ahead
@@ -59,6 +53,19 @@ def heading(scene: Scene) -> Heading | None:
     yaw_deg, yaw_sigma = _at_no_curvature(curvature, yaw)
     return Heading(yaw_deg, _trimmed_mean(pitch), yaw_sigma,
                    float(np.std(pitch) / np.sqrt(len(pitch))), rear)
+
+
+def _steps(scene: Scene) -> tuple[Floats, Floats, Floats]:
+    """Return the steps of a turn's path: rotation vectors (k, 3), lengths (k,), directions (k, 3).
+
+    A direction is in the camera's frame halfway through its step.
+    """
+    rotations, centres = scene.structure.path()
+    turned = rotation_vectors(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
+    halfway = rotation_matrices(turned / 2) @ rotations[:-1]
+    steps = np.diff(centres, axis=0)
+    lengths = np.maximum(np.linalg.norm(steps, axis=1), np.finfo(float).tiny)
+    return turned, lengths, np.einsum('kij,kj->ki', halfway, steps) / lengths[:, None]
 
 
 # of the steps at either end, left out of a mean: bumps and bad poses
@@ -80,11 +87,8 @@ def off_axis_deg(scene: Scene) -> float:
 
     A camera that looks back counts like one that looks ahead.
     """
-    rotations, centres = scene.structure.path()
-    steps = np.diff(centres, axis=0)
-    along = np.abs(np.einsum('kj,kj->k', rotations[:-1, 2], steps))
-    lengths = np.maximum(np.linalg.norm(steps, axis=1), np.finfo(float).tiny)
-    return float(np.median(np.degrees(np.arccos(np.clip(along / lengths, 0, 1)))))
+    _, _, ahead = _steps(scene)
+    return float(np.median(np.degrees(np.arccos(np.clip(np.abs(ahead[:, 2]), 0, 1)))))
 
 
 def roll_deg(scenes: Sequence[Scene]) -> float:
