@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from mapping import GRID, camera_that_sees
 from measure import ALL_KEYS, processor_s
-from wide import FisheyeLens, WideDrive
+from wide import WideDrive
 
 from dashcalib_ros import Calibrator, Config
-from dashcalib_ros.demo import Drive, DriveSpec, Glass, Lens, Turn
+from dashcalib_ros.demo import Drive, DriveSpec, FisheyeLens, Glass, Lens, Turn
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.stamps import least_step_ns
@@ -147,7 +147,7 @@ def _pinhole(size: tuple[int, int], across_deg: float, rng: np.random.Generator)
     if rng.random() < NEAR_FOLDS:
         k1, k2 = _nearly_folding(corner, rng.uniform(0.6, 0.97), rng.uniform(-0.6, -0.2))
         if k1 < MOST_BARREL:
-            raise ConfigError('no dashcam has so much distortion')
+            raise ConfigError('E-BENCHMARK', 'no dashcam has so much distortion')
     p1 = p2 = k3 = 0.0
     if rng.random() < DECENTRED:
         p1, p2 = np.clip(rng.normal(0.0, 0.001, 2), -0.003, 0.003).tolist()
@@ -224,21 +224,20 @@ def _named(*names: str) -> dict[str, float]:
     return dict.fromkeys(names, 1e-9)
 
 
-def reconstructed(seed: int) -> Case:
+def reconstructed(seed: int, config: Config) -> Case:
     """Render a drive, detect and reconstruct its turns."""
     cv2.setNumThreads(1)
     drive = drive_of(seed)
     lens: AnyLens = drive.wide_lens if isinstance(drive, WideDrive) else drive.lens
-    with Calibrator(Config(), inline=True) as calibrator:
-        for frame in _looked_at(drive, Config().motion.rate):
+    with Calibrator(config, inline=True) as calibrator:
+        for frame in _looked_at(drive, config.motion.rate):
             calibrator.push(frame)
         calibrator.detection.finish()
         chosen = calibrator.scenes
         chosen.submit()
-        scenes, _ = chosen.wanted(_silent, True, _nothing)
-        more: list[Scene] = []
+        scenes, more = chosen.wanted(_silent, True), []
         if chosen.widen():
-            more, _ = chosen.wanted(_silent, True, _nothing)
+            more = chosen.wanted(_silent, True)
         evidence = evidence_of_detection(calibrator.detection, chosen.built())
         evidence = replace(
             evidence, warnings=(*evidence.warnings, *chosen.warnings), pictures=None,
@@ -268,7 +267,3 @@ def _looked_at(drive: Drive, rate: float) -> Iterator[Frame]:
 
 def _silent(stage: str, share: float) -> None:
     """Tell nobody."""
-
-
-def _nothing(scenes: Sequence[Scene], config: Config, progress: Any = None) -> None:
-    """Take the scenes where a calibration would solve them."""

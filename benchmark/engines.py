@@ -1,22 +1,25 @@
 #!/usr/bin/env python3
 """Are the engines that estimate poses equal? Drives calibrated with each, in one table.
 
-    python benchmark/engines.py --data DIR [--cache DIR]
+    python benchmark/engines.py [--data DIR] [--cache DIR] [--workers N]
 
 fx, its sigma, the verdict and the seconds of processor time of kitti03 and kitti07 (with --data),
-of rendered lenses and settings. Prints a Markdown table.
+of the first ten settings of accuracy.py and of two demo lenses. Prints Markdown tables. Random
+dashcams: population.py --engine, twice.
 """
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drives import BY_NAME, drive_of, pictures_of
-from measure import calibrate, commit, isolated, parser_with, processor_s, table
+import numpy as np
+from drives import SETTINGS, drive_of, pictures_of
+from measure import calibrate, commit, complain, isolated, parser_with, processor_s, table
 
 from dashcalib_ros import Config, open_frames
 from dashcalib_ros.config import COLMAP, OPENCV
@@ -24,7 +27,6 @@ from dashcalib_ros.demo import demo_drive
 from dashcalib_ros.input import Frame
 
 LENSES = ('radial', 'fisheye')
-SETTINGS = ('KITTI raw lens, 1392x512', 'dashcam: bonnet, text', '640x480, fy/fx 1.01, noise 3')
 ENGINES = (COLMAP, OPENCV)
 # Hz; of pictures without stamps
 KITTI07_FPS = 9.65
@@ -45,42 +47,66 @@ def recorded(path: Path, fps: float | None, engine: str) -> dict[str, Any]:
     return measured(open_frames(path, fps=fps), engine)
 
 
-def row(name: str, engine: str, true_fx: float, found: dict[str, Any]) -> list[str]:
+def with_each_engine(name: str, true_fx: float, calibrated: Any) -> list[dict[str, Any]]:
+    """Return a row for each engine; one that failed has its failure for a verdict."""
+    rows = []
+    for engine in ENGINES:
+        outcome = isolated(calibrated, engine)
+        found = outcome.value or {'verdict': outcome.failure, 'fx': None, 'sigma': None,
+                                  'cpu_s': float('nan')}
+        off = None if found['fx'] is None else 100 * (found['fx'] / true_fx - 1)
+        rows.append({'drive': name, 'engine': engine, 'off_percent': off, **found})
+        complain(' '.join(cells(rows[-1])))
+    return rows
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
     """Return the cells of a drive and an engine."""
-    fx = found['fx']
-    return [name, engine, found['verdict'],
-            *(['-'] * 3 if fx is None else [f'{fx:.2f}', f'{100 * (fx / true_fx - 1):+.2f} %',
-                                            f'{found["sigma"]:.2f}']),
-            f'{found["cpu_s"]:.1f}']
+    return [row['drive'], row['engine'], row['verdict'],
+            *(['-'] * 3 if row['fx'] is None else
+              [f'{row["fx"]:.2f}', f'{row["off_percent"]:+.2f}', f'{row["sigma"]:.2f}']),
+            f'{row["cpu_s"]:.1f}']
 
 
-def main() -> int:
+def compared(pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> str:
+    """Return the summary of all drives, each with the first and the second engine."""
+    both = [pair for pair in pairs if all(row['fx'] is not None for row in pair)]
+    medians = [np.median([abs(pair[n]['off_percent']) for pair in both]) for n in (0, 1)]
+    sigmas = [second['sigma'] / first['sigma'] for first, second in both]
+    spent = [sum(pair[n]['cpu_s'] for pair in pairs) for n in (0, 1)]
+    equal = sum(first['verdict'] == second['verdict'] for first, second in pairs)
+    return table(('', *ENGINES, 'second over first'), [
+        ['verdicts that are equal', '', '', f'{equal} of {len(pairs)}'],
+        ['fx off, %: median', *(f'{median:.3f}' for median in medians),
+         f'{medians[1] / medians[0]:.2f}'],
+        ['sigma of fx: median; least, most', '', '',
+         f'{np.median(sigmas):.2f}; {min(sigmas):.2f}, {max(sigmas):.2f}'],
+        ['CPU s', *(f'{seconds:.0f}' for seconds in spent), f'{spent[1] / spent[0]:.2f}']])
+
+
+def main() -> None:
     """Measure and print."""
     parser = parser_with(__doc__, 'data', 'cache')
+    parser.add_argument('--workers', type=int, default=1, help='drives at a time')
     parser.set_defaults(cache=Path('measured/pictures'))
     args = parser.parse_args()
-    drives: dict[str, tuple[float, Any]] = {}
+    drives: list[tuple[str, float, Any]] = []
     if args.data is not None:
         for name, path, fps in (('kitti03', 'kitti03/bag', None),
                                 ('kitti07', 'kitti07/images', KITTI07_FPS)):
             truth = json.loads((args.data / name / 'truth.json').read_text())
-            drives[name] = truth['fx'], partial(recorded, args.data / path, fps)
+            drives.append((name, truth['fx'], partial(recorded, args.data / path, fps)))
     rendered = {f'demo {lens}': demo_drive(0, lens) for lens in LENSES}
-    rendered |= {name: drive_of(BY_NAME[name], 0) for name in SETTINGS}
+    rendered |= {setting.name: drive_of(setting, 0) for setting in SETTINGS[:10]}
     for name, drive in rendered.items():
-        drives[name] = drive.lens.fx, partial(measured, pictures_of(drive, args.cache))
-    rows, failed = [], False
-    for name, (true_fx, calibrated) in drives.items():
-        for engine in ENGINES:
-            outcome = isolated(calibrated, engine)
-            failed |= outcome.value is None
-            rows.append([name, engine, outcome.failure, *['-'] * 4] if outcome.value is None
-                        else row(name, engine, true_fx, outcome.value))
-            print(' '.join(rows[-1]), file=sys.stderr, flush=True)
-    print(f'commit {commit()}\n')
-    print(table(('drive', 'engine', 'verdict', 'fx px', 'off', 'sigma px', 'CPU s'), rows))
-    return int(failed)
+        drives.append((name, drive.lens.fx, partial(measured, pictures_of(drive, args.cache))))
+    with ThreadPoolExecutor(args.workers) as pool:
+        pairs = list(pool.map(lambda drive: with_each_engine(*drive), drives))
+    print(f'Measured at {commit()}, on {os.cpu_count()} cores, {args.workers} drives at a time.\n')
+    print(table(('drive', 'engine', 'verdict', 'fx px', 'off %', 'sigma px', 'CPU s'),
+                [cells(row) for pair in pairs for row in pair]))
+    print(f'\n{compared([(first, second) for first, second in pairs])}')
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -3,6 +3,7 @@
 
     python benchmark/population.py --seeds 1000-1059 --out DIR [--workers N]
                                    [--stage scenes|all] [--again] [--summary]
+                                   [--engine colmap|opencv]
 
 DIR/SEED.scenes.pkl has what `solve` gets: the reconstructed turns, and the truth (dashcams.py).
 DIR/SEED.json has what the result is off by. What is there is not made again; --again: results are,
@@ -40,7 +41,9 @@ from measure import (
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from dashcalib_ros import Calibration
+from dashcalib_ros import Config
+from dashcalib_ros.config import COLMAP, OPENCV
+from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.agreement import contradicting_turns
 from dashcalib_ros.judge.conclude import conclude
 from dashcalib_ros.solve import solve
@@ -54,7 +57,7 @@ TOLD_GLASS_PX, TOLD_READOUT_MS = 0.5, 5.0
 FX_PERCENT, FX_SIGMAS = 1.0, 3.0
 
 
-def calibrated(case: Case) -> Calibration:
+def calibrated(case: Case) -> CalibrationData:
     """Return what the command makes of a case: with more turns, where the first ones are weak."""
     evidence, scenes = case.evidence, case.scenes
     while True:
@@ -99,7 +102,7 @@ def measured(path: Path) -> dict[str, Any]:
     return row
 
 
-def named(found: Calibration) -> list[str]:
+def named(found: CalibrationData) -> list[str]:
     """Return which effects the result names."""
     text = ' '.join((*found.verdict.reasons, *found.warnings))
     return [name for name, is_named in (
@@ -292,11 +295,11 @@ def _median(values: Sequence[float], form: str = '.2f') -> str:
     return format(_quantile(values, 0.5), form) if values else ''
 
 
-def run(seed: int, out: Path, stage: str, again: bool) -> None:
+def run(seed: int, out: Path, stage: str, again: bool, config: Config) -> None:
     """Make what is missing of a seed."""
     scenes, result = out / f'{seed}.scenes.pkl', out / f'{seed}.json'
     if not scenes.exists():
-        outcome = isolated(_write_case, seed, scenes)
+        outcome = isolated(_write_case, seed, config, scenes)
         complain(f'{seed}: {outcome.failure or outcome.value}, {outcome.seconds:.0f} s, '
                  f'{outcome.peak_mb:.0f} MB')
         if outcome.failure:
@@ -309,8 +312,8 @@ def run(seed: int, out: Path, stage: str, again: bool) -> None:
         complain(f'{seed}: {row["verdict"]}, {outcome.seconds:.0f} s')
 
 
-def _write_case(seed: int, path: Path) -> str:
-    case = reconstructed(seed)
+def _write_case(seed: int, config: Config, path: Path) -> str:
+    case = reconstructed(seed, config)
     save_case(case, path)
     return f'{len(case.scenes)} scenes of {len(case.spec.turn_list)} turns, {case.cpu_s:.0f} CPU s'
 
@@ -332,11 +335,14 @@ def main() -> None:
     parser.add_argument('--stage', choices=('scenes', 'all'), default='all')
     parser.add_argument('--again', action='store_true', help='results that are there, too')
     parser.add_argument('--summary', action='store_true', help='of the results there are, and end')
+    parser.add_argument('--engine', choices=(COLMAP, OPENCV), default=Config().reconstruct.engine,
+                        help='what estimates the poses of turns')
     given = parser.parse_args()
+    config = Config().replace({'reconstruct.engine': given.engine})
     given.out.mkdir(parents=True, exist_ok=True)
     if not given.summary:
         with ThreadPoolExecutor(given.workers) as pool:
-            list(pool.map(lambda seed: run(seed, given.out, given.stage, given.again),
+            list(pool.map(lambda seed: run(seed, given.out, given.stage, given.again, config),
                           given.seeds))
     rows = [row for seed in given.seeds if (row := load(given.out / f'{seed}.json'))]
     if rows:
