@@ -207,7 +207,7 @@ class Drive:
             self._role.accompany(message.header, source.size)
         stamp_ns = self._intake.stamp_ns(message)
         # where one publisher mixes two cameras, its images must tell when that ends
-        if stamp_ns is not None and len(self.images.publishers) < 2:
+        if stamp_ns is not None and not self.images.several:
             self.learner.offer(index, stamp_ns, message, source.size, source.frame_id)
 
     def _hold(self) -> None:
@@ -217,7 +217,7 @@ class Drive:
         """
         images, mixed = self.images, self.learner.activity.status.two_cameras
         before, self.held = self.held, ''
-        if len(images.publishers) > 1:
+        if images.several:
             self.held = (f'{len(images.publishers)} publishers on {images.topic} '
                          f'({", ".join(images.publishers)}): nothing is learned, published or '
                          f'saved until one is left; remap the others')

@@ -6,6 +6,7 @@ another camera than before: damaged ones must not be believed.
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar
@@ -42,6 +43,10 @@ CURES = {
     'set_back': 'the stamps jumped back (as those of a bag that loops): tracking starts again, '
                 'and the turns are kept',
 }
+# DDS lists a publisher for 20 s after it was killed: two of one node are two cameras only if their
+# messages alternate, so that the sequence number falls twice within so many messages
+ALTERNATING = 30
+UNKNOWN = 'unknown node'
 # packets that a subscription holds for a callback that is late; a lost one costs more images
 VIDEO_DEPTH = 50
 # s without an image before it is logged, and between two such lines
@@ -186,8 +191,8 @@ class ImageInput:
 
     Of a video, the topic and its type are those of the first publisher that there is.
 
-    topic: its full name; base: without the transport. publishers: the names of its nodes.
-    reliability: of the present subscription.
+    topic: its full name; base: without the transport. publishers: the names of its nodes, twice
+    after a restart until DDS has forgotten the first. reliability: of the present subscription.
     """
 
     def __init__(self, endpoints: Endpoints, config: NodeConfig,
@@ -201,6 +206,10 @@ class ImageInput:
         self.topic = f'{base}/compressed' if self._kind == COMPRESSED else base
         self._is_video = self._kind is None
         self.publishers: tuple[str, ...] = ()
+        # messages so far, the last one's sequence number, and when that fell
+        self._count = 0
+        self._number: int | None = 0
+        self._falls: deque[int] = deque([-ALTERNATING] * 2, maxlen=2)
         override = endpoints.given.get(f'qos_overrides.{self.topic}.subscription.reliability')
         # without an override, rclpy's parameter would hold the first value for each later one
         self._overridable = None if self._kind is None else QoSOverridingOptions(
@@ -229,6 +238,13 @@ class ImageInput:
         """Return whether the images are subscribed, or will be as soon as there are any."""
         return self._active
 
+    @property
+    def several(self) -> bool:
+        """Return whether the images are of several publishers."""
+        alternating = self._number is None or self._count - self._falls[0] < ALTERNATING
+        return len({*self.publishers} - {UNKNOWN}) > 1 or (
+            len(self.publishers) > 1 and alternating)
+
     def start(self) -> None:
         """Subscribe."""
         self._active = True
@@ -247,8 +263,17 @@ class ImageInput:
         qos.reliability = ReliabilityPolicy[self.reliability.upper()]
         if self._is_video:
             qos.depth = VIDEO_DEPTH
-        return self._node.create_subscription(message_class(kind), self.topic, self._callback, qos,
+        callback: Any = self._on_message  # rclpy's annotation knows callbacks of one argument only
+        return self._node.create_subscription(message_class(kind), self.topic, callback, qos,
                                               qos_overriding_options=self._overridable)
+
+    def _on_message(self, message: Any, about: Any) -> None:
+        number = about['publication_sequence_number']  # None where the middleware has none
+        self._count += 1
+        if number is not None and self._number is not None and number <= self._number:
+            self._falls.append(self._count)
+        self._number = number
+        self._callback(message)
 
     def _find_video(self) -> None:
         """Look for the packets of a video."""
@@ -371,7 +396,7 @@ def since_text(silent_s: float | None) -> str:
 def _node_name(info: TopicEndpointInfo) -> str:
     # for a moment, and of programs without ROS, the middleware does not know it
     if info.node_name.startswith('_NODE_NAME_UNKNOWN'):
-        return 'unknown node'
+        return UNKNOWN
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 

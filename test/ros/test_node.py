@@ -21,6 +21,7 @@ from ros_bench import (
     CAMERA_FILE,
     COMMAND,
     OURS,
+    REPOSITORY,
     SECOND,
     SOON,
     START,
@@ -37,6 +38,20 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from dashcalib_ros.camera import Fisheye, ros_camera
 from dashcalib_ros.formats import load_camera
+
+# publishes images until it is killed; the first one's number comes as an argument
+DRIVER = f"""
+import sys
+sys.path.insert(0, {str(REPOSITORY / 'test')!r})
+import rclpy
+from ros_bench import Bench, SECOND, START, image_message, noise
+rclpy.init()
+bench = Bench(None, listen=False, name='driver')
+bench.until(lambda: bench.images.get_subscription_count() > 0)
+for n in range(int(sys.argv[1]), 10**9):
+    bench.publish(image_message(noise(n % 20), START + n * SECOND // 10))
+    bench.spin(0.1)
+"""
 
 # -- the end ----------------------------------------------------------------------------------
 
@@ -310,6 +325,37 @@ def test_two_publishers_get_nothing_until_one_is_left(start_node, make_bench, tm
     assert node.text.count('[ERROR]') == 1
 
 
+def test_two_publishers_of_one_name_get_nothing_while_they_alternate(
+        start_node, make_bench, tmp_path):
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS)
+    node, first = start_node(), make_bench()
+    first.connect(node)
+    second = make_bench(listen=False)
+    first.until(lambda: first.values['publishers'] == '/bench, /bench', node=node)
+    for n in range(10):
+        first.publish(image_message(noise(n), START + 2 * n * SECOND))
+        second.publish(image_message(noise(n), START + (2 * n + 1) * SECOND))
+    first.until(lambda: '2 publishers' in first.values['warnings'], node=node)
+    assert 0 < len(first.infos) < 20
+
+
+def test_a_driver_that_was_killed_and_started_again_is_one_publisher(
+        start_node, make_bench, tmp_path):
+    """DDS lists the killed one for 20 s more."""
+    keep_file(tmp_path, CAMERA_FILE.format(width=320) + OURS)
+    node, camera = start_node(), make_bench(topic='elsewhere')
+    for first, listed in ((0, '/driver'), (100, '/driver, /driver')):
+        driver = subprocess.Popen([sys.executable, '-c', DRIVER, str(first)], env={
+            **os.environ, **ros_environment(tmp_path)})
+        try:
+            camera.until(lambda count=first // 10 + 10: len(camera.infos) >= count, node=node)
+            camera.until(lambda listed=listed: camera.values['publishers'] == listed, node=node)
+        finally:
+            driver.kill()
+            driver.wait(SOON)
+    assert not camera.values['warnings'] and '[ERROR]' not in node.text
+
+
 @pytest.mark.parametrize('change', [{'size': (640, 240)}, {'frame_id': 'rear'}],
                          ids=['size', 'frame'])
 def test_a_change_of_size_or_frame_resets_it_loudly(start_node, make_bench, tmp_path, change):
@@ -335,7 +381,7 @@ def test_auto_reliability_follows_the_publishers(start_node, make_bench):
     node = start_node()
     first.connect(node)
     node.wait_for('subscribing reliable')
-    second = make_bench(reliable=False, listen=False)
+    second = make_bench(reliable=False, listen=False, name='other')
     first.until(lambda: 'subscribing best_effort' in node.text, node=node)
     second.until(lambda: second.images.get_subscription_count() > 0, node=node)
     before = first.count('received')

@@ -1,0 +1,191 @@
+"""The node for an hour: restarts of the driver, lost images, a camera that is mounted anew.
+
+    python benchmark/node_soak.py --minutes 60
+
+A second process publishes 1280x720 bgr8 at 30 Hz: a rendered drive of five turns, over and over.
+The node starts without a calibration. The driver ends every ten minutes, by SIGINT and SIGKILL in
+turn, and comes back after ten seconds; from half of the time on the camera points elsewhere. Now
+and then up to 30 images in a row are not sent. Prints how many of the images sent after the first
+camera_info got theirs, what the node said, and its memory.
+"""
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rclpy
+import with_tests  # noqa: F401
+from measure import commit
+from node_latency import LENS, SIZE, Listener, cpu_s, resident_mb
+from ros_bench import REPOSITORY, Bench, NodeProcess, image_message, ros_environment
+
+from dashcalib_ros.demo import Drive, DriveSpec
+
+RATE = 30.0
+SPEC = DriveSpec(seed=0, rate=RATE)
+# degrees at most in each of yaw, pitch and roll: of the camera, and after it was mounted anew
+MOUNTS_DEG = {'as it was': 1.0, 'anew': 4.0}
+RESTART_S, ABSENT_S = 600.0, 10.0
+# how likely an image begins a gap, and how many images that takes
+GAP, GAP_IMAGES = 0.002, (3, 30)
+
+
+class Recorder(Listener):
+    """Also notes the stamps of camera_info, and each change of what diagnostics say.
+
+    stamps: ns. said: level and state, with the changes and contradictions that stand beside them.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.stamps: set[int] = set()
+        self.said: list[tuple[float, str]] = []
+
+    def on_info(self, message: Any) -> None:
+        """Note the stamp, too."""
+        super().on_info(message)
+        self.stamps.add(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+    def _on_diagnostics(self, message: Any) -> None:
+        super()._on_diagnostics(message)
+        values = self.values
+        text = (f'{ord(self.status.level)} {values["state"]}, change {values["change"]!r}, '
+                f'contradictions {values["contradictions"]}')
+        if not self.said or self.said[-1][1] != text:
+            self.said.append((time.time(), text))
+
+
+def render(folder: Path) -> None:
+    """Keep the pictures of the drive with each mounting."""
+    for name, degrees in MOUNTS_DEG.items():
+        frames = Drive(LENS, replace(SPEC, mount_deg=degrees)).frames(processes=2)
+        np.save(folder / f'{name}.npy', np.stack([frame.image for frame in frames]))
+
+
+def publish(folder: Path, mounting: str, seed: int) -> None:
+    """Be the driver until a signal: a line with the stamp of each image goes to sent.txt."""
+    pictures = np.load(folder / f'{mounting}.npy', mmap_mode='r')
+    rng, silent_until = np.random.default_rng(seed), 0
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    bench = Bench(context, reliable=False, listen=False)
+    bench.until(lambda: bench.images.get_subscription_count() > 0, 60.0)
+    # the other side matches a moment later
+    bench.spin(0.5)
+    started = time.monotonic()
+    with (folder / 'sent.txt').open('a', buffering=1) as sent:
+        for n in range(10**9):
+            time.sleep(max(0.0, started + n / RATE - time.monotonic()))
+            if n > 100 and rng.random() < GAP:
+                silent_until = n + int(rng.integers(*GAP_IMAGES))
+            if n < silent_until:
+                continue
+            picture = cv2.cvtColor(cv2.resize(pictures[n % len(pictures)], SIZE),
+                                   cv2.COLOR_GRAY2BGR)
+            stamp = time.time_ns()
+            bench.images.publish(image_message(picture, stamp))
+            sent.write(f'{stamp}\n')
+
+
+def driver(folder: Path, mounting: str, seed: int) -> subprocess.Popen[bytes]:
+    """Start the driver."""
+    return subprocess.Popen(
+        [sys.executable, __file__, '--publish', str(folder), mounting, str(seed)],
+        env={**os.environ, 'FASTRTPS_DEFAULT_PROFILES_FILE':
+             str(REPOSITORY / 'config' / 'fastdds_large_images.xml')})
+
+
+def measure(minutes: float, restart_s: float, folder: Path) -> str:
+    """Run everything and return a table."""
+    os.environ.update(ros_environment(folder))
+    os.environ.pop('ROS_PYTHON_CHECK_FIELDS')  # not in the field either
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    bench = Recorder(context, topic='nothing')
+    node = NodeProcess(folder)
+    camera, restarts, memory = driver(folder, 'as it was', 0), 0, []
+    try:
+        bench.until(lambda: bench.count('received') > 0, 60.0, node=node)
+        started, spent = time.monotonic(), cpu_s(node.process.pid)
+        while (passed := time.monotonic() - started) < 60 * minutes:
+            if passed > (restarts + 1) * restart_s:
+                camera.send_signal((signal.SIGINT, signal.SIGKILL)[restarts % 2])
+                camera.wait(30.0)
+                bench.spin(ABSENT_S)
+                restarts += 1
+                camera = driver(folder, 'as it was' if passed < 30 * minutes else 'anew', restarts)
+            bench.spin(1.0)
+            memory.append(resident_mb(node.process.pid))
+        share = (cpu_s(node.process.pid) - spent) / (time.monotonic() - started)
+        camera.send_signal(signal.SIGINT)
+        camera.wait(30.0)
+        bench.spin(3.0)
+        return report(bench, node.text, [int(line) for line in (
+            folder / 'sent.txt').read_text().split()], restarts, memory, share)
+    finally:
+        camera.kill()
+        print(f'exit code on SIGINT: {node.stop()}', file=sys.stderr)
+        node.kill()
+
+
+def report(bench: Recorder, log: str, sent: list[int], restarts: int, memory: list[float],
+           share: float) -> str:
+    """Return the table, and what the node said, numbers aside."""
+    due = [stamp for stamp in sent if stamp >= min(bench.stamps, default=0)]
+    values = bench.values
+    lines = ['| | |', '|---|---|',
+             f'| images sent, received by the node | {len(sent)}, {values["received"]} |',
+             f'| sent after the first camera_info; of them without one | {len(due)}; '
+             f'{sum(stamp not in bench.stamps for stamp in due)} |',
+             f'| dropped by the node, counted as lost | {values["dropped"]}, {values["lost"]} |',
+             f'| restarts of the driver | {restarts} |']
+    for (calibrating, _), ages in sorted(bench.latencies.items()):
+        median, p99 = np.percentile(ages, [50, 99])
+        lines.append(f'| image to camera_info, {"while it calibrates" if calibrating else "idle"}'
+                     f': median, p99 ({len(ages)} images) | {median:.1f}, {p99:.1f} ms |')
+    tens = ', '.join(f'{np.mean(memory[n:n + 300]):.0f}' for n in range(0, len(memory), 300))
+    lines += [f'| CPU of the node\'s process, of one core | {100 * share:.1f} % |',
+              f'| resident memory, mean of each 5 minutes | {tens} MB (most {max(memory):.0f}) |']
+    said = Counter(re.sub(r'\d+(\.\d+)?', '#', re.sub(r'^\[.*?\]: ', '', line))
+                   for line in log.splitlines())
+    first = bench.said[0][0] if bench.said else 0.0
+    return '\n'.join([
+        *lines, '', 'The log, numbers aside, and how often:', '',
+        *(f'- {count} × {text}' for text, count in said.most_common()), '',
+        'Diagnostics, as they change:', '',
+        *(f'- {when - first:.0f} s: {text}' for when, text in bench.said)])
+
+
+def main() -> None:
+    """Parse the arguments; --publish is for the second process."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n')[0])
+    parser.add_argument('--minutes', type=float, default=60.0)
+    parser.add_argument('--restart', type=float, default=RESTART_S, help='s between restarts')
+    parser.add_argument('--publish', nargs=3, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.publish:
+        folder, mounting, seed = args.publish
+        with contextlib.suppress(KeyboardInterrupt):
+            publish(Path(folder), mounting, int(seed))
+        return
+    with tempfile.TemporaryDirectory(prefix='dashcalib-soak-') as name:
+        render(Path(name))
+        text = measure(args.minutes, args.restart, Path(name))
+    print(f'Measured at {commit()}, on {os.cpu_count()} cores.\n\n{text}')
+
+
+if __name__ == '__main__':
+    main()
