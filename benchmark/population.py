@@ -298,6 +298,8 @@ def _median(values: Sequence[float], form: str = '.2f') -> str:
 def run(seed: int, out: Path, stage: str, again: bool, config: Config) -> None:
     """Make what is missing of a seed."""
     scenes, result = out / f'{seed}.scenes.pkl', out / f'{seed}.json'
+    if stage == 'all' and not again and done(load(result) or None):
+        return
     if not scenes.exists():
         outcome = isolated(_write_case, seed, config, scenes)
         complain(f'{seed}: {outcome.failure or outcome.value}, {outcome.seconds:.0f} s, '
@@ -305,7 +307,7 @@ def run(seed: int, out: Path, stage: str, again: bool, config: Config) -> None:
         if outcome.failure:
             save(result, {'seed': seed, 'verdict': 'failed', 'reasons': [outcome.failure]})
             return
-    if stage == 'all' and (again or not done(load(result) or None)):
+    if stage == 'all':
         outcome = isolated(measured, scenes)
         row = outcome.value or {'verdict': 'failed', 'reasons': [outcome.failure]}
         save(result, {'seed': seed, 'commit': commit(), 'seconds': outcome.seconds, **row})
