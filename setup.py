@@ -6,11 +6,13 @@ from setuptools import find_packages, setup
 
 PACKAGE = 'dashcalib_ros'
 ROOT = Path(__file__).parent
+# ROS's tools read package.xml: version, addresses and maintainer stand there and nowhere else
+ABOUT = ElementTree.parse(ROOT / 'package.xml')
+MAINTAINER = ABOUT.find('maintainer')
 
 setup(
     name=PACKAGE,
-    # ROS's tools read package.xml: the version stands there and nowhere else
-    version=ElementTree.parse(ROOT / 'package.xml').findtext('version'),
+    version=ABOUT.findtext('version'),
     description='Calibrates a dashcam from the turns the car takes anyway',
     long_description=(ROOT / 'README.md').read_text('utf-8'),
     long_description_content_type='text/markdown',
@@ -25,8 +27,9 @@ setup(
         'Topic :: Scientific/Engineering :: Image Processing',
         'Typing :: Typed',
     ],
-    maintainer='dashcalib_ros maintainers',
-    maintainer_email='maintainers@example.com',
+    maintainer=MAINTAINER.text,
+    maintainer_email=MAINTAINER.get('email'),
+    project_urls={url.get('type').capitalize(): url.text for url in ABOUT.findall('url')},
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={PACKAGE: ['py.typed', 'report/templates/*']},
