@@ -3,7 +3,7 @@
     python benchmark/node_soak.py --minutes 60
 
 A second process publishes 1280x720 bgr8 at 30 Hz: a rendered drive of five turns, over and over.
-The node starts without a calibration. The driver ends every ten minutes, by SIGINT and SIGKILL in
+The node starts without a calibration. The driver ends every ten minutes, by SIGTERM and SIGKILL in
 turn, and comes back after ten seconds; from half of the time on the camera points elsewhere. Now
 and then up to 30 images in a row are not sent. Prints how many of the images sent after the first
 camera_info got theirs, what the node said, and its memory.
@@ -122,7 +122,7 @@ def measure(minutes: float, restart_s: float, folder: Path) -> str:
         started, spent = time.monotonic(), cpu_s(node.process.pid)
         while (passed := time.monotonic() - started) < 60 * minutes:
             if passed > (restarts + 1) * restart_s:
-                camera.send_signal((signal.SIGINT, signal.SIGKILL)[restarts % 2])
+                camera.send_signal((signal.SIGTERM, signal.SIGKILL)[restarts % 2])
                 camera.wait(30.0)
                 bench.spin(ABSENT_S)
                 restarts += 1
@@ -130,7 +130,7 @@ def measure(minutes: float, restart_s: float, folder: Path) -> str:
             bench.spin(1.0)
             memory.append(resident_mb(node.process.pid))
         share = (cpu_s(node.process.pid) - spent) / (time.monotonic() - started)
-        camera.send_signal(signal.SIGINT)
+        camera.send_signal(signal.SIGTERM)
         camera.wait(30.0)
         bench.spin(3.0)
         return report(bench, node.text, [int(line) for line in (
@@ -178,6 +178,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.publish:
         folder, mounting, seed = args.publish
+        # not SIGINT, which a process in the background ignores
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt):
             publish(Path(folder), mounting, int(seed))
         return
