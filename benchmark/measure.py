@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input import Frame
 from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
+from dashcalib_ros.reconstruct import load as load_engine
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve import solve
 from dashcalib_ros.workers.child import ChildWorker
@@ -208,7 +210,8 @@ def calibrate(frames: Iterable[Frame], config: Config) -> tuple[CalibrationData,
 
 def reconstructed(detection: Detection, turns: Sequence[Turn], config: Config) -> list[Scene]:
     """Return the scenes of these turns, the best first; processes start cold."""
-    pool = ScenePool(config, lambda: ChildWorker(threads=config.threads))
+    pool = ScenePool(config, lambda: ChildWorker(threads=config.threads),
+                     partial(load_engine, config.reconstruct.used))
     try:
         for turn in turns:
             pool.submit(turn, detection.valid())

@@ -4,6 +4,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from types import TracebackType
 
 from dashcalib_ros import judge
@@ -117,7 +118,8 @@ class Calibrator:
             _load_judging()
         self.detection = Detection(config, mask, beside=not live)
         self.workers = ScenePool(config, InlineWorker if inline else child,
-                                 _load_all if live else _load_solving,
+                                 partial(_load_all if live else _load_solving,
+                                         config.reconstruct.used),
                                  queue=config.turns.wanted if live else None, on_lost=lost,
                                  on_trouble=on_trouble, keep_pictures=not live, on_wait=on_wait)
         self.scenes = SceneSelection(config, self.detection, self.workers, live, use_stored, warn)
@@ -330,11 +332,11 @@ class Calibrator:
         self.close()
 
 
-def _load_solving() -> None:
-    """Import what a worker needs until the solution, COLMAP too."""
+def _load_solving(engine: str) -> None:
+    """Import what a worker needs until the solution, the engine too."""
     import dashcalib_ros.solve.joint  # noqa: F401
     from dashcalib_ros.reconstruct import load
-    load()
+    load(engine)
 
 
 def _load_judging() -> None:
@@ -345,7 +347,7 @@ def _load_judging() -> None:
     import dashcalib_ros.judge.conclude  # noqa: F401
 
 
-def _load_all() -> None:
+def _load_all(engine: str) -> None:
     """Import what a worker of a live drive needs until the result."""
     _load_judging()
-    _load_solving()
+    _load_solving(engine)

@@ -112,7 +112,7 @@ def test_it_tells_of_its_turns(drive, result):
     assert set(result.timing) == {'detect', 'calibrate', 'total'}
     assert result.magnitudes.shape[1] == 2 and len(result.magnitudes) > 50
     assert result.versions['engine'] == Config().reconstruct.used
-    assert result.versions['numpy'] != 'unknown'
+    assert result.versions['numpy'] != 'not installed'
     # for the report: each turn's picture, of a keyframe
     for turn in result.turns:
         assert turn.unused_because is None

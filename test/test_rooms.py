@@ -228,9 +228,10 @@ result_json(found), report_html(found), report_html(make_calibration(mount=MOUNT
     assert loaded_by(code, 'scipy', 'jinja2') == {'jinja2'}
 
 
-def test_colmap_is_loaded_where_it_is_used():
-    code = 'from dashcalib_ros.reconstruct import load\nload()'
-    assert loaded_by(code, 'pycolmap') == {'pycolmap'}
+@pytest.mark.parametrize(('engine', 'loaded'), [('pycolmap', {'pycolmap'}), ('opencv', set())])
+def test_colmap_is_loaded_where_it_is_used(engine, loaded):
+    code = f'from dashcalib_ros.reconstruct import load\nload({engine!r})'
+    assert loaded_by(code, 'pycolmap') == loaded
 
 
 def test_a_live_calibrator_loads_nothing_large_while_images_come():

@@ -369,5 +369,5 @@ def versions(reconstruct: ReconstructConfig) -> dict[str, str]:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = 'unknown'
+            found[name] = 'not installed'
     return found

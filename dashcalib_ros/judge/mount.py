@@ -23,7 +23,7 @@ from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.judge.calibration import MOVED_DEG, MOVED_SIGMAS, Mount
 from dashcalib_ros.judge.monitor import HEADING_SIGMA_DEG, PITCH_SIGMA_DEG
-from dashcalib_ros.reconstruct.heading import heading
+from dashcalib_ros.reconstruct.heading import LEAST_YAW_DEG, heading
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.robust import (
     cauchy_fit,
@@ -372,8 +372,8 @@ def _roll(scenes: Sequence[Scene], lines: Lines | None, camera: Camera
     return roll, float(np.hypot(sigma, CROWN_DEG))
 
 
-# degrees of a turn's yaw whose path tells a plane; of its largest bend, below which it is straight
-LEAST_YAW_DEG, UNBENT = 30.0, 0.3
+# of a path's largest bend, below which it is straight
+UNBENT = 0.3
 
 
 def roll_of_path(scene: Scene) -> float | None:

@@ -344,14 +344,13 @@ LEAST_PATH_ROLL_DEG = 45.0
 def _turned_pictures(grounds: Grounds) -> Finding | None:
     """A car turns about the vertical, and the road is below it.
 
-    Only a turn of enough yaw shows that axis: in others bumps and the lean of a two-wheeler turn
-    the camera as much. The plane of the path of such turns must agree.
+    The plane of the path of turns of enough yaw must agree.
     """
     scenes = grounds.solution.scenes
     paths = [abs(roll) for scene in scenes if (roll := roll_of_path(scene)) is not None]
-    if not paths:
-        return None
     roll = roll_deg(scenes)
+    if roll is None or not paths:
+        return None
     quarters = round(roll / 90)
     # the plane of a path has no upper side: of pictures upside down it says 0
     agrees = abs(quarters) != 1 or np.median(paths) > LEAST_PATH_ROLL_DEG

@@ -38,12 +38,11 @@ def finish(turn: Turn, config: Config, begun: Draft) -> Scene | None:
     return None
 
 
-def load() -> None:
-    """Import all that reconstruct() needs, such as COLMAP where it is the default engine."""
+def load(engine: str) -> None:
+    """Import all that reconstruct() needs with an engine, COLMAP or OPENCV of config."""
     import dashcalib_ros.reconstruct.build  # noqa: F401
-    from dashcalib_ros.config import ReconstructConfig
     from dashcalib_ros.reconstruct.geometry import engine_named
-    engine_named(ReconstructConfig().used)
+    engine_named(engine)
 
 
 @contextlib.contextmanager

@@ -91,12 +91,21 @@ def off_axis_deg(scene: Scene) -> float:
     return float(np.median(np.degrees(np.arccos(np.clip(np.abs(ahead[:, 2]), 0, 1)))))
 
 
-def roll_deg(scenes: Sequence[Scene]) -> float:
+# degrees; only a turn of so much shows the axis about which a car turns: in others bumps and the
+# lean of a two-wheeler turn the camera as much
+LEAST_YAW_DEG = 30.0
+
+
+def roll_deg(scenes: Sequence[Scene]) -> float | None:
     """Return by how much the pictures of these turns are turned against the upright, degrees.
 
     Of the axis about which the car turns, the end where the road is points downwards: points on
-    the road all lie as deep, those above the camera at any height.
+    the road all lie as deep, those above the camera at any height. None without a turn of
+    LEAST_YAW_DEG.
     """
+    scenes = [scene for scene in scenes if abs(scene.yaw_deg) >= LEAST_YAW_DEG]
+    if not scenes:
+        return None
     down = main_axis(np.concatenate([scene.turned for scene in scenes]))
     if np.median([_open_below(scene, down) for scene in scenes]) > OPEN:
         down = -down

@@ -89,7 +89,8 @@ def _of_another_drive(found: Estimate) -> bool:
         return False
     old, new = ([scene for scene in found.scenes if scene.turn.of_this_drive == this]
                 for this in (False, True))
-    apart = abs(roll_deg(old) - roll_deg(new)) % 360
+    uprights = [roll for some in (old, new) if (roll := roll_deg(some)) is not None]
+    apart = abs(uprights[0] - uprights[-1]) % 360 if uprights else 0.0
     return (min(apart, 360 - apart) > OTHER_UPRIGHT_DEG
             or _posterior(found).of_another_drive > CONTRADICTION)
 

@@ -74,7 +74,7 @@ class ScenePool:
     """
 
     def __init__(self, config: Config, make_worker: Callable[[], Worker],
-                 load: Callable[[], object] = reconstruct.load, queue: int | None = None,
+                 load: Callable[[], object], queue: int | None = None,
                  on_lost: Callable[[str], None] = lambda text: None,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  keep_pictures: bool = False,
