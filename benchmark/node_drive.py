@@ -5,7 +5,8 @@
 
 Prints when camera_info began, counted from the end of the turn that completes the evidence; how
 many images after that were without one; how many pairs a rectifier gets that matches stamps
-exactly; and the result against the truth, or against the same drive through `dashcalib run`.
+exactly; what the node warned of; and the result against the truth, or against the same drive
+through `dashcalib run`.
 """
 from __future__ import annotations
 
@@ -133,6 +134,9 @@ def drive(frames: Iterable[Frame], turns: list[int], half_width: float
                 else round(bench.began - evidence, 1),
             'images after that without camera_info': len([s for s in after if s not in stamps]),
             'camera_info': len(stamps), 'rectified': bench.rectified,
+            'change': bench.values['change'],
+            'warned': [line for line in node.text.splitlines()
+                       if line.startswith(('[WARN', '[ERROR'))],
             'calibration': file.read_text() if file.exists() else None}
     finally:
         print(f'exit code on SIGINT: {node.stop()}', file=sys.stderr)
