@@ -104,7 +104,8 @@ def costs_left_out(now: Estimate, loss_px: float) -> dict[TurnId, float]:
 def chosen_kind(found: Sequence[Estimate]) -> tuple[Estimate, tuple[Candidate, ...]]:
     """Return the estimate whose kind of lens predicts the turns best, and how others compare.
 
-    A fisheye comes after the pinholes, and must be clearly better: a decentred pinhole is none.
+    A fisheye comes after the pinholes, and must be much better: a decentred pinhole is none. Where
+    the pinhole folds over in the picture, which no real lens does, clearly better is enough.
     """
     if len(found) == 1:
         return found[0], ()
@@ -123,7 +124,10 @@ def chosen_kind(found: Sequence[Estimate]) -> tuple[Estimate, tuple[Candidate, .
     best = 0
     for n in range(1, len(found)):
         gains = np.array([totals[best][turn] - totals[n][turn] for turn in worst])
-        if ((is_clear(gains) and found[n].camera.family == found[best].camera.family)
+        alike = found[n].camera.family == found[best].camera.family
+        # no real lens folds over: where the pinholes need that, a fisheye need not be as good
+        mends = found[n].camera.covers_picture() and not found[best].camera.covers_picture()
+        if (((alike or mends) and is_clear(gains))
                 or is_clear(gains, LEAST_KIND_GAIN * sum(totals[n].values()))):
             best = n
     sums = [sum(each.values()) for each in totals]

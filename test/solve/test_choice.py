@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial
 from dashcalib_ros.camera.mapping import as_model, mapping_error
+from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.reconstruct.scene import Profile, Scene, Start
+from dashcalib_ros.solve import evidence
 from dashcalib_ros.solve.evidence import Candidate, is_clear
 
 pytestmark = pytest.mark.usefixtures('no_profile')
@@ -133,6 +136,21 @@ def test_a_pinhole_that_all_turns_were_taken_for_a_fisheye_is_one():
               for world, turn in enumerate(turns)]
     found = solved(scenes)
     assert found.camera.family == 'pinhole' and mapping_error(found.camera, LENS) < 1.0
+
+
+@pytest.mark.parametrize(('k1', 'chosen'), [(LENS.k1, Radial), (-0.6, Fisheye)],
+                         ids=['a lens', 'it folds over'])
+def test_a_pinhole_that_folds_over_loses_to_a_fisheye_that_is_a_little_better(
+        monkeypatch, k1, chosen):
+    kinds = [SimpleNamespace(camera=camera, inflation=1.0, loss_px=lambda: 1.0,
+                             noise=lambda loss_px: SimpleNamespace(variance=1.0))
+             for camera in (replace(LENS, k1=k1), WIDE)]
+    costs = {Radial: 1000.0, Fisheye: 970.0}
+    monkeypatch.setattr(evidence, 'costs_left_out', lambda kind, loss_px: dict.fromkeys(
+        map(TurnId.at, range(3)), costs[type(kind.camera)]))
+    found, tried = evidence.chosen_kind(kinds)
+    assert type(found.camera) is chosen
+    assert [each.chosen for each in tried] == [kind is found for kind in kinds]
 
 
 @pytest.mark.parametrize(('ratio', 'sigmas', 'doubted'), [
