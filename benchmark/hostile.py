@@ -116,7 +116,9 @@ def running(home: Path, kind: type = Image, command: Sequence[str] = COMMAND, ke
     node = NodeProcess(home, command=command, image_transport='raw' if kind is Image
                        else 'compressed', **parameters)
     try:
-        camera.until(lambda: camera.latched, node=node)
+        # until it is configured it publishes nothing
+        if parameters.get('autostart', True):
+            camera.until(lambda: camera.latched, node=node)
         yield node, camera  # killed afterwards, with its children
         assert node.process.poll() is None, f'the node ended: {node.text[-500:]}'
     finally:
@@ -179,13 +181,14 @@ def service_calls(folder: Path, tries: Sequence[int]) -> Iterator[None]:
     with running(folder) as (node, camera):
         for n in tries:
             name = odd[n % len(odd)]
-            kind, service, fields = [
+            calls: list[tuple[type, str, dict[str, Any]]] = [
                 (Trigger, ('calibrate', 'reset', 'save')[n % 3], {}),
                 (GetParameters, 'get_parameters', {'names': [name]}),
                 (DescribeParameters, 'describe_parameters', {'names': [name]}),
                 (ListParameters, 'list_parameters', {'prefixes': [name], 'depth': n}),
                 (SetParameters, 'set_parameters', {'parameters': [Parameter(name=name)]}),
-            ][n % 5]
+            ]
+            kind, service, fields = calls[n % len(calls)]
             assert call(node, camera, kind, service, **fields) is not None
             yield
 
@@ -246,7 +249,9 @@ def odd_bytes(n: int) -> bytes:
             return data.tobytes()
         case 2:
             return whole[:12] + bytes(rng.integers(256, size=200, dtype=np.uint8))
-    return rng.choice([b'', b'\xff\xd8', b'GIF89a', b'P5 65535 65535 255\n', b'\0' * 10**6])
+    # not rng.choice(): numpy's bytes lose the zeros at their end
+    heads = b'', b'\xff\xd8', b'GIF89a', b'P5 65535 65535 255\n', b'\0' * 10**6
+    return heads[int(rng.integers(len(heads)))]
 
 
 def odd_images(kind: type, make: Callable[[int], Any]
@@ -425,7 +430,9 @@ def calibration_files(folder: Path, tries: Sequence[int]) -> Iterator[None]:
 
 def stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
     """A damaged turn costs one warning, and the others stay."""
-    from test_turn_store import CAMERA, SPOILED, TurnStore, hold, stored
+    from test_turn_store import CAMERA, SPOILED, hold, stored
+
+    from dashcalib_ros.store.turn_store import TurnStore
     for n in tries:
         said: list[str] = []
         store = TurnStore(str(folder / str(n)), 10, 3.0, said.append)

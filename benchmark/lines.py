@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,12 @@ def true_camera(drive: Drive) -> Camera:
     return camera_of(str(model), (drive.lens.width, drive.lens.height), params)
 
 
+def with_more_k1(camera: Camera, more: float) -> Camera:
+    """Return the camera with a k1 that is higher by so much."""
+    named = camera.named
+    return camera.with_params([*{**named, 'k1': named['k1'] + more}.values()])
+
+
 def each_second(drive: Drive, cache: Path) -> Iterator[Frame]:
     """Yield a frame each second, rendered once and kept as pictures."""
     folder = cache / f'{_key(drive)}.seconds'
@@ -81,8 +87,7 @@ def rendered_row(name: str, seed: int, cache: Path) -> dict[str, Any]:
     lines, _ = found_lines(each_second(drive, cache), config)
     lines = lines.within(scale.mask(~drive.overlay.mask))
     small = camera.resized(1 / scale.px, scale.size(camera.image_size))
-    k1 = small.named['k1']
-    return {name: _plain(bend(lines, replace(small, k1=k1 + off)))
+    return {name: _plain(bend(lines, with_more_k1(small, off)))
             for name, off in (('true', 0.0), ('more', SPOILED), ('less', -SPOILED))}
 
 
@@ -107,9 +112,8 @@ def kitti_rows(data: Path, config: Config) -> dict[str, Any]:
     lines = lines.within(found.mask)
     truth = json.loads((path / 'truth.json').read_text())
     theirs = camera_of(Radial.model, found.image_size, [truth[key] for key in Radial.names()])
-    k1 = found.camera.named['k1']
     cameras = {"KITTI's K": theirs, 'ours': found.camera,
-               **{f'ours, k1 {off:+.2f}': replace(found.camera, k1=k1 + off)
+               **{f'ours, k1 {off:+.2f}': with_more_k1(found.camera, off)
                   for off in (SPOILED, -SPOILED)}}
     rows = {name: _plain(bend(lines, camera)) for name, camera in cameras.items()}
     return {'cameras': rows, 'verdict': found.verdict.level, 'seconds': seconds,

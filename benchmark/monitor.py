@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from held_out import solved_drives
+from lines import with_more_k1
 from measure import complain, parser_with, table
 from scipy.spatial.transform import Rotation
 from solutions import Solved
@@ -49,8 +50,8 @@ def zoomed(camera: Camera, by: float, about: tuple[float, float] = (0.5, 0.5)) -
 
 def exchanged(camera: Camera) -> Camera:
     """Return another device: 12 % longer, less distorted, another centre."""
-    return replace(zoomed(camera, 1.12), k1=0.7 * camera.k1,
-                   cx=camera.cx + 0.01 * camera.image_size[0])
+    return with_more_k1(replace(zoomed(camera, 1.12), cx=camera.cx + 0.01 * camera.image_size[0]),
+                        -0.3 * camera.named['k1'])
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ EVENTS: Mapping[str, Event] = {
     'crop of 95 % at a corner': Event(lambda camera: zoomed(camera, 1 / 0.95, (0.0, 1.0)),
                                       PARTS[:2]),
     'exchanged': Event(exchanged, PARTS),
-    'k1 0.02 higher': Event(lambda camera: replace(camera, k1=camera.k1 + 0.02), PARTS[2:]),
+    'k1 0.02 higher': Event(lambda camera: with_more_k1(camera, 0.02), PARTS[2:]),
     'turned 1° to a side': Event(yaw_deg=1.0),
     'tilted by 1°': Event(pitch_deg=1.0),
     'turned 3° to a side': Event(yaw_deg=-3.0),
@@ -96,7 +97,7 @@ def seen_after(scene: Scene, camera: Camera, event: Event) -> Scene:
     turn = Rotation.from_euler('yx', [event.yaw_deg, event.pitch_deg], degrees=True).as_matrix()
     xy = new.project(camera.rays(scene.tracks.xy) @ turn.T)
     width, height = new.image_size
-    inside = (xy >= 0).all(axis=2) & (xy <= [width - 1, height - 1]).all(axis=2)
+    inside = np.all((xy >= 0) & (xy <= [width - 1, height - 1]), axis=2)
     structure = scene.structure
     return replace(
         scene, camera=new, tracks=replace(
@@ -178,9 +179,9 @@ def told(library: Library, row: Row, seed: int) -> Told:
     before = int(rng.integers(3, 7)) if changes else UNCHANGED
     for turn in range(before + (AFTER if changes else 0)):
         rows = library.readings[row.before if turn < before else row.after]
-        reading = rows[rng.integers(len(rows))]
+        reading = rows[int(rng.integers(len(rows)))]
         monitor = monitor.after(replace(reading, turn=TurnId.at(turn),
-                                        score=reading.score - reading.hessian @ off))
+                                        cost=reading.cost.moved(off)))
         if turn < before and monitor.changes:
             return Told(for_nothing=monitor.changes[0])
         found = [change for change in monitor.changes if change.kind == event.kind]

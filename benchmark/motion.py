@@ -20,11 +20,12 @@ import with_tests  # noqa: F401
 from drives import pictures_of
 from made_motion import town
 from scipy.spatial.transform import Rotation, RotationSpline
+from solving import with_camera
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
-from dashcalib_ros.demo.drive import MARGIN_S
+from dashcalib_ros.demo.vehicle import MARGIN_S
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.input.motion import Samples, SensorStream, local_metres
@@ -143,8 +144,8 @@ def harm(drive: Driven, stream: SensorStream) -> None:
     moved = abs(unknown.solution.camera.fx - solution.camera.fx) / solution.sigma[0]
     camera = solution.camera.with_focal(1.02 * solution.camera.fx)
     scenes = [scene_with(camera, scene, Config()) for scene in solution.scenes]
-    longer = dataclasses.replace(
-        solution, camera=camera, scenes=tuple(each for each in scenes if each is not None))
+    longer = dataclasses.replace(with_camera(solution, camera), scenes=tuple(
+        each for each in scenes if each is not None))
     said = [found.witnesses.gyro for found in (
         asked(drive, scaled(stream, 1.03)), asked(drive, scaled(stream, 1.0), longer))]
     told = ['' if each is None else

@@ -61,8 +61,7 @@ def window_tracks(frames: Sequence[Frame], config: Config) -> Tracks:
 
 def window_path(tracks: Tracks, camera: Camera, config: Config) -> TruePath | None:
     """Return where the camera was in each keyframe; None where it does not explain all of them."""
-    scene: Scene | None = chain_scene(tracks, TurnId.at(0), camera, NO_PROFILE, config.scene,
-                                      config.seed)
+    scene: Scene | None = chain_scene(tracks, TurnId.at(0), camera, NO_PROFILE, config)
     scene = None if scene is None else scene_with(camera, scene, config)
     if scene is None or not scene.structure.registered.all():
         return None

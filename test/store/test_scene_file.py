@@ -4,6 +4,7 @@ from __future__ import annotations
 import io
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,7 +73,7 @@ ABOUTS = [
     {'turns': [{}]}, {'stamp_s': 'x'}, {'stamp_s': 10**400}, {'stamp_s': float('nan')},
     {'stamp_s': True}, {'prominence': 0}, {'prominence': 1e300}, {'center': 'x'}, {'center': 0.5},
     {'center': 100}, {'frame_id': 7}]
-ARRAYS = [
+ARRAYS: list[dict[str, Any]] = [
     {'xy': EVIL}, {'xy': None}, {'rotations': np.zeros((3, 3))},
     {'rotations': 1e300 * array('rotations')}, {'rotations': 1.001 * array('rotations')},
     {'rotations': -array('rotations')}, {'rotations': np.zeros((8, 3, 3))},
