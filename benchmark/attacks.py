@@ -84,8 +84,8 @@ class Film:
     @property
     def seconds(self) -> Floats:
         """Return the frames' times since the first."""
-        stamps = np.array([frame.stamp_ns for frame in self.frames])
-        return (stamps - stamps[0]) / 1e9
+        stamps = np.array([frame.stamp_ns for frame in self.frames], np.int64)
+        return np.asarray((stamps - stamps[0]) / 1e9)
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,8 @@ def stabilised(limit: float, lag_s: float, pitched: bool = False, gaussian: bool
     """
     def lagging(angle: Floats, seconds: Floats) -> Floats:
         if gaussian:
-            return angle - gaussian_filter1d(angle, lag_s / np.median(np.diff(seconds)),
-                                             mode='nearest')
+            return np.asarray(angle - gaussian_filter1d(
+                angle, lag_s / np.median(np.diff(seconds)), mode='nearest'))
         smooth = np.empty_like(angle)
         smooth[0] = angle[0]
         for k in range(1, len(angle)):
@@ -169,6 +169,12 @@ def zoomed(scale_of: Callable[[Floats, int], Floats]
 def stepped(scale: float, since: float) -> Callable[[Film, np.random.Generator], Film]:
     """Zoom by a factor after this share of the drive."""
     return zoomed(lambda seconds, count: np.where(np.arange(count) < since * count, 1.0, scale))
+
+
+def breathing(percent: float) -> Callable[[Film, np.random.Generator], Film]:
+    """Zoom in and out again every two seconds."""
+    return zoomed(lambda seconds, count:
+                  1.0 + percent / 100 * (1 + np.sin(np.pi * seconds)) / 2)
 
 
 def behind_windscreen(most_px: float) -> Callable[[Film, np.random.Generator], Film]:
@@ -284,7 +290,7 @@ def reflection(image: Grey, rng: np.random.Generator) -> npt.NDArray[Any]:
     height, width = image.shape
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     pattern = 30 * (np.sin(x / 17.0) > 0.6) * (y > height / 2) * (np.sin(y / 23.0) > 0)
-    return 0.8 * image + pattern
+    return np.asarray(0.8 * image + pattern)
 
 
 def jpeg(quality: int) -> Callable[[Grey, np.random.Generator], npt.NDArray[Any]]:
@@ -332,7 +338,8 @@ def stretched(factor: float) -> Callable[[Film, np.random.Generator], Film]:
         exact = size[0] / width
         method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
         return with_pictures(
-            film, (cv2.resize(frame.image, size, interpolation=method) for frame in film.frames),
+            film, (np.asarray(cv2.resize(frame.image, size, interpolation=method), np.uint8)
+                   for frame in film.frames),
             fx=film.truth['fx'] * exact, cx=(film.truth['cx'] + 0.5) * exact - 0.5)
 
     return change
@@ -365,7 +372,7 @@ def blended(film: Film, rng: np.random.Generator) -> Film:
     mixed = []
     for n, (now, then) in enumerate(zip(images, [*images[1:], images[-1]], strict=True)):
         share = (n % 5) / 5
-        mixed.append(np.asarray(cv2.addWeighted(now, 1 - share, then, share, 0)))
+        mixed.append(np.asarray(cv2.addWeighted(now, 1 - share, then, share, 0), np.uint8))
     return with_pictures(film, mixed)
 
 
@@ -404,8 +411,9 @@ def compressed(bits_per_pixel: float) -> Callable[[Film, np.random.Generator], F
                 box.mux(stream.encode(picture))
             box.mux(stream.encode())
         data.seek(0)
-        with av.open(data) as box:
-            decoded = [picture.to_ndarray(format='gray') for picture in box.decode(video=0)]
+        with av.open(data, 'r') as video:
+            decoded = [np.asarray(picture.to_ndarray(format='gray'), np.uint8)
+                       for picture in video.decode(video=0)]
         return with_pictures(film, decoded)
 
     return change
@@ -424,13 +432,10 @@ ATTACKS = (
     *(Attack(f'zoom {zoom} % after {100 * since:.0f} %', stepped(1 + zoom / 100, since), ZOOMED)
       for zoom in (2, 10) for since in (0.3, 0.5, 0.7)),
     Attack('every other picture zoomed 2 %',
-           zoomed(lambda seconds, count: 1.0 + 0.02 * (np.arange(count) % 2)), ZOOMED),
+           zoomed(lambda seconds, count: np.where(np.arange(count) % 2, 1.02, 1.0)), ZOOMED),
     Attack('zoom 6 %, slowly',
            zoomed(lambda seconds, count: np.linspace(1.0, 1.06, count)), ZOOMED),
-    *(Attack(f'breathing {percent} %',
-             zoomed(lambda seconds, count, share=percent / 100:
-                    1.0 + share * (1 + np.sin(np.pi * seconds)) / 2), ZOOMED)
-      for percent in (1, 3)),
+    *(Attack(f'breathing {percent} %', breathing(percent), ZOOMED) for percent in (1, 3)),
     *(Attack(f'windscreen {most} px', behind_windscreen(most), BENT) for most in (1.5, 3.0, 5.0)),
     Attack('one turn five times', looped(5), REPEATED),
     Attack('one turn five times, there and back', looped(5, True), REPEATED),

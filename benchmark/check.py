@@ -88,6 +88,8 @@ def ask(solved: Solved) -> dict[str, Any]:
                              for each in (taken, truth))
             # the spoil alone, as exactly as this drive would see it
             alone = replace(spoiled, offsets=spoiled.offsets - true.offsets)
+            # whoever has a solution has its sigmas
+            assert alone.distance is not None
             row['spoil_distance'] = alone.distance
             row['can_tell'] = (name not in pairs_without_size() or
                                alone.distance >= alone.limit + POWER)

@@ -16,6 +16,7 @@ import numpy as np
 
 import dashcalib_ros.demo
 from dashcalib_ros.demo import Drive, DriveSpec, Lens, Stop, Turn
+from dashcalib_ros.demo.drive import AnyLens
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.input import Frame
 
@@ -136,7 +137,7 @@ class Pictures:
     """A rendered drive on disk: 000000.png ... in a folder, stamped as the drive stamps them."""
 
     folder: Path
-    drive: tuple[Lens, DriveSpec]
+    drive: tuple[AnyLens, DriveSpec]
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames in order."""

@@ -49,7 +49,7 @@ def write_clip(path: Path, frames: Sequence[Frame], lens: Lens) -> Path:
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
     making = path.with_suffix('.new.avi')
-    video = cv2.VideoWriter(str(making), cv2.VideoWriter_fourcc(*'MJPG'), RATE,
+    video = cv2.VideoWriter(str(making), cv2.VideoWriter.fourcc(*'MJPG'), RATE,
                             (lens.width, lens.height))
     video.set(cv2.VIDEOWRITER_PROP_QUALITY, 97)
     for frame in Viewed(View(path.stem, lens), frames, STREET_LENS):

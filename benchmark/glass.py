@@ -23,9 +23,10 @@ from result_tables import write_table
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from dashcalib_ros import Calibration, Config
+from dashcalib_ros import Config
 from dashcalib_ros.demo import Drive, Glass, Lens
 from dashcalib_ros.demo.glass import moves_of_a_lens
+from dashcalib_ros.judge.calibration import CalibrationData
 
 Floats = npt.NDArray[np.float64]
 DECENTRED = replace(Lens.of(1280, 720, 75.0, -0.30, 0.10, (14.0, -9.0), 1.003),
@@ -83,7 +84,7 @@ def off(project: Callable[[Floats], Floats], lens: Lens, pixels: Floats) -> floa
     return float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
 
 
-def correlation(found: Calibration, lens: Lens, pixels: Floats) -> float | None:
+def correlation(found: CalibrationData, lens: Lens, pixels: Floats) -> float | None:
     """Return that of the field that was found and the true one, of both what no lens does."""
     if found.field is None or not found.field.used or lens.glass is None:
         return None

@@ -9,7 +9,8 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dashcalib_ros.demo import Drive, DriveSpec, Lens
+from dashcalib_ros.demo import Drive, DriveSpec
+from dashcalib_ros.demo.drive import AnyLens
 from dashcalib_ros.demo.parallel import render_parallel
 from dashcalib_ros.demo.town import Town
 from dashcalib_ros.input import Frame
@@ -37,7 +38,7 @@ class OnRoad(Drive):
 
     spec: RoadSpec
 
-    def __init__(self, lens: Lens, spec: RoadSpec) -> None:
+    def __init__(self, lens: AnyLens, spec: RoadSpec) -> None:
         super().__init__(lens, spec)
         lean = math.atan(spec.crown_percent / 100.0)
         self.ride = replace(self.ride, roll=self.ride.roll + lean)

@@ -145,7 +145,8 @@ def text_of(rows: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
 
 def joints_of(pictures: Sequence[Path], fps: float) -> dict[tuple[bool, str], list[bool]]:
     """Return what is said at each joint, by whether the car stands there, and what is lost."""
-    images = [cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE) for picture in pictures]
+    images = [np.asarray(cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE), np.uint8)
+              for picture in pictures]
     rng = np.random.default_rng(0)
     estimator = MotionEstimator(Config().motion)
     said: dict[tuple[bool, str], list[bool]] = {}

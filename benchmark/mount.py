@@ -105,7 +105,7 @@ def by_poses(folder: Path) -> tuple[Floats, SensorStream]:
     focal, centre = (np.array([shipped[name] for name in names])
                      for names in (('fx', 'fy'), ('cx', 'cy')))
     return (focal * slopes + centre,
-            speed_of(frame_s * np.arange(len(poses.positions)), poses.positions))
+            speed_of(np.arange(len(poses.positions)) * np.float64(frame_s), poses.positions))
 
 
 def summary(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -173,11 +173,11 @@ def main() -> None:
                 name = f'{each}, seed {seed}'
                 if done(rows.get(name)) and not arguments.again:
                     continue
-                pictures = pictures_of(drive, arguments.cache or Path(passing))
+                rendered = pictures_of(drive, arguments.cache or Path(passing))
                 truth = {**true_angles(drive), 'height_m': drive.spec.height_m}
                 times = np.arange(0.0, drive.times[-1], 0.01)
                 speed = speed_of(times, drive.ride.camera_at(times + MARGIN_S)[1])
-                keep(name, isolated(found, pictures, Config(seed=seed), speed), True, truth)
+                keep(name, isolated(found, rendered, Config(seed=seed), speed), True, truth)
     text = summary(rows)
     print(text)
     if arguments.results:

@@ -15,7 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 import with_tests  # noqa: F401
-from solving import LENS, scenes_of, solved, with_camera
+from solving import scenes_of, solved, with_camera
+from synthetic import LENS
 from test_mount import SPACING_S, SPEED, mounted, pairs_of
 
 from dashcalib_ros.arrays import Floats

@@ -59,13 +59,17 @@ class Listener(Bench):
     def watch(self, on: bool) -> None:
         """Subscribe the overlay and the rectified picture, or end that."""
         if on and not self._watching:
-            self._watching = [self.node.create_subscription(
-                CompressedImage, f'calibrator/{name}/compressed',
-                lambda message, sizes=sizes: sizes.append(len(message.data)), 10)
-                for name, sizes in self.pictures.items()]
+            self._watching = [self._subscribed(*each) for each in self.pictures.items()]
         elif not on:
             while self._watching:
                 self.node.destroy_subscription(self._watching.pop())
+
+    def _subscribed(self, name: str, sizes: list[int]) -> Any:
+        def note(message: Any) -> None:
+            sizes.append(len(message.data))
+
+        return self.node.create_subscription(
+            CompressedImage, f'calibrator/{name}/compressed', note, 10)
 
 
 def publish(seconds: float, rate: float) -> None:

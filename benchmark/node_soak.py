@@ -62,7 +62,7 @@ class Recorder(Listener):
     def _on_diagnostics(self, message: Any) -> None:
         super()._on_diagnostics(message)
         values = self.values
-        text = (f'{ord(self.status.level)} {values["state"]}, change {values["change"]!r}, '
+        text = (f'{ord(message.status[0].level)} {values["state"]}, change {values["change"]!r}, '
                 f'contradictions {values["contradictions"]}')
         if not self.said or self.said[-1][1] != text:
             self.said.append((time.time(), text))

@@ -91,7 +91,8 @@ def _epipoles(images: list[GreyImage]) -> Floats:
     found = np.full((len(images), 2), np.nan)
     for n in range(len(images) - SPACING):
         first = cv2.goodFeaturesToTrack(images[n], 400, 0.01, 8)
-        second, good, _ = cv2.calcOpticalFlowPyrLK(images[n], images[n + SPACING], first, None)
+        second, good, _ = cv2.calcOpticalFlowPyrLK(images[n], images[n + SPACING], first,
+                                                   first.copy())
         kept = good[:, 0] > 0
         ends = epipoles_of(first[kept, 0], second[kept, 0], images[n].shape[::-1], 1.0)
         if ends is not None:
@@ -128,7 +129,9 @@ def pair(seen: Measured) -> None:
 
 def _shrink(path: Path) -> None:
     """Write a picture anew, as small as it can be: it is in every clone."""
-    cv2.imwrite(str(path), cv2.imread(str(path)), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 def report() -> None:

@@ -60,7 +60,8 @@ def table() -> str:
     whole, compiled = (sum(column) for column in zip(*found.values(), strict=True))
     rows = [f'| all | {whole / 1e6:.0f} | | {compiled / 1e6:.0f} MB of it is compiled Python, '
             'of which `pip install --no-compile` makes only what is used |']
-    large = sorted((name for name in found if found[name][0] >= 2e6), key=found.get, reverse=True)
+    large = sorted((name for name in found if found[name][0] >= 2e6),
+                   key=lambda name: found[name], reverse=True)
     for name in large:
         rows.append(f'| {name} | {found[name][0] / 1e6:.0f} | '
                     f'{", ".join(sorted(needed_by[name]))} | {reasons.get(name, "")} |')

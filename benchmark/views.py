@@ -20,6 +20,7 @@ from drives import BY_NAME, drive_of, pictures_of
 
 from dashcalib_ros import open_frames
 from dashcalib_ros.demo import Lens
+from dashcalib_ros.demo.drive import AnyLens
 from dashcalib_ros.input import Frame
 
 Grey = npt.NDArray[np.uint8]
@@ -98,7 +99,7 @@ class Viewed:
 
     view: View
     frames: Iterable[Frame]
-    own: Lens
+    own: AnyLens
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames in order."""
@@ -121,7 +122,7 @@ class Viewed:
         lens = self.view.lens or self._turned()
         return {**asdict(lens), **dict(zip(('p1', 'p2', 'k3'), self.view.extra, strict=True))}
 
-    def _turned(self) -> Lens:
+    def _turned(self) -> AnyLens:
         """Return the drive's lens, mirrored and shrunk as the pictures are."""
         lens, by = self.own, self.view.shrink
         if self.view.mirrored:
