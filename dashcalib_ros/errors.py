@@ -1,6 +1,7 @@
 """All errors that a user can cause. The core raises them; only the borders (cli, ros) catch them.
 
-Each has a code and one line of text with the problem and its cure. docs/messages.md lists them.
+Each has a code and one line of text with the problem and its cure, and so have warnings.
+docs/messages.md lists them.
 """
 from __future__ import annotations
 
@@ -24,6 +25,24 @@ def coded(error: Exception, limit: int = 1000) -> str:
     """Return an error's message on one line, with its code at the end if it has one."""
     code = error.code if isinstance(error, DashcalibError) else ''
     return one_line(error, limit) + (f' [{code}]' if code else '')
+
+
+class Notice(str):
+    """A warning, or another line for the user that is no error, with a code as errors have it.
+
+    It is a string: the code is for scripts, and stays when the text is reworded.
+    """
+
+    code: str
+
+    def __new__(cls, code: str, text: str) -> Notice:
+        """code: such as E-RATE-ASSUMED, or that of an error. text: one line."""
+        notice = super().__new__(cls, text)
+        notice.code = code
+        return notice
+
+    def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
+        return self.code, str(self)
 
 
 def shortened(text: str, limit: int = 160) -> str:

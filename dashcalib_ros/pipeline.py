@@ -13,7 +13,7 @@ from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.poses import Poses
@@ -80,7 +80,7 @@ class Calibrator:
 
     def __init__(self, config: Config | None = None, mask: Mask | None = None,
                  verbose: bool = False, live: bool = False, use_stored: bool = True,
-                 warn: Callable[[str], None] = lambda text: None, inline: bool = False,
+                 warn: Callable[[Notice], None] = lambda notice: None, inline: bool = False,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  on_wait: Callable[[], bool] | None = None) -> None:
         """mask: (h, w), False where the ego vehicle is.
@@ -109,9 +109,9 @@ class Calibrator:
         def child() -> Worker:
             return ChildWorker(live, verbose, config.threads, on_trouble)
 
-        def lost(text: str) -> None:
-            self.scenes.warnings.append(text)
-            on_trouble(text)
+        def lost(notice: Notice) -> None:
+            self.scenes.warnings.append(notice)
+            on_trouble(notice)
 
         if live:
             # nothing else runs during an import: while images come, some would be lost

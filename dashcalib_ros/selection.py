@@ -8,7 +8,7 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.errors import WorkerError
+from dashcalib_ros.errors import Notice, WorkerError
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.store.scene_file import Origin, StoredTurn
 from dashcalib_ros.store.turn_store import TurnStore
@@ -34,10 +34,10 @@ class SceneSelection:
 
     def __init__(self, config: Config, detection: Detection, workers: ScenePool,
                  live: bool = False, use_stored: bool = True,
-                 warn: Callable[[str], None] = lambda text: None) -> None:
+                 warn: Callable[[Notice], None] = lambda notice: None) -> None:
         """live, use_stored, warn: as the Calibrator's."""
         self.config = config
-        self.warnings: list[str] = []
+        self.warnings: list[Notice] = []
         self.stored_before: tuple[StoredTurn, ...] = ()
         self._detection = detection
         self._workers = workers
@@ -104,7 +104,7 @@ class SceneSelection:
 
     def exclude_repeated(self, repeated: Mapping[TurnId, TurnId]) -> None:
         """Let turns not count that show the same pictures as another one: once is enough."""
-        self.warnings += [_repeated_text(turn, other) for turn, other in sorted(repeated.items())]
+        self.warnings += [_repeated(turn, other) for turn, other in sorted(repeated.items())]
         self.exclude({turn: f'shows the same pictures as {other}, which counts'
                       for turn, other in repeated.items()})
 
@@ -261,11 +261,11 @@ class SceneSelection:
                for turn in self._detection.turns() if (scene := built.get(turn.id)) is not None}
         self._store.mirror({**self._store.turns, **own})
 
-    def _store_failed(self, text: str) -> None:
-        self.warnings.append(text)
-        self._warn(text)
+    def _store_failed(self, notice: Notice) -> None:
+        self.warnings.append(notice)
+        self._warn(notice)
 
 
-def _repeated_text(turn: TurnId, other: TurnId) -> str:
-    return (f'{turn} repeats {other}: it shows the same place in the same pictures, and counts '
-            f'once; is the recording played in a loop?')
+def _repeated(turn: TurnId, other: TurnId) -> Notice:
+    return Notice('E-TURN-REPEATED', f'{turn} repeats {other}: it shows the same place in the '
+                  f'same pictures, and counts once; is the recording played in a loop?')

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.errors import InputError, Notice, counted
 from dashcalib_ros.formats import Given, given_camera
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, read_mask
@@ -221,7 +221,7 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
         cures = (line.rpartition(': ')[2] for line in doubts)
         verdict = replace(verdict, reasons=(*doubts, *verdict.reasons),
                           cures=(*cures, *verdict.cures),
-                          codes=(*['E-INPUT-CONTRADICTED'] * len(doubts), *verdict.codes))
+                          codes=(*(each.code for each in doubts), *verdict.codes))
     if material is not None:
         shown = material.pictures
         images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})
@@ -232,8 +232,9 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
     if stored:
         values = ', '.join(f'{name} {value:.2f}' for name, value in zip(
             ('fx', 'fy', 'cx', 'cy'), stored.params, strict=False))
-        new += (f'for the pictures as they are stored ({size_text(stored.image_size)}): '
-                f'{values}, and the same distortion',)
+        new += (Notice(
+            'E-PIXELS-STORED', f'for the pictures as they are stored '
+            f'({size_text(stored.image_size)}): {values}, and the same distortion'),)
     return replace(calibration, verdict=verdict, material=material,
                    input_name=calibration.input_name or source.name,
                    warnings=(*new, *calibration.warnings))

@@ -14,13 +14,14 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1] / 'dashcalib_ros'
 PAGE = Path(__file__).with_name('messages.md')
 CODE = re.compile(r'E(-[A-Z0-9]+){1,5}')
-ROOT = 'DashcalibError'
+ROOTS = {'DashcalibError', 'Notice'}
 HEAD = """\
 # Messages
 
-Every error, and every finding of a verdict, has a code. The code stays the same when the text is
-improved: search for the code, and use it in scripts. An ellipsis stands for a file name, a number
-or another text that is known at run time only. Written by `python docs/messages.py`.
+Every error, every warning, and every reason of a verdict or of a mounting has a code. The code
+stays the same when the text is improved: search for the code, and use it in scripts. An ellipsis
+stands for a file name, a number or another text that is known at run time only. Written by
+`python docs/messages.py`.
 
 | code | message |
 |---|---|
@@ -33,8 +34,8 @@ def trees(folder: Path = PACKAGE) -> dict[Path, ast.Module]:
 
 
 def faults(modules: Mapping[Path, ast.Module]) -> list[str]:
-    """Return where an error is made without a literal code, or the code of another error."""
-    names = _error_names(modules.values())
+    """Return where an error or a warning is made without a literal code, or that of an error."""
+    names = _coded_names(modules.values())
     return [f'{path.name}:{node.lineno}' for path, tree in modules.items()
             for node in ast.walk(tree) if _lacks_code(node, names)]
 
@@ -62,21 +63,21 @@ def _is_code(node: ast.AST) -> bool:
             and CODE.fullmatch(node.value) is not None)
 
 
-def _error_names(modules: Iterable[ast.Module]) -> set[str]:
-    """Return the names of the root of all errors and of its children."""
+def _coded_names(modules: Iterable[ast.Module]) -> set[str]:
+    """Return the names of what has a code: the roots and their children."""
     classes = [node for tree in modules for node in ast.walk(tree)
                if isinstance(node, ast.ClassDef)]
-    names, size = {ROOT}, 0
+    names, size = set(ROOTS), 0
     while len(names) > size:
         size = len(names)
         names |= {each.name for each in classes if names & set(map(_name, each.bases))}
     return names
 
 
-def _lacks_code(node: ast.AST, errors: set[str]) -> bool:
+def _lacks_code(node: ast.AST, names: set[str]) -> bool:
     if isinstance(node, ast.Raise):
-        return _name(node.exc) in errors
-    if not isinstance(node, ast.Call) or _name(node.func) not in errors:
+        return _name(node.exc) in names
+    if not isinstance(node, ast.Call) or _name(node.func) not in names:
         return False
     code = node.args[0] if node.args else None
     return not (_is_code(code) or (isinstance(code, ast.Attribute) and code.attr == 'code'))
@@ -110,6 +111,8 @@ def _template(node: ast.expr, constants: Mapping[str, ast.expr]) -> str:
     if isinstance(node, ast.JoinedStr):
         return ''.join(_template(part, constants) for part in node.values)
     if isinstance(node, ast.FormattedValue):
+        if isinstance(node.value, ast.Call) and _name(node.value.func) == 'counted':
+            return f'… {_template(node.value.args[1], constants)}s'
         value = constants.get(_name(node.value))
         return '…' if value is None else _template(value, constants)
     return '…'

@@ -1,11 +1,15 @@
-"""Every error has a code, and docs/messages.md lists all of them."""
+"""Every error and every warning has a code, and docs/messages.md lists all of them."""
 from __future__ import annotations
 
+import copy
 import importlib.util
+import pickle
 import re
 from pathlib import Path
 
 import pytest
+
+from dashcalib_ros.errors import Notice
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').rglob('*.md')])
@@ -45,6 +49,8 @@ def test_the_documents_name_codes_that_exist(modules):
     ('raise InputError()', True),
     ("x = errors.InputError(code, 'the file is empty')", True),
     ("raise InputError('E-FILE-EMPTY', 'the file is empty') from error", False),
+    ("warnings.append(Notice('the file is empty'))", True),
+    ("warnings += [Notice('E-FILE-EMPTY', 'the file is empty')]", False),
     ("return InputError(error.code, f'{name}: {error}')", False),
     ("raise ValueError('the file is empty')", False),
     ('raise', False)])
@@ -60,9 +66,17 @@ def test_texts_are_shown_with_an_ellipsis_for_what_is_not_known(tmp_path):
         "CURE = 'copy it ' f'again'\n"
         "InputError('E-B', f'{path} has {n}{m} of {a | b} ' f'images: {CURE}')\n"
         "Finding(level='weak', code='E-A', text='one ' + turn + (' turn' if n else ' bend'))\n"
-        "InputError('E-C', text)\n")
+        "InputError('E-C', text)\n"
+        "Notice('E-D', f'{counted(n, \"image\")} skipped')\n")
     rows = docs.messages(docs.trees(tmp_path))
     assert rows == [('E-A', 'one … bend'), ('E-A', 'one … turn'),
-                    ('E-B', '… has … of … images: copy it again'), ('E-C', '…')]
+                    ('E-B', '… has … of … images: copy it again'), ('E-C', '…'),
+                    ('E-D', '… images skipped')]
     assert '| `E-C` | … |' in docs.page(rows)
     assert docs.page([('E-A', 'a | b')]).endswith('| `E-A` | a \\| b |\n')
+
+
+def test_a_notice_is_its_text_and_keeps_its_code_in_a_copy():
+    notice = Notice('E-RATE-ASSUMED', '10 Hz')
+    for each in (notice, copy.deepcopy(notice), pickle.loads(pickle.dumps(notice))):
+        assert (each, each.code, type(str(each))) == ('10 Hz', 'E-RATE-ASSUMED', str)

@@ -14,7 +14,7 @@ from dashcalib_ros.cli.arguments import ACCEPTED, NOT_ENOUGH
 from dashcalib_ros.cli.drive import read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, warn
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import counted
+from dashcalib_ros.errors import Notice, counted
 from dashcalib_ros.fleet.batch import Camera, cameras_of, problems, shard_of
 from dashcalib_ros.fleet.batch import batch as calibrate_fleet
 from dashcalib_ros.fleet.clips import ClipResult
@@ -52,8 +52,9 @@ def batch(args: argparse.Namespace) -> int:
                 files = calibrate_fleet(cameras, args.out, config, engine, args.shard is None,
                                         progress.tell)
         except KeyboardInterrupt:
-            warn([f'{progress.done} of {counted(progress.clips, "clip")} are done and kept in '
-                  f'{args.out}: the same command continues from there'])
+            warn([Notice('E-BATCH-INTERRUPTED', f'{progress.done} of '
+                         f'{counted(progress.clips, "clip")} are done and kept in {args.out}: the '
+                         f'same command continues from there')])
             raise
     name = '' if args.shard is None else f'-{shard[0]}-of-{shard[1]}'
     write(joined(args.out, f'effort{name}.json'), progress.effort_json(engine))
@@ -78,11 +79,10 @@ def _engine(args: argparse.Namespace, config: Config) -> Engine:
 def _summarise(cameras: Sequence[Camera], screen: Screen) -> int:
     """Show what came of the cameras; return the exit code."""
     found = list(problems(cameras))
-    lines = [_problem(row, why) for row, why in found[:SHOWN]]
+    warn(_problem(row, why) for row, why in found[:SHOWN])
     if len(found) > SHOWN:
-        lines.append(f'{len(found) - SHOWN} more clips could not be read; the table of clips '
-                     f'lists them')
-    warn(lines)
+        warn([Notice('E-CLIPS-UNREADABLE', f'{len(found) - SHOWN} more clips could not be read; '
+                     f'the table of clips lists them')])
     verdicts = [camera.verdict for camera in cameras if camera.name]
     counts = ', '.join(f'{verdicts.count(level)} {level}' for level in LEVELS)
     screen.show(line(f'{counted(len(verdicts), "camera")}: {counts}; '

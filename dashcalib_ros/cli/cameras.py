@@ -11,6 +11,7 @@ from rich.console import Group
 from dashcalib_ros.camera.mapping import rayless_share
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
 from dashcalib_ros.cli.terminal import show, warn
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import export as exported
 from dashcalib_ros.formats import load_calibration, load_camera
 from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
@@ -75,23 +76,28 @@ def export(args: argparse.Namespace) -> int:
         check_suffix(args.out, args.to)
     content = exported(replace(found, camera=camera, readout_ms=readout_ms), args.to)
     if readout_ms is None and 'readout_ms' in keeps:
-        warn([f'{found.name} has no readout time of a rolling shutter: set it in {args.to}, '
-              f'unless the shutter is global'])
+        warn([Notice('E-EXPORT-NO-READOUT', f'{found.name} has no readout time of a rolling '
+                     f'shutter: set it in {args.to}, unless the shutter is global')])
     if 'mount' in keeps and found.mount is not None and found.mount.verdict == 'weak':
-        warn([f'{found.name}: its mounting is {verdict_text(found.mount)}'])
+        warn([Notice('E-EXPORT-MOUNT-WEAK',
+                     f'{found.name}: its mounting is {verdict_text(found.mount)}')])
     if found.field is not None and not {'field', 'mount'} & set(keeps):
         lost = found.field.over(found.camera)
         others = ', '.join(kind for kind, form in EXPORTS.items() if 'field' in form.keeps)
-        warn([f'{found.name} has a field over the picture, for which {args.to} has no place: '
-              f'without it pixels are off by {np.sqrt(np.mean(lost**2)):.2f} px RMS and '
-              f'{lost.max():.2f} px at the worst (of {size_text(found.image_size)}); export to '
-              f'{others} to keep it'])
+        warn([Notice(
+            'E-EXPORT-FIELD-LOST',
+            f'{found.name} has a field over the picture, for which {args.to} has no place: '
+            f'without it pixels are off by {np.sqrt(np.mean(lost**2)):.2f} px RMS and '
+            f'{lost.max():.2f} px at the worst (of {size_text(found.image_size)}); export to '
+            f'{others} to keep it')])
     unseen = rayless_share(camera)
     if unseen:
-        warn([f'{found.name} has no ray for {100 * unseen:.0f} % of the picture: there its model '
-              f'folds over; calibrate again, unless nothing is visible there'])
+        warn([Notice(
+            'E-EXPORT-FOLDS', f'{found.name} has no ray for {100 * unseen:.0f} % of the picture: '
+            f'there its model folds over; calibrate again, unless nothing is visible there')])
     if found.verdict == 'weak':
-        warn([f'{found.name} is weak: look at its standard deviations (sigma) before you use it'])
+        warn([Notice('E-EXPORT-WEAK', f'{found.name} is weak: look at its standard deviations '
+                     f'(sigma) before you use it')])
     if args.out is not None:
         write_text(args.out, content)
     elif isinstance(content, bytes):

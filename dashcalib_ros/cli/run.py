@@ -14,9 +14,9 @@ from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
 from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
 from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.errors import InputError, OutputError, counted
+from dashcalib_ros.errors import InputError, Notice, OutputError, counted
 from dashcalib_ros.formats import result_json
-from dashcalib_ros.formats.ours import plain_values
+from dashcalib_ros.formats.ours import codes_of, plain_values
 from dashcalib_ros.input import FrameSource
 from dashcalib_ros.report import Calibration, Written, output_folder, write_results
 from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE
@@ -76,7 +76,8 @@ def _write_bag(args: argparse.Namespace, topic: str, calibration: Calibration, s
                ) -> None:
     from dashcalib_ros.input.bag_write import camera_info_topic, write_bag
     if calibration.verdict.level != 'accepted':
-        warn([f'no bag was written: the calibration is {calibration.verdict.level}, not accepted'])
+        warn([Notice('E-BAG-NOT-WRITTEN', f'no bag was written: the calibration is '
+                     f'{calibration.verdict.level}, not accepted')])
         return
     assert calibration.camera is not None
     count = write_bag(args.input[0], topic, calibration.camera, args.write_bag,
@@ -95,7 +96,8 @@ def warn_of(calibration: Calibration, written: Written) -> None:
     warn(calibration.warnings)
     if written.set_aside is not None:
         old = written.set_aside.with_name(ACCEPTED_FILE)
-        warn([f'the earlier calibration {old} was renamed to {written.set_aside}'])
+        warn([Notice('E-CALIBRATION-RENAMED',
+                     f'the earlier calibration {old} was renamed to {written.set_aside}')])
 
 
 def now() -> str:
@@ -117,14 +119,16 @@ def turns(args: argparse.Namespace) -> int:
         frames = feed(detection, drive, stages)
     detection.finish()
     found = detection.turns()
-    warn((*source.warnings, *detection.warnings()))
+    warnings = (*source.warnings, *detection.warnings())
+    warn(warnings)
     if args.json:
         write_stdout(json.dumps(plain_values({
             'input': source.name, 'frames': frames,
             'turns': [{'center': turn.center, 'first': turn.first, 'last': turn.last,
                        'stamp': turn.stamp_s, 'prominence': turn.prominence,
                        'images': turn.images} for turn in found],
-            'warnings': (*source.warnings, *detection.warnings())}), indent=2, allow_nan=False))
+            'warnings': warnings, 'warning_codes': codes_of(warnings)}), indent=2,
+            allow_nan=False))
         return ACCEPTED
     if found:
         show(TextTable(COLUMNS, [

@@ -26,7 +26,7 @@ from rich.progress import (
 from rich.progress_bar import ProgressBar
 
 from dashcalib_ros.cli.program import handling
-from dashcalib_ros.errors import OutputError, visible
+from dashcalib_ros.errors import Notice, OutputError, visible
 from dashcalib_ros.session import Observer
 from dashcalib_ros.standard_streams import write_stderr, write_stdout
 
@@ -66,13 +66,14 @@ class Screen:
             show(Group(*renderables), self._to_stderr)
         except OutputError as error:
             self._quiet = True  # one warning is enough
-            warn([str(error)])
+            warn([Notice(error.code, str(error))])
 
 
 def warn(lines: Iterable[str]) -> None:
-    """Print warnings on stderr, one line each."""
+    """Print warnings on stderr, one line each, that of a Notice with its code at the end."""
     for line in lines:
-        write_stderr(f'dashcalib: warning: {" ".join(line.split())}')
+        code = f' [{line.code}]' if isinstance(line, Notice) and line.code else ''
+        write_stderr(f'dashcalib: warning: {" ".join(line.split())}{code}')
 
 
 class MovingBar(BarColumn):

@@ -15,7 +15,7 @@ from dashcalib_ros.detect.estimator import MotionEstimator, TrackedPoints
 from dashcalib_ros.detect.one_camera import APART, OtherCamera
 from dashcalib_ros.detect.straights import PAIRS, Straights
 from dashcalib_ros.detect.turn import Turn
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import check_mask
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
@@ -138,10 +138,11 @@ class Detection:
         """Return pairs of images of straight driving, the newest, in px of the resized images."""
         return self._motion.straights(newest)
 
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[Notice, ...]:
         """Return warnings for the user, one line each."""
         found = self.other_camera
-        return (*((f'{found}: {APART}',) if found else ()), *self._motion.warnings())
+        return (*((Notice('E-TWO-CAMERAS', f'{found}: {APART}'),) if found else ()),
+                *self._motion.warnings())
 
     @property
     def other_camera(self) -> OtherCamera | None:

@@ -18,6 +18,7 @@ from dashcalib_ros.detect.one_camera import OneCamera
 from dashcalib_ros.detect.points import Tracking, find_clear_corners, follow_points
 from dashcalib_ros.detect.segmentation import SegmentationMask, open_segmentation
 from dashcalib_ros.detect.straights import PAIRS, STRAIGHT, StraightCollector, Straights
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import check_mask
 from dashcalib_ros.input.scale import shrink_image
@@ -200,7 +201,7 @@ class MotionEstimator:
         return replace(found, before=resized_pixels(found.before, factor),
                        after=resized_pixels(found.after, factor))
 
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[Notice, ...]:
         """Return warnings about the masks for the user, one line each."""
         warning = self._segmented and self._segmented.warning()
         return (warning,) if warning else ()

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from dashcalib_ros.arrays import Floats32, GreyImage, Mask
 from dashcalib_ros.config import MaskConfig
 from dashcalib_ros.detect.mask import LARGEST
-from dashcalib_ros.errors import ConfigError, InputError, one_line
+from dashcalib_ros.errors import ConfigError, InputError, Notice, one_line
 from dashcalib_ros.limits import MODEL_BYTES, check_file
 
 # images that vote; the mask is available after the first one
@@ -127,19 +127,19 @@ class SegmentationMask:
         widened = cv2.dilate((share >= 0.5).astype(np.uint8), np.ones((side, side), np.uint8))
         return np.asarray(widened > 0)
 
-    def warning(self) -> str | None:
+    def warning(self) -> Notice | None:
         """Return a warning for the user, one line; None where the result looks right."""
         found = self._found()
         cure = 'check mask.segmentation_classes'
         if found is None:
             return None
         if not found.any():
-            return (f'the segmentation model finds no part of the ego vehicle; if the images show '
-                    f'one, {cure}')
+            return Notice('E-SEGMENTATION-EMPTY', f'the segmentation model finds no part of the '
+                          f'ego vehicle; if the images show one, {cure}')
         if found.mean() > LARGEST:
-            return (f'the mask of the segmentation model is not used: it covers '
-                    f'{100 * found.mean():.0f} % of the image, and the limit is '
-                    f'{100 * LARGEST:.0f} %; {cure}')
+            return Notice('E-SEGMENTATION-TOO-LARGE', f'the mask of the segmentation model is not '
+                          f'used: it covers {100 * found.mean():.0f} % of the image, and the '
+                          f'limit is {100 * LARGEST:.0f} %; {cure}')
         return None
 
     def _found(self) -> Mask | None:

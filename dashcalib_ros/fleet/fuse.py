@@ -14,7 +14,7 @@ import numpy as np
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import counted
+from dashcalib_ros.errors import Notice, counted
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Verdict
@@ -159,7 +159,7 @@ def _evidence(clips: Clips, origin: Origin, stored: Sequence[StoredTurn],
     return Evidence(
         image_size=origin.image_size, scale=origin.scale,
         frames=sum(clip.frames for clip in clips.values()), stored=tuple(stored),
-        warnings=tuple(f'the clip {name} was left out: it {why}'
+        warnings=tuple(Notice('E-CLIP-LEFT-OUT', f'the clip {name} was left out: it {why}')
                        for name, why in sorted(left_out.items())),
         turns=(), built={}, magnitudes=np.zeros((0, 2)), mask=None, timing={},
         straights=StraightCollector().straights())  # none: the turns' paths stand in

@@ -11,7 +11,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera, camera_of
 from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.errors import InputError, Notice, one_line
 from dashcalib_ros.fleet import lens_prior
 from dashcalib_ros.fleet.lens_prior import LensPrior, ModelPrior, Unit, conditioned
 from dashcalib_ros.formats import result_dict
@@ -160,8 +160,8 @@ def final_of(solved: Solved, found: ModelPrior | None) -> Final:
     if found.prior is not None:
         return _with_prior(solved, found.prior)
     if found.other_mode:
-        own = replace(own, warnings=(
-            *own.warnings, f'camera model {solved.make}: {found.why_not}'))
+        own = replace(own, warnings=(*own.warnings, Notice(
+            'E-PRIOR-OTHER-MODE', f'camera model {solved.make}: {found.why_not}')))
     return Final(own, prior_note=found.why_not, other_mode=found.other_mode)
 
 

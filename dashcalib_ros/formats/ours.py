@@ -9,7 +9,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from dashcalib_ros.camera.field import BASIS, Field
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
-from dashcalib_ros.errors import DashcalibError, InputError, one_line
+from dashcalib_ros.errors import DashcalibError, InputError, Notice, one_line
 from dashcalib_ros.formats import opencv, ros
 from dashcalib_ros.formats.values import (
     Cameras,
@@ -81,12 +81,13 @@ def result_dict(calibration: CalibrationData) -> dict[str, Any]:
             'rms_px': c.field.rms_px, 'worst_px': c.field.worst_px, 'used': c.field.used,
             'sigma_px': c.field.sigma_px, 'basis': BASIS,
             'coefficients': c.field.field.coefficients},
-        'mount': c.mount,
+        'mount': _mount_dict(c.mount),
         'held_out': [_held_out_dict(turn) for turn in c.held_out],
         'straight_lines': c.straight_lines,
         'witnesses': c.witnesses,
         'input': c.input_name,
         'warnings': c.warnings,
+        'warning_codes': codes_of(c.warnings),
         'masked_fraction': None if c.mask is None else 1.0 - float(np.mean(c.mask)),
         'details': c.details | {name: getattr(c, name) for name in COVARIANCES
                                 if getattr(c, name) is not None},
@@ -159,7 +160,7 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         frames=data.get('frames', 0), reprojection_error_px=data.get('reprojection_error_px'),
         timing=dict(data.get('timing', {})), versions=dict(data.get('versions', {})),
         config=config.replace({'seed': data.get('seed', config.seed)}),
-        input_name=data.get('input', ''), warnings=tuple(data.get('warnings', ())),
+        input_name=data.get('input', ''), warnings=_notices(data, 'warnings', 'warning_codes'),
         details=details, covariance=covariance, picture_covariance=of_picture, stored_turns=tuple(
             made(StoredTurnSummary, turn, id=TurnId.stored(place))
             for place, turn in enumerate(data.get('stored_turns', ()))),
@@ -182,8 +183,10 @@ def _frozen(value: Any) -> Any:
 
 def plain_values(value: Any) -> Any:
     """Return the value as types of strict JSON; NaN and infinity become None."""
-    if value is None or isinstance(value, (bool, str)):
+    if value is None or isinstance(value, bool):
         return value
+    if isinstance(value, str):
+        return str(value)  # YAML has no place for a Notice
     if isinstance(value, (np.ndarray, np.generic)):
         return plain_values(value.tolist())
     if isinstance(value, int):
@@ -204,6 +207,22 @@ def _held_out_dict(turn: LeftOut) -> dict[str, Any]:
     center = turn.turn.number if turn.turn.of_this_drive else None
     return {'center': center, 'px': turn.px, 'sigmas': turn.sigmas, 'sigma_px': turn.sigma_px,
             'others_sigma_px': turn.others_sigma_px}
+
+
+def codes_of(lines: Iterable[str]) -> list[str]:
+    """Return the codes of warnings or reasons; '' for a line that is no Notice."""
+    return [line.code if isinstance(line, Notice) else '' for line in lines]
+
+
+def _notices(data: Any, texts: str, codes: str) -> tuple[Notice, ...]:
+    """Return what a file's lists of texts and of codes hold; older files have no codes."""
+    lines = [str(line) for line in data.get(texts, ())]
+    return tuple(map(Notice, [*map(str, data.get(codes, ())), *[''] * len(lines)], lines))
+
+
+def _mount_dict(mount: Mount | None) -> dict[str, Any] | None:
+    return None if mount is None else {
+        **plain_values(mount), 'reason_codes': codes_of(mount.reasons)}
 
 
 def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
@@ -240,7 +259,7 @@ def _provenance(calibration: CalibrationData, created: str | None) -> dict[str, 
         'input': calibration.input_name,
         'seed': calibration.config.seed,
         'versions': calibration.versions,
-        **({} if calibration.mount is None else {'mount': calibration.mount}),
+        **({} if calibration.mount is None else {'mount': _mount_dict(calibration.mount)}),
     })
     return block if created is None else {**block, 'created': created}
 
@@ -366,7 +385,8 @@ def _mount(data: Any) -> Mount | None:
         roll, height = (None if data[name] is None else read_number(data, name, '')
                         for name in ('roll_right_deg', 'height_m'))
         return Mount('accepted' if data['verdict'] == 'accepted' else 'weak',
-                     tuple(map(str, data['reasons'])), read_number(data, 'yaw_left_deg', ''),
+                     _notices(data, 'reasons', 'reason_codes'),
+                     read_number(data, 'yaw_left_deg', ''),
                      read_number(data, 'pitch_up_deg', ''), roll, height, sigma,
                      (travel[0], travel[1]), read_number(data, 'travel_sigma_px', ''),
                      read_number(data, 'straight_m', ''),

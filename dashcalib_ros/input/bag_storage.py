@@ -17,7 +17,7 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.errors import InputError, Notice, counted
 from dashcalib_ros.input.bag_read import Damage, Record, message_counts, records
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.encodings import ENCODINGS, PICTURES
@@ -73,7 +73,7 @@ class Bag:
     files: tuple[Path, ...]
     topics: tuple[Topic, ...]
     indexed: bool
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
 
     def records(self, topics: Collection[str], damage: Damage) -> Iterator[Record]:
         """Yield the messages of these topics, file by file; raises InputError, OSError."""
@@ -92,13 +92,13 @@ def open_bag(path: Path) -> Bag:
     present = tuple(path / name for name in names if name not in skipped)
     warnings = []
     if skipped:
-        warnings = [f'{counted(len(skipped), "file")} in {path} skipped, not regular files: '
-                    f'{first_of(skipped)}']
+        warnings = [Notice('E-BAG-FILES-SKIPPED', f'{counted(len(skipped), "file")} in {path} '
+                           f'skipped, not regular files: {first_of(skipped)}')]
     listed, promised = _metadata(path / METADATA)
     files = tuple(file for file in listed if file in present)
     if files:
-        warnings += [f'{file.name} is listed in metadata.yaml but does not exist: its '
-                     f'images are lost'
+        warnings += [Notice('E-BAG-FILE-MISSING', f'{file.name} is listed in metadata.yaml but '
+                            f'does not exist: its images are lost')
                      for file in listed if file not in present and file.name not in skipped]
     elif present:
         files = present
@@ -106,8 +106,9 @@ def open_bag(path: Path) -> Bag:
             raise InputError('E-INPUT-SEVERAL-CAMERAS', f'{path} has recordings of {cameras} '
                              f'cameras ({first_of([file.name for file in files])}): pass the '
                              f'files of one camera')
-        warnings += [f'{path} has no usable metadata.yaml: its files are read in the order '
-                     f'{first_of([file.name for file in files])}']
+        warnings += [Notice(
+            'E-BAG-NO-METADATA', f'{path} has no usable metadata.yaml: its files are read in the '
+            f'order {first_of([file.name for file in files])}')]
     if not files:
         why = f' ({"; ".join(warnings)})' if warnings else ''
         raise InputError('E-BAG-NO-FILES',
@@ -183,7 +184,8 @@ class BagSource(FrameSource):
         chosen = _choose(path, self._bag, topic)
         warnings = list(self._bag.warnings)
         if fps is not None:
-            warnings.append(f'{path} is a bag, and its images have time stamps: fps is ignored')
+            warnings.append(Notice('E-FPS-IGNORED', f'{path} is a bag, and its images have time '
+                                   f'stamps: fps is ignored'))
         super().__init__(str(path), chosen.count, chosen.name, tuple(warnings))
 
     @property
@@ -229,20 +231,19 @@ class BagSource(FrameSource):
             yield from [shot] if shown is None else starmap(_of_video, shown)
         yield from starmap(_of_video, packets.rest())
         if packets.waited:
-            reading.warnings.append(f'the first {packets.waited} images of the video are skipped: '
-                                    f'they depend on images from before the recording')
+            reading.warnings.append(Notice(
+                'E-VIDEO-BEGINS-LATE', f'the first {packets.waited} images of the video are '
+                f'skipped: they depend on images from before the recording'))
 
-    def _losses(self, read: int, damage: list[str]) -> list[str]:
+    def _losses(self, read: int, damage: list[str]) -> list[Notice]:
         lost = (self._promised or 0) - read if self._bag.indexed else 0
         if not damage and lost <= 0:
             return []
         why = f' ({"; ".join(damage[:2])}{" ..." if len(damage) > 2 else ""})' if damage else ''
-        start = f'the bag is damaged{why}: {read}'
-        if lost > 0:
-            return [f'{start} of {self._promised} images were read, {lost} are lost']
-        if self._bag.indexed:
-            return [f'{start} of {self._promised} images were read, none is lost']
-        return [f'{start} images were read, the number of lost images is unknown']
+        return [Notice('E-BAG-IMAGES-LOST', f'the bag is damaged{why}: {read}' + (
+            ' images were read, the number of lost images is unknown' if not self._bag.indexed else
+            f' of {self._promised} images were read, {lost} are lost' if lost > 0 else
+            f' of {self._promised} images were read, none is lost'))]
 
 
 def _of_video(shot: _Shot, frame: Any) -> _Shot:

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.errors import InputError, Notice, counted
 from dashcalib_ros.input.source import (
     IMAGE_SUFFIXES,
     METADATA,
@@ -188,7 +188,8 @@ def _in_folder(folder: Path) -> _Group:
 def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> FrameSource:
     """Open all recordings of all groups as one drive; those that cannot be read are left out."""
     parts: list[FrameSource] = []
-    warnings = [f'{group.where}: {counted(group.others, "other file")} skipped'
+    warnings = [Notice('E-FILES-OTHER',
+                       f'{group.where}: {counted(group.others, "other file")} skipped')
                 for group in groups if group.others]
     failures: list[InputError] = []
     for group in groups:
@@ -204,19 +205,22 @@ def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> F
                 raise InputError('E-INPUT-SEVERAL-CAMERAS', f'{group.where} has recordings of '
                                  f'{cameras} cameras ({_listed(opened)}): use a pattern that '
                                  f'matches the files of one camera')
-            warnings.append(f'{group.where}: {len(opened)} files, ordered by {by}: '
-                            f'{_listed(opened)}')
+            warnings.append(Notice(
+                'E-FILES-ORDERED',
+                f'{group.where}: {len(opened)} files, ordered by {by}: {_listed(opened)}'))
         parts += opened
     if len(parts) == len(groups):
         ordered, by = _ordered(parts)
         if by in MAKERS and ordered != parts:
-            warnings.append(f'the files are used in the order of the arguments; ordered by {by} '
-                            f'they are {_listed(ordered)}: pass their folder for that order')
+            warnings.append(Notice(
+                'E-FILES-AS-GIVEN',
+                f'the files are used in the order of the arguments; ordered by {by} they are '
+                f'{_listed(ordered)}: pass their folder for that order'))
     if not parts:
         more = f' (and {len(failures) - 1} more like it)' if len(failures) > 1 else ''
         raise InputError(failures[0].code, f'none of the files can be read: {failures[0]}{more}')
-    return JoinedSource(parts, (*warnings, *(f'one of the files is skipped: {each}'
-                                             for each in failures)))
+    return JoinedSource(parts, (*warnings, *(
+        Notice('E-FILE-SKIPPED', f'one of the files is skipped: {each}') for each in failures)))
 
 
 def _ordered(sources: list[FrameSource]) -> tuple[list[FrameSource], str]:
@@ -334,13 +338,16 @@ class FolderSource(FrameSource):
         self._fps = fps or DEFAULT_FPS
         warnings = []
         if fps is None:
-            warnings.append(f'{path} has no image rate, and {DEFAULT_FPS:g} images per second are '
-                            f'assumed: specify another rate with --fps')
+            warnings.append(Notice(
+                'E-RATE-ASSUMED', f'{path} has no image rate, and {DEFAULT_FPS:g} images per '
+                f'second are assumed: specify another rate with --fps'))
         if topic is not None:
-            warnings.append(f'{path} is a folder of images: the topic {topic} is ignored')
+            warnings.append(Notice('E-TOPIC-IGNORED', f'{path} is a folder of images: the topic '
+                                   f'{topic} is ignored'))
         if turned := self._turned():
-            warnings.append(f'{path} has images that are {turned} by their EXIF orientation: the '
-                            f'calibration is valid for the images as they are shown')
+            warnings.append(Notice(
+                'E-IMAGES-ROTATED', f'{path} has images that are {turned} by their EXIF '
+                f'orientation: the calibration is valid for the images as they are shown'))
         super().__init__(str(path), len(self._names), warnings=tuple(warnings))
         self.length_ns = round(len(self._names) * 1e9 / self._fps)
 
@@ -417,7 +424,7 @@ class JoinedSource(FrameSource):
     tell their size have different ones.
     """
 
-    def __init__(self, parts: Sequence[FrameSource], warnings: tuple[str, ...] = ()) -> None:
+    def __init__(self, parts: Sequence[FrameSource], warnings: tuple[Notice, ...] = ()) -> None:
         self._parts = tuple(parts)
         first = self._parts[0]
         sized = [(part.name, part.size) for part in self._parts if part.size is not None]
@@ -449,8 +456,9 @@ class JoinedSource(FrameSource):
                 with closing(place.pictures(part, inner)) as pictures:
                     yield from pictures
             except (InputError, OSError) as error:
-                reading.warnings.append(f'{part.name} is skipped from image {inner.images} on: '
-                                        f'{error}')
+                reading.warnings.append(Notice(
+                    'E-FILE-SKIPPED',
+                    f'{part.name} is skipped from image {inner.images} on: {error}'))
             told.append((part.name, inner.summary()))
             place.index += inner.images
         reading.images = place.index
@@ -518,17 +526,19 @@ class _Place:
         return self._next_ns - stamp_ns, True, False
 
 
-def _together(told: Sequence[tuple[str, Sequence[str]]]) -> tuple[str, ...]:
+def _together(told: Sequence[tuple[str, Sequence[Notice]]]) -> tuple[Notice, ...]:
     """Return the warnings of all sources; what several say in the same words is said once.
 
     told: names and warnings.
     """
-    first: dict[str, str] = {}
+    first: dict[str, Notice] = {}
     counts: Counter[str] = Counter()
     for name, warnings in told:
         for warning in warnings:
             words = warning.replace(name, '')
-            first.setdefault(words, warning if name in warning else f'{name}: {warning}')
+            first.setdefault(words, warning if name in warning
+                             else Notice(warning.code, f'{name}: {warning}'))
             counts[words] += 1
-    return tuple(line + (f' (and {counts[words] - 1} more like it)' if counts[words] > 1 else '')
+    return tuple(line if counts[words] == 1 else
+                 Notice(line.code, f'{line} (and {counts[words] - 1} more like it)')
                  for words, line in first.items())

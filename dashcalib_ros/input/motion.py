@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.errors import InputError, counted
+from dashcalib_ros.errors import InputError, Notice, counted
 
 # s; stamps beyond it are times of day, since 1970
 EPOCH_S = 1e8
@@ -81,7 +81,7 @@ class SensorStream:
     rate: Samples | None = None
     speed: Samples | None = None
     position: Samples | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     absolute: bool = False
 
     @property
@@ -120,11 +120,12 @@ class SensorStream:
         if start_s > EPOCH_S or first <= EPOCH_S:
             return replace(self.shifted(-start_s), absolute=False)
         return replace(self.shifted(start_s - first), absolute=False, warnings=(
-            *self.warnings, 'the images have no time of day: the first sample of the motion '
-                            'sensors is assigned to the first image'))
+            *self.warnings, Notice(
+                'E-MOTION-NO-TIME-OF-DAY', 'the images have no time of day: the first sample of '
+                'the motion sensors is assigned to the first image')))
 
 
-def in_seconds(stamps: Floats, what: str) -> tuple[Floats, tuple[str, ...]]:
+def in_seconds(stamps: Floats, what: str) -> tuple[Floats, tuple[Notice, ...]]:
     """Return stamps (n,) in s, and a warning where those since 1970 are of another unit.
 
     what: where they are from, for messages. Raises InputError for those of no known unit.
@@ -137,8 +138,9 @@ def in_seconds(stamps: Floats, what: str) -> tuple[Floats, tuple[str, ...]]:
         step = float(np.median(np.abs(np.diff(known)))) if len(known) > 1 else 0.0
     for name, unit in UNITS.items():
         if EPOCH_S < size * unit <= LATEST_S and step * unit <= LONGEST_STEP_S:
-            return stamps * unit, (
-                f'the time stamps of {what} are interpreted as {name} since 1970',)
+            return stamps * unit, (Notice(
+                'E-STAMP-UNIT-ASSUMED',
+                f'the time stamps of {what} are interpreted as {name} since 1970'),)
     if size > LATEST_S:
         raise InputError('E-STAMP-UNIT', f'{what} has time stamps such as {known[0]:.10g}, which '
                          f'are not seconds, milliseconds, microseconds or nanoseconds since 1970; '
@@ -155,15 +157,16 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
     absolute: as SensorStream's.
     """
     found: dict[str, Samples] = {}
-    warnings: list[str] = []
+    warnings: list[Notice] = []
     for kind, (stamps_s, rows) in values.items():
         stamps_s, rows = np.asarray(stamps_s, np.float64), np.asarray(rows, np.float64)
         if kind == 'position':
             nowhere = _nowhere(rows)
             stamps_s, rows = stamps_s[~nowhere], local_metres(*rows[~nowhere].T)
             if nowhere.any():
-                warnings.append(f'{counted(int(nowhere.sum()), "position")} of {what} skipped: '
-                                f'0, 0 or not on Earth, as a GPS sends them without a fix')
+                warnings.append(Notice(
+                    'E-GPS-NO-FIX', f'{counted(int(nowhere.sum()), "position")} of {what} '
+                    f'skipped: 0, 0 or not on Earth, as a GPS sends them without a fix'))
         # whole seconds of a GPS at 10 Hz: the first one is at its time
         with np.errstate(invalid='ignore'):
             again = np.diff(stamps_s, prepend=np.nan) == 0
@@ -172,10 +175,12 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
             stamps_s, rows = stamps_s[~again], rows[~again]
         samples, trouble = _cleaned(stamps_s, rows, kind)
         if thinned and samples is not None:
-            warnings.append(f'several {NAMES[kind]} of {what} have the same time stamp: the first '
-                            f'one of each is used')
+            warnings.append(Notice(
+                'E-MOTION-STAMPS-EQUAL', f'several {NAMES[kind]} of {what} have the same time '
+                f'stamp: the first one of each is used'))
         if trouble:
-            warnings.append(f'the {NAMES[kind]} of {what} are not used: {trouble}')
+            warnings.append(Notice('E-MOTION-NOT-USED',
+                                   f'the {NAMES[kind]} of {what} are not used: {trouble}'))
         if samples is not None:
             found[kind] = samples
     return SensorStream(**found, warnings=tuple(warnings), absolute=absolute)

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from dashcalib_ros.arrays import Floats
-from dashcalib_ros.errors import InputError, one_line, shortened
+from dashcalib_ros.errors import InputError, Notice, one_line, shortened
 from dashcalib_ros.input.inputs import is_video
 from dashcalib_ros.input.motion import (
     EPOCH_S,
@@ -326,7 +326,7 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
     """
     from dashcalib_ros.input.bag_storage import open_bag
     samples = SensorBuffer(SAMPLES + 1)
-    warnings: list[str] = []
+    warnings: list[Notice] = []
     for path in paths:
         bag = open_bag(path)
         topics = {}
@@ -344,17 +344,20 @@ def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],
                                      f'of those that it has ({there})')
             if len(found) > 1:
                 names = ', '.join(topic.name for topic in found)
-                warnings.append(f'none of the {len(found)} {option} topics is used ({names}): '
-                                f'choose one with --{option}')
+                warnings.append(Notice(
+                    'E-MOTION-TOPICS', f'none of the {len(found)} {option} topics is used '
+                    f'({names}): choose one with --{option}'))
             elif found and found[0].count > SAMPLES:
-                warnings.append(f'{found[0].name} is not used: it has more than {SAMPLES} '
-                                f'messages')
+                warnings.append(Notice(
+                    'E-MOTION-TOO-LONG',
+                    f'{found[0].name} is not used: it has more than {SAMPLES} messages'))
             elif found:
                 topics[found[0].name] = option
         later = _aligned(bag, tuple(topics), images)
-        warnings += [f'the clock of {name} is {abs(apart):.0f} s '
-                     f'{"behind" if apart > 0 else "ahead of"} the clock of the images: the times '
-                     f'of reception are used to align them' for name, apart in later.items()]
+        warnings += [Notice(
+            'E-MOTION-CLOCK', f'the clock of {name} is {abs(apart):.0f} s '
+            f'{"behind" if apart > 0 else "ahead of"} the clock of the images: the times of '
+            f'reception are used to align them') for name, apart in later.items()]
         for record in bag.records(tuple(topics), lambda _: None) if topics else ():
             try:
                 message = record.message()

@@ -10,7 +10,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera.rotation import OPTICAL
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input.motion import Samples, in_seconds
 from dashcalib_ros.limits import read_lines
 
@@ -44,7 +44,7 @@ class Poses:
     rotations: Floats
     positions: Floats
     stamps_s: Floats | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     longest_gap_s: float = LONGEST_GAP_S
 
     def at(self, frames: Ints, stamps_ns: Ints) -> tuple[Floats, Floats, Mask]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dashcalib_ros.arrays import GreyImage, Pixels
-from dashcalib_ros.errors import InputError, counted, shortened
+from dashcalib_ros.errors import InputError, Notice, counted, shortened
 
 if TYPE_CHECKING:
     from dashcalib_ros.camera import Camera
@@ -145,7 +145,7 @@ class Reading:
     images: how many there were, also those that are no frames; complete after the last one.
     """
 
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[Notice] = field(default_factory=list)
     images: int = 0
     undecodable: int = 0
     first_failure: InputError | None = None
@@ -156,11 +156,13 @@ class Reading:
         where = f'{file}: image {index}' if file else f'image {index}'
         self.first_failure = self.first_failure or InputError(error.code, f'{where}: {error}')
 
-    def summary(self) -> tuple[str, ...]:
+    def summary(self) -> tuple[Notice, ...]:
         """Return all warnings, one line each."""
-        skipped = ([f'{counted(self.undecodable, "undecodable image")} skipped '
-                    f'({self.first_failure})'] if self.undecodable else [])
-        return (*self.warnings, *skipped)
+        if not self.undecodable:
+            return tuple(self.warnings)
+        return (*self.warnings, Notice(
+            'E-IMAGES-UNDECODABLE',
+            f'{counted(self.undecodable, "undecodable image")} skipped ({self.first_failure})'))
 
 
 class FrameSource(ABC):
@@ -186,18 +188,18 @@ class FrameSource(ABC):
     stored_size: tuple[int, int] | None = None
     length_ns: int | None = None
     recorded = False
-    contradictions: tuple[str, ...] = ()
+    contradictions: tuple[Notice, ...] = ()
     _cure = 'check that another program can play it, or record it again'
     _start_ns = 0
     _duration_ns: int | None = None
 
     def __init__(self, name: str, count: int | None, topic: str | None = None,
-                 warnings: tuple[str, ...] = ()) -> None:
+                 warnings: tuple[Notice, ...] = ()) -> None:
         self.name = name
         self.count = self._promised = count
         self.topic = topic
         self._opening_warnings = warnings
-        self._reading_warnings: tuple[str, ...] = ()
+        self._reading_warnings: tuple[Notice, ...] = ()
 
     @property
     def begin_ns(self) -> int | None:
@@ -205,7 +207,7 @@ class FrameSource(ABC):
         return None
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[Notice, ...]:
         """Return what the user should know, one line each; complete after the last frame."""
         return self.contradictions + self._opening_warnings + self._reading_warnings
 

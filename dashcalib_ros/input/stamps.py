@@ -5,7 +5,7 @@ import statistics
 from collections import deque
 from itertools import pairwise
 
-from dashcalib_ros.errors import counted
+from dashcalib_ros.errors import Notice, counted
 
 SECOND_NS = 1_000_000_000
 # a stamp further back means a clock that was set back (a bag that loops), not a late image
@@ -138,21 +138,23 @@ class StampGate:
         self._used = stamp_ns
         return stamp_ns
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Notice]:
         """Return warnings about a recording's stamps for the user, one line each."""
-        lines = []
+        found = []
         if self.unstamped:
-            lines.append('the image headers have no time stamps: the times of reception are used')
+            found.append(Notice('E-STAMP-MISSING', 'the image headers have no time stamps: the '
+                                'times of reception are used'))
         if self.fault:
-            lines.append(f'{self.fault}; from there on the times of reception are used: fix the '
-                         f'driver')
+            found.append(Notice('E-STAMP-WRONG', f'{self.fault}; from there on the times of '
+                                f'reception are used: fix the driver'))
         elif self.repeated:
-            lines.append(f'{counted(self.repeated, "image")} skipped: the time stamps are not '
-                         f'later than the previous ones')
+            found.append(Notice('E-STAMP-NOT-LATER', f'{counted(self.repeated, "image")} skipped: '
+                                f'the time stamps are not later than the previous ones'))
         if self.set_back:
-            lines.append(f'the clock was set back {counted(self.set_back, "time")}, by up to '
-                         f'{self.furthest_back_ns / 1e9:.1f} s: later time stamps are shifted')
-        return lines
+            found.append(Notice(
+                'E-STAMP-SET-BACK', f'the clock was set back {counted(self.set_back, "time")}, by '
+                f'up to {self.furthest_back_ns / 1e9:.1f} s: later time stamps are shifted'))
+        return found
 
     def _time(self, header_ns: int, received_ns: int) -> int | None:
         """Return the image's time, None if it has no stamp or one that is not later."""

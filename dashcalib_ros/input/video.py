@@ -19,7 +19,7 @@ from av.stream import Disposition
 from av.video.reformatter import ColorRange, VideoReformatter
 
 from dashcalib_ros.arrays import Pixels
-from dashcalib_ros.errors import InputError, shortened
+from dashcalib_ros.errors import InputError, Notice, shortened
 from dashcalib_ros.input.source import FrameSource, Picture, Reading, size_text
 from dashcalib_ros.input.stamps import SECOND_NS, StampGate
 from dashcalib_ros.limits import check_pixels
@@ -86,17 +86,20 @@ class VideoSource(FrameSource):
             self._created = container.metadata.get('creation_time', '')
         if self.size != stored:
             self.stored_size = stored
-            warnings.append(f'{path} has pixels that are not square: its images of '
-                            f'{size_text(stored)} '
-                            f'pixels are scaled to {size_text(self.size)}, as players show them')
+            warnings.append(Notice(
+                'E-PIXELS-NOT-SQUARE', f'{path} has pixels that are not square: its images of '
+                f'{size_text(stored)} pixels are scaled to {size_text(self.size)}, as players '
+                f'show them'))
         if turn:
-            warnings.append(f'{path} has a rotation flag of {turn} degrees: the calibration is '
-                            f'valid for the rotated images')
+            warnings.append(Notice(
+                'E-IMAGES-ROTATED', f'{path} has a rotation flag of {turn} degrees: the '
+                f'calibration is valid for the rotated images'))
         super().__init__(str(path), count, warnings=tuple(warnings))
         if fps and rate and abs(fps / rate - 1) > ALIKE:
-            self.contradictions = (
+            self.contradictions = (Notice(
+                'E-INPUT-CONTRADICTED',
                 f'{path} has {rate:.4g} images per second, but --fps {fps:g} replaces its time '
-                f'stamps: omit --fps unless the time stamps are wrong',)
+                f'stamps: omit --fps unless the time stamps are wrong'),)
         self.length_ns = round(((count or 0) / fps if fps else length_s) * 1e9) or None
 
     @property
@@ -130,8 +133,9 @@ class VideoSource(FrameSource):
         reading.warnings += gate.warnings()
         promised = self._promised or 0
         if read < self._complete * promised - 1:
-            reading.warnings.append(f'the video is truncated or damaged: {read} of {promised} '
-                                    f'images were read, {promised - read} are lost')
+            reading.warnings.append(Notice(
+                'E-VIDEO-TRUNCATED', f'the video is truncated or damaged: {read} of {promised} '
+                f'images were read, {promised - read} are lost'))
 
     def _stamp_ns(self, time_ns: int | None, index: int) -> int | None:
         if self._fps:
@@ -197,7 +201,7 @@ class FramePicture:
         return np.ascontiguousarray(np.rot90(image, frame.rotation // 90), np.uint8)
 
 
-def _stretch(stream: av.VideoStream, path: Path, warnings: list[str]) -> tuple[float, float]:
+def _stretch(stream: av.VideoStream, path: Path, warnings: list[Notice]) -> tuple[float, float]:
     """Return by how much columns and rows are stretched, so that pixels are square.
 
     The longer side of a pixel is kept: nothing is lost.
@@ -205,8 +209,9 @@ def _stretch(stream: av.VideoStream, path: Path, warnings: list[str]) -> tuple[f
     aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
     ratio = float(aspect) if aspect else 1.0
     if aspect and not 1 / MOST_STRETCH <= ratio <= MOST_STRETCH:
-        warnings.append(f'{path} has a pixel aspect ratio of {aspect.numerator}:'
-                        f'{aspect.denominator}, which no camera has: square pixels are assumed')
+        warnings.append(Notice(
+            'E-PIXELS-ASSUMED-SQUARE', f'{path} has a pixel aspect ratio of {aspect.numerator}:'
+            f'{aspect.denominator}, which no camera has: square pixels are assumed'))
         return SQUARE
     if abs(ratio - 1) <= ALMOST_SQUARE:
         return SQUARE
@@ -251,7 +256,7 @@ def _length_s(container: InputContainer, stream: av.VideoStream) -> float:
     return max(0, (container.duration or 0) - max(0, container.start_time or 0)) / av.time_base
 
 
-def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[str]]:
+def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[Notice]]:
     """Return the number of the stream that is wanted, and what is to be said of the choice.
 
     Raises InputError where there is no such stream.
@@ -262,15 +267,15 @@ def _chosen(path: Path, topic: str | None) -> tuple[int | None, list[str]]:
                           for n, each in enumerate(streams, 1))
         if topic is None:
             taken = next((n for n, each in enumerate(streams, 1) if each.index == best.index), 1)
-            several = [f'{path} has {len(streams)} video streams ({there}): stream {taken} is '
-                       f'used; choose another one with --stream'] if len(streams) > 1 else []
-            return None, several
+            return None, [Notice(
+                'E-VIDEO-STREAMS', f'{path} has {len(streams)} video streams ({there}): stream '
+                f'{taken} is used; choose another one with --stream')] * (len(streams) > 1)
         if topic.isdecimal() and 1 <= int(topic[:9]) <= len(streams):
             return int(topic), []
         if len(streams) > 1 or topic.isdecimal():
             raise InputError('E-VIDEO-STREAM', f'{path} has no video stream {shortened(topic)!r} '
                              f'({there}): choose one with --stream')
-    return None, [f'{path} is a video: the topic {topic} is ignored']
+    return None, [Notice('E-TOPIC-IGNORED', f'{path} is a video: the topic {topic} is ignored')]
 
 
 def _streams(container: InputContainer) -> list[av.VideoStream]:

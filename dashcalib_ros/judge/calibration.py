@@ -19,7 +19,7 @@ from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.solve.solution import LeftOut, Solution
 from dashcalib_ros.solve.spread import PictureSigma, sigma_over
@@ -197,7 +197,7 @@ class Mount:
     """
 
     verdict: Literal['accepted', 'weak']
-    reasons: tuple[str, ...]
+    reasons: tuple[Notice, ...]
     yaw_left_deg: float
     pitch_up_deg: float
     roll_right_deg: float | None
@@ -303,7 +303,7 @@ class CalibrationData:
     versions: dict[str, str]
     config: Config
     input_name: str = ''
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     magnitudes: Floats | None = None
     mask: Mask | None = None
     details: dict[str, Any] = default(default_factory=dict)

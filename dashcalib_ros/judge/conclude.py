@@ -19,7 +19,7 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
-from dashcalib_ros.errors import counted
+from dashcalib_ros.errors import Notice, counted
 from dashcalib_ros.input.motion import SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
@@ -76,7 +76,7 @@ class Evidence:
     mask: Mask | None
     scale: Scale
     timing: dict[str, float]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     stored: tuple[StoredTurn, ...] = ()
     left_out: Mapping[TurnId, str] = default(default_factory=dict)
     pictures: Mapping[TurnId, TurnPicture] | None = default(default_factory=dict)
@@ -99,8 +99,7 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
         turns=detection.turns(), magnitudes=detection.magnitudes(), mask=detection.valid(),
         built={scene.turn: scene for scene in scenes if scene is not None}, timing={},
         # the verdict says it
-        warnings=tuple(line for line in detection.warnings()
-                       if not other or not line.startswith(str(other))),
+        warnings=tuple(each for each in detection.warnings() if each.code != 'E-TWO-CAMERAS'),
         other_camera=other, start_s=detection.start_s, lines=detection.lines(),
         straights=detection.straights())
 
@@ -171,27 +170,31 @@ def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None
 REPORTED_FIELD_PX = 0.5
 
 
-def _warnings(found: CalibrationData, solution: Solution) -> tuple[str, ...]:
+def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
     """Return what the user must know of the numbers, which are no reason for the verdict."""
     level, model, field = found.verdict.level, found.config.model, found.field
     warnings = []
     if level != 'accepted' and model != AUTO:
-        warnings.append(
+        warnings.append(Notice(
+            'E-MODEL-CHOSEN',
             f'the lens model {model} was chosen by hand and may be why the result is {level}: '
-            f'--model {AUTO} uses the one that fits the turns')
+            f'--model {AUTO} uses the one that fits the turns'))
     if field is not None and field.rms_px >= max(REPORTED_FIELD_PX, field.sigma_px):
-        warnings.append(
+        warnings.append(Notice(
+            'E-FIELD-LARGE',
             f'the picture is bent by {field.rms_px:.1f} px (up to {field.worst_px:.1f} px), as by '
             f'a windscreen or a rectification: camera_info cannot describe this, and sigma over '
-            f'the picture includes it; `dashcalib export --to rays` keeps it')
+            f'the picture includes it; `dashcalib export --to rays` keeps it'))
     if found.mount is not None and found.mount.moved_s is not None:
-        warnings.append(
+        warnings.append(Notice(
+            'E-CAMERA-MOVED',
             f'the camera was moved on the car {found.mount.moved_s - found.start_s:.0f} s into '
-            f'the drive: the mounting is that from there on')
+            f'the drive: the mounting is that from there on'))
     if found.stabiliser is not None and STEADY not in found.verdict.cures:
-        warnings.append(
+        warnings.append(Notice(
+            'E-PICTURE-SEEMS-TO-MOVE',
             f'the picture seems to move by up to {found.stabiliser.largest_px:.0f} px against the '
-            f'lens, which is within the uncertainty of the lens, and was removed: {STEADY}')
+            f'lens, which is within the uncertainty of the lens, and was removed: {STEADY}'))
     return tuple(warnings)
 
 

@@ -21,6 +21,7 @@ from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
 from dashcalib_ros.detect import Lines
 from dashcalib_ros.detect.straights import Straights
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.judge.calibration import MOVED_DEG, MOVED_SIGMAS, Mount
 from dashcalib_ros.judge.monitor import HEADING_SIGMA_DEG, PITCH_SIGMA_DEG
 from dashcalib_ros.reconstruct.heading import LEAST_YAW_DEG, heading
@@ -103,8 +104,9 @@ def mount_of(straights: Straights, lines: Lines | None, solution: Solution, leve
         height = None
     reasons = _reasons(level, total, own, metres)
     if max(backwards, 1 - backwards) < MAJORITY:
-        reasons += ('the car drove forwards and backwards, or stood, too often to tell whether '
-                    'the camera looks ahead or back: drive straight on for longer',)
+        reasons += (Notice('E-MOUNT-DIRECTION', 'the car drove forwards and backwards, or stood, '
+                           'too often to tell whether the camera looks ahead or back: drive '
+                           'straight on for longer'),)
     return Mount(
         verdict='weak' if reasons else 'accepted', reasons=reasons,
         yaw_left_deg=math.remainder(angles[0] + 180 * rear, 360), pitch_up_deg=float(angles[1]),
@@ -140,16 +142,18 @@ def moved(straights: Straights, camera: Camera) -> tuple[float, Floats] | None:
 MAX_SIGMA_DEG = 0.2
 
 
-def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[str, ...]:
+def _reasons(level: str, sigma: Floats, own: Floats, metres: float) -> tuple[Notice, ...]:
     """Return why a mount is weak. sigma, own: (2,) all of it, and what the lens's centre adds."""
     found = []
     if level != 'accepted':
-        found.append(f'the lens is {level}')
+        found.append(Notice('E-MOUNT-LENS', f'the lens is {level}'))
     if max(sigma) > MAX_SIGMA_DEG:
         cure = ('drive more turns, to know the centre of the picture better'
                 if max(own) > MAX_SIGMA_DEG else 'drive straight on for longer')
-        found.append(f'yaw and pitch are known only to {max(sigma):.2f}° after {metres:.0f} m of '
-                     f'straight driving, {MAX_SIGMA_DEG:g}° or better is needed: {cure}')
+        found.append(Notice(
+            'E-MOUNT-SIGMA',
+            f'yaw and pitch are known only to {max(sigma):.2f}° after {metres:.0f} m of straight '
+            f'driving, {MAX_SIGMA_DEG:g}° or better is needed: {cure}'))
     return tuple(found)
 
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.judge.calibration import Witness, Witnesses
 from dashcalib_ros.judge.gyro_scale import (
@@ -54,7 +55,7 @@ class SensorComparison:
 
     solution: Solution | None = None
     witnesses: Witnesses = field(default_factory=Witnesses)
-    unused: tuple[str, ...] = ()
+    unused: tuple[Notice, ...] = ()
 
 
 # keyframes of a turn at the least
@@ -74,7 +75,7 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
         return SensorComparison(solution, unused=stream.warnings)
     scenes = [scene for scene in solution.scenes if scene.turn.of_this_drive]
     gyro = gps = informed = None
-    lines = list(stream.warnings)
+    notices: list[Notice | None] = list(stream.warnings)
     try:
         loss_px = loss_px_of(solution.scenes, solution.camera, config.intrinsics)
         turns = [steps for scene in scenes
@@ -84,18 +85,20 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
             fit = fit_to(turns, stream.rate)
             own = _own_scale(stream.rate, stream.position, config.motion.gyro_scale_sigma)
             fit = None if fit is None else fit.scaled(own.scale)
-            gyro, line = _gyro(fit, solution, own)
-            lines += [own.contradiction, line]
+            gyro, notice = _gyro(fit, solution, own)
+            notices += [own.contradiction, notice]
             if fit is not None and gyro is not None and gyro.agrees:
-                informed, line = _informed(solution, fit, own, config)
-                lines.append(line)
+                informed, notice = _informed(solution, fit, own, config)
+                notices.append(notice)
         if stream.position is not None:
-            gps, line = _gps(turns, stream.position, solution)
-            lines.append(line)
+            gps, notice = _gps(turns, stream.position, solution)
+            notices.append(notice)
     except (np.linalg.LinAlgError, ValueError, FloatingPointError) as error:
-        lines.append(f'the motion sensors could not be compared with the turns ({error})')
+        notices.append(Notice(
+            'E-SENSORS-NOT-COMPARED',
+            f'the motion sensors could not be compared with the turns ({error})'))
     kept = solution if informed is None or (gps is not None and not gps.agrees) else informed
-    return SensorComparison(kept, Witnesses(gyro, gps), tuple(line for line in lines if line))
+    return SensorComparison(kept, Witnesses(gyro, gps), tuple(filter(None, notices)))
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ class _OwnScale:
     scale: float
     sigma: float
     by_gps: tuple[float, float] | None = None
-    contradiction: str = ''
+    contradiction: Notice | None = None
 
 
 # sigmas; where a witness is farther off, it contradicts
@@ -123,7 +126,8 @@ def _own_scale(rate: Samples, position: Samples | None, prior: float) -> _OwnSca
         return _OwnScale(1.0, prior)
     scale, sigma = found
     if abs(scale - 1) > CONTRADICTED * np.hypot(sigma, prior):
-        return _OwnScale(scale, sigma, found, (
+        return _OwnScale(scale, sigma, found, Notice(
+            'E-GYRO-SCALE',
             f'the angles of the gyro are {scale:.4f} ± {sigma:.4f} times those of GPS headings, '
             f'and this scale is used: set motion.gyro_scale_sigma, {prior:g}, higher'))
     share = prior**2 / (prior**2 + sigma**2)
@@ -139,7 +143,7 @@ KNOWN_SCALE = 0.015
 
 
 def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
-              ) -> tuple[Solution | None, str]:
+              ) -> tuple[Solution | None, Notice | None]:
     """Return the solution with the gyro's angles as information, or None and why not, if at all.
 
     They are one more measurement of the camera's parameters (a Kalman update); then the turns'
@@ -150,18 +154,20 @@ def _informed(solution: Solution, fit: Fit, gyro: _OwnScale, config: Config
     own = float(fit.by_camera @ along)
     known = float(fit.covariance[6, 6]) + gyro.sigma**2
     if config.motion.use != 'information' or gyro.sigma > KNOWN_SCALE:
-        return None, ''
+        return None, None
     apart = abs(1 - fit.gyro.inverse_scale) / float(np.sqrt(own + known))
     if len(solution.scenes) == 1 and apart > DOUBTED:
-        return None, (f'the gyro does not confirm the only turn, it is {apart:.1f} sigmas off: '
-                      f'check its scale, its clock and that it belongs to this drive')
+        return None, Notice(
+            'E-GYRO-UNCONFIRMED',
+            f'the gyro does not confirm the only turn, it is {apart:.1f} sigmas off: check its '
+            f'scale, its clock and that it belongs to this drive')
     moved = with_measurement(solution, fit.by_camera @ solution.written.by_solution,
                              1 - fit.gyro.inverse_scale, known)
     scenes = [scene_with(moved.camera, scene, config) for scene in solution.scenes]
     if any(scene is None for scene in scenes):
-        return None, ''
+        return None, None
     return replace(moved, by_pictures=solution, scenes=tuple(
-        scene for scene in scenes if scene is not None)), ''
+        scene for scene in scenes if scene is not None)), None
 
 
 # s to either side: clocks of sensors in one car are not farther apart
@@ -172,33 +178,38 @@ LEAST_EXPLAINED = 0.9
 DEGREES = (40.0, 80.0)
 
 
-def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale) -> tuple[Witness | None, str]:
+def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale
+          ) -> tuple[Witness | None, Notice | None]:
     """Return what the gyro says, or why it says nothing."""
     if fit is None:
-        return None, ('the gyro is not used: it has no samples during the turns, within 0.5 s of '
-                      'their time stamps: check its clock')
+        return None, Notice(
+            'E-GYRO-NO-SAMPLES', 'the gyro is not used: it has no samples during the turns, '
+            'within 0.5 s of their time stamps: check its clock')
     gyro = fit.gyro
     if abs(gyro.offset_s) >= LARGEST_OFFSET_S or not fit.explained >= LEAST_EXPLAINED:
-        return None, (f'the gyro is not used: it does not turn as the pictures do (it explains '
-                      f'{100 * max(fit.explained, 0.0):.0f} % of their turning): check that it '
-                      f'belongs to this drive, and that its time stamps are within 0.5 s of those '
-                      f'of the pictures')
+        return None, Notice(
+            'E-GYRO-OTHER-MOTION',
+            f'the gyro is not used: it does not turn as the pictures do (it explains '
+            f'{100 * max(fit.explained, 0.0):.0f} % of their turning): check that it belongs to '
+            f'this drive, and that its time stamps are within 0.5 s of those of the pictures')
     if not SCALES[0] < fit.scale < SCALES[1]:
         cure = ('write rad/s, not degrees per second' if DEGREES[0] < fit.scale < DEGREES[1] else
                 'check its unit')
-        return None, (f'the gyro is not used: its angles are {fit.scale:.3g} times those of the '
-                      f'pictures: {cure}')
+        return None, Notice(
+            'E-GYRO-UNIT', f'the gyro is not used: its angles are {fit.scale:.3g} times those of '
+            f'the pictures: {cure}')
     if fit.out_of_pace:
-        return None, (f'the gyro is not used: its time stamps and those of the pictures do not '
-                      f'keep pace ({fit.out_of_pace}): check --fps, and whether images are '
-                      f'missing')
+        return None, Notice(
+            'E-GYRO-CLOCK',
+            f'the gyro is not used: its time stamps and those of the pictures do not keep pace '
+            f'({fit.out_of_pace}): check --fps, and whether images are missing')
     sigmas = np.sqrt(np.diag(fit.covariance))
     witness = _witness(gyro.inverse_scale, float(sigmas[6]), own.sigma, fit.by_camera, solution)
     return replace(
         witness, time_offset_s=gyro.offset_s, time_sigma_s=float(sigmas[7]),
         camera_from_sensor=tuple(tuple(row) for row in gyro.alignment.tolist()),
         alignment_sigma_deg=float(np.degrees(np.sqrt(np.trace(fit.covariance[:3, :3])))),
-        bias_rad_s=tuple(gyro.bias.tolist()), scale_by_gps=own.by_gps), ''
+        bias_rad_s=tuple(gyro.bias.tolist()), scale_by_gps=own.by_gps), None
 
 
 def _witness(inverse_scale: float, sigma: float, own_sigma: float, by_camera: Floats,
@@ -576,16 +587,16 @@ LEAST_GPS_DEG = 30.0
 
 
 def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
-         ) -> tuple[Witness | None, str]:
+         ) -> tuple[Witness | None, Notice | None]:
     """Return what GPS headings say, from straight to straight, or why they say nothing."""
     pairs = [pair for turn in turns if (pair := _ends(turn, position)) is not None]
     if not pairs:
-        return None, ''
+        return None, None
     usual = float(np.median([each.off_m for pair in pairs for each in pair]))
     sound = [pair for pair in pairs
              if all(each.off_m <= max(JUMP * usual, LEAST_NOISE_M) for each in pair)]
     if not sound:
-        return None, ''
+        return None, None
     straights = [each.straight for pair in sound for each in pair]
     noise_m = max(float(np.sqrt(sum(each.off_m2 for each in straights)
                                 / sum(each.freedom for each in straights))), LEAST_NOISE_M)
@@ -604,16 +615,17 @@ def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
         sigmas.append(sigma)
         follow.append(after.follow - before.follow)
     if not ours:
-        return None, ''
+        return None, None
     camera, gps = np.array(ours), np.array(measured)
     ratios, variances = camera / gps, (np.array(sigmas) / gps)**2
     mean = weighted_mean(ratios, variances)
     if not 1 / SCALES[1] < mean.value < 1 / SCALES[0]:
-        return None, ('GPS is not used: it does not turn as the pictures do: check its time '
-                      'stamps, and that it belongs to this drive')
+        return None, Notice(
+            'E-GPS-OTHER-MOTION', 'GPS is not used: it does not turn as the pictures do: check '
+            'its time stamps, and that it belongs to this drive')
     variance = mean.variance + _between_turns(ratios - mean.value, variances, mean.value)
     by_camera = np.average(np.array(follow) / gps[:, None], axis=0, weights=1 / variances)
-    return _witness(mean.value, float(np.sqrt(variance)), 0.0, by_camera, solution), ''
+    return _witness(mean.value, float(np.sqrt(variance)), 0.0, by_camera, solution), None
 
 
 # degrees by which the car may turn on what counts as a straight

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import InputError, counted, one_line
+from dashcalib_ros.errors import InputError, Notice, counted, one_line
 from dashcalib_ros.limits import read_file
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.store.scene_file import (
@@ -42,7 +42,7 @@ class TurnStore:
     """
 
     def __init__(self, folder: str, capacity: int, half_width_s: float,
-                 warn: Callable[[str], None]) -> None:
+                 warn: Callable[[Notice], None]) -> None:
         """folder: empty for none at all; ~ is expanded.
 
         capacity: largest number of turns of one camera. half_width_s: turns that are nearer in
@@ -55,8 +55,8 @@ class TurnStore:
             self._folder = self._folder.expanduser()
         except RuntimeError:  # ~user of an unknown user: do not make a folder of that name
             self._off = True
-            warn(f'turns cannot be stored in {folder} (that home folder does not exist); set '
-                 f'turns.store to a path without ~')
+            warn(Notice('E-STORE-HOME', f'turns cannot be stored in {folder} (that home folder '
+                        f'does not exist); set turns.store to a path without ~'))
         self._capacity = capacity
         self._half_width_s = half_width_s
         self._warn = warn
@@ -167,12 +167,14 @@ class TurnStore:
     def _report(self, bad: list[str], others: list[Origin], origin: Origin) -> None:
         if bad:
             more = f' and {len(bad) - 3} more' if len(bad) > 3 else ''
-            self._warn(f'{counted(len(bad), "file")} in {self._folder} skipped: '
-                       f'{", ".join(bad[:3])}{more}; delete files that are not stored turns')
+            self._warn(Notice(
+                'E-STORE-FILES', f'{counted(len(bad), "file")} in {self._folder} skipped: '
+                f'{", ".join(bad[:3])}{more}; delete files that are not stored turns'))
         if others:
-            self._warn(f'{counted(len(others), "file")} in {self._folder} skipped: the images '
-                       f'were {others[0]}, but these are {origin}; use a separate folder for each '
-                       f'camera in turns.store')
+            self._warn(Notice(
+                'E-STORE-OTHER-CAMERA', f'{counted(len(others), "file")} in {self._folder} '
+                f'skipped: the images were {others[0]}, but these are {origin}; use a separate '
+                f'folder for each camera in turns.store'))
 
     def _read(self, name: str) -> tuple[Origin, StoredTurn]:
         """Return a file's origin and turn; raises InputError if it is no stored turn."""
@@ -232,6 +234,8 @@ class TurnStore:
             return
         self._warned = True
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        self._warn(f'turns cannot be stored in {self._folder} ({error.strerror or error}); '
-                   + ('free some disk space' if full else
-                      'set turns.store to a folder with write permission'))
+        self._warn(Notice(
+            'E-STORE-NOT-WRITABLE',
+            f'turns cannot be stored in {self._folder} ({error.strerror or error}); '
+            + ('free some disk space' if full else
+               'set turns.store to a folder with write permission')))

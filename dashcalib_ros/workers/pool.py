@@ -14,7 +14,7 @@ from dashcalib_ros import reconstruct
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
-from dashcalib_ros.errors import DashcalibError, WorkerError, coded
+from dashcalib_ros.errors import DashcalibError, Notice, WorkerError, coded
 from dashcalib_ros.reconstruct.scene import Draft, Scene, TurnPicture, picture_of
 from dashcalib_ros.workers.memory import return_free_memory
 from dashcalib_ros.workers.worker import Progress, Worker, WorkerDiedError
@@ -75,7 +75,7 @@ class ScenePool:
 
     def __init__(self, config: Config, make_worker: Callable[[], Worker],
                  load: Callable[[], object], queue: int | None = None,
-                 on_lost: Callable[[str], None] = lambda text: None,
+                 on_lost: Callable[[Notice], None] = lambda notice: None,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  keep_pictures: bool = False,
                  on_wait: Callable[[], bool] | None = None) -> None:
@@ -310,8 +310,8 @@ class ScenePool:
         elif isinstance(error, WorkerDiedError):
             # the other turns can still be used
             self._end(call)
-            self._on_lost(f'{call.turn.id} ended the reconstruction process {call.failures} times '
-                          f'and was left out')
+            self._on_lost(Notice('E-TURN-LEFT-OUT', f'{call.turn.id} ended the reconstruction '
+                                 f'process {call.failures} times and was left out'))
         else:
             if not isinstance(error, DashcalibError):
                 error = WorkerError('E-TURN-FAILED', f'reconstruction of {call.turn.id} failed: '

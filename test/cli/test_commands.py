@@ -30,11 +30,15 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, Lens, demo_drive, render_to_bag
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.turn import Turn
-from dashcalib_ros.errors import ConfigError, OutputError, WorkerError
+from dashcalib_ros.errors import ConfigError, Notice, OutputError, WorkerError
 from dashcalib_ros.pipeline import Calibrator, Status
 from dashcalib_ros.report import write_results
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
+
+
+# what the fake warns of, and what the user sees of it
+DARK, WARNED = Notice('E-DARK', 'dark'), 'dashcalib: warning: dark [E-DARK]\n'
 
 
 @stands_in_for(Calibrator)
@@ -64,7 +68,7 @@ class FakeCalibrator:
         progress('reconstructing', 0.5)
         if self.failure is not None:
             raise self.failure
-        return make_calibration(self.level, config=self.config, warnings=('dark',), input_name='')
+        return make_calibration(self.level, config=self.config, warnings=(DARK,), input_name='')
 
     def close(self):
         self.closed = True
@@ -142,19 +146,21 @@ def test_run_writes_shows_and_says_the_verdict(
     assert lines[0] == f'verdict: {level}' and lines[-1].startswith('next: ')
     assert '\x1b' not in shown.out
     assert all(name in shown.out.partition('written to calibration: ')[2] for name in files)
-    assert shown.err == 'dashcalib: warning: dark\n'  # no progress in a pipe
+    assert shown.err == WARNED  # no progress in a pipe
     assert fake.made[0].frames == 4 and fake.made[0].closed
     result = json.loads((tmp_path / 'work/calibration/result.json').read_text())
     assert 'drive' in result['input'] and result['warnings'] == ['dark']
+    assert result['warning_codes'] == ['E-DARK']
 
 
 def test_warnings_about_the_input_reach_the_user_and_the_result(fake, drive, tmp_path, capsys):
     (tmp_path / 'drive' / '2.png').write_bytes(b'no picture')
     assert main(['run', drive, '--fps', '10']) == 0
     warned = capsys.readouterr().err.splitlines()
-    assert len(warned) == 2 and 'skipped' in warned[0]
+    assert len(warned) == 2 and warned[0].endswith(' [E-IMAGES-UNDECODABLE]')
     result = json.loads((tmp_path / 'work/calibration/result.json').read_text())
-    assert 'skipped' in result['warnings'][0]
+    assert result['warning_codes'] == ['E-IMAGES-UNDECODABLE', 'E-DARK']
+    assert len(result['warnings']) == 2 and '[' not in result['warnings'][0]
 
 
 @pytest.mark.parametrize('level', ['weak', 'refused'])
@@ -166,7 +172,8 @@ def test_an_earlier_calibration_that_is_moved_aside_is_told(
     assert main(['run', drive]) == 3
     lines = capsys.readouterr().err.splitlines()
     assert lines[-1] == ('dashcalib: warning: the earlier calibration calibration/'
-                         'calibration.yaml was renamed to calibration/calibration.previous.yaml')
+                         'calibration.yaml was renamed to calibration/calibration.previous.yaml '
+                         '[E-CALIBRATION-RENAMED]')
 
 
 def test_the_result_alone_on_stdout(fake, drive, tmp_path, capsys):
@@ -181,7 +188,7 @@ def test_the_result_alone_on_stdout(fake, drive, tmp_path, capsys):
 
 def test_quiet(fake, drive, tmp_path, capsys):
     assert main(['run', drive, '--fps', '10', '--quiet']) == 0
-    assert capsys.readouterr() == ('', 'dashcalib: warning: dark\n')
+    assert capsys.readouterr() == ('', WARNED)
     assert main(['run', '--json', drive, '--fps', '10', '--quiet']) == 0
     shown = capsys.readouterr()
     assert json.loads(shown.out)['verdict'] == 'accepted' and 'next' not in shown.err
@@ -208,7 +215,7 @@ def test_in_a_pipe_progress_is_a_line_from_time_to_time(fake, drive, monkeypatch
     assert 'dashcalib: reading: frame 4, 1 turn, 100 %' in lines
     assert 'dashcalib: reconstructing, 50 %' in lines
     assert main(['run', drive, '--fps', '10', '--quiet']) == 0
-    assert capsys.readouterr().err == 'dashcalib: warning: dark\n'
+    assert capsys.readouterr().err == WARNED
     clock = iter(range(10**6))
     monkeypatch.setattr('dashcalib_ros.cli.terminal.EVERY_S', 10.0)
     monkeypatch.setattr('time.monotonic', lambda: next(clock))
@@ -442,6 +449,7 @@ def test_turns_as_json(fake_detection, drive, tmp_path, capsys):
     assert data['turns'] == [{'center': 88, 'first': 58, 'last': 118, 'stamp': 8.8,
                               'prominence': 0.06, 'images': 61}]
     assert data['frames'] == 4 and 'drive' in data['input']
+    assert data['warning_codes'] == ['E-RATE-ASSUMED'] and len(data['warnings']) == 1
     assert names(tmp_path / 'work') == []
 
 

@@ -117,11 +117,13 @@ def test_a_clock_that_is_set_back_does_not_end_the_votes(dark):
 
 def test_what_is_not_believed_or_not_there_is_said(dark):
     model = SegmentationModel(dark, '64')
-    for rows, words in ((np.s_[60:], 'covers 79 %'), (np.s_[:0], 'no part of the ego vehicle')):
+    for rows, code in ((np.s_[60:], 'E-SEGMENTATION-TOO-LARGE'),
+                       (np.s_[:0], 'E-SEGMENTATION-EMPTY')):
         mask = SegmentationMask(model, MaskConfig())
         mask.push(picture_with(rows), 0)
         assert mask.hidden((HEIGHT, WIDTH)) is None
-        assert words in mask.warning() and 'mask.segmentation_classes' in mask.warning()
+        assert mask.warning().code == code
+        assert ('79 %' in mask.warning()) == (code == 'E-SEGMENTATION-TOO-LARGE')
 
 
 def test_only_a_car_that_moves_asks(dark):
@@ -196,7 +198,7 @@ def test_the_core_uses_it_and_says_what_was_odd(tmp_path):
         for frame in frames:
             calibrator.push(frame)
         result = calibrator.calibrate()
-    assert result.mask is None and 'mask.segmentation_classes' in result.warnings[0]
+    assert result.mask is None and result.warnings[0].code.startswith('E-SEGMENTATION-')
 
 
 def test_a_model_is_loaded_once_for_a_node_that_begins_anew(dark):

@@ -34,6 +34,7 @@ def test_what_contradicts_is_named_and_left_out(fused):
     assert [shares[f'{n}.mp4'].used for n in range(4)] == [1, 1, 1, 1]
     assert not shares['straight.mp4'].left_out
     warnings = '; '.join(fused.calibration.warnings)
+    assert {each.code for each in fused.calibration.warnings} == {'E-CLIP-LEFT-OUT'}
     assert all(name in warnings for name in ('again.mp4', 'small.mp4', 'zoomed.mp4'))
 
 

@@ -187,7 +187,7 @@ def test_where_there_is_no_prior_it_says_why():
     assert unit_of(solved_unit(make='')) is None and unit_of(solved_unit(sound=False)) is None
     assert 'unknown' in final_of(solved_unit(make=''), None).prior_note
     thrown = final_of(solved_unit(), ModelPrior(None, 'its fx is off: another mode', True))
-    assert thrown.other_mode and 'another mode' in thrown.calibration.warnings[0]
+    assert thrown.other_mode and thrown.calibration.warnings[0].code == 'E-PRIOR-OTHER-MODE'
     assert thrown.calibration.camera.fx == 540.0
 
 

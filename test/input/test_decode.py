@@ -314,7 +314,8 @@ def test_a_folder_tells_that_its_pictures_are_turned(tmp_path):
     source = open_frames(tmp_path, fps=10)
     assert next(iter(source)).size == (40, 60)
     [warning] = source.warnings
-    assert str(tmp_path) in warning and 'EXIF' in warning and 'rotated by 90 degrees' in warning
+    assert warning.code == 'E-IMAGES-ROTATED'
+    assert str(tmp_path) in warning and 'rotated by 90 degrees' in warning
 
 
 def thermal(low, high, seed=0, **changes):

@@ -80,7 +80,8 @@ def test_files_in_the_order_of_the_camera(tmp_path, maker):
     assert [round(each) % 15 for each in brightness(source)[::12]] == [5, 6, 7]
     assert f'by {maker.split()[-1]} names: {".avi, ".join(NAMES[maker])}.avi' in source.warnings[0]
     given = sorted((tmp_path / 'clips').iterdir(), reverse=True)
-    assert f'{".avi, ".join(NAMES[maker])}.avi' in open_frames(given).warnings[0]
+    [warning] = open_frames(given).warnings
+    assert warning.code == 'E-FILES-AS-GIVEN' and f'{".avi, ".join(NAMES[maker])}.avi' in warning
 
 
 def test_files_in_the_order_of_their_times(tmp_path):
@@ -240,7 +241,9 @@ def test_one_that_cannot_be_read_is_left_out(tmp_path):
     source = open_frames(tmp_path / 'clips')
     assert [frame.index for frame in source] == list(range(24))
     assert [frame.perhaps_after_gap for frame in source].index(True) == 12
-    assert 'clip10.avi, clip11.avi' in source.warnings[0] and len(source.warnings) == 3
+    assert [each.code for each in source.warnings] == [
+        'E-FILES-ORDERED', 'E-FILE-SKIPPED', 'E-FILE-SKIPPED']
+    assert 'clip10.avi, clip11.avi' in source.warnings[0]
     assert str(paths[0]) in source.warnings[1] and 'clip99.mp4 is empty' in source.warnings[2]
     source = open_frames([tmp_path / 'missing.mp4', paths[1]])
     assert len(list(source)) == 12 and 'missing.mp4 does not exist' in source.warnings[0]
@@ -260,7 +263,8 @@ def test_one_that_breaks_while_it_is_read(tmp_path):
     source = open_frames(paths)
     paths[1].unlink()
     assert [frame.index for frame in source] == list(range(24))
-    assert len(source.warnings) == 1 and str(paths[1]) in source.warnings[0]
+    assert [each.code for each in source.warnings] == ['E-FILE-SKIPPED']
+    assert str(paths[1]) in source.warnings[0]
 
 
 def test_sizes_must_agree(tmp_path):
@@ -291,7 +295,7 @@ def test_an_undecodable_first_image_leaves_the_question_to_the_next(tmp_path):
 def test_what_all_files_say_is_said_once(tmp_path):
     folders = [write_folder(tmp_path / name, drive(3)) for name in 'abc']
     warning, = open_frames(folders).warnings
-    assert '--fps' in warning and 'and 2 more like it' in warning
+    assert warning.code == 'E-RATE-ASSUMED' and 'and 2 more like it' in warning
 
 
 @pytest.mark.parametrize('text, code, cure', [

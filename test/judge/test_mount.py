@@ -1,6 +1,7 @@
 """How the camera sits on the car: made pairs of images, made turns, and what makes it weak."""
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,9 @@ from dashcalib_ros import judge
 from dashcalib_ros.camera.rotation import OPTICAL
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.straights import PAIRS, POINTS, StraightCollector, Straights
+from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import load_calibration
+from dashcalib_ros.formats.ours import codes_of
 from dashcalib_ros.input.scale import FULL_SIZE
 from dashcalib_ros.judge import conclude
 from dashcalib_ros.judge.calibration import Mount
@@ -101,7 +104,7 @@ def test_a_car_that_drives_both_ways_does_not_say_where_it_looks(solution):
     both = replace(pairs, before=np.where(turned, pairs.after, pairs.before),
                    after=np.where(turned, pairs.before, pairs.after))
     found = mount_of(both, None, known, 'accepted', None)
-    assert found.verdict == 'weak' and any('backwards' in each for each in found.reasons)
+    assert found.verdict == 'weak' and codes_of(found.reasons)[-1] == 'E-MOUNT-DIRECTION'
     assert mount_of(pairs, None, known, 'accepted', None).reasons == ()
 
 
@@ -236,13 +239,14 @@ def test_it_is_never_better_than_the_lens(solution):
     known = replace(with_camera(solution, LENS), scenes=())
     assert mount_of(pairs, None, known, 'accepted', None).verdict == 'accepted'
     weak = mount_of(pairs, None, known, 'weak', None)
-    assert weak.verdict == 'weak' and 'the lens is weak' in weak.reasons[0]
+    assert weak.verdict == 'weak' and codes_of(weak.reasons) == ['E-MOUNT-LENS']
     assert mount_of(pairs, None, known, 'refused', None).verdict == 'weak'
     # 5 px of cy are half a degree of pitch, but not of the pixel of travel
     vague = np.array(solution.covariance)
     vague[3, 3] = 5.0**2
     found = mount_of(pairs, None, with_covariance(known, vague), 'accepted', None)
-    assert found.verdict == 'weak' and 'drive more turns' in found.reasons[0]
+    assert found.verdict == 'weak' and codes_of(found.reasons) == ['E-MOUNT-SIGMA']
+    assert 'drive more turns' in found.reasons[0]
     assert found.sigma['pitch_up_deg'] > np.degrees(5.0 / LENS.fy)
     assert found.travel_sigma_px == weak.travel_sigma_px
 
@@ -268,7 +272,8 @@ def test_a_lens_that_is_not_accepted_never_has_an_accepted_mount(
     if found is None:
         assert which == 0 and turns == 0
         return
-    assert found.verdict == 'weak' and f'the lens is {level}' in found.reasons[0]
+    assert found.verdict == 'weak' and codes_of(found.reasons)[0] == 'E-MOUNT-LENS'
+    assert level in found.reasons[0]
     # with the same evidence, only sigma decides for an accepted lens
     better = mount_of(drives[which], None, known, 'accepted', None)
     known_well = max(better.sigma['yaw_left_deg'], better.sigma['pitch_up_deg']) <= 0.2
@@ -279,7 +284,8 @@ def test_few_straights_say_to_drive_on(solution):
     known = replace(with_covariance(with_camera(solution, LENS), 1e-4 * np.eye(6)), scenes=())
     found = mount_of(pairs_of(mounted(0, 0, 0), count=10, noise_px=4.0), None, known, 'accepted',
                      None)
-    assert found.verdict == 'weak' and 'drive straight on' in found.reasons[0]
+    assert found.verdict == 'weak' and codes_of(found.reasons) == ['E-MOUNT-SIGMA']
+    assert 'drive straight on' in found.reasons[0]
 
 
 @settings(max_examples=50, deadline=None)
@@ -293,11 +299,19 @@ def test_the_quaternion_is_the_rotation(angles):
 
 
 def test_a_file_keeps_it(tmp_path):
-    mount = Mount('weak', ('thin',), 1.0, -0.5, None, None, {
+    mount = Mount('weak', (Notice('E-MOUNT-SIGMA', 'thin'),), 1.0, -0.5, None, None, {
         'yaw_left_deg': 0.1, 'pitch_up_deg': 0.2, 'roll_right_deg': None, 'height_m': None},
         (600.5, 170.25), 0.7, 273.0)
     write_results(make_calibration(mount=mount), tmp_path)
-    assert load_calibration(tmp_path).mount == mount
+    for name in ('result.json', 'calibration.yaml'):
+        found = load_calibration(tmp_path / name).mount
+        assert found == mount and codes_of(found.reasons) == ['E-MOUNT-SIGMA']
+    path = tmp_path / 'result.json'
+    data = json.loads(path.read_text())
+    assert data['mount'].pop('reason_codes') == ['E-MOUNT-SIGMA']
+    path.write_text(json.dumps(data))
+    older = load_calibration(path).mount
+    assert older == mount and codes_of(older.reasons) == ['']
 
 
 def test_the_pairs_of_a_long_drive_are_few_and_spread():

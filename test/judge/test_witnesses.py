@@ -162,17 +162,19 @@ def jumped(drive, later_s):
         rate.stamps_s + later_s * ((rate.stamps_s > 50.0) & (rate.stamps_s < 70.0)), rate.values))
 
 
-@pytest.mark.parametrize(('stream', 'line'), [
-    (lambda drive: gyro(drive, unit=180 / np.pi), 'not degrees per second'),
-    (lambda drive: gyro(drive, unit=9.0), 'check its unit'),
-    (lambda drive: gyro(drive).shifted(3.0), 'does not turn as the pictures do'),
-    (lambda drive: gyro(drive).shifted(1e4), 'no samples during the turns'),
-    (lambda drive: jumped(drive, 0.15), 'do not keep pace (turns are'),
+@pytest.mark.parametrize(('stream', 'code', 'value'), [
+    (lambda drive: gyro(drive, unit=180 / np.pi), 'E-GYRO-UNIT', 'not degrees per second'),
+    (lambda drive: gyro(drive, unit=9.0), 'E-GYRO-UNIT', 'check its unit'),
+    (lambda drive: gyro(drive).shifted(3.0), 'E-GYRO-OTHER-MOTION', ''),
+    (lambda drive: gyro(drive).shifted(1e4), 'E-GYRO-NO-SAMPLES', ''),
+    (lambda drive: jumped(drive, 0.15), 'E-GYRO-CLOCK', 'turns are'),
     (lambda drive: SensorStream(rate=Samples(
-        1.011 * gyro(drive).rate.stamps_s - 0.55, gyro(drive).rate.values)), '+1.1 % of time')])
-def test_streams_that_do_not_fit_are_told_and_not_used(drive, stream, line):
+        1.011 * gyro(drive).rate.stamps_s - 0.55, gyro(drive).rate.values)), 'E-GYRO-CLOCK',
+     '+1.1 % of time')])
+def test_streams_that_do_not_fit_are_told_and_not_used(drive, stream, code, value):
     said, [found] = asked(drive, stream(drive))
-    assert said is None and line in found and len(found.splitlines()) == 1
+    assert said is None and found.code == code
+    assert value in found and len(found.splitlines()) == 1
 
 
 def test_gaps_leave_out_what_they_hide(drive):
@@ -253,7 +255,7 @@ def test_one_turn_is_not_moved_by_a_gyro_that_is_called_calibrated_and_is_not(dr
     for scale in (0.975, 1.025):
         solution = alone(drive, 0)
         found = compare_sensors(solution, gyro(drive, scale), START_S, CALIBRATED)
-        named = any('does not confirm' in line for line in found.unused)
+        named = 'E-GYRO-UNCONFIRMED' in [each.code for each in found.unused]
         assert found.solution is solution and (named or not found.witnesses.gyro.agrees)
 
 
@@ -294,6 +296,6 @@ def test_gps_calibrates_a_gyro_of_unknown_scale(drive, scale):
 def test_a_scale_that_gps_contradicts_is_named_and_not_used(drive):
     solution = alone(drive, 0)
     found = compare_sensors(solution, with_town(drive, 1.03), START_S, CALIBRATED)
-    assert any('gyro_scale_sigma, 0.001, higher' in line for line in found.unused)
+    assert 'E-GYRO-SCALE' in [each.code for each in found.unused]
     assert found.witnesses.gyro.agrees
     assert abs(found.solution.camera.fx - LENS.fx) < 3 * found.solution.sigma[0]

@@ -12,7 +12,7 @@ from made_calibration import EACH_MODEL, TRUTH, calibration_of, make_calibration
 
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect import Bend, TurnId
-from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.errors import InputError, Notice, OutputError
 from dashcalib_ros.formats import export, load_camera, result_dict
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.calibration import (
@@ -123,8 +123,9 @@ def test_it_is_read_back(calibration, tmp_path):
             Condition('E-FEW-TURNS', 'turns used', '3', 'at least 2', True),)),
         stored_turns=(stored,), details={'profile_contrast': 0.3},
         covariance=np.eye(count) / 3, picture_covariance=np.eye(count) / 7,
-        rolling_shutter=Shutter(21.0, 0.3), stabiliser=Stabiliser(30.0), warnings=('dark',),
-        sigma_px=PictureSigma(0.5, 1.5), straight_lines=Bend(9, 3, 0.2, 0.01, 0.02, None, 0.5),
+        rolling_shutter=Shutter(21.0, 0.3), stabiliser=Stabiliser(30.0),
+        warnings=(Notice('E-DARK', 'dark'),), sigma_px=PictureSigma(0.5, 1.5),
+        straight_lines=Bend(9, 3, 0.2, 0.01, 0.02, None, 0.5),
         held_out=(LeftOut(TurnId.at(88), 0.5, 0.7, 0.8), LeftOut(TurnId.stored(1), 1.0, 2.0, 3.0)))
     full.save(tmp_path)
     for path in (tmp_path, tmp_path / 'result.json'):

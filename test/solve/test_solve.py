@@ -511,7 +511,7 @@ def test_a_model_that_was_asked_for_and_does_not_do_is_told_of(good):
     assert not conclude(good, evidence_for(good), asked).warnings
     refused = replace(good, around=replace(good.around, costs=np.ones_like(good.around.costs)))
     [warning] = conclude(refused, evidence_for(refused), asked).warnings
-    assert 'model radial' in warning and 'auto' in warning
+    assert warning.code == 'E-MODEL-CHOSEN' and 'radial' in warning and 'auto' in warning
 
 
 @pytest.mark.parametrize(('turns', 'frames', 'code', 'number'), [

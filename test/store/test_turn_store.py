@@ -187,8 +187,8 @@ def test_another_camera_is_left_out_with_one_warning(make, other):
     hold(make(), stored(0), stored(1))
     store = make(other)
     assert store.turns == {}
-    assert len(store.said) == 1 and '2 files in' in store.said[0]
-    assert 'in turns.store' in store.said[0] and str(other) in store.said[0]
+    assert [each.code for each in store.said] == ['E-STORE-OTHER-CAMERA']
+    assert '2 files in' in store.said[0] and str(other) in store.said[0]
     # they are left alone, and do not take the others' places
     hold(store, stored(2))
     assert len(names(store)) == 3
@@ -297,7 +297,7 @@ def test_a_file_of_no_use_is_left_out_with_one_warning(make, kind):
     SPOILED[kind](victim)
     found = make()
     assert len(found.turns) == 1
-    assert len(found.said) == 1 and victim.name in found.said[0] and 'delete' in found.said[0]
+    assert [each.code for each in found.said] == ['E-STORE-FILES'] and victim.name in found.said[0]
     assert '\n' not in found.said[0]
     # it stays, and is in nobody's way
     hold(found, stored(5), stored(6))
@@ -354,7 +354,7 @@ def test_a_folder_that_cannot_be_written_to_costs_one_warning(make, tmp_path):
     store = make(folder=tmp_path / 'file' / 'turns')
     hold(store, stored(0))
     hold(store, stored(0), stored(1))
-    assert len(store.said) == 1 and 'set turns.store' in store.said[0]
+    assert [each.code for each in store.said] == ['E-STORE-NOT-WRITABLE']
     store.clear()
 
 
