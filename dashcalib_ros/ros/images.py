@@ -379,7 +379,7 @@ class ImageInput:
     def _drawn(self, topic: str) -> bool:
         """Return whether another node like this one draws what is on a topic, for people."""
         place, _, _ = _base(topic).rpartition('/')
-        return self._node.count_publishers(f'{place}/turn_magnitude') > 0
+        return bool(self._node.count_publishers(f'{place}/turn_magnitude'))
 
 
 def _base(topic: str) -> str:
