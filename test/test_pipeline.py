@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import os
 import pickle
 import signal
@@ -11,6 +12,7 @@ import sys
 import threading
 import time
 import types
+import weakref
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
@@ -284,6 +286,25 @@ def test_close_ends_a_calibration_that_runs(frames):
         assert not thread.is_alive()
     assert len(outcome) == 1 and isinstance(outcome[0], WorkerError)
     assert calibrator.workers.pids() == []
+
+
+def test_close_frees_the_images_at_once(frames):
+    """A calibrator refers to itself: Python would free it some time, and a drive has several."""
+    gc.disable()
+    try:
+        with Calibrator(QUICK, live=True) as calibrator:
+            held = []
+            for frame in frames[:ONE_TURN]:
+                image = frame.image.copy()
+                held.append(weakref.ref(image))
+                calibrator.push(replace(frame, image=image))
+            del frame, image
+            assert sum(ref() is not None for ref in held) > 10
+        assert calibrator.detection.turns()
+        # the newest images stay with what tracks points
+        assert sum(ref() is not None for ref in held) <= 3
+    finally:
+        gc.enable()
 
 
 def test_more_turns_than_the_bank_would_hold():

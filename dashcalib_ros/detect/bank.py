@@ -64,6 +64,11 @@ class TurnBank:
             if held.turn.center == center:
                 held.turn = replace(held.turn, frames=frames, released_images=held.turn.images)
 
+    def free_images(self) -> None:
+        """Drop the images of all turns."""
+        for held in self._held + self._newest:
+            held.turn = replace(held.turn, frames=(), released_images=held.turn.images)
+
     def _made(self, peak: Peak, frames: tuple[Frame, ...]) -> _Held:
         center = next(frame.index for frame in frames if frame.stamp_ns == peak.stamp_ns)
         taken = max((held.turn.last for held in self._held + self._newest

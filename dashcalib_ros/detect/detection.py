@@ -97,8 +97,12 @@ class Detection:
         return self._turns.finish()
 
     def close(self) -> None:
-        """End the thread that finds lines; the lines found are kept."""
+        """End the thread that finds lines, and free all images; lines and turns are kept.
+
+        Python frees what refers to itself, as a calibrator does, only now and then.
+        """
         self._lines.close()
+        self._turns.close()
 
     def turns(self) -> tuple[Turn, ...]:
         """Return the best turns so far, the most prominent first."""

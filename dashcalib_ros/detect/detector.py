@@ -108,6 +108,11 @@ class TurnDetector:
         self._end()
         return self.bank.new_turns()
 
+    def close(self) -> None:
+        """Drop all images; the turns are kept, and no push() may follow."""
+        self._begin()
+        self.bank.free_images()
+
     def magnitudes(self) -> Floats:
         """Return (n, 2): stamp in s and filtered magnitude of the drive so far, decimated."""
         return self._history.table()

@@ -225,6 +225,7 @@ class ScenePool:
         for worker in self._workers:
             worker.close()
         with self._changed:
+            self._calls.clear()  # they have images
             self._notify()
         for thread in self._threads:
             if thread.is_alive():  # else an interrupt came before it started
