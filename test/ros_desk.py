@@ -39,6 +39,9 @@ class Desk:
             arguments += ['-r', f'image_raw:={topic}']
         if remapped:
             arguments += ['-r', f'set_camera_info:={remapped}']
+        if 'image_transport' not in parameters:
+            # node and bench take turns: the usual five would overflow where a turn is late
+            arguments += ['-p', f'qos_overrides./{topic}.subscription.depth:=50']
         for name, value in parameters.items():
             arguments += ['-p', f'{name}:={value}']
         rclpy.init(args=[program, *arguments])

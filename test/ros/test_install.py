@@ -153,8 +153,6 @@ def test_the_page_of_the_interface_is_that_of_a_running_node(start_node, make_be
     node, bench = start_node(command=[*QUICK_COMMAND, program]), make_bench(listen=False)
     bench.until(lambda: bench.images.get_subscription_count() > 0
                 and program in bench.node.get_node_names(), node=node)
-    # the node's own list comes a moment later
-    bench.spin(0.5)
 
     def full(name):
         return '/' + name.replace('~', program).lstrip('/')
@@ -168,6 +166,11 @@ def test_the_page_of_the_interface_is_that_of_a_running_node(start_node, make_be
                 if program in topic.programs and name != '/tf_static' and '_topic' not in name}
 
     of_rclpy = {full(name) for name in OF_RCLPY['topics']}
+    # the node's own lists come one after the other, a moment later
+    bench.until(lambda: found('publisher').keys() >= expected(PUBLISHED).keys()
+                and found('subscriber').keys() >= expected(SUBSCRIBED).keys()
+                and len(found('service')) >= len(OF_RCLPY['services']), node=node)
+    bench.spin(0.5)
     said, heard = found('publisher'), found('subscriber')
     assert of_rclpy < set(said)
     assert {name: said[name] for name in set(said) - of_rclpy} == expected(PUBLISHED)
