@@ -21,6 +21,10 @@ class _Held:
         """Return the turn with its prominence so far."""
         return replace(self.turn, prominence=self.peak.prominence)
 
+    def exchange(self, frames: tuple[Frame, ...]) -> None:
+        """Take the same images, stored in another way; none: drop them."""
+        self.turn = replace(self.turn, frames=frames, released_images=self.turn.images)
+
 
 class TurnBank:
     """Keeps the `capacity` most prominent turns, and those that may still grow into them."""
@@ -62,12 +66,12 @@ class TurnBank:
         """Take the same images, stored in another way, for those of a turn; none: drop them."""
         for held in self._held + self._newest:
             if held.turn.center == center:
-                held.turn = replace(held.turn, frames=frames, released_images=held.turn.images)
+                held.exchange(frames)
 
     def free_images(self) -> None:
         """Drop the images of all turns."""
         for held in self._held + self._newest:
-            held.turn = replace(held.turn, frames=(), released_images=held.turn.images)
+            held.exchange(())
 
     def _made(self, peak: Peak, frames: tuple[Frame, ...]) -> _Held:
         center = next(frame.index for frame in frames if frame.stamp_ns == peak.stamp_ns)

@@ -169,7 +169,7 @@ class Calibrating:
     def _adopt(self, calibration: Calibration) -> None:
         source = self.drive.source
         kept = StoredCalibration.of(calibration, self._whose, source.frame_id if source else '',
-                       *self.drive.images.publishers)
+                                    *self.drive.images.publishers)
         info = self._use(kept)
         self._log.info(f'accepted: {sigma_text(kept.camera)}; {self.save()[1]}')
         if self._own.commit:

@@ -241,9 +241,10 @@ class ImageInput:
     @property
     def several(self) -> bool:
         """Return whether the images are of several publishers."""
+        if len(self.publishers) < 2:
+            return False
         alternating = self._number is None or self._count - self._falls[0] < ALTERNATING
-        return len({*self.publishers} - {UNKNOWN}) > 1 or (
-            len(self.publishers) > 1 and alternating)
+        return alternating or len({*self.publishers} - {UNKNOWN}) > 1
 
     def start(self) -> None:
         """Subscribe."""

@@ -89,8 +89,9 @@ def _of_another_drive(found: Estimate) -> bool:
         return False
     old, new = ([scene for scene in found.scenes if scene.turn.of_this_drive == this]
                 for this in (False, True))
-    uprights = [roll for some in (old, new) if (roll := roll_deg(some)) is not None]
-    apart = abs(uprights[0] - uprights[-1]) % 360 if uprights else 0.0
+    before, now = roll_deg(old), roll_deg(new)
+    # gentle turns do not tell
+    apart = 0.0 if before is None or now is None else abs(before - now) % 360
     return (min(apart, 360 - apart) > OTHER_UPRIGHT_DEG
             or _posterior(found).of_another_drive > CONTRADICTION)
 
