@@ -11,7 +11,7 @@ from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.config import Config
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve import solve
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.solve.solution import Solution
 
 CONFIG = Config().replace({'intrinsics.profile_tracks': 60})

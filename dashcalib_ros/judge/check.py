@@ -112,7 +112,7 @@ def loss_of(given: Camera, solution: Solution, config: Config) -> float:
 
     given: of the solution's pictures. Poses and points are adjusted anew with each camera held.
     """
-    from dashcalib_ros.solve.prior import loss_px_of
+    from dashcalib_ros.solve.optimise import loss_px_of
     from dashcalib_ros.solve.start import costs_with, with_few_tracks
     # a part of the tracks says it, and takes a fifth of the time
     scenes = list(map(with_few_tracks, solution.scenes))

@@ -21,12 +21,12 @@ from dashcalib_ros.config import Config, MonitorConfig
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge.agreement import MAX_MISFIT
 from dashcalib_ros.judge.difference import CONTRADICTION, LEAST_SIGMA, RELEVANT, Way, limit_of
+from dashcalib_ros.problem.blocks import lens_alone
+from dashcalib_ros.problem.quadratic import Quadratic
+from dashcalib_ros.problem.steps import State
 from dashcalib_ros.reconstruct.heading import Heading, heading
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.imaging import lens_alone
-from dashcalib_ros.solve.linear import noise_of, normal_equations, residuals
-from dashcalib_ros.solve.prior import loss_px_of
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.solve.optimise import loss_px_of
 
 Kind = Literal['lens', 'mount']
 
@@ -69,10 +69,11 @@ def reading_of(scene: Scene, camera: Camera, config: Config) -> Reading:
     if found is None or misfit > MAX_MISFIT:
         nothing = Quadratic.prior(np.zeros((count, count)))
         return Reading(scene.turn, nothing, None, False, misfit)
-    loss_px, alone = loss_px_of([found], camera, config.intrinsics), lens_alone(camera)
-    normal = normal_equations(found, alone, loss_px, clusters=False)
-    cost = normal.cost.of(np.arange(count)).at_noise(
-        noise_of([found], [residuals(found, alone)], count, loss_px).variance)
+    loss_px = loss_px_of([found], camera, config.intrinsics)
+    alone = State(lens_alone(camera), (found,))
+    variance = alone.noise(loss_px).variance
+    [normal] = alone.normals(loss_px, variance, safe=False, tracks=True)
+    cost = normal.cost.at_noise(variance)
     # errors that the observations of a track share make it worth less than their number
     inflation = max(1.0, float(np.trace(np.linalg.pinv(cost.hessian) @ cost.by_track)) / count)
     return Reading(scene.turn, cost.at_noise(inflation), heading(found), misfit=misfit)

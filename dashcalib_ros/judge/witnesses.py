@@ -38,11 +38,11 @@ from dashcalib_ros.judge.gyro_scale import (
     scale_by_gps,
     straight_between,
 )
+from dashcalib_ros.problem.blocks import lens_alone
+from dashcalib_ros.problem.steps import State
 from dashcalib_ros.reconstruct.scene import Scene, main_axis
 from dashcalib_ros.robust import weighted_mean
-from dashcalib_ros.solve.imaging import lens_alone
-from dashcalib_ros.solve.linear import normal_equations, used_keyframes
-from dashcalib_ros.solve.prior import loss_px_of
+from dashcalib_ros.solve.optimise import loss_px_of
 from dashcalib_ros.solve.solution import Solution, with_measurement
 
 
@@ -79,7 +79,7 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
     try:
         loss_px = loss_px_of(solution.scenes, solution.camera, config.intrinsics)
         turns = [steps for scene in scenes
-                 if len(used_keyframes(scene)) >= LEAST_KEYFRAMES
+                 if len(scene.observed.keyframes) >= LEAST_KEYFRAMES
                  and (steps := steps_of(scene, solution, loss_px, start_s)) is not None]
         if stream.rate is not None:
             fit = fit_to(turns, stream.rate)
@@ -320,15 +320,12 @@ class Fit:
 
 def steps_of(scene: Scene, solution: Solution, loss_px: float, start_s: float) -> Steps:
     """Return how a scene's camera turned. start_s: stamp of the drive's first image."""
-    structure, camera = scene.structure, solution.camera
-    eliminated = normal_equations(scene, lens_alone(camera), loss_px).eliminated
-    rows, size = used_keyframes(scene), eliminated.pose_mixed.shape[1]
+    structure, rows = scene.structure, scene.observed.keyframes
+    [normal] = State(lens_alone(solution.camera), (scene,)).normals(loss_px, 1.0, safe=False)
     follow = []
-    for place, sigma in enumerate(np.sqrt(np.diag(solution.covariance))):
-        step = np.zeros(size)
-        step[place] = sigma
-        ahead, behind = (eliminated.moved(structure, sign * step).rotations[rows]
-                         for sign in (1, -1))
+    for step in np.diag(np.sqrt(np.diag(solution.covariance))):
+        sigma = float(step.max())
+        ahead, behind = (normal.moved(sign * step).structure.rotations[rows] for sign in (1, -1))
         follow.append((_turned(ahead) - _turned(behind)) / (2 * sigma))
     start_ns = round(start_s * 1e9)
     stamps_s = (scene.tracks.stamps_ns[rows] - start_ns) / 1e9

@@ -10,9 +10,9 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, GreyImage, Mask, Pixels
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.rotation import rotation_vectors
-from dashcalib_ros.detect.turn import Turn, TurnId
-from dashcalib_ros.reconstruct.tracks import Tracks
+from dashcalib_ros.detect.turn import Turn
+from dashcalib_ros.problem.observations import Stretch, Tracks, main_axis
+from dashcalib_ros.problem.observations import Structure as Structure
 
 # cosine (11 degrees); a point farther off its viewing ray is an outlier, wherever it projects
 ALONG = 0.98
@@ -27,27 +27,6 @@ Pose = tuple[Floats, Floats]
 
 # of a turn at the least; with fewer it is not reconstructed
 MIN_KEYFRAMES = 6
-
-
-@dataclass(frozen=True)
-class Structure:
-    """Poses and points of a scene, up to scale.
-
-    rotations: (k, 3, 3), translations: (k, 3): world to camera; rows of images that are not
-    registered are zero. points: (t, 3) in the world's frame.
-    registered: (k,); used: (k, t) observations that the structure explains.
-    """
-
-    rotations: Floats
-    translations: Floats
-    points: Floats
-    registered: Mask
-    used: Mask
-
-    def path(self) -> tuple[Floats, Floats]:
-        """Return the rotations (n, 3, 3) and the centres (n, 3) of the n registered images."""
-        rotations = self.rotations[self.registered]
-        return rotations, -np.einsum('kji,kj->ki', rotations, self.translations[self.registered])
 
 
 def triangulate(camera: Camera, rays: Floats, rotations: Floats, translations: Floats,
@@ -204,15 +183,12 @@ class Draft:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Stretch):
     """One turn, reconstructed: its tracks, the structure that explains them, and its profile.
 
     profile: of the camera's kind of lens. rivals: the starts of other kinds that were tried.
     """
 
-    turn: TurnId
-    tracks: Tracks
-    structure: Structure
     camera: Camera
     profile: Profile
     rivals: tuple[Start, ...] = ()
@@ -241,26 +217,9 @@ class Scene:
         return np.asarray(yaws if np.ptp(yaws) > BUMPS_DEG else -np.degrees(self.turned[:, 1]))
 
     @property
-    def turned(self) -> Floats:
-        """Return (k, 3) rad, by how much each registered keyframe turned about x, y and z.
-
-        It is the sum of the steps since the first one, each in the camera's own frame: a car turns
-        about one axis of it, the vertical, which is (0, 1, 0) where the pictures are upright.
-        """
-        rotations = self.structure.rotations[self.structure.registered]
-        steps = rotation_vectors(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
-        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-
-    @property
     def explained(self) -> float:
         """Return the share of all observations that the structure explains."""
         return float(self.structure.used.sum() / max(int(self.tracks.seen.sum()), 1))
-
-
-def main_axis(turned: Floats) -> Floats:
-    """Return the unit vector about which was turned most, its largest component positive."""
-    axis = np.linalg.svd(turned, full_matrices=False)[2][0]
-    return np.asarray(axis * np.sign(axis[np.argmax(np.abs(axis))]))
 
 
 def errors_px(scene: Scene, camera: Camera) -> Floats:

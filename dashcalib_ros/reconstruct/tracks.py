@@ -5,7 +5,7 @@ so that tracking is exact to a part of a pixel, in a tenth of the time.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from dashcalib_ros.arrays import Floats, GreyImage, Ints, Mask
 from dashcalib_ros.config import TracksConfig
 from dashcalib_ros.detect.points import Tracking, find_corners, follow_points
 from dashcalib_ros.detect.turn import Turn
+from dashcalib_ros.problem.observations import Tracks
 
 # keyframes; a track seen in fewer is dropped
 MIN_LENGTH = 3
@@ -26,26 +27,6 @@ LEVELS = 4
 GRID = (6, 3)
 # a keyframe comes at the latest when fewer of the last one's points live
 KEYFRAME_OVERLAP = 0.6
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Correspondences of one turn.
-
-    frames: (k,) indices of the keyframes among the input's frames.
-    xy: (k, t, 2) pixel coordinates (first pixel's centre at 0, 0), NaN where a track is not seen.
-    image_size: (width, height). stamps_ns: (k,) when the keyframes were taken.
-    """
-
-    frames: Ints
-    xy: Floats
-    image_size: tuple[int, int]
-    stamps_ns: Ints
-
-    @property
-    def seen(self) -> Mask:
-        """Return (k, t): whether the track is seen in the keyframe."""
-        return np.isfinite(self.xy[:, :, 0])
 
 
 def track_turn(turn: Turn, config: TracksConfig, valid: Mask | None = None) -> Tracks:

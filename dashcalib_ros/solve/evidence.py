@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -21,24 +20,14 @@ from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera import MODELS
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.problem.blocks import Bend, Block, ImageBlock, Shift, Zoom
+from dashcalib_ros.problem.normal import Normal, linearised, normal_equations
+from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import errors_px
-from dashcalib_ros.solve.linear import (
-    COUPLED_READOUT_S,
-    IMAGE,
-    ImagePrior,
-    Normal,
-    normal_equations,
-)
-from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate, about_shared
-from dashcalib_ros.solve.prior import crop_prior, zoom_prior
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate
 
 Kind = Literal['shift', 'zoom', 'bend']
 
-# columns and rows over the picture of places at which a local bend is estimated
-BENDS = (5, 4)
-# prior sigma of the bend at each of them, px
-BEND_PX = 3.0
 # times what chance gains; more is clear
 CLEAR: Mapping[Kind, float] = {'shift': 2.0, 'zoom': 2.0, 'bend': 8.0}
 # times these behind a rolling shutter, of which bumps leave something over; and in one turn alone.
@@ -76,10 +65,9 @@ class Candidate:
 
 def costs_of(now: Estimate, loss_px: float) -> list[Quadratic]:
     """Return each turn's cost about what turns share, at the noise; images' shifts follow."""
-    variance = now.noise(loss_px).variance * now.inflation
-    normals = [normal_equations(scene, now.imaging, loss_px, now.moves, variance=variance)
-               for scene in now.scenes]
-    return [cost.at_noise(variance) for cost in about_shared(now, normals, variance)]
+    unit = now.noise(loss_px).variance * now.inflation
+    return [normal.cost.at_noise(unit) for normal in now.normals(
+        loss_px, unit, safe=False, tracks=True, images=not now.moves)]
 
 
 def costs_left_out(now: Estimate, loss_px: float) -> dict[TurnId, float]:
@@ -89,7 +77,7 @@ def costs_left_out(now: Estimate, loss_px: float) -> dict[TurnId, float]:
     """
     unit = now.noise(loss_px).variance * now.inflation
     turns = costs_of(now, loss_px)
-    total = Quadratic.together([*turns, now.prior()])
+    total = Quadratic.together([*turns, now.imaging.prior()])
     limit_px, found = now.config.scene.error_px, {}
     for scene, turn in zip(now.seen_by_lens, turns, strict=True):
         errors = np.minimum(errors_px(scene, now.camera), limit_px)[scene.tracks.seen]
@@ -196,22 +184,15 @@ def fixed_camera_tests(found: Estimate) -> tuple[FixedCameraTest, ...]:
     """
     now = found.with_tracks(FIRST_TRACKS)
     loss_px, width = now.loss_px(), now.camera.image_size[0]
-    variance = now.noise(loss_px).variance
-    further = partial(_bends, image_size=now.camera.image_size)
-    normals = [normal_equations(scene, now.imaging, loss_px, True, further,
-                                variance=variance * now.inflation) for scene in now.scenes]
-    prior = now.prior()
-    # what is the present optimum but for a part of the tracks
-    prior = Quadratic.prior(prior.hessian, np.full(
-        len(normals[0].shared.score) - len(prior.score), BEND_PX**-2), np.pad(
-        prior.score, (0, len(normals[0].shared.score) - len(prior.score))))
-    own = np.arange(len(now.prior().score))
-    shifts = [crop_prior(scene, variance, now.imaging.images.get(
-        scene.turn, np.zeros((len(scene.tracks.frames), IMAGE)))) for scene in now.scenes]
-    zooms = [zoom_prior(scene, variance) for scene in now.scenes]
+    variance, count = now.noise(loss_px).variance, len(now.imaging.names)
+    shift, zoom = now.imaging.blocks.get(Shift.name, Shift()), Zoom()
+    asked = now.having(shift, zoom, Bend())
+    normals = [normal_equations(linearised(each, loss_px), variance * now.inflation,
+                                (shift.name, zoom.name), tracks=True) for each in asked.seen]
+    prior, own = asked.imaging.prior(), np.arange(count)
 
-    def solved(images: Sequence[ImagePrior] | None, places: Ints) -> _Step:
-        return _solved(normals, prior, variance, images, places)
+    def solved(block: Block | None, places: Ints) -> _Step:
+        return _solved(normals, prior, variance, block, places)
 
     def test(kind: Kind, step: _Step, base: _Step, limit: float, unit: float) -> FixedCameraTest:
         parts = step.images if kind != 'bend' else (step.shared[len(own):],)
@@ -223,35 +204,43 @@ def fixed_camera_tests(found: Estimate) -> tuple[FixedCameraTest, ...]:
             turns if kind == 'zoom' else {})
 
     fixed, more = solved(None, own), ONE_TURN if len(now.scenes) == 1 else 1.0
-    if abs(now.imaging.readout_s) > COUPLED_READOUT_S:
+    if now.imaging.coupled:
         more *= ROLLING
     # a stabilised picture goes on moving
-    moving = shifts if now.moves else None
-    tests = [test('shift', solved(shifts, own), fixed,
+    moving = shift if now.moves else None
+    tests = [test('shift', solved(shift, own), fixed,
                   LEFT_SHIFT if now.moves else more * CLEAR['shift'], width),
-             test('zoom', solved(zooms, own), fixed, more * CLEAR['zoom'], 1.0),
+             test('zoom', solved(zoom, own), fixed, more * CLEAR['zoom'], 1.0),
              test('bend', solved(moving, np.arange(len(prior.score))), solved(moving, own),
                   CLEAR['bend'], width / 1000)]
     return tuple(sorted(tests, key=lambda each: (not each.clear, -each.strength / each.limit)))
 
 
 def _solved(normals: Sequence[Normal], prior: Quadratic, variance: float,
-            images: Sequence[ImagePrior] | None, places: Ints) -> _Step:
-    """Return the step with these parameters free; images: a prior for each turn."""
+            block: Block | None, places: Ints) -> _Step:
+    """Return the step with these shared parameters free, and a block of images; None: none."""
     gain = chance = 0.0
-    costs = [prior.of(places)]
-    for n, normal in enumerate(normals):
-        cost = normal.shared if images is None else images[n].eliminated(normal)
-        costs.append(cost.of(places).at_noise(variance))
-        if images is not None:
-            own = images[n].of(normal)
+    costs, wholes = [prior.of(places)], []
+    for normal in normals:
+        first = len(normal.cost.score) - len(prior.score)
+        free = np.zeros(0, np.intp)
+        if isinstance(block, ImageBlock):
+            free = np.arange(first)[normal.places[block.name]]
+            precision, off = block.prior_of(normal.linear.stretch)
+        cost = normal.cost.of(np.concatenate([free, first + places]))
+        if len(free):
+            cost = Quadratic.together([cost, Quadratic.prior(
+                variance * precision, np.zeros(len(places)),
+                -variance * np.pad(precision @ off, (0, len(places))))])
+            own = cost.of(np.arange(len(free)))
             gain += float(own.score @ own.covariance @ own.score) / variance
             chance += own.chance / variance
+        wholes.append((cost, len(free)))
+        costs.append(cost.eliminated(len(free)).at_noise(variance))
     total = Quadratic.together(costs)
     step = total.optimum
-    of_images = () if images is None else tuple(
-        each.step(normal, np.asarray(places), step)
-        for each, normal in zip(images, normals, strict=True))
+    of_images = tuple(cost.moved(np.pad(step, (count, 0))).of(np.arange(count)).optimum
+                      for cost, count in wholes if count)
     return _Step(gain + float(total.score @ step), chance + total.chance, step, of_images)
 
 
@@ -266,19 +255,3 @@ def largest_crop(crops: Mapping[TurnId, Floats]) -> float:
     """Return how far the crop moved at the most, from its middle, px."""
     paths = np.concatenate(list(crops.values()))
     return float(np.abs(paths - np.median(paths, axis=0)).max())
-
-
-def _bends(projected: Floats, image_size: tuple[int, int]) -> Floats:
-    """Return (n, 2, 2 f) derivatives of pixels (n, 2) by displacements at f places.
-
-    The weights of the places at a pixel sum to 1.
-    """
-    places = projected / np.array(image_size)
-    columns, rows = ((np.arange(count) + 0.5) / count for count in BENDS)
-    across = np.exp(-0.5 * ((places[..., :1] - columns) * BENDS[0])**2)
-    down = np.exp(-0.5 * ((places[..., 1:] - rows) * BENDS[1])**2)
-    weight = (across[..., :, None] * down[..., None, :]).reshape(len(places), 1, -1)
-    weight /= np.maximum(weight.sum(axis=-1, keepdims=True), 1e-9)
-    zero = np.zeros_like(weight)
-    return np.concatenate([np.concatenate([weight, zero], axis=-1),
-                           np.concatenate([zero, weight], axis=-1)], axis=1)

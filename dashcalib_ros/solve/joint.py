@@ -10,6 +10,14 @@ import numpy as np
 from dashcalib_ros.camera import AUTO, Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.problem.blocks import (
+    FOCAL_BOUND,
+    Readout,
+    Shift,
+    bounds_of,
+    imaging_with,
+    lens_like,
+)
 from dashcalib_ros.reconstruct.chain import CHAIN_ERROR
 from dashcalib_ros.reconstruct.heading import roll_deg
 from dashcalib_ros.reconstruct.scene import Profile, Scene
@@ -21,10 +29,7 @@ from dashcalib_ros.solve.evidence import (
     fixed_camera_tests,
     moves,
 )
-from dashcalib_ros.solve.imaging import imaging_with, lens_like
-from dashcalib_ros.solve.linear import IMAGE
 from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate, optimised
-from dashcalib_ros.solve.prior import FOCAL_BOUND, bounds_of
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import Posterior
 from dashcalib_ros.solve.start import (
@@ -47,7 +52,7 @@ Progress = Callable[[str, float], None]
 LOSSES = ((2.0, 4), (1.0, 2), (0.5, 2), (0.0, 5))
 # the same with one focal length, a centred lens, its first two coefficients, and a readout
 FIRST_LOSSES = ((2.0, 5), (1.0, 3))
-FIRST_REACH = 0.35
+FIRST_REACH, FIRST_FREE = 0.35, (0, 1, 4, 5)
 # gain of a step, in units of the noise, that ends the search with a part of the tracks
 NEAR = 0.5
 # with all tracks: steps after each triangulation
@@ -138,19 +143,20 @@ def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progr
     progress('adjusting one focal length', 0.0)
     measured = {scene.turn: adapted_to(scene, camera, config) for scene in per_turn}
     found = _start(camera, tuple(measured.values()), camera, config, FIRST_REACH)
+    lens = found.imaging.lens
+    found = found.having(replace(lens, directions=np.eye(len(lens.value))[:, FIRST_FREE]),
+                         replace(found.imaging.smooth, held=True))
     for least_px, steps in FIRST_LOSSES:
         found = found.with_tracks(FIRST_TRACKS).retriangulated(2 * least_px)
         if not found.scenes:
             return None
-        found = optimised(found, least_px, steps,
-                          np.array([0, 1, 4, 5, len(found.camera.params)]), NEAR)
+        found = optimised(found, least_px, steps, NEAR, choose=False)
     kept = explained_by(found.retriangulated().scenes, measured, found.camera, config)
     if not kept:
         return None
     progress('adjusting all parameters', 0.0)
-    readout_s = found.imaging.readout_s
-    found = _start(found.camera, tuple(kept), found.camera, config)
-    found = replace(found, imaging=replace(found.imaging, readout_s=readout_s))
+    readout = found.imaging.blocks[Readout.name]
+    found = _start(found.camera, tuple(kept), found.camera, config).having(readout)
     near = _narrowed(found.with_tracks(FIRST_TRACKS))
     return None if near is None else _Begun(near, profile)
 
@@ -160,8 +166,10 @@ def _start(camera: Camera, scenes: tuple[Scene, ...], centred: Camera, config: C
     """Return the estimate with a lens alone, in the widest model of its kind."""
     wide = type(camera.widened())
     centred = wide.centred(camera.image_size, centred.fx, *centred.params[4:6])
-    return Estimate(imaging_with(camera.widened(), scenes), scenes, centred, config, focal_reach,
-                    aspect_sigma=config.intrinsics.aspect_sigma)
+    found = Estimate(imaging_with(camera.widened(), scenes), scenes, config=config)
+    return found.having(replace(
+        found.imaging.lens, centred=centred, bounds=bounds_of(centred, focal_reach),
+        aspect_sigma=config.intrinsics.aspect_sigma))
 
 
 def _narrowed(found: Estimate, losses: Sequence[tuple[float, int]] = LOSSES
@@ -172,9 +180,9 @@ def _narrowed(found: Estimate, losses: Sequence[tuple[float, int]] = LOSSES
         now = now.retriangulated(2 * least_px)
         if not now.scenes:
             return None
-        now = optimised(now, least_px, steps, settled=NEAR)
+        now = optimised(now, least_px, steps, NEAR)
         # what was found first may be farther off than the bounds about it allow
-        now = replace(now, centred=now.centred.with_focal(now.camera.fx))
+        now = now.about(now.imaging.lens.centred.with_focal(now.camera.fx))
     return now
 
 
@@ -221,13 +229,13 @@ def _with_all_tracks(found: Estimate, per_turn: Mapping[TurnId, Scene], config: 
     """Return the estimate with all tracks, without turns that the camera does not explain."""
     # a shutter's displacements depend on the points: find these with a generous limit first
     generous = replace(
-        found, imaging=replace(found.imaging, readout_s=0.0),
-        scenes=tuple(with_poses_of(per_turn[scene.turn], scene) for scene in found.scenes)
+        found.having(Readout()),
+        stretches=tuple(with_poses_of(per_turn[scene.turn], scene) for scene in found.scenes)
     ).retriangulated(CHAIN_ERROR * found.camera.image_size[0])
     seen = replace(generous, imaging=found.imaging).retriangulated().seen_by_lens
     kept = explained_by(seen, {scene.turn: scene for scene in seen}, found.camera, config)
     kept = with_better_poses(kept, list(per_turn.values()), found.camera, config.scene)
-    return replace(found, scenes=tuple(
+    return replace(found, stretches=tuple(
         replace(scene, tracks=per_turn[scene.turn].tracks) for scene in kept))
 
 
@@ -236,9 +244,8 @@ def _steadied(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config)
 
     With a part of the tracks first, and without a readout: it looks alike, and may be far off.
     """
-    still = {scene.turn: np.zeros((len(scene.tracks.frames), IMAGE)) for scene in found.scenes}
-    start = replace(found, imaging=replace(
-        found.imaging, readout_s=0.0, images=still, shaking={})).with_tracks(FIRST_TRACKS)
+    start = found.having(Readout(), Shift())
+    start = replace(start, imaging=start.imaging.anchored()).with_tracks(FIRST_TRACKS)
     near = _narrowed(start, ((LOSSES[0][0], config.intrinsics.crop_rounds), *LOSSES[1:]))
     if near is None:
         return found
@@ -252,8 +259,9 @@ def _posterior(found: Estimate) -> Posterior:
     """Return what the turns know at their optimum."""
     lens = found.camera
     return Posterior(
-        lens, found.field_sigma**2 * lens_like(lens), tuple(costs_of(found, found.loss_px())),
-        np.array([not scene.turn.of_this_drive for scene in found.scenes]), found.prior())
+        lens, found.imaging.smooth.sigma**2 * lens_like(lens),
+        tuple(costs_of(found, found.loss_px())),
+        np.array([not scene.turn.of_this_drive for scene in found.scenes]), found.imaging.prior())
 
 
 def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
@@ -270,14 +278,14 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
     progress('trying other focal lengths', 0.0)
     around = profile_around(scenes, result.camera, coarse, config)
     count = len(result.camera.params)
-    place = len(lens.params)
+    place, centred = found.imaging.places[Readout.name], found.imaging.lens.centred
     return Solution(
         written=result, posterior=posterior, scenes=scenes, coarse=coarse, around=around,
         centred=type(result.camera).centred(
-            lens.image_size, found.centred.fx, *found.centred.params[4:min(count, 6)]),
-        bounds=np.array(bounds_of(found.centred))[:, :count],
+            lens.image_size, centred.fx, *centred.params[4:min(count, 6)]),
+        bounds=bounds_of(centred)[:, :count],
         readout_s=found.imaging.readout_s,
-        readout_sigma_s=float(np.sqrt(posterior.covariance[place, place])),
+        readout_sigma_s=float(np.sqrt(posterior.covariance[place, place].item())),
         misfits=unlike, tried=tried,
-        fixed_camera=tests, field_sigma=found.field_sigma,
-        crops={turn: images[:, :2] for turn, images in found.imaging.images.items()})
+        fixed_camera=tests, field_sigma=found.imaging.smooth.sigma,
+        crops=dict(found.imaging.of_images(Shift.name)))

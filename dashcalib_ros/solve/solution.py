@@ -11,10 +11,10 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.problem.blocks import lens_alone
+from dashcalib_ros.problem.quadratic import NONE, Quadratic
 from dashcalib_ros.reconstruct.scene import Profile, Scene, rms_px
 from dashcalib_ros.solve.evidence import Candidate, FixedCameraTest
-from dashcalib_ros.solve.imaging import lens_alone
-from dashcalib_ros.solve.quadratic import NONE, Quadratic
 from dashcalib_ros.solve.spread import PictureSigma, Posterior, SigmaMap, sigma_over
 from dashcalib_ros.solve.written import Written, written
 

@@ -17,7 +17,7 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Ints, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import sensitivity
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.problem.quadratic import Quadratic
 
 # of fx: by how much turns may differ. Real ones do by 0.2 to 1 %, rendered ones by nothing
 TURNS_DIFFER = (0.0, 0.0015, 0.003, 0.006, 0.012)

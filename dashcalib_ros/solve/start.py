@@ -24,8 +24,7 @@ from dashcalib_ros.reconstruct.scene import (
     retriangulated,
     truncated_cost,
 )
-from dashcalib_ros.solve.optimise import FIRST_TRACKS, subsample_tracks
-from dashcalib_ros.solve.prior import loss_px_of
+from dashcalib_ros.solve.optimise import FIRST_TRACKS, loss_px_of, subsample_tracks
 
 # factors of the resulting focal length at which the profile is evaluated
 PROBES = (0.8, 1.0, 1.25)

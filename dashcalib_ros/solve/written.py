@@ -17,8 +17,8 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import AUTO, Camera, calibrated_models
 from dashcalib_ros.camera.field import Field, field_terms
 from dashcalib_ros.camera.mapping import grid_of, turned
+from dashcalib_ros.problem.blocks import Imaging, Lens, Smooth, displacements
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.imaging import Imaging, displacements
 from dashcalib_ros.solve.spread import SigmaMap, sigma_over
 
 # places of tracks that are looked at; the picture's grid has the rest of the weight
@@ -139,10 +139,14 @@ def _places(imaging: Imaging, pixels: Floats, weights: Floats | None = None) -> 
     rays = imaging.camera.rays(imaging.field.ideal(pixels))
     known = np.isfinite(rays).all(axis=1)
     pixels, rays, weights = pixels[known], rays[known], weights[known]
-    by_lens = imaging.camera.derivatives(rays)[0]
-    bends = displacements(pixels, imaging.camera.image_size, imaging.basis)
-    return _Places(pixels, weights / weights.sum(), rays, np.concatenate(
-        [by_lens, np.zeros((len(pixels), 2, 1)), bends], axis=2))
+    moves = np.zeros((len(pixels), 2, len(imaging.names)))
+    for name, place in imaging.places.items():
+        if name == Lens.name:
+            moves[:, :, place] = imaging.camera.derivatives(rays)[0]
+        elif name == Smooth.name:
+            moves[:, :, place] = displacements(
+                pixels, imaging.camera.image_size, imaging.smooth.basis)
+    return _Places(pixels, weights / weights.sum(), rays, moves)
 
 
 def _fit(imaging: Imaging, places: _Places, model: type[Camera]) -> _Fit:

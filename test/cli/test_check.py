@@ -20,7 +20,7 @@ from dashcalib_ros.formats import result_json
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
 from dashcalib_ros.pipeline import Calibrator
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.solve.spread import PictureSigma
 
 

@@ -34,7 +34,7 @@ from dashcalib_ros.ros.calibrate import camera_info
 from dashcalib_ros.ros.check import NOT_YET, flat_texts
 from dashcalib_ros.ros.images import LASTING
 from dashcalib_ros.selection import SceneSelection
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.problem.quadratic import Quadratic
 
 TOPIC = '/camera_info'
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,

@@ -30,7 +30,7 @@ from dashcalib_ros.ros.background import (
     Watched,
 )
 from dashcalib_ros.selection import SceneSelection
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.problem.quadratic import Quadratic
 
 LIMIT = 20.0
 CONFIG = Config().replace({'turns.wanted': 2})

@@ -17,8 +17,8 @@ from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.cli import main
 from dashcalib_ros.formats import load_calibration, result_json
 from dashcalib_ros.judge.calibration import LensField
+from dashcalib_ros.problem.blocks import displacements, field_basis, imaging_with
 from dashcalib_ros.reconstruct.scene import Profile, Start
-from dashcalib_ros.solve.imaging import displacements, field_basis, imaging_with
 
 
 def a_field(rms_px: float, seed: int = 3) -> Field:
@@ -119,9 +119,10 @@ def test_the_tracks_are_where_the_lens_alone_would_see_them():
     [scene] = scenes_of(1)
     field = a_field(1.0)
     imaging = imaging_with(LENS)
-    inside, *_ = np.linalg.lstsq(imaging.basis, field.coefficients.ravel(), rcond=None)
+    smooth = imaging.smooth
+    inside, *_ = np.linalg.lstsq(smooth.basis, field.coefficients.ravel(), rcond=None)
     seen = scene.tracks.seen
-    xy = dataclasses.replace(imaging, directions=inside).ideal(scene)
+    xy = imaging.having(dataclasses.replace(smooth, value=inside)).ideal(scene)
     np.testing.assert_allclose(field.observed(xy[seen]), scene.tracks.xy[seen], atol=1e-6)
 
 

@@ -13,8 +13,8 @@ from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.input.scale import FULL_SIZE
 from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import STEADY, judge
+from dashcalib_ros.problem.blocks import Shift, Zoom, imaging_with
 from dashcalib_ros.reconstruct.scene import Scene
-from dashcalib_ros.solve.imaging import imaging_with
 
 # what the others are measured against: nothing is taken out
 KEPT = CONFIG.replace({'intrinsics.crop_rounds': 0})
@@ -93,9 +93,10 @@ def test_a_crop_is_taken_out_of_the_tracks():
     [scene] = scenes_of(1)
     imaging = imaging_with(LENS)
     np.testing.assert_array_equal(imaging.ideal(scene), scene.tracks.xy)
-    images = np.tile((3.0, -1.0, 0.01), (len(scene.tracks.frames), 1))
+    count = len(scene.tracks.frames)
     middle = (np.array(SIZE) - 1) / 2
-    moved = replace(imaging, images={scene.turn: images}).ideal(scene)
+    moved = imaging.having(Shift({scene.turn: np.tile((3.0, -1.0), (count, 1))}), Zoom(
+        {scene.turn: np.full((count, 1), 0.01)})).ideal(scene)
     np.testing.assert_allclose(middle + 1.01 * (moved - middle) + (3.0, -1.0), scene.tracks.xy)
 
 

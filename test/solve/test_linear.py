@@ -10,9 +10,19 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Brown, Camera, Fisheye
 from dashcalib_ros.camera.rotation import rotation_matrices
+from dashcalib_ros.problem.blocks import (
+    Imaging,
+    Lens,
+    Readout,
+    Shift,
+    Smooth,
+    Zoom,
+    bounds_of,
+    imaging_with,
+)
+from dashcalib_ros.problem.normal import Normal, linearised, noise_of, normal_equations
+from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import Scene, residuals_px
-from dashcalib_ros.solve.imaging import Imaging, imaging_with, shake_precision
-from dashcalib_ros.solve.linear import IMAGE, noise_of, normal_equations, residuals
 from dashcalib_ros.solve.optimise import Estimate, optimised
 
 DECENTRED = Brown(SIZE, *LENS.params, 0.001, -0.001, 0.005)
@@ -26,6 +36,14 @@ def small_scene(camera: Camera) -> Scene:
     """Return a turn of few tracks with its true structure."""
     turn = synthetic_turn(camera, 70.0, 6, 30, keyframe_s=0.15)
     return replace(turn.scene(camera), structure=turn.structure)
+
+
+def residuals(scene: Scene, imaging: Imaging) -> np.ndarray:
+    return imaging.seen(scene).off
+
+
+def normal_of(scene: Scene, imaging: Imaging, loss_px: float, **options) -> Normal:
+    return normal_equations(linearised(imaging.seen(scene), loss_px), **options)
 
 
 def as_seen(scene: Scene, imaging: Imaging, noise_px: float = 0.02) -> Scene:
@@ -45,35 +63,37 @@ def imaging_of(camera: Camera, scene: Scene, readout_s: float, few: int = 5) -> 
     """Return the imaging with few directions of the field, and with some of everything."""
     found, rng = imaging_with(camera, [scene]), np.random.default_rng(2)
     count = len(scene.tracks.frames)
-    return replace(
-        found, readout_s=readout_s, basis=found.basis[:, :few],
-        directions=0.02 * rng.normal(size=few),
-        images={scene.turn: rng.normal(size=(count, 3)) * (0.5, 0.5, 1e-4)},
-        shaking={scene.turn: 0.01 * rng.normal(size=(count, 3))} if readout_s else {})
+    smooth = Smooth(0.002 * rng.normal(size=few), found.smooth.basis[:, :few])
+    moved = rng.normal(size=(count, 3)) * (0.5, 0.5, 1e-4)
+    shaking = {scene.turn: 0.01 * rng.normal(size=(count, 3))} if readout_s else {}
+    return found.having(
+        Readout(np.array([readout_s])), smooth, Shift({scene.turn: moved[:, :2]}, held=True),
+        Zoom({scene.turn: moved[:, 2:]}, held=True),
+        replace(found.blocks['shake'], value=shaking, readout_s=readout_s))
 
 
-def numeric(scene: Scene, imaging: Imaging, loss_px: float, by_image: bool
+def numeric(scene: Scene, imaging: Imaging, loss_px: float, kept: tuple[str, ...]
             ) -> tuple[np.ndarray, np.ndarray]:
     """Return hessian and score by differences, all poses, points and shaking eliminated."""
-    structure, turn = scene.structure, scene.turn
+    structure = scene.structure
     k, t = structure.used.shape
-    shaking = 3 * k if imaging.readout_s else 0
-    sizes = [6 * k, shaking, 3 * t, IMAGE * k if by_image else 0, len(imaging.camera.params) + 1
-             + len(imaging.directions)]
+    gone = [block.name for block in imaging.of_each_image if block.name not in kept]
+    blocks = {name: imaging.blocks[name] for name in [*gone, *kept]}
+    sizes = [6 * k, *(k * blocks[name].count for name in gone), 3 * t,
+             *(k * blocks[name].count for name in kept), len(imaging.names)]
+    ends = np.cumsum(sizes)
 
     def off(values: np.ndarray) -> np.ndarray:
-        pose, shake, point, image, step = np.split(values, np.cumsum(sizes)[:-1])
+        pose, *more, step = np.split(values, ends[:-1])
+        point = more.pop(len(gone))
         turned, moved = np.split(pose.reshape(k, 6), 2, axis=1)
         other = replace(scene, structure=replace(
             structure, rotations=rotation_matrices(turned) @ structure.rotations,
             translations=structure.translations + moved,
             points=structure.points + point.reshape(t, 3)))
-        now = imaging.stepped(step)
-        if shaking:
-            now = replace(now, shaking={turn: imaging.shaking[turn] + shake.reshape(k, 3)})
-        if by_image:
-            now = replace(now, images={turn: imaging.images[turn] + image.reshape(k, IMAGE)})
-        return residuals(other, now).ravel()
+        return residuals(other, imaging.moved(step).having(*(
+            block.moved_in(scene, each) for block, each in zip(blocks.values(), more,
+                                                               strict=True)))).ravel()
 
     here = np.zeros(sum(sizes))
     base = off(here)
@@ -85,15 +105,18 @@ def numeric(scene: Scene, imaging: Imaging, loss_px: float, by_image: bool
     weight = np.repeat(1 / (1 + np.sum(base.reshape(-1, 2)**2, axis=1) / loss_px**2), 2)
     weighted = jacobian * weight[:, None]
     normal, pull = weighted.T @ weighted, weighted.T @ base
-    if shaking:
-        own = slice(sizes[0], sizes[0] + shaking)
-        precision = VARIANCE * np.kron(np.eye(k), shake_precision(imaging.axes[turn]))
-        normal[own, own] += precision
-        pull[own] -= precision @ imaging.shaking[turn].ravel()
-    inner = np.linalg.pinv(normal[:-sum(sizes[3:]), :-sum(sizes[3:])], rcond=1e-11, hermitian=True)
-    first, rest = slice(len(inner)), slice(len(inner), None)
-    follow = normal[rest, first] @ inner
-    return normal[rest, rest] - follow @ normal[first, rest], pull[rest] - follow @ pull[first]
+    for n, name in enumerate(gone):
+        own = slice(ends[n], ends[n + 1])
+        precision, away = blocks[name].prior_of(scene)
+        normal[own, own] += VARIANCE * precision
+        pull[own] -= VARIANCE * precision @ away
+    count = ends[len(gone) + 1]
+    unit = 1 / np.sqrt(np.diag(normal)[:count])
+    inner = unit[:, None] * np.linalg.pinv(
+        normal[:count, :count] * np.outer(unit, unit), rcond=1e-11, hermitian=True) * unit
+    follow = normal[count:, :count] @ inner
+    return normal[count:, count:] - follow @ normal[:count, count:], (
+        pull[count:] - follow @ pull[:count])
 
 
 @pytest.mark.parametrize(('camera', 'readout_s', 'loss_px', 'by_image'), [
@@ -103,13 +126,29 @@ def test_they_agree_with_differences(camera, readout_s, loss_px, by_image):
     scene = small_scene(camera)
     imaging = imaging_of(camera, scene, readout_s)
     scene = as_seen(scene, imaging)
-    found = normal_equations(scene, imaging, loss_px, by_image, variance=VARIANCE).cost
-    hessian, score = numeric(scene, imaging, loss_px, by_image)
+    kept = (Shift.name, Zoom.name) if by_image else ()
+    imaging = imaging.having(*(replace(imaging.blocks[name], held=False) for name in kept))
+    found = normal_of(scene, imaging, loss_px, variance=VARIANCE, kept=kept).cost
+    hessian, score = numeric(scene, imaging, loss_px, kept)
+    # of images, the numbers of each block stand image by image, as they are asked for
     scale = 1 / np.sqrt(np.diag(hessian))
     np.testing.assert_allclose(found.hessian * np.outer(scale, scale),
                                hessian * np.outer(scale, scale), atol=0.011)
     np.testing.assert_allclose(found.score * scale, score * scale, atol=1e-3)
     assert np.abs(score * scale).max() > 0.03
+
+
+def test_blocks_of_images_are_eliminated_with_their_priors():
+    scene = small_scene(DECENTRED)
+    imaging = imaging_of(DECENTRED, scene, READOUT_S)
+    scene = as_seen(scene, imaging)
+    imaging = imaging.having(replace(imaging.blocks[Shift.name], held=False))
+    found = normal_of(scene, imaging, 50.0, variance=VARIANCE).cost
+    hessian, score = numeric(scene, imaging, 50.0, ())
+    scale = 1 / np.sqrt(np.diag(hessian))
+    np.testing.assert_allclose(found.hessian * np.outer(scale, scale),
+                               hessian * np.outer(scale, scale), atol=0.011)
+    np.testing.assert_allclose(found.score * scale, score * scale, atol=1e-3)
 
 
 def test_residuals_are_seen_minus_projected():
@@ -118,27 +157,29 @@ def test_residuals_are_seen_minus_projected():
                                -residuals_px(scene, LENS)[scene.structure.used])
 
 
+def started(scenes: tuple[Scene, ...]) -> Estimate:
+    wide = LENS.widened()
+    return Estimate(imaging_with(wide, scenes).having(
+        Lens(wide, centred=wide, bounds=bounds_of(wide))), scenes, config=CONFIG)
+
+
 def test_there_is_no_gradient_at_the_optimum():
-    scenes = tuple(scenes_of(2, start=LENS, tracks=120))
-    start = Estimate(imaging_with(LENS.widened(), scenes), scenes, LENS.widened(), CONFIG, 0.15)
+    start = started(tuple(scenes_of(2, start=LENS, tracks=120)))
     loss_px = start.loss_px()
 
     def pull(now: Estimate) -> float:
         """Return how far the least cost is, in sigmas of the parameter that is farthest."""
         noise = now.noise(loss_px).variance * now.inflation
-        total = type(now.prior()).together([now.prior(), *(
-            normal_equations(scene, now.imaging, loss_px, variance=noise).cost.at_noise(noise)
-            for scene in now.scenes)])
+        total = Quadratic.together([now.imaging.prior(), *(
+            normal.cost.at_noise(noise) for normal in now.normals(loss_px, noise, safe=False))])
         return float(np.abs(total.optimum / np.sqrt(np.diag(total.covariance))).max())
 
     assert pull(optimised(start, 0.0, 20, settled=1e-6)) < 0.05 < 0.3 < pull(start)
 
 
 def test_the_variance_of_the_noise_is_found():
-    scenes = tuple(scenes_of(2, start=LENS, noise_px=0.3))
-    start = Estimate(imaging_with(LENS.widened(), scenes), scenes, LENS.widened(), CONFIG, 0.15)
-    found = optimised(start, 100.0, 5)
-    noise = noise_of(found.scenes, found.residuals, 6, 100.0)
+    found = optimised(started(tuple(scenes_of(2, start=LENS, noise_px=0.3))), 100.0, 5)
+    noise = noise_of(found.seen, 6, 100.0)
     assert noise.variance == pytest.approx(0.09, rel=0.08)
     assert noise.curvature == pytest.approx(1.0, abs=0.01)
 
@@ -146,24 +187,24 @@ def test_the_variance_of_the_noise_is_found():
 @pytest.mark.parametrize('readout_s', [0.0, READOUT_S])
 def test_points_and_poses_follow_the_camera(readout_s):
     scene = small_scene(LENS)
-    imaging = replace(imaging_with(LENS, [scene]), readout_s=readout_s)
+    imaging = imaging_with(LENS, [scene]).having(Readout(np.array([readout_s])))
     scene = as_seen(scene, imaging)
-    normal = normal_equations(scene, imaging, 50.0)
+    normal = normal_of(scene, imaging, 50.0)
     step = np.zeros(len(normal.cost.score))
     step[0] = 1e-3 * LENS.fx
-    zero = np.zeros((len(scene.tracks.frames), 3))
 
-    def rms(structure, now: Imaging) -> float:
-        return float(np.sqrt(np.mean(residuals(replace(scene, structure=structure), now)**2)))
+    def rms(scene: Scene, now: Imaging) -> float:
+        return float(np.sqrt(np.mean(residuals(scene, now)**2)))
 
     def after(step: np.ndarray) -> float:
-        return rms(normal.eliminated.moved(scene.structure, step), replace(
-            imaging.stepped(step), shaking={scene.turn: normal.eliminated.shaken(zero, step)}))
+        now, follow = imaging.moved(step), normal.follow(step)
+        return rms(normal.moved(step), now.having(*(
+            imaging.blocks[name].moved_in(scene, each) for name, each in follow.images.items())))
 
     best = after(np.zeros_like(step))
     # they make up for nearly all that another focal length spoils
-    assert after(step) - best < 0.1 * (rms(scene.structure, imaging.stepped(step)) - best)
-    for rotation in normal.eliminated.moved(scene.structure, step).rotations:
+    assert after(step) - best < 0.1 * (rms(scene, imaging.moved(step)) - best)
+    for rotation in normal.moved(step).structure.rotations:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
 
 
@@ -172,6 +213,6 @@ def test_a_lens_that_sees_none_of_some_points_counts_them_for_nothing():
     points = scene.structure.points.copy()
     # behind the camera, all the time
     points[:len(points) // 2] = scene.structure.path()[1][0] - (0.0, 0.0, 1e4)
-    normal = normal_equations(replace(scene, structure=replace(
+    normal = normal_of(replace(scene, structure=replace(
         scene.structure, points=points)), imaging_with(LENS, [scene]), 0.5)
     assert np.isfinite(normal.cost.hessian).all() and np.isfinite(normal.cost.score).all()

@@ -12,8 +12,8 @@ from synthetic import LENS, SIZE, path_of, synthetic_turn
 from dashcalib_ros.camera import Fisheye
 from dashcalib_ros.camera.mapping import mapping_error
 from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.problem.blocks import Readout, imaging_with
 from dashcalib_ros.reconstruct.scene import residuals_px
-from dashcalib_ros.solve.imaging import imaging_with, motion_of, row_shift
 
 pytestmark = pytest.mark.usefixtures('no_profile')
 
@@ -53,7 +53,8 @@ def test_tracks_of_a_rolling_shutter_become_those_of_a_global_one():
     scene = replace(turn.scene(LENS), structure=turn.structure)
     used = scene.structure.used
     assert np.abs(residuals_px(scene, LENS)[used]).max() > 5
-    back = replace(imaging_with(LENS, [scene]), readout_s=readout_s).as_lens_sees(scene)
+    back = imaging_with(LENS, [scene]).having(
+        Readout(np.array([readout_s]))).as_lens_sees(scene)
     assert np.abs(residuals_px(back, LENS)[used]).max() < 0.5
     assert np.sqrt(np.mean(residuals_px(back, LENS)[used]**2)) < 0.07
     np.testing.assert_array_equal(back.tracks.seen, scene.tracks.seen)
@@ -61,25 +62,25 @@ def test_tracks_of_a_rolling_shutter_become_those_of_a_global_one():
 
 def test_the_motion_is_that_of_a_cubic_spline():
     turn = synthetic_turn(LENS, 70.0, keyframes=9)
-    motion = motion_of(turn.structure, turn.tracks.stamps_ns)
+    turning, moving = replace(turn.scene(LENS), structure=turn.structure).trajectory.velocity
     seconds = turn.tracks.stamps_ns / 1e9
     rotations, centres = turn.structure.path()
     np.testing.assert_allclose(
-        motion.moving, -np.einsum('kij,kj->ki', rotations, CubicSpline(seconds, centres)(
+        moving, -np.einsum('kij,kj->ki', rotations, CubicSpline(seconds, centres)(
             seconds, 1)), atol=1e-9)
     # and nearly that of the car
     path = path_of(70.0, seconds, 0)
     little = np.full((9, 1), 1e-4)
     moved = path.local(np.eye(3)[:1], little) - path.local(np.eye(3)[:1], -little)
     local = np.einsum('kij,j->ki', rotations, np.eye(3)[0]) + turn.structure.translations
-    expected = np.cross(motion.turning, local) + motion.moving
+    expected = np.cross(turning, local) + moving
     assert np.abs(moved[:, 0] / 2e-4 - expected)[1:-1].max() < 0.1 * np.abs(expected).max()
 
 
 def test_rows_do_not_shift_without_movement():
     [scene] = scenes_of(1, start=LENS)
-    imaging = replace(imaging_with(LENS, [scene]), readout_s=0.02)
-    shift = row_shift(scene, imaging)
+    imaging = imaging_with(LENS, [scene]).having(Readout(np.array([0.02])))
+    shift = imaging.row_shift(scene)
     assert np.isfinite(shift).all() and np.abs(shift).max() > 1
     # the middle row is on time
     late = (scene.tracks.xy[:, :, 1] + 0.5) / LENS.image_size[1] - 0.5
@@ -87,10 +88,10 @@ def test_rows_do_not_shift_without_movement():
     assert np.abs(shift[middle]).max() < 0.05 * np.abs(shift).max()
     still = replace(scene, tracks=replace(
         scene.tracks, stamps_ns=np.zeros_like(scene.tracks.stamps_ns)))
-    assert not row_shift(still, imaging).any()
+    assert not imaging.row_shift(still).any()
     alone = replace(scene, structure=replace(
         scene.structure, registered=np.arange(len(scene.tracks.frames)) == 3))
-    assert not row_shift(alone, imaging).any()
+    assert not imaging.row_shift(alone).any()
 
 
 def test_turns_without_stamps_know_nothing_of_the_shutter():

@@ -90,7 +90,7 @@ def test_turns_that_all_lose_their_points_give_no_solution(monkeypatch, no_profi
     def without_turns(self, least_px=0.0):
         calls.append(least_px)
         found = retriangulated(self, least_px)
-        return found if len(calls) < limit else replace(found, scenes=())
+        return found if len(calls) < limit else replace(found, stretches=())
     monkeypatch.setattr(Estimate, 'retriangulated', without_turns)
     scenes = scenes_of(2, tracks=90, keyframes=8)
     assert solve(scenes, CONFIG) is not None

@@ -9,7 +9,7 @@ from solving import CONFIG, only, scenes_of, solved
 from synthetic import LENS
 
 from dashcalib_ros.camera import Brown
-from dashcalib_ros.solve.quadratic import Quadratic
+from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.solve.solution import Solution, with_measurement
 from dashcalib_ros.solve.spread import Posterior, softened
 

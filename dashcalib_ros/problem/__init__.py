@@ -1,0 +1,1 @@
+"""Blocks, observations, steps: what every adjustment of the package is made of."""

@@ -1,0 +1,232 @@
+"""The steps that lower the cost of a problem over its free blocks, structures included.
+
+A step is the optimum of the linearised problem, inside the bounds of the blocks. Where no part of
+it lowers the cost, it is damped (Levenberg-Marquardt). The tracks stay as they were measured.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from dashcalib_ros.arrays import Floats
+from dashcalib_ros.camera import Camera
+from dashcalib_ros.problem.blocks import ImageBlock, Imaging, Seen
+from dashcalib_ros.problem.normal import (
+    Follow,
+    Linear,
+    Noise,
+    Normal,
+    damping,
+    linearised,
+    moved_by,
+    noise_of,
+    normal_equations,
+)
+from dashcalib_ros.problem.observations import Stretch
+from dashcalib_ros.problem.quadratic import Quadratic
+
+# shares of a step that are tried, the longest first: safe steps are a little short
+PARTS = (1.3, 0.7, 0.3, 0.1, 0.02)
+# the region in which the linearisation is trusted at first, where it is not trusted everywhere,
+# and the greatest one
+FIRST_RADIUS, LARGEST_RADIUS = 1e4, 1e16
+# of the gain that was expected; a damped step that gains less is not taken
+WORTH = 1e-3
+# steps in a row that lower nothing
+FAILURES = 5
+# of the cost, in units of the noise: by how much a step of what is shared lowers it at the most
+# where it is the last one, 0.2 of a sigma; and where the optimum is reached all the same
+SETTLED, REACHED = 0.04, 0.2
+# eigenvalues below this share of the largest, each parameter in its own unit: of a direction that
+# nothing determines
+SINGULAR = 1e-15
+# of such a direction: parameters with a smaller part are not named
+NAMED_PART = 0.3
+
+
+class Undetermined(np.linalg.LinAlgError):
+    """Nothing determines a direction of the parameters. names: of those that it consists of."""
+
+    def __init__(self, text: str, names: tuple[str, ...] = ()) -> None:
+        super().__init__(text)
+        self.names = names
+
+
+@dataclass(frozen=True)
+class State:
+    """The present state of a problem.
+
+    stretches: each with its tracks as measured. inflation: of the noise, by errors that the
+    observations of a track share. converged: whether the last steps reached the optimum.
+    """
+
+    imaging: Imaging
+    stretches: tuple[Stretch, ...]
+    inflation: float = 1.0
+    converged: bool = False
+
+    @property
+    def camera(self) -> Camera:
+        """Return the lens."""
+        return self.imaging.camera
+
+    @cached_property
+    def seen(self) -> list[Seen]:
+        """Return where the used observations of each stretch are seen."""
+        return [self.imaging.seen(stretch) for stretch in self.stretches]
+
+    def noise(self, loss_px: float) -> Noise:
+        """Return the noise of the residuals."""
+        return noise_of(self.seen, len(self.camera.params), loss_px)
+
+    def cost(self, loss_px: float, unit: float) -> float:
+        """Return the robust cost of all residuals, in units (px^2) of the noise, and of priors."""
+        total = sum(float(np.log1p(np.einsum('na,na->n', each.off, each.off) / loss_px**2).sum())
+                    for each in self.seen)
+        return loss_px**2 * total / unit + self.imaging.prior_cost(self.stretches)
+
+    def normals(self, loss_px: float, unit: float, safe: bool = True, tracks: bool = False,
+                images: bool = False) -> list[Normal]:
+        """Return the normal equations of each stretch."""
+        return [normal_equations(linearised(each, loss_px, safe), unit, tracks=tracks,
+                                 images=images) for each in self.seen]
+
+
+S = TypeVar('S', bound=State)
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """How to step, and when to end.
+
+    steps: at the most. unit: px^2 of the noise; None: of the residuals. settled: a step that is
+    expected to lower the cost by less, by what is shared, is the last one; tolerance: one that
+    changes it by a smaller share. radius: in which the linearisation is trusted at first.
+    """
+
+    loss_px: float
+    steps: int
+    unit: float | None = None
+    settled: float = 0.0
+    tolerance: float = 0.0
+    radius: float = np.inf
+
+
+def optimised(start: S, how: Stepping,
+              chosen: Callable[[S, int], S] = lambda now, n: now) -> S:
+    """Return the state after steps that lower its cost.
+
+    chosen: the state before step n with the sizes of its priors; these hardly change.
+    """
+    now, radius, shrink, failures = start, how.radius, 2.0, 0
+    for n in range(how.steps):
+        now = chosen(replace(now, imaging=now.imaging.anchored()), n)
+        unit = how.unit or now.noise(how.loss_px).variance * now.inflation
+        linear = [linearised(each, how.loss_px, safe=True) for each in now.seen]
+        before, gain, step = now.cost(how.loss_px, unit), -np.inf, None
+        while failures <= FAILURES:
+            trusted = radius == np.inf
+            try:
+                step = _Step.of(now, linear, unit, radius)
+            except np.linalg.LinAlgError:
+                if trusted:
+                    raise
+                step = None
+            for part in () if step is None else PARTS if trusted else (1.0,):
+                after = step.taken(now, part)
+                gain = before - after.cost(how.loss_px, unit)
+                if gain > (0.0 if trusted else WORTH * step.expected):
+                    break
+            else:
+                if abs(gain) <= how.tolerance * before:
+                    return replace(now, converged=True)
+                radius, shrink, failures = (
+                    min(radius / shrink, FIRST_RADIUS), 2 * shrink, failures + 1)
+                continue
+            break
+        if step is None or failures > FAILURES:
+            # no step lowers the cost: this is as low as it gets
+            return now
+        now, shrink, failures = replace(
+            after, converged=part * step.shared_gain < REACHED), 2.0, 0
+        if (part * step.shared_gain < how.settled and trusted) or gain <= how.tolerance * before:
+            break
+        radius = how.radius if how.radius == np.inf else min(
+            radius / max(1 / 3, 1 - (2 * gain / step.expected - 1)**3), LARGEST_RADIUS)
+    return now
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A step of what is shared (m,), and how each stretch follows it.
+
+    shared_gain: by how much what is shared should lower the cost; expected: all.
+    """
+
+    shared: Floats
+    follows: list[Follow]
+    shared_gain: float
+    expected: float
+
+    @classmethod
+    def of(cls, now: State, linear: Sequence[Linear], unit: float, radius: float) -> _Step:
+        normals = [normal_equations(each, unit, radius=radius) for each in linear]
+        total = Quadratic.together([now.imaging.prior(), *(
+            normal.cost.at_noise(unit) for normal in normals)])
+        if radius < np.inf and len(total.score):
+            own = np.sum([np.diag(each.shared[:, :-1]) for each in linear], axis=0)
+            total = replace(total, hessian=total.hessian + np.diag(damping(own, radius)) / unit)
+        step = bounded(total, now.imaging)
+        gain = float(total.score @ step)
+        return cls(step, [normal.follow(step) for normal in normals], gain,
+                   gain + sum(normal.gain for normal in normals) / unit)
+
+    def taken(self, now: S, part: float) -> S:
+        """Return the state after a part of the step."""
+        imaging, stretches = now.imaging.moved(part * self.shared), []
+        for follow, stretch in zip(self.follows, now.stretches, strict=True):
+            stretches.append(moved_by(stretch, follow, part))
+            for name, step in follow.images.items():
+                block = imaging.blocks[name]
+                assert isinstance(block, ImageBlock)
+                imaging = imaging.having(block.moved_in(stretch, part * step))
+        return replace(now, imaging=imaging, stretches=tuple(stretches))
+
+
+def bounded(total: Quadratic, imaging: Imaging) -> Floats:
+    """Return the step (m,) to the optimum inside the bounds of the blocks.
+
+    What would go beyond its bound stays at it, and the others go to their optimum then. Raises
+    Undetermined.
+    """
+    step, held = solution(total, imaging), np.zeros(len(total.score), bool)
+    for _ in range(2):
+        inside = imaging.clipped(step)
+        held |= np.abs(inside - step) > 1e-9 * (np.abs(step) + 1e-9)
+        if not held.any():
+            break
+        step, rest = inside, np.flatnonzero(~held)
+        step[rest] = np.linalg.solve(
+            total.hessian[np.ix_(rest, rest)],
+            total.score[rest] - total.hessian[np.ix_(rest, held)] @ step[held])
+    return step
+
+
+def solution(total: Quadratic, imaging: Imaging) -> Floats:
+    """Return the step (m,) to the least cost; raises Undetermined where nothing determines it."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(total.hessian), 1e-300))
+    try:
+        scaled = total.hessian * scale[:, None] * scale
+        np.linalg.cholesky(scaled + SINGULAR * np.eye(len(scale)))
+        return np.asarray(np.linalg.solve(total.hessian, total.score))
+    except np.linalg.LinAlgError as error:
+        if not np.isfinite(scaled).all():
+            raise Undetermined('residuals are not numbers') from error
+        direction = np.abs(np.linalg.eigh(scaled)[1][:, 0])
+        names = tuple(name for name, part in zip(imaging.names, direction, strict=True)
+                      if part > NAMED_PART * direction.max())
+        raise Undetermined(f'nothing determines {", ".join(names)}', names) from error
