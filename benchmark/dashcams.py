@@ -37,6 +37,11 @@ SIZES = {(640, 360): 3, (640, 480): 3, (800, 450): 2, (848, 480): 3, (960, 540):
 RATES = {10.0: 5, 12.5: 3, 15.0: 4, 20.0: 2, 25.0: 1, 30.0: 2}
 # shares of the cameras
 FISHEYES, GLASSES, SHUTTERS, DECENTRED, NEAR_FOLDS = 0.25, 0.35, 0.6, 0.5, 0.25
+# share of the turns that are bends; degrees and radius of both
+BENDS, BEND_DEG, BEND_RADIUS_M = 0.25, (15.0, 40.0), (25.0, 80.0)
+TURN_DEG, TURN_RADIUS_M = (30.0, 90.0), (8.0, 13.0)
+# share of the cameras whose pixels may be up to 1 % from square
+STRETCHED = 0.3
 # k1 of the strongest barrel
 MOST_BARREL = -0.42
 # of a pinhole: undistorted radius, in focal lengths, of what the corners see
@@ -91,15 +96,18 @@ def drive_of(seed: int) -> Drive:
     size = _one_of(SIZES, rng)
     rate = _one_of(RATES, rng)
     count = int(rng.integers(3, 7))
+    bends = rng.random(count) < BENDS
     side = rng.choice([-1.0, 1.0])
     spec = DriveSpec(
         seed=seed, rate=rate,
-        turns=tuple(Turn(float(side * (-1.0) ** i * rng.uniform(60.0, 100.0)),
-                         float(rng.uniform(8.0, 13.0))) for i in range(count)),
+        turns=tuple(Turn(float(side * (-1.0) ** i * rng.uniform(*BEND_DEG if bend else TURN_DEG)),
+                         float(rng.uniform(*BEND_RADIUS_M if bend else TURN_RADIUS_M)))
+                    for i, bend in enumerate(bends)),
         straight_m=float(rng.uniform(20.0, 30.0)), lead_m=float(rng.uniform(20.0, 30.0)),
         speed_mps=float(rng.uniform(8.0, 12.0)), turn_speed_mps=float(rng.uniform(4.5, 7.0)),
         height_m=float(rng.uniform(1.1, 1.7)), mount_deg=float(rng.uniform(0.5, 4.0)),
-        vibration_deg=float(rng.uniform(0.1, 0.7)), noise=float(rng.uniform(0.5, 4.0)),
+        vibration_deg=float(rng.uniform(0.1, 0.7)),
+        shortest_bump_m=float(rng.uniform(0.8, 2.5)), noise=float(rng.uniform(0.5, 4.0)),
         blur=float(rng.uniform(0.3, 1.0)), vignetting=float(rng.uniform(0.0, 0.5)),
         flicker=float(rng.uniform(0.0, 0.03)), moving_cars=int(rng.integers(0, 5)),
         bonnet=bool(rng.random() < 0.5), pillar=bool(rng.random() < 0.15),
@@ -140,7 +148,7 @@ def _pinhole(size: tuple[int, int], across_deg: float, rng: np.random.Generator)
     width, height = size
     x, y = np.clip(rng.normal(0.0, 0.012, 2), -0.03, 0.03) * width
     plain = Lens.of(width, height, across_deg, 0.0, 0.0, (float(x), float(y)),
-                    1.0 + float(np.clip(rng.normal(0.0, 0.003), -0.01, 0.01)))
+                    _aspect(rng))
     corner = math.hypot(width, height) / 2 / plain.fx
     k1 = float(rng.uniform(MOST_BARREL, 0.12))
     k2 = float(k1 * k1 * rng.uniform(0.0, 1.4))
@@ -150,9 +158,15 @@ def _pinhole(size: tuple[int, int], across_deg: float, rng: np.random.Generator)
             raise ConfigError('E-BENCHMARK', 'no dashcam has so much distortion')
     p1 = p2 = k3 = 0.0
     if rng.random() < DECENTRED:
-        p1, p2 = np.clip(rng.normal(0.0, 0.001, 2), -0.003, 0.003).tolist()
+        p1, p2 = rng.uniform(-0.003, 0.003, 2).tolist()
         k3 = float(rng.uniform(-0.05, 0.05) / max(1.0, corner) ** 6)
     return replace(plain, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
+
+
+def _aspect(rng: np.random.Generator) -> float:
+    """Return fy / fx: of a sensor, or of a picture that was stretched."""
+    stretched = rng.random() < STRETCHED
+    return 1.0 + float(rng.uniform(-0.01, 0.01) if stretched else rng.normal(0.0, 0.001))
 
 
 def _nearly_folding(corner: float, share: float, first: float) -> tuple[float, float]:
@@ -169,8 +183,7 @@ def _fisheye(size: tuple[int, int], across_deg: float, rng: np.random.Generator)
     """Return an equidistant lens with four terms; across_deg: with distortion."""
     x, y = np.clip(rng.normal(0.0, 0.012, 2), -0.03, 0.03) * size[0]
     k = rng.uniform(-1.0, 1.0, 4) * (0.06, 0.015, 0.004, 0.0008)
-    return FisheyeLens.of(*size, across_deg, tuple(k.tolist()), (float(x), float(y)),
-                          1.0 + float(np.clip(rng.normal(0.0, 0.003), -0.01, 0.01)))
+    return FisheyeLens.of(*size, across_deg, tuple(k.tolist()), (float(x), float(y)), _aspect(rng))
 
 
 def _sees_its_corners(lens: AnyLens) -> bool:

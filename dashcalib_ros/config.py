@@ -164,7 +164,7 @@ class IntrinsicsConfig:
     """Scenes -> the parameters of the lens."""
 
     loss: float = expert(
-        1.0, 'scale of the Cauchy loss, in units of the median reprojection error', 0.1, 100.0)
+        0.5, 'scale of the Cauchy loss, in units of the median reprojection error', 0.1, 100.0)
     profile_tracks: int = expert(
         120, 'tracks per turn for the focal profile around the result', 20, 5000)
     aspect_sigma: float = expert(

@@ -40,6 +40,7 @@ class DriveSpec:
     height_m: of the camera; mount_deg: largest yaw, pitch and roll of its mounting.
     vibration_deg: RMS of pitch from the road; roll is 0.7 of it, and
     the body also dives when it brakes and leans in turns. 0 switches all of these off.
+    shortest_bump_m: wavelength of the shortest bumps; those below 2.5 m are as much lower.
     noise: sigma in grey levels. blur: sigma in pixels. exposure_ms: how long each row is exposed;
     its time is the middle of that, and 0 has no motion blur. vignetting: of the light, lost in
     the corners. bonnet, pillar, timestamp: what dashcams see of their own car, and burn in.
@@ -61,6 +62,7 @@ class DriveSpec:
     height_m: float = 1.4
     mount_deg: float = 1.0
     vibration_deg: float = 0.35
+    shortest_bump_m: float = 2.5
     seed: int = 0
     noise: float = 1.5
     blur: float = 0.4
@@ -81,7 +83,7 @@ class DriveSpec:
 
     def __post_init__(self) -> None:
         positive = ('rate', 'straight_m', 'lead_m', 'speed_mps', 'turn_speed_mps',
-                    'accel_mps2', 'height_m', 'duration_s')
+                    'accel_mps2', 'height_m', 'duration_s', 'shortest_bump_m')
         for name in positive:
             if not getattr(self, name) > 0.0:
                 raise ConfigError('E-DRIVE-RANGE', f'a drive needs {name} > 0, not '

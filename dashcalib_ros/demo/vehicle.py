@@ -21,6 +21,8 @@ DIVE_DEG = 0.25
 LEAN_DEG = 0.5
 # time before the first and after the last frame: rows of a rolling shutter reach into it
 MARGIN_S = 0.1
+# m; bumps with shorter waves are lower in proportion
+SHORT_M = 2.5
 
 
 @dataclass(frozen=True)
@@ -88,9 +90,10 @@ def ride_of(course: Course, spec: DriveSpec) -> Ride:
     rng = np.random.default_rng([spec.seed, 2])
     rough = math.radians(spec.vibration_deg)
     body = 1.0 if spec.vibration_deg > 0.0 else 0.0
-    pitch = _undulation(rng, s, rough) - body * math.radians(DIVE_DEG) * forward
-    roll = _undulation(rng, s, 0.7 * rough) + body * math.radians(LEAN_DEG) * lateral
-    lift = _undulation(rng, s, 2.0 * rough)
+    shortest = spec.shortest_bump_m
+    pitch = _undulation(rng, s, rough, shortest) - body * math.radians(DIVE_DEG) * forward
+    roll = _undulation(rng, s, 0.7 * rough, shortest) + body * math.radians(LEAN_DEG) * lateral
+    lift = _undulation(rng, s, 2.0 * rough, shortest)
     if spec.kind == 'spin':
         yaw = yaw + math.radians(70.0) * np.sin(2.0 * math.pi * t / 7.0)
     lever = np.array([AHEAD_M, ASIDE_M, spec.height_m])
@@ -124,11 +127,12 @@ def _timetable(course: Course, spec: DriveSpec) -> tuple[Floats, Floats]:
     return t, np.interp(t, nodes_t, nodes_s)
 
 
-def _undulation(rng: np.random.Generator, s: Floats, rms: float) -> Floats:
-    """Return a road's unevenness along s (n,) with the given RMS: wavelengths 2.5 to 25 m."""
-    waves = np.geomspace(2.5, 25.0, 7) * rng.uniform(0.9, 1.1, 7)
+def _undulation(rng: np.random.Generator, s: Floats, rms: float, shortest_m: float) -> Floats:
+    """Return a road's unevenness along s (n,) with the given RMS: wavelengths up to 25 m."""
+    waves = np.geomspace(shortest_m, 25.0, 7) * rng.uniform(0.9, 1.1, 7)
     phases = rng.uniform(0.0, 2.0 * math.pi, 7)
-    total = np.sum(np.sin(2.0 * math.pi * s[:, None] / waves + phases), axis=1)
+    heights = np.minimum(waves / SHORT_M, 1.0) if shortest_m < SHORT_M else np.ones(len(waves))
+    total = np.sin(2.0 * math.pi * s[:, None] / waves + phases) @ heights
     return np.asarray(total * rms / math.sqrt(3.5))
 
 

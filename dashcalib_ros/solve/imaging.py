@@ -29,6 +29,8 @@ LEAST_KEYFRAMES = 4
 # prior sigmas of how much faster a camera turns than the spline says: about the axis of the turn,
 # and about the others (3 degrees a second)
 STEERING_RAD_S, BUMPS_RAD_S = 0.005, 0.05
+# s; with a shorter readout, shaking is held as with this
+LEAST_SHAKEN_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,11 @@ class Imaging:
     camera: the lens, in the widest model of its kind. readout_s: from the first row to the last.
     basis: (2 len(TERMS), f) the field's directions, see field_basis(); directions: (f,) how far it
     goes in each, px. images: by turn (k, 3), the shift of each keyframe's picture in x and y, px,
-    and its zoom; a turn that is not in it has none. shaking: by turn (k, 3) rad/s, by how much
-    each keyframe's camera turns faster than the spline through the poses says, as bumps make it.
-    axes: by turn (3,) about which the car turns, in the camera's axes.
+    and its zoom; a turn that is not in it has none. shaking: by turn (k, 3) rad, by how much each
+    keyframe's camera turns more, from the first row to the last, than the spline through the poses
+    says, as bumps make it. shaken_s: the readout at which the prior of that is taken; a step does
+    not change it, or a longer readout would make the same shaking likelier. axes: by turn (3,)
+    about which the car turns, in the camera's axes.
     """
 
     camera: Camera
@@ -50,6 +54,7 @@ class Imaging:
     images: Mapping[TurnId, Floats] = field(default_factory=dict)
     shaking: Mapping[TurnId, Floats] = field(default_factory=dict)
     axes: Mapping[TurnId, Floats] = field(default_factory=dict)
+    shaken_s: float = 0.0
 
     @cached_property
     def field(self) -> Field:
@@ -86,6 +91,11 @@ class Imaging:
         return replace(self, camera=self.camera.with_params(self.camera.params + step[:count]),
                        readout_s=self.readout_s + float(step[count]),
                        directions=self.directions + step[count + 1:])
+
+    def held(self) -> Imaging:
+        """Return the imaging with the prior of the shaking at the present readout."""
+        coupled = abs(self.readout_s) > LEAST_SHAKEN_S
+        return replace(self, shaken_s=self.readout_s, shaking=self.shaking if coupled else {})
 
     def as_lens_sees(self, scene: Scene) -> Scene:
         """Return the turn with the tracks that the lens alone would have seen, all rows at once.
@@ -193,7 +203,8 @@ class LocalPoints:
     """Points of the n used observations in the camera's axes.
 
     rotated: (n, 3) the world's points, rotated. still: (n, 3) at the time of the middle row;
-    local: (n, 3) at the time of their rows. turning: (n, 3) rad/s of the camera. by_readout:
+    local: (n, 3) at the time of their rows. turning: (n, 3) rad of the camera, from the first row
+    to the last. by_readout:
     (n, 3) how far they move for a second of readout. late: (n,) when their rows are exposed, in
     readouts after the middle one. motion: of the camera.
     """
@@ -215,10 +226,15 @@ def local_points(scene: Scene, imaging: Imaging) -> LocalPoints:
     still = rotated + structure.translations[rows]
     motion = motion_of(structure, scene.tracks.stamps_ns)
     late = (scene.tracks.xy[rows, columns, 1] + 0.5) / imaging.camera.image_size[1] - 0.5
-    turning = (motion.turning + imaging.shaking.get(scene.turn, 0.0))[rows]
-    by_readout = late[:, None] * (np.cross(turning, still) + motion.moving[rows])
-    return LocalPoints(rotated, still, still + imaging.readout_s * by_readout, turning, by_readout,
-                       late, motion)
+    by_readout = late[:, None] * (
+        np.cross(motion.turning[rows], still) + motion.moving[rows])
+    # rad and units from the first row to the last
+    turning = imaging.readout_s * motion.turning[rows]
+    local = still + imaging.readout_s * by_readout
+    if scene.turn in imaging.shaking:
+        shaking = imaging.shaking[scene.turn][rows]
+        turning, local = turning + shaking, local + late[:, None] * np.cross(shaking, still)
+    return LocalPoints(rotated, still, local, turning, by_readout, late, motion)
 
 
 def row_shift(scene: Scene, imaging: Imaging) -> Floats:
@@ -275,13 +291,13 @@ def _derivative(seconds: tuple[float, ...]) -> Floats:
     return np.asarray(np.linalg.solve(left, right))
 
 
-def shake_precision(axis: Floats) -> Floats:
-    """Return (3, 3) the inverse of the prior covariance of how a keyframe shakes, (rad/s)^-2.
+def shake_precision(axis: Floats, readout_s: float) -> Floats:
+    """Return (3, 3) the inverse of the prior covariance of how a keyframe shakes, rad^-2.
 
     Bumps pitch and roll the car; about the axis of the turn, (3,), it is the driver who turns it.
     """
-    return np.asarray(np.eye(3) / BUMPS_RAD_S**2
-                      + np.outer(axis, axis) * (STEERING_RAD_S**-2 - BUMPS_RAD_S**-2))
+    return np.asarray((np.eye(3) / BUMPS_RAD_S**2 + np.outer(axis, axis) * (
+        STEERING_RAD_S**-2 - BUMPS_RAD_S**-2)) / max(abs(readout_s), LEAST_SHAKEN_S)**2)
 
 
 def cross(vectors: Floats) -> Floats:

@@ -190,7 +190,7 @@ def normal_equations(scene: Scene, imaging: Imaging, loss_px: float, by_image: b
     shakes, still = np.arange(poses - shaking, poses), np.zeros(poses)
     if shaking:
         precision = variance * np.kron(np.eye(len(keyframes)), shake_precision(
-            imaging.axes[scene.turn]))
+            imaging.axes[scene.turn], imaging.shaken_s))
         reduced[np.ix_(shakes, shakes)] += precision
         still[shakes] = -precision @ imaging.shaking.get(
             scene.turn, np.zeros((len(used), SHAKE)))[keyframes].ravel()
@@ -285,10 +285,10 @@ def _linearised(scene: Scene, imaging: Imaging, loss_px: float, by_image: bool,
     by_still, by_motion, follow = by_local, [], None
     if abs(imaging.readout_s) > COUPLED_READOUT_S:
         # a point X moves by turning x X + moving, and both follow the poses
-        late = by_local * (imaging.readout_s * found.late)[:, None, None]
+        late = by_local * found.late[:, None, None]
         by_still, by_motion = by_local + late @ cross(found.turning), [
             late @ -cross(found.still), late]
-        follow = found.motion.follow(structure)
+        follow = imaging.readout_s * found.motion.follow(structure)
     parts = [by_still @ -cross(found.rotated), by_still, *by_motion]
     if by_image:
         middle = (np.array(camera.image_size) - 1) / 2

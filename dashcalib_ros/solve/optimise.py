@@ -146,7 +146,8 @@ class Estimate:
         images = sum(float(each.values @ each.precision @ each.values)
                      for each in self.image_priors(1.0))
         shaking = sum(
-            float(np.sum((each @ shake_precision(self.imaging.axes[turn])) * each))
+            float(np.sum((each @ shake_precision(
+                self.imaging.axes[turn], self.imaging.shaken_s)) * each))
             for turn, each in self.imaging.shaking.items())
         return (loss_px**2 * total / variance + float(away @ prior.hessian @ away) + images
                 + shaking)
@@ -174,6 +175,7 @@ def _step(now: Estimate, loss_px: float, free: Ints | None, choose: bool
 
     0 where no step lowers the cost. choose: the sizes of the priors, too.
     """
+    now = replace(now, imaging=now.imaging.held())
     noise = now.noise(loss_px)
     normals = _normals(now, loss_px, noise.variance * now.inflation, choose)
     if choose:
