@@ -173,7 +173,7 @@ class SensorStream:
             return replace(self.shifted(-self.begin_s - own_s), absolute=False)
         if start_s > EPOCH_S or first <= EPOCH_S:
             return replace(self.shifted(-start_s), absolute=False)
-        return replace(self.shifted(-first - start_s), absolute=False, warnings=(
+        return replace(self.shifted(-first - start_s), absolute=False, doubt_s=DOUBT_S, warnings=(
             *self.warnings, Notice(
                 'E-MOTION-NO-TIME-OF-DAY', 'the images have no time of day: the first sample of '
                 'the motion sensors is assigned to the first image')))
@@ -252,6 +252,12 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
             warnings.append(Notice(
                 'E-MOTION-STAMPS-EQUAL', f'several {NAMES[kind]} of {what} have the same time '
                 f'stamp: the first one of each is used'))
+        if samples is not None and (far := int(np.sum(
+                (stamps_s < samples.stamps_s[0] - ANOTHER_CLOCK_S)
+                | (stamps_s > samples.stamps_s[-1] + ANOTHER_CLOCK_S)))):
+            warnings.append(Notice(
+                'E-MOTION-OTHER-CLOCK', f'{far} of {len(stamps_s)} {NAMES[kind]} of {what} '
+                f'skipped: their time stamps are of another clock than those of the others'))
         if trouble:
             warnings.append(Notice('E-MOTION-NOT-USED',
                                    f'the {NAMES[kind]} of {what} are not used: {trouble}'))
