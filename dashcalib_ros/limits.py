@@ -53,6 +53,8 @@ YAML_VALUES = 300_000
 YAML_DEPTH = 30
 # of a clip of a fleet, in so many files: a day of 4K video, or of images at 10 Hz
 CLIP_BYTES, CLIP_FILES = 2**38, 1_000_000
+# of a list of the times of a folder's images
+LIST_BYTES = 2**27
 # of a CSV of motion sensors: ten hours of a gyro at 100 Hz
 MOTION_BYTES = 2**29
 # of a GPX: ten hours at 10 Hz; its levels, and names of elements and attributes: some have 50

@@ -81,9 +81,18 @@ def open_drive(path: Paths, topic: str | None = None, fps: float | None = None,
     """
     valid, paths = _valid(mask), as_list(path)
     source = open_frames(paths, topic, fps, start_s, duration_s)
-    sensors = motion if isinstance(motion, SensorStream) else drive_motion(
-        paths, motion, sensor_topics, start_s, topic)
+    if isinstance(motion, SensorStream):
+        return Recording(source, valid, _on_clock_of(source, motion))
+    sensors = drive_motion(paths, motion, sensor_topics, topic)
+    if sensors is not None:
+        sensors = _on_clock_of(source, sensors)
+        # it counts from the drive's first image, not from the first one that is used
+        sensors = sensors if sensors.absolute else sensors.shifted(-start_s)
     return Recording(source, valid, sensors)
+
+
+def _on_clock_of(source: FrameSource, sensors: SensorStream) -> SensorStream:
+    return sensors.on_clock_of(source.begin_ns, source.recorded, source.length_ns)
 
 
 def calibrate_drive(drive: Recording, config: Config | None = None,
@@ -111,7 +120,7 @@ def check_drive(drive: Recording, named: NamedCamera, config: Config | None = No
             return Checked(check, calibration)  # it explains no motion either
         changes = tuple(str(change) for change in calibrator.watch(given).changes)
         if track is not None:
-            track = track.since(calibration.start_s)
+            track = _on_clock_of(drive.source, track).since(calibration.start_s)
             assert track.position is not None
             poses = track_poses(track.position, calibration.start_s)
         odometry = None if poses is None else calibrator.odometry(given, poses, observer.show)
@@ -151,10 +160,9 @@ def feed(taker: Calibrator | Detection, drive: Recording, observer: Observer) ->
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
                  chosen: Mapping[str, str | None] = MappingProxyType({}),
-                 start_s: float = 0.0, topic: str | None = None) -> SensorStream | None:
+                 topic: str | None = None) -> SensorStream | None:
     """Return the sensors' data of the file motion, else of the bags; None if there is none.
 
-    start_s: where the used part of the drive starts; a CSV counts from the drive's first image.
     chosen: the bag's topics by imu, gps and odom; topic: its image topic. Raises InputError for a
     file of another kind, and for a topic that does not exist.
     """
@@ -163,8 +171,7 @@ def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
         if wanted:
             raise InputError('E-MOTION-TWICE', '--imu, --gps and --odom choose topics of a bag: '
                                                'omit them or --motion')
-        found = read_motion(Path(motion))
-        return found if found.absolute else found.shifted(-start_s)
+        return read_motion(Path(motion))
     try:
         bags = [each for each in map(Path, as_list(path)) if each.exists() and fits_bag(each)]
         return bag_motion(bags, wanted, topic) if bags else None

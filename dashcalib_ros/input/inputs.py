@@ -12,10 +12,8 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
-from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError, Notice, counted
 from dashcalib_ros.input.source import (
     IMAGE_SUFFIXES,
@@ -25,12 +23,11 @@ from dashcalib_ros.input.source import (
     Reading,
     by_name,
     cameras_named,
-    first_of,
     is_bag_file,
     os_error,
     size_text,
 )
-from dashcalib_ros.limits import PICTURE_BYTES, check_file, read_file
+from dashcalib_ros.limits import check_file
 
 # what is known by its name, where its content does not tell; not whatever FFmpeg takes: it would
 # play a text file
@@ -281,7 +278,10 @@ def _opener_of(path: Path) -> Callable[[Path, str | None, float | None], FrameSo
     if is_video(path):
         from dashcalib_ros.input.video import VideoSource
         return VideoSource
-    return FolderSource if path.is_dir() else None
+    if path.is_dir():
+        from dashcalib_ros.input.folder import FolderSource
+        return FolderSource
+    return None
 
 
 def fits_bag(path: Path) -> bool:
@@ -314,75 +314,6 @@ def _head(path: Path) -> bytes:
 
 def _has_image_name(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES
-
-
-DEFAULT_FPS = 10.0  # Hz; the rate the paper works at
-
-
-class FolderSource(FrameSource):
-    """The images of a folder, by name; numbers in names count as numbers: 2.png before 10.png.
-
-    Stamps are index / fps. Raises InputError for a folder without images.
-    """
-
-    def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:
-        names = [entry.name for entry in path.iterdir()]
-        self._path = path
-        self._names = sorted(filter(_is_image, names), key=by_name)
-        if not self._names:
-            raise _no_images(path, names)
-        if (cameras := cameras_named(self._names)) > 1:
-            raise InputError('E-INPUT-SEVERAL-CAMERAS', f'{path} has images of {cameras} cameras '
-                             f'({first_of(self._names)}): put the images of one camera into a '
-                             f'separate folder')
-        self._fps = fps or DEFAULT_FPS
-        warnings = []
-        if fps is None:
-            warnings.append(Notice(
-                'E-RATE-ASSUMED', f'{path} has no image rate, and {DEFAULT_FPS:g} images per '
-                f'second are assumed: specify another rate with --fps'))
-        if topic is not None:
-            warnings.append(Notice('E-TOPIC-IGNORED', f'{path} is a folder of images: the topic '
-                                   f'{topic} is ignored'))
-        if turned := self._turned():
-            warnings.append(Notice(
-                'E-IMAGES-ROTATED', f'{path} has images that are {turned} by their EXIF '
-                f'orientation: the calibration is valid for the images as they are shown'))
-        super().__init__(str(path), len(self._names), warnings=tuple(warnings))
-        self.length_ns = round(len(self._names) * 1e9 / self._fps)
-
-    def _turned(self) -> str:
-        """Return how the first picture is turned when it is shown; '' for not at all."""
-        from dashcalib_ros.input.decode import turned_text
-        with suppress(InputError):  # raised again when it is read
-            return turned_text(read_file(self._path / self._names[0], PICTURE_BYTES), '')
-        return ''
-
-    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
-        from dashcalib_ros.input.decode import BitDepth, decode_file
-        depth = BitDepth()
-        reading.images = len(self._names)
-
-        def image(name: str, colour: bool = False) -> Pixels:
-            return decode_file(read_file(self._path / name, PICTURE_BYTES, name), depth, name,
-                               colour)
-
-        for index in range(math.ceil(start_ns * self._fps / 1e9), len(self._names)):
-            yield Picture(index, round(index * 1e9 / self._fps),
-                          partial(image, self._names[index]))
-
-
-def _is_image(name: str) -> bool:
-    return Path(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith('.')
-
-
-def _no_images(path: Path, names: list[str]) -> InputError:
-    if not names:
-        return InputError('E-FOLDER-EMPTY',
-                          f'{path} is empty: pass a folder of images, a bag or a video')
-    return InputError('E-FOLDER-NO-IMAGES', f'{path} has no images (png, jpg, bmp, tif, pgm, ppm, '
-                      f'webp) and is not a bag: it has {first_of(sorted(names))}; pass the folder '
-                      f'or the file with the images')
 
 
 def _check_recorded(text: str) -> None:
@@ -446,6 +377,12 @@ class JoinedSource(FrameSource):
         self.contradictions = tuple(dict.fromkeys(
             line for part in self._parts for line in part.contradictions))
         self.length_ns = None if None in lengths else sum(filter(None, lengths))
+        self.recorded = first.recorded
+
+    @property
+    def begin_ns(self) -> int | None:
+        """Return when the first recording began, None where that is not known."""
+        return self._parts[0].begin_ns
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
         place = _Place(start_ns)
