@@ -16,8 +16,6 @@ from dashcalib_ros.camera.camera import Camera
 
 # columns, rows: enough for a smooth field, and as in the benchmarks
 GRID = (25, 15)
-# the same, where a share of the picture is asked for
-FINE = (100, 60)
 # px; where a camera that is fitted does not see a ray, that counts as this
 UNSEEN_PX = 100.0
 # degrees off the axis; cameras that do not see behind are compared up to here
@@ -34,15 +32,6 @@ def grid_of(camera: Camera) -> Floats:
     width, height = camera.image_size
     u, v = np.meshgrid(np.linspace(0, width - 1, GRID[0]), np.linspace(0, height - 1, GRID[1]))
     return np.stack([u.ravel(), v.ravel()], -1)
-
-
-def rayless_share(camera: Camera) -> float:
-    """Return the share of the picture for which the model has no ray: it folds over before."""
-    columns, rows = ((np.arange(side) + 0.5) / side for side in FINE)
-    width, height = camera.image_size
-    pixels = np.stack(np.meshgrid(columns * width - 0.5, rows * height - 0.5), -1)
-    with np.errstate(all='ignore'):
-        return float(np.mean(~np.isfinite(camera.rays(pixels)).all(axis=-1)))
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,8 @@ def check(args: argparse.Namespace) -> int:
         checked = check_drive(drive, named, config, stages, poses, track, args.verbose)
     found, motion = with_faults(checked.check, named.faults), checked.odometry
     calibration, changes = checked.calibration, checked.changes
-    warn((*drive.source.warnings, *calibration.warnings, *(track.warnings if track else ())))
+    warn((*named.warnings, *drive.source.warnings, *calibration.warnings,
+          *(track.warnings if track else ())))
     now, before = calibration.mount, named.mount
     if args.json:
         write_stdout(json.dumps(answer_dict(found, changes, motion, mount_dict(now, before)),

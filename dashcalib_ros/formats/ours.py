@@ -24,10 +24,10 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, Notice, one_line
 from dashcalib_ros.formats import opencv, ros
+from dashcalib_ros.formats.plausible import check_lens
 from dashcalib_ros.formats.values import (
     Cameras,
     Data,
-    check_lens,
     read_number,
     read_pair,
     read_sigma,

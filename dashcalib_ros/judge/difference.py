@@ -22,7 +22,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import PictureSigma, SigmaMap, sigma_over
@@ -240,7 +240,8 @@ class NamedCamera:
     field: what its lens model leaves over, where a result.json has one that is used. mount: how it
     sits on the car, where the file says. readout_ms: of a rolling shutter, from the first row to
     the last; None where the file has none.
-    faults: in words, of what else stands beside the camera (ROS's K, R and P).
+    faults: in words, of what else stands beside the camera (ROS's K, R and P). warnings: of what
+    is odd in the camera itself.
     """
 
     name: str
@@ -253,6 +254,7 @@ class NamedCamera:
     mount: Mount | None = default(default=None, compare=False)
     readout_ms: float | None = default(default=None, compare=False)
     faults: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = default(default=(), compare=False)
 
     def without_faults(self) -> NamedCamera:
         """Return it; raises InputError where something beside the camera is wrong."""

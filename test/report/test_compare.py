@@ -260,8 +260,8 @@ def test_a_truth_has_numbers_that_a_computer_can_hold(tmp_path, number):
 
 @pytest.mark.parametrize(('change', 'complaint'), [
     ({'k1': 1e300}, 'k1 = 1e.300'), ({'k2': -1e300}, 'k2 = -1e'),
-    ({'fx': 1e300}, 'fx = 1e'), ({'cy': -1e9}, 'cy = -1e'), ({'fx': 1e-300}, 'sees no ray'),
-    ({'cx': 1e6, 'k1': -1}, 'sees no ray'), ({'width': 60_000, 'height': 60_000}, 'million')])
+    ({'fx': 1e300}, 'fx = 1e'), ({'cy': -1e9}, 'cy = -1e'), ({'fx': 1e-300}, 'times fx'),
+    ({'cx': 1e6, 'k1': -1}, 'off the middle'), ({'width': 60_000, 'height': 60_000}, 'million')])
 def test_numbers_that_no_lens_has_are_one_line(tmp_path, change, complaint):
     path = tmp_path / 'truth.json'
     path.write_text(json.dumps({'width': 640, 'height': 480, 'fx': 400, 'fy': 400, 'cx': 320,
