@@ -34,7 +34,7 @@ def compare(args: argparse.Namespace) -> int:
     if args.html is not None:
         write_text(args.html, difference_html(found))
     if args.json:
-        write_stdout(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        write_stdout(json.dumps(found.to_dict(), indent=2, allow_nan=False))
     else:
         show(comparison(found))
         if args.html is not None:
