@@ -18,7 +18,7 @@ from dashcalib_ros.arrays import Mask
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, Notice, counted
-from dashcalib_ros.formats import Given, given_camera
+from dashcalib_ros.formats import Given, given_camera, load_camera
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, read_mask
 from dashcalib_ros.input.inputs import Paths, as_list, fits_bag, open_frames
@@ -125,6 +125,30 @@ def check_drive(drive: Recording, named: NamedCamera, config: Config | None = No
             poses = track_poses(track.position, calibration.start_s)
         odometry = None if poses is None else calibrator.odometry(given, poses, observer.show)
     return Checked(check, calibration, changes, odometry)
+
+
+@contextmanager
+def in_order(given: Given, path: Paths) -> Iterator[None]:
+    """Let an InputError of opening both say, where it is so, that they are exchanged."""
+    try:
+        yield
+    except InputError as error:
+        paths = as_list(path)
+        if len(paths) == 1 and _is_calibration(paths[0]) and not _is_calibration(given):
+            raise InputError('E-ARGUMENTS-EXCHANGED',
+                             f'{paths[0]} is a calibration, and {given} is none: exchange them, '
+                             f'the calibration comes first') from error
+        raise
+
+
+def _is_calibration(given: Given) -> bool:
+    """Return whether this is a calibration, and no drive: a bag may be both."""
+    if not isinstance(given, (str, os.PathLike)):
+        return True
+    try:
+        return not fits_bag(Path(given)) and bool(load_camera(given))
+    except (InputError, OSError):
+        return False
 
 
 @contextmanager
@@ -312,5 +336,7 @@ def check(given: Given, path: Paths, fps: float | None = None,
     'wrong' or 'cannot tell', with reasons. Raises InputError for what cannot be read, ConfigError
     for a bad setting, WorkerError where a child process cannot run.
     """
-    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
-    return check_drive(drive, given_camera(given), config, _Progress(progress)).check
+    with in_order(given, path):
+        drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
+        named = given_camera(given)
+    return check_drive(drive, named, config, _Progress(progress)).check

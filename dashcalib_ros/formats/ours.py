@@ -24,10 +24,10 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, Notice, one_line
 from dashcalib_ros.formats import opencv, ros
+from dashcalib_ros.formats.plausible import check_lens
 from dashcalib_ros.formats.values import (
     Cameras,
     Data,
-    check_lens,
     read_number,
     read_pair,
     read_sigma,
@@ -168,7 +168,7 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         sigma_px=made(PictureSigma, data.get('sigma_px')),
         stabiliser=made(Stabiliser, data.get('stabiliser')),
         field=None if field is None else LensField(
-            Field(size, np.array(field['coefficients'], np.float64)), bool(field['used']),
+            Field(size, np.array(field['coefficients'], np.float64)), _counts(field),
             field['rms_px'], field['worst_px'], field['sigma_px']),
         mount=_mount(data.get('mount')),
         held_out=tuple(held_out), straight_lines=made(Bend, data.get('straight_lines')),
@@ -361,9 +361,17 @@ def _covariance(details: Any, camera: Camera, sigma: Mapping[str, float] | None
     return None
 
 
+def _counts(field: Mapping[str, Any]) -> bool:
+    """Return whether a field is used; files of 0.2.0 call those below their sigma used, too."""
+    try:
+        return field.get('used') is True and not field['rms_px'] < field['sigma_px']
+    except (KeyError, TypeError):
+        return True
+
+
 def _used_field(data: Any, image_size: tuple[int, int]) -> Field | None:
     """Return result.json's field, None where there is none that is used."""
-    if not isinstance(data, Mapping) or data.get('used') is not True:
+    if not isinstance(data, Mapping) or not _counts(data):
         return None
     try:
         coefficients = np.array(data['coefficients'], np.float64)

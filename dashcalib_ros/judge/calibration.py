@@ -157,9 +157,8 @@ class Witnesses:
 class LensField:
     """The smooth displacements over the picture that no lens model has, as of a windscreen.
 
-    field: zero where it is not used. used: whether turns that did not make it are predicted better
-    with it; where not, it is in the sigmas only. sigma_px: how far rays with the camera and the
-    field may be off over the picture, RMS.
+    used: whether it is as large as its sigma; where not, it is in the sigmas only. sigma_px: how
+    far rays with the camera and the field may be off over the picture, RMS.
     """
 
     field: Field
@@ -171,9 +170,8 @@ class LensField:
     @property
     def text(self) -> str:
         """Return the clause that stands beside the camera's parameters, without a verb."""
-        side = 'below' if self.rms_px < self.sigma_px else 'above'
         digits = 1 if self.rms_px >= 0.1 else 2
-        return (f'a smooth field of {self.rms_px:.{digits}f} px, {side} its sigma of '
+        return (f'a smooth field of {self.rms_px:.{digits}f} px, above its sigma of '
                 f'{self.sigma_px:.{digits}f} px')
 
 

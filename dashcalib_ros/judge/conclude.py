@@ -179,7 +179,7 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
             'E-MODEL-CHOSEN',
             f'the lens model {model} was chosen by hand and may be why the result is {level}: '
             f'--model {AUTO} uses the one that fits the turns'))
-    if field is not None and field.rms_px >= max(REPORTED_FIELD_PX, field.sigma_px):
+    if field is not None and field.used and field.rms_px >= REPORTED_FIELD_PX:
         warnings.append(Notice(
             'E-FIELD-LARGE',
             f'the picture is bent by {field.rms_px:.1f} px (up to {field.worst_px:.1f} px), as by '
@@ -248,9 +248,9 @@ def _field(solution: Solution, image_size: tuple[int, int]) -> LensField | None:
         return None
     px = solution.px
     sizes = px * solution.field.over(solution.camera)
-    return LensField(
-        solution.field.resized(px, image_size), True,
-        float(np.sqrt(np.mean(sizes**2))), float(sizes.max()), px * solution.rays_sigma_px)
+    rms_px, sigma_px = float(np.sqrt(np.mean(sizes**2))), px * solution.rays_sigma_px
+    return LensField(solution.field.resized(px, image_size), rms_px >= sigma_px, rms_px,
+                     float(sizes.max()), sigma_px)
 
 
 def _verdict_without_solution(evidence: Evidence, config: VerdictConfig) -> Verdict:

@@ -502,8 +502,8 @@ def _lines_disagree(grounds: Grounds) -> Finding | None:
     glass = '' if solution.field is None else f', or {RAYS} if a curved windscreen bends them'
     return Finding('E-LINES-BENT', 'weak',
                    f'poles and the edges of houses are not straight with this distortion '
-                   f'({lines.lines} upright lines indicate k1 {lines.k1:+.3f}, {lines.sigmas:.0f} '
-                   f'times the sigma of the difference)', f'{MORE_TURNS}{glass}')
+                   f'({lines.lines} upright lines: {lines.change}, {lines.sigmas:.0f} sigma)',
+                   f'{MORE_TURNS}{glass}')
 
 
 def _sensors_disagree(grounds: Grounds) -> Finding | None:

@@ -105,7 +105,8 @@ def template(name: str) -> jinja2.Template:
 
 
 def _truth_rows(against: Comparison) -> list[tuple[str, ...]]:
-    return [(d.name, number(d.name, d.b), f'{d.difference:+.{digits_of(d.name)}f}',
+    return [(d.name, number(d.name, d.b),
+             '' if d.difference is None else f'{d.difference:+.{digits_of(d.name)}f}',
              '' if d.percent is None else f'{d.percent:+.2f} %', optional(d.z, 1))
             for d in against.differences]
 

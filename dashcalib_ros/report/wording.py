@@ -45,8 +45,10 @@ def parameter_rows(calibration: CalibrationData) -> list[tuple[str, str, str, st
     return rows
 
 
-def number(name: str, value: float) -> str:
-    """Return a parameter's value with its significant digits and its unit."""
+def number(name: str, value: float | None) -> str:
+    """Return a parameter's value with its significant digits and its unit; a dash for None."""
+    if value is None:
+        return '-'
     return f'{value:.{digits_of(name)}f}' + (' px' if name in PIXELS else '')
 
 
@@ -55,7 +57,7 @@ def digits_of(name: str) -> int:
     if name in PIXELS:
         return 2
     # the coefficients of higher terms, and of a lens that is decentred, are small
-    return 4 if name in ('k1', 'k2') else 6
+    return 4 if name.partition(' ')[0] in ('k1', 'k2') else 6
 
 
 # of each angle of a mounting: its name, and where it goes when it is positive, and negative
@@ -236,8 +238,8 @@ def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
                                     'px, removed'))
     if c.straight_lines is not None:
         lines = c.straight_lines
-        facts.append(('upright lines', f'{lines.lines} found, bent by {lines.bend_px:.2f} px: k1 '
-                                       f'off by {lines.k1:+.4f} ± {lines.sigma:.4f}'))
+        facts.append(('upright lines', f'{lines.lines} found, bent by {lines.bend_px:.2f} px: '
+                                       f'{lines.change}'))
     if c.mask is not None and not c.mask.all():
         facts.append(('not used', f'{100 * (1 - float(np.mean(c.mask))):.1f} % of the picture, '
                                   f'which moves with the car (bonnet, pillar, burnt-in text)'))

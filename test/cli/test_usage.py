@@ -452,6 +452,6 @@ def test_export_tells_of_a_lens_that_folds_over_inside_the_picture(here, tmp_pat
     path = tmp_path / 'camera.json'
     path.write_text(text % '[-13.2, -98.0, 0.0014, 0.0028, 1357.8, -13.05, -102.4, 1383.0]')
     done = here('export', path, '--to', 'ros')
-    assert done.returncode == 0 and 'has no ray for 23 % of the picture' in done.stderr
+    assert done.returncode == 0 and done.stderr.strip().endswith('[E-CALIBRATION-FOLDS]')
     path.write_text(text % '[-0.3, 0.1, 0, 0, 0]')
     assert here('export', path, '--to', 'ros').stderr == ''

@@ -80,9 +80,9 @@ def test_terminal_and_page_describe_a_mounting_alike():
 
 
 def test_the_summary_says_that_a_field_is_used():
-    field = LensField(Field(TRUTH.image_size, np.zeros((2, 5))), True, 0.31, 0.7, 0.52)
+    field = LensField(Field(TRUTH.image_size, np.zeros((2, 5))), True, 0.31, 0.7, 0.2)
     text = terminal(summary(make_calibration(field=field)))
-    assert 'a smooth field of 0.3 px, below its sigma of 0.5 px' in text
+    assert 'a smooth field of 0.3 px, above its sigma of 0.2 px' in text
     assert 'field' not in terminal(summary(make_calibration()))
 
 
@@ -148,7 +148,7 @@ def test_what_one_of_two_models_cannot_see_is_told():
     text = terminal(comparison(compare(pinhole, NamedCamera('truth', wide))))
     assert re.search(r'removed; without the\s\d+\s% of the picture that the\sradial\smodel\s'
                      r'cannot', text)
-    assert 'k1' not in text and 'cy' in text
+    assert 'k1 (fisheye)' in text and 'k1 (radial)' in text
     assert 'without' not in terminal(comparison(compare(NamedCamera('truth', wide), pinhole)))
 
 

@@ -20,8 +20,10 @@ from solving import (
 from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
 from dashcalib_ros.camera import Radial
+from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
+from dashcalib_ros.formats import calibrated_camera
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
 from dashcalib_ros.judge.agreement import (
     focal_disagreement,
@@ -504,6 +506,21 @@ def test_a_refused_solution_gives_no_numbers(good):
     assert calibration.verdict.level == 'refused'
     assert calibration.intrinsics is None and calibration.sigma is None
     assert calibration.reprojection_error_px is None
+
+
+@pytest.mark.parametrize(('share', 'used'), [(0.9, False), (1.1, True)])
+def test_a_field_is_used_from_its_sigma_on(good, share, used):
+    def with_field(size):
+        field = Field(SIZE, np.full((2, len(TERMS)), size))
+        return replace(good, written=replace(good.written, field=field))
+
+    unit = with_field(1.0)
+    rms_px = np.sqrt(np.mean(unit.field.over(unit.camera)**2))
+    bent = with_field(share * unit.rays_sigma_px / rms_px)
+    found = conclude(bent, evidence_for(bent), CONFIG)
+    assert found.field.rms_px == pytest.approx(share * found.field.sigma_px)
+    assert found.field.used == used and ('smooth field' in repr(found)) == used
+    assert (calibrated_camera(found).field is not None) == used
 
 
 def test_a_model_that_was_asked_for_and_does_not_do_is_told_of(good):
