@@ -77,11 +77,12 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
 
     path: a ROS 2 bag (folder, .mcap, .db3, with or without zstd), a ROS 1 .bag, a video file, or a
     folder of images, ordered by name (2.png before 10.png). Several of these are one drive of one
-    camera: a sequence, in its own order (but 2 before 10, where that is alphabetical), or a folder of videos or bags, or a pattern
+    camera: a sequence, in its own order, or a folder of videos or bags, or a pattern
     (drives/*.mp4). The files of a folder or a pattern are ordered by the naming rule of the
     camera's maker, otherwise by time of recording, otherwise by name; a warning states which rule
-    was used. A turn spans two files only if the second one continues the first one. A file that
-    cannot be read is skipped, with a warning.
+    was used. So is a sequence in alphabetical order, as shells list it: 10.mp4, 2.mp4. A turn
+    spans two files only if the second one continues the first one. A file that cannot be read is
+    skipped, with a warning.
     topic: the image topic of a bag, needed only if the bag has several; or the number of a stream
     of a video ('2').
     fps: image rate in Hz, of a folder (default 10), or to replace the time stamps of a video.
