@@ -12,6 +12,8 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise, zip_longest
 from pathlib import Path
 
 from dashcalib_ros.errors import InputError, Notice, counted
@@ -60,6 +62,8 @@ MAKERS = {maker: re.compile(name, re.IGNORECASE) for maker, name in (
     ('Vantrue names', r'(?P<t>\d{8}_\d{6})_(?P<n>\d+)_(?:[A-Z]_)?(?P<c>[ABC])'))}
 # names of files in a message; of more only the first and the last are told
 TOLD = 12
+# missing files for each that is there, where they are numbered one by one
+MOST_MISSING = 3
 
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -74,8 +78,9 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     camera: a sequence, in its own order, or a folder of videos or bags, or a pattern
     (drives/*.mp4). The files of a folder or a pattern are ordered by the naming rule of the
     camera's maker, otherwise by time of recording, otherwise by name; a warning states which rule
-    was used. A turn spans two files only if the second one continues the first one. A file that
-    cannot be read is skipped, with a warning.
+    was used. So is a sequence in alphabetical order, as shells list it: 10.mp4, 2.mp4. A turn
+    spans two files only if the second one continues the first one. A file that cannot be read is
+    skipped, with a warning.
     topic: the image topic of a bag, needed only if the bag has several; or the number of a stream
     of a video ('2').
     fps: image rate in Hz, of a folder (default 10), or to replace the time stamps of a video.
@@ -188,14 +193,14 @@ def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> F
     warnings = [Notice('E-FILES-OTHER',
                        f'{group.where}: {counted(group.others, "other file")} skipped')
                 for group in groups if group.others]
-    failures: list[InputError] = []
+    failures: dict[Path, InputError] = {}
     for group in groups:
         opened = []
         for path in group.paths:
             try:
                 opened.append(_open_one(path, topic, fps))
             except InputError as error:
-                failures.append(error)
+                failures[path] = error
         if len(opened) > 1:
             opened, by = _ordered(opened)
             if (cameras := _cameras(opened)) > 1:
@@ -204,20 +209,44 @@ def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> F
                                  f'matches the files of one camera')
             warnings.append(Notice(
                 'E-FILES-ORDERED',
-                f'{group.where}: {len(opened)} files, ordered by {by}: {_listed(opened)}'))
+                f'{group.where}: {len(opened)} files, ordered by {by}: {_listed(opened)}'
+                f'{_missing(opened)}'))
         parts += opened
     if len(parts) == len(groups):
-        ordered, by = _ordered(parts)
-        if by in MAKERS and ordered != parts:
+        ordered, by = _ordered(sorted(parts, key=lambda each: by_name(each.name)))
+        if by not in MAKERS and _as_shells_list(parts) and ordered != parts:
+            parts = ordered
+            warnings.append(Notice(
+                'E-FILES-ORDERED', f'{len(parts)} files in alphabetical order are used ordered by '
+                f'{by}: {_listed(parts)}{_missing(parts)}'))
+        elif by in MAKERS and ordered != parts:
             warnings.append(Notice(
                 'E-FILES-AS-GIVEN',
                 f'the files are used in the order of the arguments; ordered by {by} they are '
                 f'{_listed(ordered)}: pass their folder for that order'))
     if not parts:
-        more = f' (and {len(failures) - 1} more like it)' if len(failures) > 1 else ''
-        raise InputError(failures[0].code, f'none of the files can be read: {failures[0]}{more}')
+        raise _all_failed(failures)
     return JoinedSource(parts, (*warnings, *(
-        Notice('E-FILE-SKIPPED', f'one of the files is skipped: {each}') for each in failures)))
+        Notice('E-FILE-SKIPPED', f'one of the files is skipped: {each}')
+        for each in failures.values())))
+
+
+def _all_failed(failures: dict[Path, InputError]) -> InputError:
+    """Return the error for files of which none can be read: each is named, each reason once."""
+    reasons: dict[str, list[Path]] = {}
+    for path, error in failures.items():
+        words = str(error).replace(str(path), '').replace(path.name, '')
+        reasons.setdefault(words, []).append(path)
+    told = [f'{failures[path]}{f" (the same for {more})" if more else ""}'
+            for path, *rest in reasons.values() for more in [_names(rest)]]
+    first = next(iter(failures.values()))
+    return InputError(first.code, f'none of the files can be read: {"; ".join(told)}')
+
+
+def _as_shells_list(sources: Sequence[FrameSource]) -> bool:
+    """Tell whether files are in alphabetical order, where numbers in their names tell another."""
+    names = [source.name for source in sources]
+    return names == sorted(names) != sorted(names, key=by_name)
 
 
 def _ordered(sources: list[FrameSource]) -> tuple[list[FrameSource], str]:
@@ -246,8 +275,44 @@ def _cameras(sources: Sequence[FrameSource]) -> int:
 
 
 def _listed(sources: Sequence[FrameSource]) -> str:
-    names = [Path(source.name).name for source in sources]
+    return _names([Path(source.name) for source in sources])
+
+
+def _names(paths: Sequence[Path]) -> str:
+    names = _told_apart(paths)
     return ', '.join(names if len(names) <= TOLD else [*names[:TOLD - 2], '...', names[-1]])
+
+
+def _told_apart(paths: Sequence[Path]) -> list[str]:
+    """Return the names of files; where some have the same, those of the folders that differ."""
+    names = [path.name for path in paths]
+    if len(set(paths)) != len(paths) or len(set(names)) == len(names):
+        return names
+    parts = [path.parts for path in paths]
+    while len({each[-1] for each in parts}) == 1:
+        parts = [each[:-1] for each in parts]
+    while len({each[0] for each in parts}) == 1:
+        parts = [each[1:] for each in parts]
+    return ['/'.join(each) for each in parts]
+
+
+def _missing(sources: Sequence[FrameSource]) -> str:
+    """Return in words which files are missing among those that are numbered one by one."""
+    parts = [re.split('([0-9]+)', name)
+             for name in _told_apart([Path(source.name) for source in sources])]
+    differ = [n for n, column in enumerate(zip_longest(*parts)) if len(set(column)) > 1]
+    if len(differ) != 1 or differ[0] % 2 == 0:
+        return ''
+    place, digits = differ[0], parts[0][differ[0]]
+    numbers = sorted(int(each[place]) for each in parts)
+    steps = {b - a for a, b in pairwise(numbers)}
+    absent = numbers[-1] - numbers[0] + 1 - len(numbers)
+    if not 0 < absent <= MOST_MISSING * len(numbers) or (len(steps) == 1 and len(numbers) > 2):
+        return ''  # numbers that are times, or every tenth
+    width = len(digits) if digits.startswith('0') else 0
+    names = [''.join([*parts[0][:place], f'{n:0{width}d}', *parts[0][place + 1:]])
+             for n in range(numbers[0], numbers[-1]) if n not in numbers]
+    return f'; missing: {first_of(names, TOLD)}'
 
 
 def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
