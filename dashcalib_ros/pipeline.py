@@ -6,15 +6,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import TracebackType
+from typing import Any
 
 from dashcalib_ros import judge
-from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.decode import mask_of
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.input.source import size_text
@@ -78,12 +80,12 @@ class Calibrator:
     None before, and where there is none.
     """
 
-    def __init__(self, config: Config | None = None, mask: Mask | None = None,
+    def __init__(self, config: Config | Mapping[str, Any] | None = None, mask: Any = None,
                  verbose: bool = False, live: bool = False, use_stored: bool = True,
                  warn: Callable[[Notice], None] = lambda notice: None, inline: bool = False,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  on_wait: Callable[[], bool] | None = None) -> None:
-        """mask: (h, w), False where the ego vehicle is.
+        """config, mask: as for calibrate().
 
         live: children run at low priority, and push() never waits for them; offline it does, so
         that few turns are in memory at a time. use_stored: False does not load the turns in
@@ -93,9 +95,9 @@ class Calibrator:
         does not end what runs. on_trouble: called with one line for each child that died or hangs,
         and for each turn that is tried again after that, from any thread. on_wait: called again
         and again while a worker is waited for; it may push() a frame, so that a live drive goes
-        on, and returns whether it did something. Raises ConfigError for an unknown model.
+        on, and returns whether it did something. Raises ConfigError, InputError.
         """
-        config = config or Config()
+        config, mask = Config.of(config), mask_of(mask)
         searched(config.model)
         self.solution: Solution | None = None
         self._live = live

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from rich.console import Group
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera.mapping import rayless_share
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
 from dashcalib_ros.cli.terminal import show, warn
@@ -15,7 +16,6 @@ from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import export as exported
 from dashcalib_ros.formats import load_calibration, load_camera
 from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge.rig import rig_of
 from dashcalib_ros.report import compare as compare_cameras
@@ -34,7 +34,7 @@ def compare(args: argparse.Namespace) -> int:
     if args.html is not None:
         write_text(args.html, difference_html(found))
     if args.json:
-        write_stdout(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        write_stdout(json.dumps(found.to_dict(), indent=2, allow_nan=False))
     else:
         show(comparison(found))
         if args.html is not None:

@@ -23,7 +23,7 @@ FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads
 def read_config(args: argparse.Namespace) -> Config:
     """Return the settings from --config, --set, and --turns and the like; later ones count."""
     path: Path | None = getattr(args, 'config', None)
-    config = Config() if path is None else Config.from_mapping(_read_yaml(path))
+    config = Config() if path is None else Config.of(_read_yaml(path))
     changes = parse_settings(getattr(args, 'set', []))
     changes.update({name: getattr(args, flag) for flag, names in FLAGS.items() for name in names
                     if getattr(args, flag, None) is not None})

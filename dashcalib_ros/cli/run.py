@@ -10,13 +10,14 @@ from pathlib import Path
 from rich.console import Group
 from rich.text import Text
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
 from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, Notice, OutputError, counted
 from dashcalib_ros.formats import result_json
-from dashcalib_ros.formats.ours import codes_of, plain_values
+from dashcalib_ros.formats.ours import codes_of
 from dashcalib_ros.input import FrameSource
 from dashcalib_ros.report import Calibration, Written, output_folder, write_results
 from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE

@@ -5,13 +5,14 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as default
 from typing import Any
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats import Given, given_camera
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.judge.calibration import Mount
@@ -42,7 +43,7 @@ class ParameterDifference:
     z: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """What compare() found.
 
@@ -52,15 +53,19 @@ class Comparison:
     a: NamedCamera
     b: NamedCamera
     differences: tuple[ParameterDifference, ...]
-    whole: Difference
+    whole: Difference = default(compare=False)
     unseen: float = 0.0
+
+    def __repr__(self) -> str:
+        """Return one line: the names, and how far both are apart."""
+        return f'Comparison({self.a.name} and {self.b.name}: {"; ".join(answers(self))})'
 
     @property
     def mapping_px(self) -> float | None:
         """Return the RMS over the image; None where a model folds over inside."""
         return self.whole.rms_px
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the comparison as values of strict JSON."""
         sides = {side: {'name': camera.name, 'verdict': camera.verdict}
                  for side, camera in (('a', self.a), ('b', self.b))}
@@ -95,7 +100,7 @@ def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = 
     changes: of the camera during the drive, in words. motion: the comparison with true poses.
     mount: how far the mounting is from the calibration's.
     """
-    values: dict[str, Any] = plain_values(found) | {'changes': list(changes), 'mount': mount}
+    values: dict[str, Any] = found.to_dict() | {'changes': list(changes), 'mount': mount}
     if motion is not None:
         values |= motion.medians()
         values['turns'] = [{'center': turn.turn.number, 'true_deg': turn.angle_deg,

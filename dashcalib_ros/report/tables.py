@@ -21,6 +21,7 @@ from dashcalib_ros.report.compare import (
     unseen_text,
 )
 from dashcalib_ros.report.wording import (
+    PARAMETERS,
     cures,
     number,
     objections,
@@ -48,7 +49,7 @@ def summary(calibration: CalibrationData) -> RenderableType:
     c = calibration
     parts: list[RenderableType] = []
     if c.camera is not None:
-        parts.append(TextTable(('', 'estimate', 'sigma', 'relative'), parameter_rows(c)))
+        parts.append(TextTable(PARAMETERS, parameter_rows(c)))
         if c.caveat:
             parts += [line(c.caveat), line('')]
     if c.turns:

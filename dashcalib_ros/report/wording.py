@@ -7,7 +7,6 @@ from itertools import zip_longest
 
 import numpy as np
 
-from dashcalib_ros.camera import Camera
 from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Condition, Mount, Witnesses
 from dashcalib_ros.judge.rig import Rig
@@ -26,6 +25,8 @@ NEXT = {
 
 # parameters that are lengths in the picture; the others have no unit
 PIXELS = ('fx', 'fy', 'cx', 'cy')
+# head of the table of parameters
+PARAMETERS = ('', 'estimate', 'sigma', 'relative')
 
 
 def parameter_rows(calibration: CalibrationData) -> list[tuple[str, str, str, str]]:
@@ -147,26 +148,9 @@ def key_figures(c: CalibrationData) -> list[tuple[str, str, str]]:
     front.append(('focal length fx', f'{c.camera.fx:.1f} px',
                   (f'± {sigma:.1f} px, {100 * sigma / c.camera.fx:.2f} %'
                    if math.isfinite(sigma) else 'uncertainty unknown') + lone))
-    across, down, diagonal = (optional(angle, 1, '°') for angle in field_of_view(c.camera))
+    across, down, diagonal = (optional(angle, 1, '°') for angle in c.camera.field_of_view)
     front.append(('field of view', across, f'by {down}, diagonal {diagonal}'))
     return [*front, *found]
-
-
-def field_of_view(camera: Camera) -> tuple[float, float, float]:
-    """Return degrees from edge to edge through the picture's middle: horizontal, vertical.
-
-    Last comes the larger of both diagonals; NaN where not known. The two sides of one direction
-    may come to more than 180.
-    """
-    width, height = camera.image_size
-    left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5
-    x, y = (width - 1) / 2, (height - 1) / 2
-    ends = np.array([[(left, y), (right, y)], [(x, top), (x, bottom)],
-                     [(left, top), (right, bottom)], [(left, bottom), (right, top)]])
-    with np.errstate(all='ignore'):
-        off_axis = np.degrees(np.arccos(np.clip(camera.rays(ends)[..., 2], -1.0, 1.0)))
-        angles = off_axis.sum(axis=1)
-    return float(angles[0]), float(angles[1]), float(angles[2:].max())
 
 
 def cures(verdict: Verdict) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from dashcalib_ros.formats import load_camera
 from dashcalib_ros.report import NamedCamera, compare
 from dashcalib_ros.workers.worker import THREAD_VARIABLES
 
-COMMAND = (sys.executable, '-m', 'dashcalib_ros.cli')
+COMMAND = (sys.executable, '-m', 'dashcalib_ros')
 
 
 def dashcalib(*args, env=None, command=COMMAND):

@@ -36,7 +36,7 @@ HEAVY = ('numpy', 'cv2', 'scipy', 'yaml', 'rich', 'matplotlib', 'pycolmap', 'ros
 
 
 def dashcalib(*args, env=None):
-    return subprocess.run([sys.executable, '-m', 'dashcalib_ros.cli', *map(str, args)],
+    return subprocess.run([sys.executable, '-m', 'dashcalib_ros', *map(str, args)],
                           capture_output=True, text=True, env=env, timeout=120)
 
 
@@ -310,7 +310,7 @@ def test_output_that_is_no_longer_read_is_no_error(results):
     os.close(reader)
     try:
         done = subprocess.run(
-            [sys.executable, '-m', 'dashcalib_ros.cli', 'compare', results / 'a',
+            [sys.executable, '-m', 'dashcalib_ros', 'compare', results / 'a',
              results / 'truth.json', '--json'], stdout=writer, stderr=subprocess.PIPE, text=True)
     finally:
         os.close(writer)
@@ -331,7 +331,7 @@ CLOSED, FULL = 'E-STDOUT-CLOSED', 'E-STDOUT-UNWRITABLE'
 def redirected(redirection, *args):
     """Run the command behind a redirection of the shell."""
     return subprocess.run(
-        ['sh', '-c', f'exec "$@" {redirection}', 'sh', sys.executable, '-m', 'dashcalib_ros.cli',
+        ['sh', '-c', f'exec "$@" {redirection}', 'sh', sys.executable, '-m', 'dashcalib_ros',
          *map(str, args)], capture_output=True, text=True, timeout=120)
 
 

@@ -131,7 +131,7 @@ def test_mapping_error_against_a_fisheye_agrees_with_the_scoring_tool(estimate):
     assert mapping_error(estimate, WIDE) == pytest.approx(expected, rel=1e-6)
     found = compare(NamedCamera('estimate', estimate), NamedCamera('truth', WIDE))
     assert found.unseen == pytest.approx(1 - np.mean(kept))
-    assert found.as_dict()['unseen'] == found.unseen and (found.unseen == 0) == fisheye
+    assert found.to_dict()['unseen'] == found.unseen and (found.unseen == 0) == fisheye
     # a coefficient of the same name has another meaning in another family
     assert [row.name for row in found.differences] == list(
         WIDE.names() if fisheye else ('fx', 'fy', 'cx', 'cy'))
@@ -307,7 +307,7 @@ def test_a_drive_given_by_mistake_is_not_read_whole(tmp_path):
 def test_the_comparison_is_strict_json():
     found = compare(NamedCamera('a', TRUTH, {**SIGMA, 'k1': math.nan}),
                     dataclasses.replace(REFERENCE, verdict='weak'))
-    data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert data['b'] == {'name': 'truth', 'verdict': 'weak'}
     assert data['parameters']['k1']['z'] is None
     assert data['parameters']['fx'] == {
@@ -381,12 +381,12 @@ def test_how_the_camera_sits_is_compared_where_both_files_say(tmp_path, name):
     moved = dataclasses.replace(MOUNT, moved_s=17.5)
     assert before.mount == MOUNT and of(moved).mount == moved and of(None).mount is None
     found = compare(now, before)
-    mount = found.as_dict()['mount']
+    mount = found.to_dict()['mount']
     assert mount['moved'] and set(mount) == {'moved', 'yaw_left_deg', 'pitch_up_deg'}
     assert mount['yaw_left_deg'] == pytest.approx({'difference': 1.0, 'sigma': 0.1 * 2**0.5})
     assert 'yaw 1.00 ± 0.14° to the left' in answers(found)[-1] and 'moved' in answers(found)[-1]
     assert 'moved' not in answers(compare(before, before))[-1]
-    assert compare(now, of(None)).as_dict()['mount'] is None
+    assert compare(now, of(None)).to_dict()['mount'] is None
     assert not any('mounting' in line for line in answers(compare(now, of(None))))
 
 
