@@ -65,6 +65,12 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
 
 def open_drive(args: argparse.Namespace) -> Recording:
     """Open the drive, the mask and the sensors that the arguments name. Raises InputError."""
+    duration_s = args.duration
+    if args.end is not None:
+        duration_s = args.end - args.start
+        if duration_s <= 0:
+            raise InputError('E-INPUT-DURATION', f'--end {args.end:g} s is not after --start '
+                                                 f'{args.start:g} s')
     topics = {name: getattr(args, name, None) for name in ('imu', 'gps', 'odom')}
-    return session.open_drive(args.input, args.topic, args.fps, args.start, args.duration,
+    return session.open_drive(args.input, args.topic, args.fps, args.start, duration_s,
                               args.mask, getattr(args, 'motion', None), topics)
