@@ -20,13 +20,14 @@ from dashcalib_ros.input.decode import mask_of
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.input.source import size_text
-from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading
+from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading, Verdict
 from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
 from dashcalib_ros.judge.check import CALIBRATION
 from dashcalib_ros.judge.conclude import (
     Evidence,
     conclude,
     evidence_of_detection,
+    outlook,
     turns_that_stood,
 )
 from dashcalib_ros.judge.monitor import readings_of
@@ -64,6 +65,23 @@ class Status:
     yaws_deg: tuple[float, ...] = ()
     reconstructed: tuple[TurnId, ...] = ()
     two_cameras: str = ''
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """The turns of a drive, and what a calibration of it can come to at best.
+
+    turns: of this drive, the best first. yaws_deg: of the turns that a calibration would use, by
+    their ids, those of earlier drives too. verdict: accepted where their number and their angles
+    are enough; their pictures decide the rest. start_s: stamp of the first image.
+    """
+
+    frames: int
+    turns: tuple[Turn, ...]
+    yaws_deg: Mapping[TurnId, float]
+    verdict: Verdict
+    warnings: tuple[Notice, ...]
+    start_s: float
 
 
 class Calibrator:
@@ -159,6 +177,19 @@ class Calibrator:
         if found.verdict.level == 'weak' and self.scenes.widen():
             found = self._calibrate(progress, final, started)  # with more turns
         return found
+
+    def outlook(self, progress: Progress | None = None) -> Outlook:
+        """Reconstruct the best turns, as calibrate() does, and say whether they are enough.
+
+        The drive is over: no push() may follow.
+        """
+        self.detection.finish()
+        scenes = self.scenes.wanted(progress or (lambda stage, done: None), final=True)
+        evidence = self._evidence(time.monotonic(), SensorComparison())
+        return Outlook(self.detection.frames, self.turns(),
+                       {scene.turn: scene.yaw_deg for scene in scenes},
+                       outlook(scenes, evidence, self.scenes.config.verdict),
+                       evidence.warnings, self.detection.start_s)
 
     def close(self) -> None:
         """End threads and child processes; a calibrate() elsewhere raises WorkerError."""

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.camera import searched
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, Notice, counted
 from dashcalib_ros.formats import Given, given_camera
 from dashcalib_ros.input import Frame, FrameSource
@@ -28,7 +27,7 @@ from dashcalib_ros.input.poses import Poses, track_poses
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.limits import path_of
-from dashcalib_ros.pipeline import Calibrator
+from dashcalib_ros.pipeline import Calibrator, Outlook
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.workers.worker import Progress
 
@@ -96,6 +95,14 @@ def calibrate_drive(drive: Recording, config: Config | None = None,
         return with_source(calibrator.calibrate(observer.show), drive.source)
 
 
+def outlook_of(drive: Recording, config: Config | None = None,
+               observer: Observer | None = None) -> Outlook:
+    """Find the turns of a recorded drive, and say whether they are enough for a calibration."""
+    observer = observer or Observer()
+    with _learned(drive, config, observer, False) as calibrator:
+        return calibrator.outlook(observer.show)
+
+
 def check_drive(drive: Recording, named: NamedCamera, config: Config | None = None,
                 observer: Observer | None = None, poses: Poses | None = None,
                 track: SensorStream | None = None, verbose: bool = False) -> Checked:
@@ -128,19 +135,19 @@ def _learned(drive: Recording, config: Config | None, observer: Observer, verbos
     try:
         if drive.motion is not None:
             calibrator.sense(drive.motion)
-        feed(calibrator, drive, observer)
+        _feed(calibrator, drive, observer)
         yield calibrator
     finally:
         with observer.closing():
             calibrator.close()
 
 
-def feed(taker: Calibrator | Detection, drive: Recording, observer: Observer) -> int:
-    """Push every frame of the drive, and return how many there were.
+def _feed(taker: Calibrator, drive: Recording, observer: Observer) -> None:
+    """Push every frame of the drive.
 
     Raises InputError for a mask of another size.
     """
-    number, count = 0, drive.source.count
+    count = drive.source.count
     observer.show('reading', None)
     for number, frame in enumerate(_read_ahead(drive.source), 1):
         if number == 1:
@@ -148,7 +155,6 @@ def feed(taker: Calibrator | Detection, drive: Recording, observer: Observer) ->
         taker.push(frame)
         observer.show('reading', min(number / count, 1.0) if count else None,
                       f'frame {number}, {counted(len(taker.turns()), "turn")}')
-    return number
 
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,

@@ -297,7 +297,8 @@ COMMANDS = {
             JSON, QUIET, VERBOSE), exit_codes=EXIT_HELP),
     'turns': Command(
         'dashcalib_ros.cli.run', 'find the turns of a drive, without calibrating',
-        'Lists the turns that a calibration would choose from, best first.',
+        'Lists the turns that a calibration would choose from, best first, with their angles, '
+        'and says whether they are enough.',
         'dashcalib turns drive.mp4 --start 60 --duration 300', (
             INPUT, *DRIVE, JSON, NO_PROGRESS)),
     'demo': Command(

@@ -300,7 +300,7 @@ def _no_intrinsics(name: str, verdict: Any, reasons: Any) -> InputError:
 def calibrated_camera(calibration: CalibrationData, name: str = 'estimate') -> NamedCamera:
     """Return the camera of a calibration. Raises InputError when it was refused."""
     if calibration.camera is None:
-        raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.reasons)
+        raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.told)
     shutter, field = calibration.rolling_shutter, calibration.field
     return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
                        _of_camera(calibration, len(calibration.camera.params)),

@@ -58,10 +58,10 @@ def summary(calibration: CalibrationData) -> RenderableType:
 
 
 def conclusion(verdict: Verdict) -> RenderableType:
-    """Return the verdict, coloured, and its reasons."""
+    """Return the verdict, coloured, and its reasons; of a refused result the cause."""
     parts: list[RenderableType] = [labelled('verdict', verdict.level)]
     parts += [Padding.indent(line(f'{what} [{code}]' if code else what), 2)
-              for code, what, _ in objections(verdict)]
+              for code, what, _ in objections(verdict)[:len(verdict.told)]]
     return Group(*parts)
 
 

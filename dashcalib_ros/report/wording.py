@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from itertools import zip_longest
 
 import numpy as np
@@ -154,15 +153,18 @@ def key_figures(c: CalibrationData) -> list[tuple[str, str, str]]:
 
 
 def cures(verdict: Verdict) -> tuple[str, ...]:
-    """Return what to do next, the likeliest to help first."""
-    return verdict.cures or (NEXT[verdict.level],)
+    """Return what to do next, the likeliest to help first; of a refused result that one."""
+    found = verdict.cures or (NEXT[verdict.level],)
+    return found[:1] if verdict.level == 'refused' else found
 
 
-def objections(verdict: Verdict) -> Iterator[tuple[str, str, str]]:
-    """Yield each reason of a verdict: its code, '' where it has none, what is wrong, the cure."""
+def objections(verdict: Verdict) -> list[tuple[str, str, str]]:
+    """Return each reason of a verdict: its code, '' where it has none, what is wrong, the cure."""
+    found = []
     for reason, code in zip_longest(verdict.reasons, verdict.codes, fillvalue=''):
         cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), '')
-        yield code, reason.removesuffix(f': {cure}'), cure
+        found.append((code, reason.removesuffix(f': {cure}'), cure))
+    return found
 
 
 def next_steps(c: CalibrationData) -> list[str]:
@@ -181,7 +183,7 @@ def next_steps(c: CalibrationData) -> list[str]:
                 'Calibrate again when the lens, the zoom, the focus or the video mode changes. '
                 'Moving the camera on the car changes nothing here.']
     yaw = c.yaw_deg
-    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in c.verdict.cures]
+    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in cures(c.verdict)]
     if c.turns_used < c.config.turns.wanted or yaw < needed.min_yaw_deg:
         steps.append(f'For the next drive: {c.config.turns.wanted} turns of 60° or more, at town '
                      f'speed, in daylight. At least {needed.min_turns} turns and '
@@ -190,10 +192,10 @@ def next_steps(c: CalibrationData) -> list[str]:
     else:
         steps.append('For the next drive: turns of 60° or more, at town speed, in daylight, with '
                      'little traffic ahead.')
-    steps.append(together)
-    if c.verdict.level == 'weak':
-        steps.append('To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.')
-    return steps
+    if c.verdict.level == 'refused':
+        return [' '.join(steps)]
+    return [*steps, together,
+            'To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.']
 
 
 def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
