@@ -6,25 +6,28 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import TracebackType
+from typing import Any
 
 from dashcalib_ros import judge
-from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.decode import mask_of
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.input.source import size_text
-from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading
+from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading, Verdict
 from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
 from dashcalib_ros.judge.check import CALIBRATION
 from dashcalib_ros.judge.conclude import (
     Evidence,
     conclude,
     evidence_of_detection,
+    outlook,
     turns_that_stood,
 )
 from dashcalib_ros.judge.monitor import readings_of
@@ -64,6 +67,23 @@ class Status:
     two_cameras: str = ''
 
 
+@dataclass(frozen=True)
+class Outlook:
+    """The turns of a drive, and what a calibration of it can come to at best.
+
+    turns: of this drive, the best first. yaws_deg: of the turns that a calibration would use, by
+    their ids, those of earlier drives too. verdict: accepted where their number and their angles
+    are enough; their pictures decide the rest. start_s: stamp of the first image.
+    """
+
+    frames: int
+    turns: tuple[Turn, ...]
+    yaws_deg: Mapping[TurnId, float]
+    verdict: Verdict
+    warnings: tuple[Notice, ...]
+    start_s: float
+
+
 class Calibrator:
     """Learns a camera from the turns of a drive.
 
@@ -78,12 +98,12 @@ class Calibrator:
     None before, and where there is none.
     """
 
-    def __init__(self, config: Config | None = None, mask: Mask | None = None,
+    def __init__(self, config: Config | Mapping[str, Any] | None = None, mask: Any = None,
                  verbose: bool = False, live: bool = False, use_stored: bool = True,
                  warn: Callable[[Notice], None] = lambda notice: None, inline: bool = False,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  on_wait: Callable[[], bool] | None = None) -> None:
-        """mask: (h, w), False where the ego vehicle is.
+        """config, mask: as for calibrate().
 
         live: children run at low priority, and push() never waits for them; offline it does, so
         that few turns are in memory at a time. use_stored: False does not load the turns in
@@ -93,9 +113,9 @@ class Calibrator:
         does not end what runs. on_trouble: called with one line for each child that died or hangs,
         and for each turn that is tried again after that, from any thread. on_wait: called again
         and again while a worker is waited for; it may push() a frame, so that a live drive goes
-        on, and returns whether it did something. Raises ConfigError for an unknown model.
+        on, and returns whether it did something. Raises ConfigError, InputError.
         """
-        config = config or Config()
+        config, mask = Config.of(config), mask_of(mask)
         searched(config.model)
         self.solution: Solution | None = None
         self._live = live
@@ -157,6 +177,19 @@ class Calibrator:
         if found.verdict.level == 'weak' and self.scenes.widen():
             found = self._calibrate(progress, final, started)  # with more turns
         return found
+
+    def outlook(self, progress: Progress | None = None) -> Outlook:
+        """Reconstruct the best turns, as calibrate() does, and say whether they are enough.
+
+        The drive is over: no push() may follow.
+        """
+        self.detection.finish()
+        scenes = self.scenes.wanted(progress or (lambda stage, done: None), final=True)
+        evidence = self._evidence(time.monotonic(), SensorComparison())
+        return Outlook(self.detection.frames, self.turns(),
+                       {scene.turn: scene.yaw_deg for scene in scenes},
+                       outlook(scenes, evidence, self.scenes.config.verdict),
+                       evidence.warnings, self.detection.start_s)
 
     def close(self) -> None:
         """End threads and child processes; a calibrate() elsewhere raises WorkerError."""

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from rich.console import Group
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
 from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import export as exported
 from dashcalib_ros.formats import load_calibration, load_camera
 from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge.rig import rig_of
 from dashcalib_ros.report import compare as compare_cameras

@@ -1,4 +1,4 @@
-"""dashcalib run, and turns (detection only)."""
+"""dashcalib run, and turns: what a run would use, without calibrating."""
 from __future__ import annotations
 
 import argparse
@@ -10,14 +10,15 @@ from pathlib import Path
 from rich.console import Group
 from rich.text import Text
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
 from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
-from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import InputError, Notice, OutputError, counted
 from dashcalib_ros.formats import result_json
-from dashcalib_ros.formats.ours import codes_of, plain_values
+from dashcalib_ros.formats.ours import codes_of
 from dashcalib_ros.input import FrameSource
+from dashcalib_ros.pipeline import Outlook
 from dashcalib_ros.report import Calibration, Written, output_folder, write_results
 from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE
 from dashcalib_ros.report.tables import (
@@ -27,8 +28,8 @@ from dashcalib_ros.report.tables import (
     next_step,
     summary,
 )
-from dashcalib_ros.report.wording import NEXT
-from dashcalib_ros.session import calibrate_drive, feed
+from dashcalib_ros.report.wording import cures, objections, optional
+from dashcalib_ros.session import calibrate_drive, outlook_of
 from dashcalib_ros.standard_streams import write_stdout
 
 
@@ -105,43 +106,55 @@ def now() -> str:
     return datetime.now(timezone.utc).isoformat(timespec='seconds')
 
 
-COLUMNS = ('at s', 'frame', 'from', 'to', 'images', 'prominence')
+COLUMNS = ('at s', 'frame', 'from', 'to', 'images', 'prominence', 'yaw °')
 PROMINENCE = ('prominence: how far a turn stands out from the driving before and after it, as a '
-              'fraction of the picture width; frames are counted from 0')
+              'fraction of the picture width; frames are counted from 0; yaw: of the turns that '
+              'a calibration would use')
+# degrees; drives without such a turn are accepted or weak, and turns alone do not tell which
+SHARP_DEG = 30.0
 
 
 def turns(args: argparse.Namespace) -> int:
-    """List the turns found, best first. The exit code is 0, also if there are none."""
+    """List the turns, best first, and say whether they are enough; the exit code is 0."""
     config = read_config(args)
     drive = open_drive(args)
-    source, detection = drive.source, Detection(config, drive.mask)
     with Stages(args.quiet) as stages:
-        frames = feed(detection, drive, stages)
-    detection.finish()
-    found = detection.turns()
-    warnings = (*source.warnings, *detection.warnings())
+        found = outlook_of(drive, config, stages)
+    warnings = (*drive.source.warnings, *found.warnings)
     warn(warnings)
+    yaws = found.yaws_deg
     if args.json:
         write_stdout(json.dumps(plain_values({
-            'input': source.name, 'frames': frames,
+            'input': drive.source.name, 'frames': found.frames,
             'turns': [{'center': turn.center, 'first': turn.first, 'last': turn.last,
                        'stamp': turn.stamp_s, 'prominence': turn.prominence,
-                       'images': turn.images} for turn in found],
+                       'images': turn.images, 'yaw_deg': yaws.get(turn.id)}
+                      for turn in found.turns],
+            'yaw_deg': sum(yaws.values()), 'verdict_at_best': found.verdict.level,
+            'reasons': found.verdict.reasons, 'reason_codes': found.verdict.codes,
             'warnings': warnings, 'warning_codes': codes_of(warnings)}), indent=2,
             allow_nan=False))
         return ACCEPTED
-    if found:
+    if found.turns:
         show(TextTable(COLUMNS, [
-            (f'{turn.stamp_s - detection.start_s:.1f}', str(turn.center), str(turn.first),
-             str(turn.last), str(turn.images), f'{turn.prominence:.4f}') for turn in found]))
+            (f'{turn.stamp_s - found.start_s:.1f}', str(turn.center), str(turn.first),
+             str(turn.last), str(turn.images), f'{turn.prominence:.4f}',
+             optional(yaws.get(turn.id), 0)) for turn in found.turns]))
         show(line(PROMINENCE))
-    show(Group(*map(line, _conclusion(len(found), config.turns.wanted, frames))))
+    show(Group(*map(line, _enough(found))))
     return ACCEPTED
 
 
-def _conclusion(found: int, wanted: int, frames: int) -> tuple[str, str]:
-    """Return what was found, and what to do next."""
-    return (f'{counted(found, "turn")} found in {counted(frames, "frame")}; a calibration uses '
-            f'the best {wanted}',
-            'next: dashcalib run with the same INPUT' if found else
-            f'next: {NEXT["refused"]}')
+def _enough(found: Outlook) -> tuple[str, str]:
+    """Return whether the turns are enough, with their degrees, and what to do next."""
+    yaws, verdict = found.yaws_deg.values(), found.verdict
+    text = f'{counted(len(found.turns), "turn")} found in {counted(found.frames, "frame")}'
+    if yaws:
+        text += (f'; a calibration would use {len(yaws)}, of {sum(yaws):.0f}° in all, the '
+                 f'sharpest of {max(yaws):.0f}°')
+    if not verdict.accepted:
+        return (f'{text}: not enough, the result would be {verdict.level}: '
+                f'{"; ".join(what for _, what, _ in objections(verdict)[:len(verdict.told)])}',
+                f'next: {cures(verdict)[0]}')
+    gentle = '' if max(yaws) >= SHARP_DEG else ', but without a sharp turn it may be weak'
+    return f'{text}: enough for a calibration{gentle}', 'next: dashcalib run with the same INPUT'

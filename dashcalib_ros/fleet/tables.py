@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera import calibrated_models
 from dashcalib_ros.errors import visible
 from dashcalib_ros.fleet.clips import ClipResult, hash_of
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.solved import ClipShare, Final, Solved
 from dashcalib_ros.fleet.storage import has, joined, write
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.judge.calibration import ANGLES
 from dashcalib_ros.store.scene_file import DATES_S
 

@@ -32,6 +32,7 @@ from dashcalib_ros.limits import (
     check_npz,
     parse_json,
     parse_yaml,
+    path_of,
     read_text,
 )
 
@@ -73,7 +74,7 @@ def load_with_faults(path: str | os.PathLike[str], name: str | None = None) -> N
 
 
 def _loaded(path: str | os.PathLike[str], name: str | None) -> NamedCamera:
-    text = os.fspath(path)
+    text = str(path_of(path))
     before, _, after = text.rpartition(':')
     # lexists() takes any text, also one that is too long for a name
     if name is None and before and os.path.lexists(before) and not os.path.lexists(text):

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, plain_values
 from dashcalib_ros.camera import MODELS, Camera, Radial
 from dashcalib_ros.camera.field import BASIS, Field
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
@@ -47,7 +47,7 @@ from dashcalib_ros.judge.calibration import (
     Witnesses,
 )
 from dashcalib_ros.judge.difference import NamedCamera
-from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, read_text
+from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, path_of, read_text
 from dashcalib_ros.solve.solution import LeftOut
 from dashcalib_ros.solve.spread import PictureSigma
 
@@ -104,7 +104,7 @@ def result_json(calibration: CalibrationData) -> str:
 
 def load_calibration(path: str | os.PathLike[str]) -> CalibrationData:
     """Read a result: see Calibration.load(). Settings that are unknown here are left out."""
-    place = Path(path)
+    place = path_of(path)
     place = place / 'result.json' if place.is_dir() else place
     text = read_text(place, JSON_BYTES)
     if text.lstrip().startswith('{'):
@@ -179,27 +179,6 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
 def _frozen(value: Any) -> Any:
     """Return the value with tuples for its lists."""
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
-
-
-def plain_values(value: Any) -> Any:
-    """Return the value as types of strict JSON; NaN and infinity become None."""
-    if value is None or isinstance(value, bool):
-        return value
-    if isinstance(value, str):
-        return str(value)  # YAML has no place for a Notice
-    if isinstance(value, (np.ndarray, np.generic)):
-        return plain_values(value.tolist())
-    if isinstance(value, int):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return plain_values({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
-    if isinstance(value, Mapping):
-        return {str(key): plain_values(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain_values(item) for item in value]
-    return str(value)
 
 
 def _held_out_dict(turn: LeftOut) -> dict[str, Any]:
@@ -321,7 +300,7 @@ def _no_intrinsics(name: str, verdict: Any, reasons: Any) -> InputError:
 def calibrated_camera(calibration: CalibrationData, name: str = 'estimate') -> NamedCamera:
     """Return the camera of a calibration. Raises InputError when it was refused."""
     if calibration.camera is None:
-        raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.reasons)
+        raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.told)
     shutter, field = calibration.rolling_shutter, calibration.field
     return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
                        _of_camera(calibration, len(calibration.camera.params)),

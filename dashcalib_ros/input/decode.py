@@ -30,6 +30,7 @@ from dashcalib_ros.limits import (
     PNG_TEXTS,
     TIFF_ENTRIES,
     check_pixels,
+    path_of,
     read_file,
 )
 
@@ -413,6 +414,23 @@ def read_mask(path: Path) -> Mask:
                          f'{what} is entirely black, so that nothing of the images '
                          f'is left; make the part to use white')
     return mask
+
+
+def mask_of(given: object) -> Mask | None:
+    """Return the mask that a user gave: a picture's path, or an array (height, width); or None.
+
+    Raises InputError.
+    """
+    if given is None:
+        return None
+    if isinstance(given, (str, os.PathLike)):
+        return read_mask(path_of(given))
+    mask = np.asarray(given)
+    if mask.ndim != 2 or mask.dtype.kind not in 'biuf':
+        raise InputError('E-MASK-SHAPE', f'the mask has the shape {mask.shape} of {mask.dtype}: '
+                                         f'pass the path of a picture, or numbers of shape '
+                                         f'(height, width)')
+    return np.asarray(mask > 0)
 
 
 def check_mask(mask: Mask | None, size: tuple[int, int]) -> None:

@@ -12,8 +12,8 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise, zip_longest
+from numbers import Real
 from pathlib import Path
 
 from dashcalib_ros.errors import InputError, Notice, counted
@@ -25,11 +25,12 @@ from dashcalib_ros.input.source import (
     Reading,
     by_name,
     cameras_named,
+    first_of,
     is_bag_file,
     os_error,
     size_text,
 )
-from dashcalib_ros.limits import check_file
+from dashcalib_ros.limits import check_file, path_of
 
 # what is known by its name, where its content does not tell; not whatever FFmpeg takes: it would
 # play a text file
@@ -89,6 +90,9 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     Raises InputError if there is nothing to read, or if the topic is ambiguous.
     """
     _check_numbers(fps, start_s, duration_s)
+    if topic is not None and not isinstance(topic, str):
+        raise InputError('E-TOPIC-TYPE', f"topic must be a str, such as '/camera/image_raw' or "
+                                         f"'2' for a video's stream, not {topic!r:.80}")
     groups = [_expanded(os.fspath(each)) for each in as_list(path)]
     if not groups:
         raise InputError('E-INPUT-MISSING',
@@ -105,22 +109,24 @@ def as_list(path: Paths) -> list[str | os.PathLike[str]]:
     given = ([path] if isinstance(path, (str, os.PathLike)) else
              list(path) if isinstance(path, Iterable) else [path])
     for each in given:
-        if not isinstance(each, (str, os.PathLike)):
-            raise InputError('E-PATH-TYPE', f'a path must be a str or a Path, not {each!r:.80}: '
-                                            f'pass a bag, a video, a folder of images, or a list '
-                                            f'of these')
+        path_of(each, 'pass a bag, a video, a folder of images, or a list of these')
     return given
 
 
 def _check_numbers(fps: float | None, start_s: float, duration_s: float | None) -> None:
-    if fps is not None and not (math.isfinite(fps) and 0 < fps <= 1000):
-        raise InputError('E-INPUT-FPS',
-                         f'fps must be greater than 0 and at most 1000 Hz, not {fps!r}')
-    if not (math.isfinite(start_s) and start_s >= 0):
-        raise InputError('E-INPUT-START', f'the start must be 0 s or later, not {start_s!r}')
-    if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
-        raise InputError('E-INPUT-DURATION',
-                         f'the duration must be greater than 0 s, not {duration_s!r}')
+    if fps is not None and not (_is_number(fps) and 0 < fps <= 1000):
+        raise InputError('E-INPUT-FPS', f'fps must be a number greater than 0 and at most 1000 '
+                                        f'(Hz), not {fps!r:.80}')
+    if not (_is_number(start_s) and start_s >= 0):
+        raise InputError('E-INPUT-START',
+                         f'the start must be a number of seconds from 0 on, not {start_s!r:.80}')
+    if duration_s is not None and not (_is_number(duration_s) and duration_s > 0):
+        raise InputError('E-INPUT-DURATION', f'the duration must be a number of seconds greater '
+                                             f'than 0, not {duration_s!r:.80}')
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,8 @@ def os_error(path: Path, error: OSError) -> InputError:
                       f'disk, or copy it again')
 
 
-@dataclass(frozen=True)
+# arrays cannot be compared: frames are the same, or not
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One image of the drive.
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from dataclasses import field as default
 from typing import Any, Literal
@@ -24,6 +25,8 @@ from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.solve.solution import LeftOut, Solution
 from dashcalib_ros.solve.spread import PictureSigma, sigma_over
 
+# what OpenCV moves the pixels of
+PIXEL_TYPES = ('uint8', 'uint16', 'int16', 'float32', 'float64')
 # after the point, in one line of text
 MOST_DIGITS = 9
 Level = Literal['accepted', 'weak', 'refused']
@@ -58,6 +61,16 @@ class Verdict:
     cures: tuple[str, ...] = ()
     codes: tuple[str, ...] = ()
     conditions: tuple[Condition, ...] = ()
+
+    @property
+    def accepted(self) -> bool:
+        """Return whether the level is accepted."""
+        return self.level == 'accepted'
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Return the reasons to show: of a refused result the first, as the others follow."""
+        return self.reasons[:1] if self.level == 'refused' else self.reasons
 
 
 @dataclass(frozen=True)
@@ -200,7 +213,7 @@ class Mount:
     pitch_up_deg: float
     roll_right_deg: float | None
     height_m: float | None
-    sigma: Mapping[str, float | None]
+    sigma: Mapping[str, float | None] = default(hash=False)
     travel_px: tuple[float, float]
     travel_sigma_px: float
     straight_m: float
@@ -259,6 +272,16 @@ class Material:
     pictures: Mapping[TurnId, TurnPicture] = default(default_factory=dict)
 
 
+def _places(given: npt.ArrayLike, columns: int, what: str) -> Floats:
+    """Return places (..., columns) that a user gave. Raises InputError for another shape."""
+    with suppress(TypeError, ValueError):
+        found = np.asarray(given, np.float64)
+        if found.shape[-1:] == (columns,):
+            return found
+    raise InputError('E-ARRAY-SHAPE', f'{what} must be numbers of the shape (..., {columns}), not '
+                                      f'{given!r:.80}')
+
+
 def _with_sigma(value: float, sigma: float) -> str:
     """Return a value and its sigma, both to the second digit of the sigma."""
     if not (math.isfinite(sigma) and sigma > 0):
@@ -293,18 +316,18 @@ class CalibrationData:
     verdict: Verdict
     image_size: tuple[int, int]
     camera: Camera | None
-    sigma: Mapping[str, float] | None
+    sigma: Mapping[str, float] | None = default(hash=False)
     turns: tuple[TurnSummary, ...]
     frames: int
     reprojection_error_px: float | None
-    timing: dict[str, float]
-    versions: dict[str, str]
+    timing: dict[str, float] = default(hash=False)
+    versions: dict[str, str] = default(hash=False)
     config: Config
     input_name: str = ''
     warnings: tuple[Notice, ...] = ()
-    magnitudes: Floats | None = None
-    mask: Mask | None = None
-    details: dict[str, Any] = default(default_factory=dict)
+    magnitudes: Floats | None = default(default=None, compare=False)
+    mask: Mask | None = default(default=None, compare=False)
+    details: dict[str, Any] = default(default_factory=dict, hash=False)
     stored_turns: tuple[StoredTurnSummary, ...] = ()
     rolling_shutter: Shutter | None = None
     sigma_px: PictureSigma | None = None
@@ -322,7 +345,7 @@ class CalibrationData:
     def __repr__(self) -> str:
         """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
         if self.camera is None:
-            return f'Calibration({self.verdict.level}: {"; ".join(self.verdict.reasons[:1])})'
+            return f'Calibration({self.verdict.level}: {"; ".join(self.verdict.told)})'
         sigma = self.sigma or {}
         found = [f'{name} {_with_sigma(value, sigma.get(name, math.nan))}'
                  for name, value in self.camera.named.items()]
@@ -358,7 +381,7 @@ class CalibrationData:
         NaN where the camera has no viewing ray. Raises InputError as samples() does.
         """
         camera, covariance = self._posterior
-        at = np.asarray(pixels, np.float64).reshape(-1, 2)
+        at = _places(pixels, 2, 'pixels').reshape(-1, 2)
         found = np.full(len(at), np.nan)
         known = np.isfinite(camera.rays(at)[:, 0])
         found[known] = sigma_over(sensitivity(camera, at[known])[0], covariance)
@@ -391,7 +414,7 @@ class CalibrationData:
         With the field, where one is used. NaN where the lens has no ray. Raises InputError where
         there is no camera.
         """
-        found = np.asarray(pixels, np.float64)
+        found = _places(pixels, 2, 'pixels')
         return self._camera.rays(found if self._used_field is None
                                  else self._used_field.ideal(found))
 
@@ -401,20 +424,26 @@ class CalibrationData:
         With the field, where one is used. NaN where the lens does not see a point. Raises
         InputError where there is no camera.
         """
-        found = self._camera.project(np.asarray(points, np.float64))
+        found = self._camera.project(_places(points, 3, 'points'))
         return found if self._used_field is None else self._used_field.observed(found)
 
     @property
     def _used_field(self) -> Field | None:
         return self.field.field if self.field is not None and self.field.used else None
 
-    def undistort(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def undistort(self, image: npt.ArrayLike) -> npt.NDArray[Any]:
         """Return an image without distortion, as a camera with the matrix K sees it.
 
-        The field is taken out, too, where one is used. Raises InputError for an image of another
-        size, and where there is no camera.
+        image: (height, width) or (height, width, channels), as cv2.imread() returns it. The field
+        is taken out, too, where one is used. Raises InputError for what is no image or one of
+        another size, and where there is no camera.
         """
-        camera = self._camera
+        camera, image = self._camera, np.asarray(image)
+        if image.ndim not in (2, 3) or image.dtype not in PIXEL_TYPES:
+            raise InputError('E-IMAGE-TYPE', f'undistort() takes an array (height, width) or '
+                             f'(height, width, channels) of {", ".join(PIXEL_TYPES)}, not '
+                             f'{image.shape} of {image.dtype}: read a file with cv2.imread(), '
+                             f'which returns None where it cannot')
         if image.shape[1::-1] != camera.image_size:
             raise InputError('E-OTHER-IMAGE-SIZE',
                              f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
@@ -426,8 +455,16 @@ class CalibrationData:
     def _camera(self) -> Camera:
         if self.camera is None:
             raise InputError('E-CALIBRATION-REFUSED', 'the calibration was refused: '
-                             f'{"; ".join(self.verdict.reasons)}')
+                             f'{"; ".join(self.verdict.told)}')
         return self.camera
+
+    @property
+    def field_of_view(self) -> tuple[float, float, float]:
+        """Return degrees across, down and along the longer diagonal, of the picture's middle.
+
+        Raises InputError where there is no camera.
+        """
+        return self._camera.field_of_view
 
     @property
     def intrinsics(self) -> dict[str, float] | None:

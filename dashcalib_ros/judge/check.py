@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 from dataclasses import field as default
 from fractions import Fraction
 from shlex import quote
+from typing import Any
 
 import numpy as np
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, Lines, bend
@@ -27,7 +29,7 @@ from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import PictureSigma
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Check:
     """What a drive says of a calibration that was given.
 
@@ -58,7 +60,7 @@ class Check:
     loss: float | None = None
     straight_lines: Bend | None = None
     bound_px: float | None = None
-    limits_px: Mapping[Use, float] = default(default_factory=dict)
+    limits_px: Mapping[Use, float] = default(default_factory=dict, hash=False)
     good_for: tuple[Use, ...] = ()
     cure: str = ''
 
@@ -76,6 +78,14 @@ class Check:
         more = ('a drive with more turns may show whether it is good enough'
                 if self.answer == 'right' else REPLACE)
         return f'{keep}; for {", ".join(others)}: {more}'
+
+    def __repr__(self) -> str:
+        """Return one line: the answer and its reasons."""
+        return f'Check({self.answer}: {"; ".join(self.reasons)})'
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as dicts, lists, text, finite numbers and None."""
+        return dict(plain_values(self))
 
 
 REPLACE = 'replace it with the calibration of this drive (dashcalib run)'
@@ -98,7 +108,7 @@ def check(given: Camera, image_size: tuple[int, int], solution: Solution | None,
         if given.image_size == image_size:
             return Check('cannot tell', tuple(
                 f'the drive has no accepted calibration of its own: {text}'
-                for text in verdict.reasons))
+                for text in verdict.told))
         return Check('wrong', (size_reason(given, image_size, None, name),), cure=FIT_SIZE)
     px = Scale.of(image_size, config).px
 

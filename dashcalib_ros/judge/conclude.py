@@ -147,6 +147,22 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
     return replace(found, warnings=found.warnings + _warnings(found, solution))
 
 
+def outlook(scenes: Sequence[Scene], evidence: Evidence, config: VerdictConfig) -> Verdict:
+    """Return the best verdict that the number of turns and their angles allow, as judge() counts.
+
+    scenes: that a calibration would use.
+    """
+    if not scenes:
+        return _verdict_without_solution(evidence, config)
+    # a gyro may confirm a single turn
+    gyro = evidence.motion is not None and evidence.motion.rate is not None
+    found = [turn_count(len(scenes), config, gyro),
+             yaw_in_all(sum(scene.yaw_deg for scene in scenes), config)]
+    other = evidence.other_camera
+    found = [two_cameras(other), *found] if other else found
+    return verdict_of(sorted(found, key=lambda each: each.level != 'refused'))
+
+
 def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None,
                   evidence: Evidence) -> CalibrationData:
     """Return the calibration with what a refused one has not, in the input's pixels."""
@@ -269,6 +285,12 @@ def _verdict_without_solution(evidence: Evidence, config: VerdictConfig) -> Verd
                         f'the car stood during all turns that were found ({turns}), according to '
                         f'its speed',
                         'drive through turns, or omit the speed if it is wrong')
+    elif any(turn not in evidence.left_out for turn in evidence.built):
+        found = Finding('E-UNDETERMINED', 'refused',
+                        'the turns could be reconstructed, but no camera follows from them: '
+                        'nothing in them limits the focal length, as where the camera slides past '
+                        'flat or distant things', 'drive through turns at crossings, past houses '
+                        'and parked cars, near and far')
     else:
         found = Finding('E-NO-SCENE', 'refused',
                         f'{counted(turns, "turn")} {"was" if turns == 1 else "were"} found, but '

@@ -14,11 +14,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as default
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, plain_values
 from dashcalib_ros.camera import Camera, misread
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
@@ -53,7 +53,7 @@ CHANCE = 1e-3
 LEAST_SIGMA_PX = 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Difference:
     """A given camera beside one that was found, in px of the same pictures.
 
@@ -257,7 +257,7 @@ class NamedCamera:
 
     name: str
     camera: Camera
-    sigma: Mapping[str, float] | None = None
+    sigma: Mapping[str, float] | None = default(default=None, hash=False)
     verdict: str | None = None
     covariance: Floats | None = default(default=None, compare=False)
     sigma_px: PictureSigma | None = None
@@ -279,6 +279,11 @@ class NamedCamera:
     def image_size(self) -> tuple[int, int]:
         """Return (width, height) in pixels."""
         return self.camera.image_size
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as dicts, lists, text, finite numbers and None."""
+        values: dict[str, Any] = plain_values(self)
+        return {**values, 'camera': {'model': self.camera.model, **values['camera']}}
 
 
 def difference_between(given: NamedCamera, found: NamedCamera) -> Difference:

@@ -169,11 +169,11 @@ def _yaw_of_turns(grounds: Grounds) -> Finding:
 
 def yaw_in_all(yaw_deg: float, config: VerdictConfig) -> Finding:
     """Judge the yaw of all turns together."""
-    least = config.min_yaw_deg
-    return Finding('E-LITTLE-YAW', _graded(yaw_deg < config.refused_yaw_deg,
-                                           yaw_deg < least),
-                   f'the turns have {yaw_deg:.0f}° of yaw in all, at least {least:.0f}° are '
-                   f'needed', MORE_TURNS).measured(
+    least, hardly = config.min_yaw_deg, yaw_deg < config.refused_yaw_deg
+    text = 'hardly a turn: those that could be used' if hardly else 'the turns'
+    return Finding('E-LITTLE-YAW', _graded(hardly, yaw_deg < least),
+                   f'{text} have {yaw_deg:.0f}° of yaw in all, at least {least:.0f}° are needed',
+                   MORE_TURNS).measured(
         'yaw of these turns together', f'{yaw_deg:.0f}°', f'at least {least:.0f}°')
 
 
@@ -206,9 +206,9 @@ def _far_from_profile(grounds: Grounds) -> Finding | None:
     if np.isclose(best, solution.camera.fx):
         return None
     return Finding('E-TWO-FOCAL-LENGTHS', 'refused',
-                   f'two ways to find the focal length contradict each other: '
-                   f'{solution.px * solution.camera.fx:.0f} px and about '
-                   f'{solution.px * best:.0f} px; neither can be trusted',
+                   f'two ways to find the focal length contradict each other, as where other '
+                   f'traffic fills the pictures: {solution.px * solution.camera.fx:.0f} px and '
+                   f'about {solution.px * best:.0f} px',
                    'record another drive, with sharper turns and less traffic')
 
 

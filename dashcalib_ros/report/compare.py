@@ -5,13 +5,14 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as default
 from typing import Any
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.mapping import unseen_share
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats import Given, given_camera
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
 from dashcalib_ros.judge.calibration import Mount
@@ -45,7 +46,7 @@ class ParameterDifference:
     z: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """What compare() found.
 
@@ -56,7 +57,7 @@ class Comparison:
     a: NamedCamera
     b: NamedCamera
     differences: tuple[ParameterDifference, ...]
-    whole: Difference
+    whole: Difference = default(compare=False)
     unseen: float = 0.0
     misread: str = ''
 
@@ -64,6 +65,10 @@ class Comparison:
     def answer(self) -> Answer:
         """Return right, differs, wrong or cannot tell, as Check.answer."""
         return self.whole.answer
+
+    def __repr__(self) -> str:
+        """Return one line: the names, and how far both are apart."""
+        return f'Comparison({self.a.name} and {self.b.name}: {"; ".join(answers(self))})'
 
     @property
     def mapping_px(self) -> float | None:
@@ -105,7 +110,7 @@ def answer_dict(found: Check, changes: Sequence[str], motion: Odometry | None = 
     changes: of the camera during the drive, in words. motion: the comparison with true poses.
     mount: how far the mounting is from the calibration's.
     """
-    values: dict[str, Any] = plain_values(found) | {
+    values: dict[str, Any] = found.to_dict() | {
         'next_step': found.next_step, 'changes': list(changes), 'mount': mount}
     if motion is not None:
         values |= motion.medians()

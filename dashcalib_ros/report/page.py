@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from shlex import quote
@@ -67,7 +67,8 @@ def report_html(calibration: CalibrationData, truth: NamedCamera | None = None,
     return template('report.html').render(
         c=c, title=f'Calibration of {c.input_name}' if c.input_name else 'Calibration',
         headline=ADVICE[c.verdict.level], figures=key_figures(c), steps=next_steps(c),
-        reasons=[what for _, what, _ in objections(c.verdict)], conditions=conditions(c.verdict),
+        reasons=[what for _, what, _ in objections(c.verdict)], told=len(c.verdict.told),
+        conditions=conditions(c.verdict),
         parameters=parameter_rows(c),
         truth=[] if against is None else _truth_rows(against),
         truth_px='' if against is None else optional(against.mapping_px, 2, ' px'),
@@ -93,7 +94,14 @@ def difference_html(found: Comparison) -> str:
         head=head, rows=rows, maps=_maps(found))
 
 
-@lru_cache(maxsize=3)
+def notebook_html(word: str, lines: Iterable[str], head: Sequence[str],
+                  rows: Iterable[Sequence[str]]) -> str:
+    """Return what a notebook shows of a result: its word, lines of text and a table."""
+    return template('notebook.html').render(word=word, lines=filter(None, lines), head=head,
+                                            rows=list(rows))
+
+
+@lru_cache(maxsize=4)
 def template(name: str) -> jinja2.Template:
     """Return a page's template."""
     # loaded here: only who writes a report needs it

@@ -21,6 +21,7 @@ from dashcalib_ros.report.compare import (
     unseen_text,
 )
 from dashcalib_ros.report.wording import (
+    PARAMETERS,
     cures,
     number,
     objections,
@@ -48,7 +49,7 @@ def summary(calibration: CalibrationData) -> RenderableType:
     c = calibration
     parts: list[RenderableType] = []
     if c.camera is not None:
-        parts.append(TextTable(('', 'estimate', 'sigma', 'relative'), parameter_rows(c)))
+        parts.append(TextTable(PARAMETERS, parameter_rows(c)))
         if c.caveat:
             parts += [line(c.caveat), line('')]
     if c.turns:
@@ -57,10 +58,10 @@ def summary(calibration: CalibrationData) -> RenderableType:
 
 
 def conclusion(verdict: Verdict) -> RenderableType:
-    """Return the verdict, coloured, and its reasons."""
+    """Return the verdict, coloured, and its reasons; of a refused result the cause."""
     parts: list[RenderableType] = [labelled('verdict', verdict.level)]
     parts += [Padding.indent(line(f'{what} [{code}]' if code else what), 2)
-              for code, what, _ in objections(verdict)]
+              for code, what, _ in objections(verdict)[:len(verdict.told)]]
     return Group(*parts)
 
 

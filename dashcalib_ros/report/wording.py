@@ -2,12 +2,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from itertools import zip_longest
 
 import numpy as np
 
-from dashcalib_ros.camera import Camera
 from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Condition, Mount, Witnesses
 from dashcalib_ros.judge.rig import Rig
@@ -26,6 +24,8 @@ NEXT = {
 
 # parameters that are lengths in the picture; the others have no unit
 PIXELS = ('fx', 'fy', 'cx', 'cy')
+# head of the table of parameters
+PARAMETERS = ('', 'estimate', 'sigma', 'relative')
 
 
 def parameter_rows(calibration: CalibrationData) -> list[tuple[str, str, str, str]]:
@@ -149,38 +149,24 @@ def key_figures(c: CalibrationData) -> list[tuple[str, str, str]]:
     front.append(('focal length fx', f'{c.camera.fx:.1f} px',
                   (f'± {sigma:.1f} px, {100 * sigma / c.camera.fx:.2f} %'
                    if math.isfinite(sigma) else 'uncertainty unknown') + lone))
-    across, down, diagonal = (optional(angle, 1, '°') for angle in field_of_view(c.camera))
+    across, down, diagonal = (optional(angle, 1, '°') for angle in c.camera.field_of_view)
     front.append(('field of view', across, f'by {down}, diagonal {diagonal}'))
     return [*front, *found]
 
 
-def field_of_view(camera: Camera) -> tuple[float, float, float]:
-    """Return degrees from edge to edge through the picture's middle: horizontal, vertical.
-
-    Last comes the larger of both diagonals; NaN where not known. The two sides of one direction
-    may come to more than 180.
-    """
-    width, height = camera.image_size
-    left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5
-    x, y = (width - 1) / 2, (height - 1) / 2
-    ends = np.array([[(left, y), (right, y)], [(x, top), (x, bottom)],
-                     [(left, top), (right, bottom)], [(left, bottom), (right, top)]])
-    with np.errstate(all='ignore'):
-        off_axis = np.degrees(np.arccos(np.clip(camera.rays(ends)[..., 2], -1.0, 1.0)))
-        angles = off_axis.sum(axis=1)
-    return float(angles[0]), float(angles[1]), float(angles[2:].max())
-
-
 def cures(verdict: Verdict) -> tuple[str, ...]:
-    """Return what to do next, the likeliest to help first."""
-    return verdict.cures or (NEXT[verdict.level],)
+    """Return what to do next, the likeliest to help first; of a refused result that one."""
+    found = verdict.cures or (NEXT[verdict.level],)
+    return found[:1] if verdict.level == 'refused' else found
 
 
-def objections(verdict: Verdict) -> Iterator[tuple[str, str, str]]:
-    """Yield each reason of a verdict: its code, '' where it has none, what is wrong, the cure."""
+def objections(verdict: Verdict) -> list[tuple[str, str, str]]:
+    """Return each reason of a verdict: its code, '' where it has none, what is wrong, the cure."""
+    found = []
     for reason, code in zip_longest(verdict.reasons, verdict.codes, fillvalue=''):
         cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), '')
-        yield code, reason.removesuffix(f': {cure}'), cure
+        found.append((code, reason.removesuffix(f': {cure}'), cure))
+    return found
 
 
 def next_steps(c: CalibrationData) -> list[str]:
@@ -199,7 +185,7 @@ def next_steps(c: CalibrationData) -> list[str]:
                 'Calibrate again when the lens, the zoom, the focus or the video mode changes. '
                 'Moving the camera on the car changes nothing here.']
     yaw = c.yaw_deg
-    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in c.verdict.cures]
+    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in cures(c.verdict)]
     if c.turns_used < c.config.turns.wanted or yaw < needed.min_yaw_deg:
         steps.append(f'For the next drive: {c.config.turns.wanted} turns of 60° or more, at town '
                      f'speed, in daylight. At least {needed.min_turns} turns and '
@@ -208,10 +194,10 @@ def next_steps(c: CalibrationData) -> list[str]:
     else:
         steps.append('For the next drive: turns of 60° or more, at town speed, in daylight, with '
                      'little traffic ahead.')
-    steps.append(together)
-    if c.verdict.level == 'weak':
-        steps.append('To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.')
-    return steps
+    if c.verdict.level == 'refused':
+        return [' '.join(steps)]
+    return [*steps, together,
+            'To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.']
 
 
 def run_facts(c: CalibrationData) -> list[tuple[str, str]]:

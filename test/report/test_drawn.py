@@ -31,7 +31,7 @@ from dashcalib_ros.judge.calibration import Condition, Shutter, Stabiliser, Stor
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.report import NamedCamera, report_html, write_results
 from dashcalib_ros.report.lens import WHY_TOGETHER, undistorted
-from dashcalib_ros.report.wording import conditions, field_of_view
+from dashcalib_ros.report.wording import conditions
 from dashcalib_ros.session import with_source
 
 
@@ -316,6 +316,6 @@ def test_the_grid_is_straight_where_the_picture_is_undistorted():
 def test_the_field_of_view_is_that_of_the_lens():
     plain = dataclasses.replace(EACH_MODEL['radial'], k1=0.0, k2=0.0, cx=620.5, cy=187.0,
                                 fx=621.0, fy=187.5)
-    across, down, diagonal = field_of_view(plain)
+    across, down, diagonal = plain.field_of_view
     assert (across, down) == pytest.approx((90, 90)) and diagonal > 90
-    assert field_of_view(EACH_MODEL['fisheye'])[0] > 150
+    assert EACH_MODEL['fisheye'].field_of_view[0] > 150

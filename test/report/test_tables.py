@@ -13,10 +13,12 @@ from rich.console import Console
 
 from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.camera.field import Field
+from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser
 from dashcalib_ros.report import NamedCamera, compare, report_html
 from dashcalib_ros.report.tables import against_truth, comparison, conclusion, next_step, summary
+from dashcalib_ros.report.wording import next_steps
 from dashcalib_ros.solve.spread import PictureSigma
 
 
@@ -60,6 +62,23 @@ def test_the_conclusion_is_verdict_reasons_and_what_to_do():
     assert last.startswith('next: ') and 'calibration.yaml' in last
     assert terminal(next_step(verdict)).splitlines() == [
         'next: drive sharper turns', 'also: fix the zoom']
+
+
+def test_a_refusal_is_its_cause_and_one_step():
+    verdict = Verdict('refused', ('dark: drive by day', 'few: drive', 'flat: drive'),
+                      ('drive by day', 'drive'), ('E-DARK', 'E-FEW-TURNS', 'E-FLAT-PROFILE'))
+    assert terminal(conclusion(verdict)).splitlines() == ['verdict: refused', '  dark [E-DARK]']
+    assert terminal(next_step(verdict)) == 'next: drive by day'
+    refused = make_calibration('refused', verdict=verdict)
+    text, page = report_html(refused), Page(report_html(refused))
+    [step] = next_steps(refused)
+    assert step.startswith('Drive by day. For the next drive: ')
+    head, _, folded = text.partition('<details><summary>What follows')
+    assert 'flat' in page.text and '<li>dark</li></ul>' in head and '<li>flat</li>' in folded
+    for ask in (refused.accepted, lambda: refused.K, lambda: compare(refused, TRUTH)):
+        with pytest.raises(DashcalibError) as caught:
+            ask()
+        assert 'dark' in caught.value.text and 'flat' not in caught.value.text
 
 
 def test_a_reason_has_its_code():
