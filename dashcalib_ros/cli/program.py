@@ -128,7 +128,7 @@ def _interrupted() -> int:
 
 def _os_error(error: OSError) -> DashcalibError:
     where = f' ({error.filename})' if error.filename else ''
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return OutputError('E-DISK-FULL', f'no space is left on the disk{where}; free some, or '
                                           f'set TMPDIR to another disk')
     return InputError('E-FILE-ACCESS', f'{error.strerror or error}{where}; check the path and its '

@@ -31,7 +31,7 @@ from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.storage import is_url, joined, read, remove, stamp, write
 from dashcalib_ros.judge.conclude import versions
 from dashcalib_ros.report import write_results
-from dashcalib_ros.report.files import ACCEPTED, WEAK
+from dashcalib_ros.report.wording import ACCEPTED, WEAK
 from dashcalib_ros.whole_files import temporary_folder
 
 

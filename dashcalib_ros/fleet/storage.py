@@ -4,7 +4,6 @@ Only URLs need fsspec.
 """
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import posixpath
@@ -20,10 +19,9 @@ from typing import Any
 from dashcalib_ros.errors import ConfigError, InputError, OutputError, one_line
 from dashcalib_ros.input.inputs import named_like
 from dashcalib_ros.limits import CLIP_BYTES, CLIP_FILES, check_file, read_file
-from dashcalib_ros.whole_files import temporary_folder, write_whole
+from dashcalib_ros.whole_files import FULL, temporary_folder, write_whole
 
 URL = re.compile(r'[a-z][a-z0-9+.-]+://')
-FULL = (errno.ENOSPC, errno.EDQUOT)
 # bytes of one of our own files
 LARGEST = 2**28
 # by which an object store shows that a file changed

@@ -17,6 +17,7 @@ from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.one_camera import APART, OtherCamera
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.errors import Notice, spared
 from dashcalib_ros.judge.agreement import (
     MAX_MISFIT,
     focal_disagreement,
@@ -102,11 +103,11 @@ def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
     would bring, where only knowledge is missing.
     """
     grounds = Grounds(solution, config, lines, witnesses or Witnesses(), other_camera)
-    findings = [found for rule in RULES if (found := rule(grounds)) is not None]
+    findings = [found for rule in RULES if (found := _found(rule, grounds)) is not None]
     findings.sort(key=lambda found: (not found.objects, found.objects and not found.cause,
                                      found.level != 'refused'))
     if outlook and findings[0].objects and lacks_knowledge_only(grounds):
-        first, more = findings[0].cure, next_turn(solution)
+        first, more = findings[0].cure, spared('the outlook', [], next_turn, solution) or ''
         findings = [replace(found, cure=first + (more and f' ({more})')) if found.cure == first
                     else found for found in findings]
     return verdict_of(findings)
@@ -128,9 +129,17 @@ def lacks_knowledge_only(grounds: Grounds) -> bool:
 
     Another focal length may explain them as well, but not clearly better.
     """
-    found = [rule(grounds) for rule in SOUND]
+    found = [_found(rule, grounds) for rule in SOUND]
     return (profile_contrast(grounds.solution) > -MIN_CONTRAST
             and not any(each is not None and each.objects for each in found))
+
+
+def _found(rule: Rule, grounds: Grounds) -> Finding | None:
+    """Return what a rule finds; one that fails costs no result, but that is not accepted."""
+    lost: list[Notice] = []
+    found = spared(f'the check {rule.__name__.strip("_")}', lost, rule, grounds)
+    return Finding('E-CHECK-FAILED', 'weak', str(lost[0]), 'calibrate again with the next release'
+                   ) if lost else found
 
 
 def _graded(refused: bool, weak: bool) -> Level:

@@ -2,8 +2,10 @@
 from __future__ import annotations
 
 import math
+import posixpath
 from collections.abc import Iterator
 from itertools import zip_longest
+from shlex import quote
 
 import numpy as np
 
@@ -17,6 +19,8 @@ ADVICE = {
     'weak': 'There are numbers, but they may be wrong: read the reasons first.',
     'refused': 'There is no calibration: this drive does not show enough.',
 }
+# where a calibration that others load is written, by its verdict, and the usual folder
+ACCEPTED, WEAK, FOLDER = 'calibration.yaml', 'calibration.weak.yaml', 'calibration'
 # where a verdict has no cures
 NEXT = {
     'accepted': 'use calibration.yaml in the camera driver; report.html has the details',
@@ -26,6 +30,11 @@ NEXT = {
 
 # parameters that are lengths in the picture; the others have no unit
 PIXELS = ('fx', 'fy', 'cx', 'cy')
+
+
+def file_of(verdict: Verdict) -> str:
+    """Return the name of the file that has the camera of a result."""
+    return ACCEPTED if verdict.level == 'accepted' else WEAK
 
 
 def parameter_rows(calibration: CalibrationData) -> list[tuple[str, str, str, str]]:
@@ -181,21 +190,29 @@ def objections(verdict: Verdict) -> Iterator[tuple[str, str, str]]:
         yield code, reason.removesuffix(f': {cure}'), cure
 
 
-def next_steps(c: CalibrationData) -> list[str]:
-    """Return what to do next, most useful first."""
+def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
+    """Return what to do next, most useful first. folder: where the result is written."""
+    file = f'`{quote(posixpath.join(folder, file_of(c.verdict)))}`'
     needed = c.config.verdict
     together = ('Short drives add up: with `--set turns.store=FOLDER`, each run uses the turns of '
                 'those before it.')
     if c.verdict.level == 'accepted':
-        steps = ['Use `calibration.yaml` in the camera driver, or copy the lines below.']
+        steps = [f'Use {file} in the camera driver, or copy the lines below.']
+        if c.field is not None and c.field.used:
+            steps.append('The picture is bent by what is in front of the lens, as by a windscreen '
+                         'or a rectification. In Python, '
+                         f'`dashcalib_ros.Calibration.load({folder!r}).undistort(image)` takes '
+                         f'this out, too.')
         if (c.sigma or {}).get('fx', 0.0) > 0.005 * (c.camera.fx if c.camera else 1.0):
             steps.append('It can become more exact: another drive with sharp turns lowers the '
                          'uncertainty. ' + together)
         return [*steps,
                 'To check it with another drive of the same camera: '
-                '`dashcalib check calibration DRIVE`.',
+                f'`dashcalib check {quote(folder)} DRIVE`.',
                 'Calibrate again when the lens, the zoom, the focus or the video mode changes. '
-                'Moving the camera on the car changes nothing here.']
+                'Moving the camera on the car changes ' + (
+                    'nothing here.' if c.mount is None else
+                    'the mounting only: drive again for it, also straight on.')]
     yaw = c.yaw_deg
     steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in c.verdict.cures]
     if c.turns_used < c.config.turns.wanted or yaw < needed.min_yaw_deg:
@@ -208,7 +225,7 @@ def next_steps(c: CalibrationData) -> list[str]:
                      'little traffic ahead.')
     steps.append(together)
     if c.verdict.level == 'weak':
-        steps.append('To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.')
+        steps.append(f'To use it all the same, rename {file}; mind its sigmas.')
     return steps
 
 
