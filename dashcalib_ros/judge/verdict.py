@@ -241,13 +241,18 @@ def _relative_sigma(solution: Solution) -> float:
     return float(solution.sigma[0] / solution.camera.fx)
 
 
-def one_turn_dominates(grounds: Grounds) -> Finding:
-    """If one turn gives nearly all information about fx, the others cannot confirm it."""
+def one_turn_dominates(grounds: Grounds) -> Finding | None:
+    """If one turn gives nearly all information about fx, the others cannot confirm it.
+
+    Of a single turn the rule on the number of turns says all.
+    """
     shares, most = leverages(grounds.solution), grounds.config.max_leverage
+    if len(shares) < 2:
+        return None
     turn = max(shares, key=lambda turn: shares[turn])
     percent, confirmed = 100 * min(shares[turn], 1.0), gyro_confirms(grounds.solution)
     return Finding('E-ONE-TURN-DOMINATES',
-                   _graded(False, len(shares) > 1 and shares[turn] > most and not confirmed),
+                   _graded(False, shares[turn] > most and not confirmed),
                    f'no other turn confirms {_turns([turn])}, which gives {percent:.0f} % of the '
                    f'information about the focal length',
                    'drive another turn that is as sharp').measured(

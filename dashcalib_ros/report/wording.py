@@ -193,16 +193,15 @@ def objections(verdict: Verdict) -> Iterator[tuple[str, str, str]]:
 def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
     """Return what to do next, most useful first. folder: where the result is written."""
     file = f'`{quote(posixpath.join(folder, file_of(c.verdict)))}`'
+    glass = [] if c.field is None or not c.field.used else [
+        'A windscreen, or a rectification, bends the picture beside the lens. In Python, '
+        f'`dashcalib_ros.Calibration.load({folder!r}).undistort(image)` removes this, too.']
     needed = c.config.verdict
     together = ('Short drives add up: with `--set turns.store=FOLDER`, each run uses the turns of '
                 'those before it.')
     if c.verdict.level == 'accepted':
         steps = [f'Use {file} in the camera driver, or copy the lines below.']
-        if c.field is not None and c.field.used:
-            steps.append('The picture is bent by what is in front of the lens, as by a windscreen '
-                         'or a rectification. In Python, '
-                         f'`dashcalib_ros.Calibration.load({folder!r}).undistort(image)` takes '
-                         f'this out, too.')
+        steps += glass
         if (c.sigma or {}).get('fx', 0.0) > 0.005 * (c.camera.fx if c.camera else 1.0):
             steps.append('It can become more exact: another drive with sharp turns lowers the '
                          'uncertainty. ' + together)
@@ -225,7 +224,7 @@ def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
                      'little traffic ahead.')
     steps.append(together)
     if c.verdict.level == 'weak':
-        steps.append(f'To use it all the same, rename {file}; mind its sigmas.')
+        steps += [f'To use it all the same, rename {file}; mind its sigmas.', *glass]
     return steps
 
 

@@ -204,6 +204,20 @@ def test_what_fails_beside_the_camera_costs_itself_only(drawn, monkeypatch, part
         drawn.camera, drawn.sigma, drawn.verdict)
 
 
+@pytest.mark.parametrize('count', [1, 2, 3])
+@pytest.mark.parametrize('turns', [1, 9])
+def test_no_row_beyond_its_limit_is_ticked(count, turns):
+    """Of one turn, the largest share of one turn is 100 %."""
+    config = dataclasses.replace(CONFIG.verdict, min_turns=turns)
+    verdict = judge(only(solution(), range(count)), config)
+    measured = [each for each in verdict.conditions if each.limit]
+    assert len(measured) >= 6
+    for each in measured:
+        value, limit = (float(re.search(r'[-\d.]+', text)[0]) for text in (each.value, each.limit))
+        within = value <= limit if 'at most' in each.limit else value >= limit
+        assert each.met == within, each
+
+
 def test_a_check_that_fails_makes_the_result_weak(monkeypatch):
     def broken(grounds):
         raise IndexError('list index out of range')
