@@ -25,10 +25,11 @@ def one_line(error: BaseException, limit: int = 160) -> str:
     return shortened(' '.join(str(error).split()) or type(error).__name__, limit)
 
 
-def coded(error: Exception, limit: int = 1000) -> str:
-    """Return an error's message on one line, with its code at the end if it has one."""
-    code = error.code if isinstance(error, DashcalibError) else ''
-    return one_line(error, limit) + (f' [{code}]' if code else '')
+def coded(message: Exception | Notice, limit: int = 1000) -> str:
+    """Return a message on one line, with its code at the end if it has one."""
+    text = shortened(message, limit) if isinstance(message, str) else one_line(message, limit)
+    code = message.code if isinstance(message, (DashcalibError, Notice)) else ''
+    return text + (f' [{code}]' if code else '')
 
 
 def spared(what: str, lost: list[Notice], make: Callable[..., T], *arguments: object) -> T | None:

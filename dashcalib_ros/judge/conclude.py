@@ -301,7 +301,7 @@ def _stored_summary(turn: StoredTurn, scene: Scene, evidence: Evidence, solution
                     ) -> StoredTurnSummary:
     return StoredTurnSummary(
         id=scene.turn, stamp_s=turn.stamp_s, prominence=turn.prominence,
-        yaw_deg=turn.scene.yaw_deg, images=len(scene.tracks.frames),
+        yaw_deg=turn.scene.yaw_deg, images=len(scene.tracks.frames), clip=scene.turn.clip,
         **_use(scene.turn, scene, evidence, solution))
 
 

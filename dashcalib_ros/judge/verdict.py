@@ -6,6 +6,7 @@ RULES.
 """
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -17,7 +18,7 @@ from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.one_camera import APART, OtherCamera
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import Notice, spared
+from dashcalib_ros.errors import Notice, counted, spared
 from dashcalib_ros.judge.agreement import (
     MAX_MISFIT,
     focal_disagreement,
@@ -289,15 +290,21 @@ def other_camera(grounds: Grounds) -> Finding:
         f'at most {MAX_MISFIT:.2g} times')
 
 
+# clips in a message
+NAMED = 3
+
+
 def _turns(turns: list[TurnId]) -> str:
     """Return the turns' names, for messages."""
     own = [str(turn.number) for turn in turns if turn.of_this_drive]
-    stored = len(turns) - len(own)
+    stored = Counter(turn.clip or 'earlier drives' for turn in turns if not turn.of_this_drive)
     names = []
     if own:
         names.append(f'the turn{"s" * (len(own) > 1)} at frame {", ".join(own)}')
-    if stored:
-        names.append(f'{stored} turn{"s" * (stored > 1)} of earlier drives')
+    if len(stored) > NAMED:
+        names.append(f'{counted(stored.total(), "turn")} of {len(stored)} clips')
+    else:
+        names += [f'{counted(count, "turn")} of {where}' for where, count in stored.items()]
     return ' and '.join(names)
 
 

@@ -99,7 +99,9 @@ def _fx_alone(c: CalibrationData) -> dict[TurnId, tuple[float, float]]:
 def names(c: CalibrationData) -> dict[TurnId, str]:
     """Return the turns' short names: numbers in the order of time, s1, s2 for stored ones."""
     own = {turn.id: str(n) for n, turn in enumerate(c.turns, 1)}
-    return own | {turn.id: f's{n}' for n, turn in enumerate(c.stored_turns, 1)}
+    # a fleet's clips are no earlier drives
+    return own | {turn.id: f'{"" if turn.clip else "s"}{n}'
+                  for n, turn in enumerate(c.stored_turns, 1)}
 
 
 def _section(turn: AnySummary, c: CalibrationData, material: Material,
@@ -107,7 +109,7 @@ def _section(turn: AnySummary, c: CalibrationData, material: Material,
     scene, shown = material.scenes.get(turn.id), material.pictures.get(turn.id)
     camera = material.solution.camera if turn.used and material.solution is not None else None
     drawn, magnified = ('', 0) if shown is None else picture_svg(shown, scene, camera, mask_id)
-    kind = 'Stored turn' if isinstance(turn, StoredTurnSummary) else 'Turn'
+    kind = 'Stored turn' if isinstance(turn, StoredTurnSummary) and not turn.clip else 'Turn'
     frame = None if shown is None else shown.frame
     return TurnSection(
         f'{kind} {names(c)[turn.id]}', _facts(turn, scene, c), turn.used, turn.unused_because,
@@ -115,7 +117,7 @@ def _section(turn: AnySummary, c: CalibrationData, material: Material,
 
 
 def _facts(turn: AnySummary, scene: Scene | None, c: CalibrationData) -> tuple[str, ...]:
-    facts = ['of an earlier drive' if isinstance(turn, StoredTurnSummary)
+    facts = [f'of {turn.clip or "an earlier drive"}' if isinstance(turn, StoredTurnSummary)
              else f'at {since_start(turn, c)} s, frames {turn.first} to {turn.last}']
     if turn.yaw_deg is not None:
         way = '' if scene is None else ' ' + direction(scene)
@@ -137,7 +139,7 @@ def turn_rows(c: CalibrationData) -> list[dict[str, str]]:
     apart = {each.turn: f'{each.px:.3g} px, {each.sigmas:.1f} sigmas' for each in c.held_out}
     rows = []
     for turn in c.all_turns:
-        row = {'turn': short[turn.id], 'at': 'earlier', 'frames': '-',
+        row = {'turn': short[turn.id], 'at': getattr(turn, 'clip', '') or 'earlier', 'frames': '-',
                'yaw': optional(turn.yaw_deg, 0, '°'), 'keyframes': str(turn.images),
                'error': optional(turn.reprojection_error_px, 2, ' px'),
                'held out': apart.get(turn.id, '-'),

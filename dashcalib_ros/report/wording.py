@@ -231,7 +231,9 @@ def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
 def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
     """Return what else is known of the run: a name, and a text."""
     facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
-    for name, turns in (('turns', c.turns), ('turns of earlier drives', c.stored_turns)):
+    clips = any(turn.clip for turn in c.stored_turns)
+    for name, turns in (('turns', c.turns), (
+            f'turns{" of earlier drives" * (not clips)}', c.stored_turns)):
         if turns:
             facts.append((name, f'{sum(turn.used for turn in turns)} of {len(turns)} used'))
     if c.camera is not None:
