@@ -14,7 +14,7 @@ from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.errors import InputError, Notice
+from dashcalib_ros.errors import InputError, Notice, spared
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.decode import mask_of
 from dashcalib_ros.input.motion import SensorStream
@@ -40,7 +40,7 @@ from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ScenePool
-from dashcalib_ros.workers.worker import InlineWorker, Progress, Worker
+from dashcalib_ros.workers.worker import InlineWorker, Progress, Worker, WorkerDiedError
 
 
 @dataclass(frozen=True)
@@ -120,6 +120,8 @@ class Calibrator:
         self.solution: Solution | None = None
         self._live = live
         self._motion: SensorStream | None = None
+        # what the calibration under way has to do without
+        self._lost: list[Notice] = []
         self._detect_s = 0.0
         self._started = time.monotonic()
         # what turns say of the camera that watch() was asked about last, resized
@@ -197,6 +199,7 @@ class Calibrator:
         self.workers.close()
 
     def _calibrate(self, progress: Progress, final: bool, started: float) -> Calibration:
+        self._lost = []
         scenes, solution = self._solve(progress, final)  # scenes -> one camera
         sensors = self._compare_sensors(solution, progress)
         solution = sensors.solution
@@ -210,7 +213,8 @@ class Calibrator:
         """Return the scenes that count, and the camera that explains them; None without any."""
         config = self.scenes.config
         while scenes := self.scenes.wanted(progress, final):
-            stood = turns_that_stood(scenes, self._motion, self.detection.start_s)
+            stood = spared('what the speed says of the turns', self._lost, turns_that_stood,
+                           scenes, self._motion, self.detection.start_s)
             if stood:
                 self.scenes.exclude(stood)
                 continue
@@ -234,9 +238,12 @@ class Calibrator:
         if solution is None or self._motion is None:
             return SensorComparison(solution)
         progress('evaluating the motion sensors', 0.0)
-        found: SensorComparison = self.workers.run(
+        found: SensorComparison | None = spared(
+            'the comparison with the motion sensors', self._lost, self.workers.run,
             compare_sensors, solution, self._motion, self.detection.start_s, self.scenes.config)
-        return found
+        if self.workers.closed:
+            raise WorkerDiedError('E-CALIBRATOR-CLOSED', 'the calibrator is closed')
+        return found or SensorComparison(solution)
 
     def _judge(self, sensors: SensorComparison, started: float) -> Calibration:
         # the solution itself is judged
@@ -252,7 +259,8 @@ class Calibrator:
                   'total': now - self._started}
         seen = evidence_of_detection(self.detection, self.scenes.built())
         return replace(
-            seen, timing=timing, warnings=(*seen.warnings, *self.scenes.warnings),
+            seen, timing=timing,
+            warnings=(*seen.warnings, *self.scenes.warnings, *self._lost),
             stored=self.scenes.stored_before, left_out=self.scenes.left_out(),
             pictures=None if self._live else self.workers.pictures(), motion=self._motion,
             sensors=sensors)

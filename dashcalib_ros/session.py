@@ -16,7 +16,7 @@ import numpy.typing as npt
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.camera import searched
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import InputError, Notice, counted
+from dashcalib_ros.errors import InputError, Notice, counted, spared
 from dashcalib_ros.formats import Given, given_camera, load_camera
 from dashcalib_ros.input import Frame, FrameSource
 from dashcalib_ros.input.decode import check_mask, mask_of
@@ -26,6 +26,7 @@ from dashcalib_ros.input.motion_files import bag_motion, read_motion
 from dashcalib_ros.input.poses import Poses, track_poses
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
+from dashcalib_ros.judge.calibration import Material
 from dashcalib_ros.limits import path_of
 from dashcalib_ros.pipeline import Calibrator, Outlook
 from dashcalib_ros.report import Calibration, NamedCamera
@@ -243,7 +244,7 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
 
     What the input contradicts is the first reason of one that is not accepted: it may be why.
     """
-    verdict, material = calibration.verdict, calibration.material
+    verdict, material, lost = calibration.verdict, calibration.material, list[Notice]()
     doubts = source.contradictions if verdict.level != 'accepted' else ()
     new = tuple(line for line in source.warnings
                 if line not in (*doubts, *calibration.warnings))
@@ -253,11 +254,8 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
                           cures=(*cures, *verdict.cures),
                           codes=(*(each.code for each in doubts), *verdict.codes))
     if material is not None:
-        shown = material.pictures
-        images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})
-        material = replace(material, pictures={
-            turn: each.coloured(images[each.frame]) if each.frame in images else each
-            for turn, each in shown.items()})
+        coloured = spared('the pictures in colour', lost, _in_colour, material, source)
+        material = coloured or material
     stored = calibration.camera and source.stored(calibration.camera)
     if stored:
         values = ', '.join(f'{name} {value:.2f}' for name, value in zip(
@@ -267,7 +265,16 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
             f'({size_text(stored.image_size)}): {values}, and the same distortion'),)
     return replace(calibration, verdict=verdict, material=material,
                    input_name=calibration.input_name or source.name,
-                   warnings=(*new, *calibration.warnings))
+                   warnings=(*new, *calibration.warnings, *lost))
+
+
+def _in_colour(material: Material, source: FrameSource) -> Material:
+    """Return the same with the input's pictures, where they can be read again."""
+    shown = material.pictures
+    images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})
+    return replace(material, pictures={
+        turn: each.coloured(images[each.frame]) if each.frame in images else each
+        for turn, each in shown.items()})
 
 
 # for Python ---------------------------------------------------------------------------------

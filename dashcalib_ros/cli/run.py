@@ -4,6 +4,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -14,13 +15,12 @@ from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
 from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
-from dashcalib_ros.errors import InputError, Notice, OutputError, counted
+from dashcalib_ros.errors import InputError, Notice, counted, spared
 from dashcalib_ros.formats import result_json
 from dashcalib_ros.formats.ours import codes_of
 from dashcalib_ros.input import FrameSource
 from dashcalib_ros.pipeline import Outlook
 from dashcalib_ros.report import Calibration, Written, output_folder, write_results
-from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE
 from dashcalib_ros.report.tables import (
     TextTable,
     conclusion,
@@ -45,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
             calibration = calibrate_drive(drive, config, stages, args.verbose)
         try:
             written = write_results(calibration, args.out, created=now())
-        except OutputError:
-            # a full disk must not hide what an hour of work has found
+        except Exception:
+            # neither a full disk nor a defect may hide what an hour of work has found
             _show(args, calibration, screen, Written(()))
             raise
     _show(args, calibration, screen, written)
@@ -58,11 +58,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _show(args: argparse.Namespace, calibration: Calibration, screen: Screen, written: Written
           ) -> None:
-    warn_of(calibration, written)
+    lost: list[Notice] = []
+    shown = spared('the summary', lost, summary, calibration)
+    warn_of(calibration, replace(written, lost=(*written.lost, *lost)))
     if args.json:
         write_stdout(result_json(calibration).rstrip('\n'))
     files = [files_line(args.out, written.files)] if written.files else []
-    screen.show(conclusion(calibration.verdict), summary(calibration), *files)
+    screen.show(conclusion(calibration.verdict), *([] if shown is None else [shown]), *files)
 
 
 def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:
@@ -94,11 +96,10 @@ def files_line(folder: Path, files: Sequence[Path]) -> Text:
 
 def warn_of(calibration: Calibration, written: Written) -> None:
     """Print the calibration's warnings, and whether an earlier calibration was renamed."""
-    warn(calibration.warnings)
+    warn((*calibration.warnings, *written.lost))
     if written.set_aside is not None:
-        old = written.set_aside.with_name(ACCEPTED_FILE)
         warn([Notice('E-CALIBRATION-RENAMED',
-                     f'the earlier calibration {old} was renamed to {written.set_aside}')])
+                     f'an earlier calibration was renamed to {written.set_aside}')])
 
 
 def now() -> str:

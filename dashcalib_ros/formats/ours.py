@@ -208,7 +208,7 @@ def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
     values = dataclasses.asdict(turn)
     # a stored turn's id has a meaning in this run only
     return {('stamp' if key == 'stamp_s' else key): item for key, item in values.items()
-            if key != 'id'}
+            if key != 'id' and (key, item) != ('clip', '')}
 
 
 def calibration_yaml(calibration: CalibrationData, camera_name: str = ros.CAMERA_NAME,

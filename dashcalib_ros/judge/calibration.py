@@ -104,7 +104,10 @@ class TurnSummary:
 
 @dataclass(frozen=True)
 class StoredTurnSummary:
-    """How a turn of an earlier drive was used. misfit: as for TurnSummary."""
+    """How a turn of an earlier drive, or of a fleet's clip, was used. misfit: as for TurnSummary.
+
+    clip: '' for an earlier drive.
+    """
 
     id: TurnId
     stamp_s: float
@@ -115,6 +118,7 @@ class StoredTurnSummary:
     misfit: float | None = None
     unused_because: str | None = None
     reprojection_error_px: float | None = None
+    clip: str = ''
 
 
 @dataclass(frozen=True)

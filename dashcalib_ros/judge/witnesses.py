@@ -25,7 +25,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import Notice
+from dashcalib_ros.errors import Notice, one_line
 from dashcalib_ros.input.motion import Samples, SensorStream, zone_text
 from dashcalib_ros.judge.calibration import Witness, Witnesses
 from dashcalib_ros.judge.gyro_scale import (
@@ -108,10 +108,10 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
         if 'speed' in apart:
             notices.append(Notice('E-SPEED-NO-SAMPLES', f'the speed is not used: it has no '
                                   f'samples during the turns, {apart["speed"]}'))
-    except (np.linalg.LinAlgError, ValueError, FloatingPointError) as error:
+    except Exception as error:
         notices.append(Notice(
             'E-SENSORS-NOT-COMPARED',
-            f'the motion sensors could not be compared with the turns ({error})'))
+            f'the motion sensors could not be compared with the turns ({one_line(error)})'))
     kept = solution if informed is None or (gps is not None and not gps.agrees) else informed
     return SensorComparison(kept, Witnesses(gyro, gps), tuple(filter(None, notices)))
 

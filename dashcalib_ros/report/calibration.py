@@ -39,8 +39,9 @@ class Calibration(CalibrationData):  # noqa: D101, it is the base's, which has t
     def save(self, folder: str | os.PathLike[str] = 'calibration') -> tuple[Path, ...]:
         """Write what `dashcalib run` writes into a folder, and return the files' paths.
 
-        These are result.json, report.html and calibration.yaml (calibration.weak.yaml where it is
-        weak, none where it is refused). Raises OutputError, which names the cure.
+        These are result.json, calibration.yaml (calibration.weak.yaml where it is weak, none where
+        it is refused), and report.html, unless there is no room for it. Raises OutputError, which
+        names the cure.
         """
         return write_results(self, path_of(folder)).files
 

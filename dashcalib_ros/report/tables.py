@@ -28,6 +28,7 @@ from dashcalib_ros.report.wording import (
     optional,
     parameter_rows,
     run_facts,
+    since_start,
 )
 
 # columns between two of a table
@@ -53,8 +54,19 @@ def summary(calibration: CalibrationData) -> RenderableType:
         if c.caveat:
             parts += [line(c.caveat), line('')]
     if c.turns:
-        parts.append(TextTable(TURNS, [_turn_row(turn, c.start_s) for turn in c.turns]))
+        parts.append(TextTable(TURNS, [_turn_row(turn, c) for turn in c.turns]))
+        parts += [line(f'not used: {why}: the turn{"s" * (len(at) > 1)} at {", ".join(at)} s')
+                  for why, at in _unused(c).items()]
     return Group(*parts, *(line(f'{name}: {text}') for name, text in run_facts(c)))
+
+
+def _unused(c: CalibrationData) -> dict[str, list[str]]:
+    """Return why turns of this drive are not used, and when those were."""
+    found: dict[str, list[str]] = {}
+    for turn in c.turns:
+        if turn.unused_because:
+            found.setdefault(turn.unused_because, []).append(since_start(turn, c))
+    return found
 
 
 def conclusion(verdict: Verdict) -> RenderableType:
@@ -76,8 +88,8 @@ def next_step(verdict: Verdict) -> RenderableType:
     return Group(line(f'next: {first}'), *(line(f'also: {cure}') for cure in others))
 
 
-def _turn_row(turn: TurnSummary, start_s: float) -> tuple[str, ...]:
-    return (f'{turn.stamp_s - start_s:.1f}', f'{turn.first} to {turn.last}',
+def _turn_row(turn: TurnSummary, c: CalibrationData) -> tuple[str, ...]:
+    return (since_start(turn, c), f'{turn.first} to {turn.last}',
             optional(turn.yaw_deg, 1), f'{turn.registered} of {turn.images}',
             optional(turn.reprojection_error_px, 2), 'yes' if turn.used else 'no')
 

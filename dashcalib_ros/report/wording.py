@@ -2,7 +2,9 @@
 from __future__ import annotations
 
 import math
+import posixpath
 from itertools import zip_longest
+from shlex import quote
 
 import numpy as np
 
@@ -15,6 +17,8 @@ ADVICE = {
     'weak': 'There are numbers, but they may be wrong: read the reasons first.',
     'refused': 'There is no calibration: this drive does not show enough.',
 }
+# where a calibration that others load is written, by its verdict, and the usual folder
+ACCEPTED, WEAK, FOLDER = 'calibration.yaml', 'calibration.weak.yaml', 'calibration'
 # where a verdict has no cures
 NEXT = {
     'accepted': 'use calibration.yaml in the camera driver; report.html has the details',
@@ -26,6 +30,11 @@ NEXT = {
 PIXELS = ('fx', 'fy', 'cx', 'cy')
 # head of the table of parameters
 PARAMETERS = ('', 'estimate', 'sigma', 'relative')
+
+
+def file_of(verdict: Verdict) -> str:
+    """Return the name of the file that has the camera of a result."""
+    return ACCEPTED if verdict.level == 'accepted' else WEAK
 
 
 def parameter_rows(calibration: CalibrationData) -> list[tuple[str, str, str, str]]:
@@ -169,21 +178,28 @@ def objections(verdict: Verdict) -> list[tuple[str, str, str]]:
     return found
 
 
-def next_steps(c: CalibrationData) -> list[str]:
-    """Return what to do next, most useful first."""
+def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
+    """Return what to do next, most useful first. folder: where the result is written."""
+    file = f'`{quote(posixpath.join(folder, file_of(c.verdict)))}`'
+    glass = [] if c.field is None or not c.field.used else [
+        'A windscreen, or a rectification, bends the picture beside the lens. In Python, '
+        f'`dashcalib_ros.Calibration.load({folder!r}).undistort(image)` removes this, too.']
     needed = c.config.verdict
     together = ('Short drives add up: with `--set turns.store=FOLDER`, each run uses the turns of '
                 'those before it.')
     if c.verdict.level == 'accepted':
-        steps = ['Use `calibration.yaml` in the camera driver, or copy the lines below.']
+        steps = [f'Use {file} in the camera driver, or copy the lines below.']
+        steps += glass
         if (c.sigma or {}).get('fx', 0.0) > 0.005 * (c.camera.fx if c.camera else 1.0):
             steps.append('It can become more exact: another drive with sharp turns lowers the '
                          'uncertainty. ' + together)
         return [*steps,
                 'To check it with another drive of the same camera: '
-                '`dashcalib check calibration DRIVE`.',
+                f'`dashcalib check {quote(folder)} DRIVE`.',
                 'Calibrate again when the lens, the zoom, the focus or the video mode changes. '
-                'Moving the camera on the car changes nothing here.']
+                'Moving the camera on the car changes ' + (
+                    'nothing here.' if c.mount is None else
+                    'the mounting only: drive again for it, also straight on.')]
     yaw = c.yaw_deg
     steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in cures(c.verdict)]
     if c.turns_used < c.config.turns.wanted or yaw < needed.min_yaw_deg:
@@ -197,13 +213,15 @@ def next_steps(c: CalibrationData) -> list[str]:
     if c.verdict.level == 'refused':
         return [' '.join(steps)]
     return [*steps, together,
-            'To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.']
+            f'To use it all the same, rename {file}; mind its sigmas.', *glass]
 
 
 def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
     """Return what else is known of the run: a name, and a text."""
     facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
-    for name, turns in (('turns', c.turns), ('turns of earlier drives', c.stored_turns)):
+    clips = any(turn.clip for turn in c.stored_turns)
+    for name, turns in (('turns', c.turns), (
+            f'turns{" of earlier drives" * (not clips)}', c.stored_turns)):
         if turns:
             facts.append((name, f'{sum(turn.used for turn in turns)} of {len(turns)} used'))
     if c.camera is not None:

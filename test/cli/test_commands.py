@@ -145,9 +145,8 @@ def test_an_earlier_calibration_that_is_moved_aside_is_told(
     monkeypatch.setattr(fake, 'level', level)
     assert main(['run', drive]) == 3
     lines = capsys.readouterr().err.splitlines()
-    assert lines[-1] == ('dashcalib: warning: the earlier calibration calibration/'
-                         'calibration.yaml was renamed to calibration/calibration.previous.yaml '
-                         '[E-CALIBRATION-RENAMED]')
+    assert lines[-1] == ('dashcalib: warning: an earlier calibration was renamed to '
+                         'calibration/calibration.previous.yaml [E-CALIBRATION-RENAMED]')
 
 
 def test_the_result_alone_on_stdout(fake, drive, tmp_path, capsys):

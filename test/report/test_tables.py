@@ -46,6 +46,14 @@ def test_the_terminal_shows_estimate_sigma_and_turns():
         calibration, turns=tuple(late), start_s=1.7e9))) == text
 
 
+def test_the_terminal_says_why_turns_are_not_used():
+    used, unused = make_calibration().turns
+    left_out = [dataclasses.replace(unused, stamp_s=at, unused_because=why) for at, why in (
+        (20.0, 'too dark'), (27.5, 'not needed'), (30.0, 'too dark'))]
+    text = terminal(summary(make_calibration(turns=(used, *left_out))))
+    assert 'too dark: the turns at 20.0, 30.0 s' in text and 'needed: the turn at 27.5 s' in text
+
+
 def test_a_refused_summary_has_no_numbers_of_a_camera():
     assert 'fx' not in terminal(summary(make_calibration('refused')))
 
