@@ -50,21 +50,15 @@ class Endpoints:
         self._ends = ExitStack()
 
     def publisher(self, name: str) -> Publisher:
-        """Make the publisher of a topic of PUBLISHED."""
-        made = self._publisher(name, profile(PUBLISHED[name]))
+        """Make the publisher of a topic of PUBLISHED.
+
+        Raises ImportError where the package of its messages is missing.
+        """
+        about = PUBLISHED[name]
+        made = self.node.create_publisher(message_class(about.type), name, profile(about),
+                                          qos_overriding_options=OVERRIDES)
         self.at_end(self.node.destroy_publisher, made)
         return made
-
-    def overridden(self, name: str) -> QoSProfile:
-        """Return the QoS of a topic of PUBLISHED that another library is to publish."""
-        qos = profile(PUBLISHED[name])
-        # rclpy writes the overrides into the profile of a publisher that it makes
-        self.node.destroy_publisher(self._publisher(name, qos))
-        return qos
-
-    def _publisher(self, name: str, qos: QoSProfile) -> Publisher:
-        return self.node.create_publisher(message_class(PUBLISHED[name].type), name, qos,
-                                          qos_overriding_options=OVERRIDES)
 
     def subscription(self, name: str, callback: Callable[[Any], None], topic: str = ''
                      ) -> Subscription:

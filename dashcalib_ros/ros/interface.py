@@ -50,9 +50,10 @@ PUBLISHED = _by_name(
           "whether the driver's calibration is right: values answer, reasons, changes, rms_px, …; "
           'WARN where it is wrong', 1, latched=True, programs=(CHECKER,)),
     Topic('~/mount', 'geometry_msgs/msg/PoseWithCovarianceStamped',
-          'how the camera sits in base_frame (REP-103)', 1, latched=True, programs=(CALIBRATOR,)),
+          "the pose of the camera's optical frame in base_frame (REP-103); what is not known is 0 "
+          'with a variance of 1e6 m²', 1, latched=True, programs=(CALIBRATOR,)),
     Topic(TF_STATIC, 'tf2_msgs/msg/TFMessage',
-          'with publish_tf: one transform from base_frame to camera_frame when the mounting is '
+          'with publish_tf: base_frame to camera_link to the optical frame when the mounting is '
           'accepted, and again after it moved', 1, latched=True, programs=(CALIBRATOR,)),
     Topic('~/turn_magnitude', 'geometry_msgs/msg/Vector3Stamped',
           'x: how much the car turns, relative to the image width; for plots'),
