@@ -322,7 +322,8 @@ class Drive:
         """Publish /diagnostics, and the state that the overlay shows."""
         images, learner, monitor = self.images, self.learner, self.monitor
         now, wanted = learner.activity.status, self._goal.config.turns.wanted
-        warnings = [*([self.held] if self.held else ()), *health.warnings]
+        clock = self._intake.clock
+        warnings = [*([self.held] if self.held else ()), *health.warnings, *clock]
         verdict = self.verdict
         values = {
             'state': health.state,
@@ -346,6 +347,7 @@ class Drive:
             'topic': images.topic,
             'publishers': ', '.join(images.publishers),
             'reliability': images.reliability,
+            'time stamps': '; '.join(clock) or 'of the images',
             'motion sensors': '; '.join(self._witnesses),
             'received': self._intake.received,
             **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},

@@ -162,6 +162,11 @@ class Intake:
         stamp = message.header.stamp
         return self._stamps.take(stamp.sec * 10**9 + stamp.nanosec, time.monotonic_ns())
 
+    @property
+    def clock(self) -> list[str]:
+        """Return why the stamps of the images are not used, in at most one line."""
+        return [f'{text} [{text.code}]' for text in self._stamps.of_clock()]
+
     def forget(self) -> None:
         """Begin anew with the stamps: turns and tracks were dropped."""
         self._stamps.forget()
@@ -172,9 +177,8 @@ class Intake:
         dropped: images dropped by the detection. why_lost: the causes of lost ones, with cures.
         """
         stamps = self._stamps
-        if stamps.fault:
-            self._complaints.once(f'{stamps.fault}: the times of reception are used instead; '
-                                  f'fix the driver')
+        for text in self.clock:
+            self._complaints.once(text)
         self._complaints.total('lost', stamps.lost, f'{CURES["lost"]}: {why_lost}')
         for kind, count in (('dropped', dropped), ('repeated', stamps.repeated),
                             ('unstamped', stamps.zero), ('set_back', stamps.set_back)):

@@ -285,6 +285,16 @@ def test_a_driver_that_never_stamps_is_learned_from_all_the_same(start_node, mak
         camera.spin(0.15)
     camera.until(lambda: len(camera.magnitudes) >= 5, node=node)
     assert camera.count('unstamped') == 0
+    # it is said once in the log, and as long as it is so in /diagnostics
+    camera.until(lambda: '[E-STAMP-MISSING]' in camera.values['time stamps'], node=node)
+    assert camera.status.level == DiagnosticStatus.WARN
+    assert camera.values['warnings'] == camera.values['time stamps']
+    line, = [line for line in node.text.splitlines() if 'E-STAMP-MISSING' in line]
+    assert 'WARN' in line and 'rolling shutter' in line
+    for n in range(10):
+        camera.publish(image_message(noise(n), START + n * SECOND // 10))
+    camera.until(lambda: camera.values['time stamps'] == 'of the images', node=node)
+    assert not camera.values['warnings']
 
 
 def test_two_publishers_of_different_sizes_do_not_reset_it(start_node, make_bench, tmp_path):
