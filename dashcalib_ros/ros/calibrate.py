@@ -61,6 +61,7 @@ class Calibrating:
                              ('save', self.save)):
             endpoints.service(f'~/{name}', action)
         self._load()
+        self._check_writable()
         self.summary = (f'learning the camera {camera_name!r} from the turns seen on '
                         f'{self.drive.images.topic}')
 
@@ -112,6 +113,18 @@ class Calibrating:
         self._use(wanted, confirmed=False)
         self._log.info(f'loaded {self._store.path}: {sigma_text(kept.camera)}; unconfirmed until '
                        f'turns agree with it')
+
+    def _check_writable(self) -> None:
+        """Raise OutputError where no calibration can be kept; one that is there is used, though.
+
+        It may be installed where the node may not write.
+        """
+        try:
+            self._store.check_writable()
+        except OutputError as error:
+            if self._kept is None:
+                raise
+            self._log.warning(coded(error))
 
     def begin_anew(self) -> None:
         """Drop the calibration in use, and begin with the file's."""

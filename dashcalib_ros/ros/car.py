@@ -152,8 +152,9 @@ class Mounting:
         found = [(float(value), BY_HAND_M**2)
                  for value in (self._own.mount_x, self._own.mount_y, self._own.mount_z)]
         height, sigma = mount.height_m, mount.sigma['height_m']
-        if math.isnan(self._own.mount_z) and self.frame != LINK and None not in (height, sigma):
-            found[2] = float(height), float(sigma)**2
+        estimated = math.isnan(self._own.mount_z) and self.frame != LINK
+        if estimated and height is not None and sigma is not None:
+            found[2] = height, sigma**2
         return [(0.0, UNKNOWN_PLACE) if math.isnan(value) else (value, variance)
                 for value, variance in found]
 

@@ -26,6 +26,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
+from dashcalib_ros.errors import OutputError
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import TurnSummary, Verdict
@@ -448,3 +449,21 @@ def test_a_camera_that_changed_does_not_learn_from_the_turns_of_earlier_drives(
     assert desk.show() is None
     desk.until(lambda: desk.bench.count('turns stored') == 0)
     desk.until(lambda: list((tmp_path / 'turns').iterdir()) == [])
+
+
+def test_a_file_where_nothing_can_be_written_is_used_with_a_warning(make_desk, request, tmp_path,
+                                                                    capfd):
+    """As one that is installed with a package is; without it, the node would learn for nothing."""
+    first = make_desk()
+    first.give()
+    first.close()
+    request.getfixturevalue('read_only')
+    second = make_desk()
+    assert second.show() == 400.0
+    line, = [line for line in capfd.readouterr().err.splitlines() if 'E-KEPT-NOT-W' in line]
+    assert '[WARN]' in line and 'Read-only file system' in line
+    second.close()
+    (tmp_path / 'camera.yaml').unlink()
+    with pytest.raises(OutputError) as raised:
+        make_desk()
+    assert raised.value.code == 'E-KEPT-NOT-WRITABLE'

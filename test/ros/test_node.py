@@ -464,6 +464,14 @@ def test_services_say_why_not(plain):
     ({'mask__segmentation': '~nobody-of-this-name/m.onnx'}, 'm.onnx', ''),
     ({'camera_info_url': '~nobody-of-this-name/camera.yaml'}, 'set camera_info_url',
      'E-HOME-UNKNOWN'),
+    ({'camera_info_url': '/proc'}, '/proc: it is a folder', 'E-KEPT-NOT-WRITABLE'),
+    ({'camera_info_url': 'file:///dev/null'}, 'a device', 'E-KEPT-NOT-WRITABLE'),
+    # for root, too
+    ({'camera_info_url': '/proc/camera.yaml'}, '/proc/camera.yaml', 'E-KEPT-NOT-WRITABLE'),
+    ({'camera_info_url': '/dev/null/camera.yaml'}, 'Not a directory', 'E-KEPT-NOT-WRITABLE'),
+    ({'camera_info_url': f'~/{"c" * 300}.yaml'}, 'too long', 'E-KEPT-NOT-WRITABLE'),
+    # too long with what a file has before it is whole
+    ({'camera_info_url': f'~/{"c" * 240}.yaml'}, 'too long', 'E-KEPT-NOT-WRITABLE'),
     ({'turns__half_widht': 3}, 'turns.half_width', 'E-PARAMETER-UNKNOWN'),
     ({'check_only': True}, 'start checker', 'E-CHECK-ONLY-REMOVED'),
     ({'of_another_node': 3}, 'of_another_node', 'E-PARAMETER-UNKNOWN'),
