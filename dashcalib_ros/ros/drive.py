@@ -323,7 +323,8 @@ class Drive:
         images, learner, monitor = self.images, self.learner, self.monitor
         now, wanted = learner.activity.status, self._goal.config.turns.wanted
         clock = self._intake.clock
-        warnings = [*([self.held] if self.held else ()), *health.warnings, *clock]
+        warnings = [*([self.held] if self.held else ()), *self._namesakes(), *health.warnings,
+                    *clock]
         verdict = self.verdict
         values = {
             'state': health.state,
@@ -356,6 +357,18 @@ class Drive:
         self._preview.show_state(message, health.camera.camera if health.camera else None)
         self._diagnostics.publish(diagnostic(
             self._endpoints.node, 'camera calibration', self._camera_name, level, message, values))
+
+    def _namesakes(self) -> list[str]:
+        """Return that another node has this one's name, in at most one line; log that once."""
+        node = self._endpoints.node
+        own = node.get_name(), node.get_namespace()
+        if node.get_node_names_and_namespaces().count(own) < 2:
+            return []
+        text = (f'another node is {node.get_fully_qualified_name()}, too: their services, '
+                f'parameters and latched topics collide; start each camera in a namespace of its '
+                f'own with -r __ns:=/front, and so on')
+        self._complaints.once(text)
+        return [text]
 
     def _level(self, health: Health, warnings: list[str]) -> tuple[bytes, str]:
         """Return the level of /diagnostics and its message: the worst of what is to be said."""

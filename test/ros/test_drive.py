@@ -207,7 +207,7 @@ def test_diagnostics_tell_an_operator_everything(driven):
     # images, so that it is not stale
     bench.publish(*driven.after)
     bench.until(lambda: bench.status.level == b'\x00', node=driven.node)
-    assert bench.status.name == 'calibrator: camera calibration'
+    assert bench.status.name == 'calibrator: camera calibration (dashcam)'
     assert bench.status.hardware_id == 'dashcam'
     values = bench.values
     assert values['verdict'] == 'accepted' and values['turns wanted'] == '2'

@@ -162,7 +162,7 @@ def test_a_namespace_names_the_camera(start_node, make_bench, tmp_path):
     camera.connect(node)
     stream(camera, 2)
     camera.until(lambda: len(camera.infos) == 2, node=node)
-    assert camera.status.name == 'front/calibrator: camera calibration'
+    assert camera.status.name == 'front/calibrator: camera calibration (front)'
     assert camera.status.hardware_id == 'front'
 
 
