@@ -17,6 +17,7 @@ pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.lifecycle import TransitionCallbackReturn
 from ros_desk import FIRST, SIGMA
 from sensor_msgs.srv import SetCameraInfo
 from synthetic import synthetic_turn
@@ -26,7 +27,6 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
-from dashcalib_ros.errors import OutputError
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import TurnSummary, Verdict
@@ -462,8 +462,9 @@ def test_a_file_where_nothing_can_be_written_is_used_with_a_warning(make_desk, r
     assert second.show() == 400.0
     line, = [line for line in capfd.readouterr().err.splitlines() if 'E-KEPT-NOT-W' in line]
     assert '[WARN]' in line and 'Read-only file system' in line
-    second.close()
+    for transition in (second.node.trigger_deactivate, second.node.trigger_cleanup):
+        assert transition() == TransitionCallbackReturn.SUCCESS
     (tmp_path / 'camera.yaml').unlink()
-    with pytest.raises(OutputError) as raised:
-        make_desk()
-    assert raised.value.code == 'E-KEPT-NOT-WRITABLE'
+    assert second.node.trigger_configure() == TransitionCallbackReturn.FAILURE
+    line, = capfd.readouterr().err.splitlines()
+    assert '[ERROR]' in line and '[E-KEPT-NOT-WRITABLE]' in line
