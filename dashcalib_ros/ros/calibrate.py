@@ -43,7 +43,7 @@ class Calibrating:
         endpoints.at_end(self._store.close)
         self._commit: Commit | None = None
         self._beside = endpoints.publisher('camera_info')
-        self._latched = endpoints.publisher('~/calibration')
+        self._latch = endpoints.latched('~/calibration')
         self._mounting = Mounting(endpoints, own)
         # what is published now, and how many were published beside images
         self._info: CameraInfo | None = None
@@ -219,7 +219,7 @@ class Calibrating:
         self._kept, self._stale, self._confirmed = kept, False, confirmed
         self._info = camera_info(kept.camera.camera, self._header(kept.frame_id or ''),
                                  self._core.rectified)
-        self._latched.publish(self._info)
+        self._latch(self._info)
         self._show_mount(kept.mount, kept.frame_id or '')
         self._watch()
         return self._info
@@ -236,7 +236,7 @@ class Calibrating:
         """Use no calibration, as at the start; the file stays where it is."""
         if self._info is not None:
             # K[0] = 0 says that it is uncalibrated (sensor_msgs)
-            self._latched.publish(CameraInfo(header=self._header(self._info.header.frame_id)))
+            self._latch(CameraInfo(header=self._header(self._info.header.frame_id)))
         self._kept, self._stale, self._info = None, False, None
         self._mounting.show(None, '')
         self._watch()

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.exceptions import NameValidationException
-from rclpy.publisher import Publisher
 from std_msgs.msg import Header
 
 from dashcalib_ros.camera.rotation import OPTICAL, quaternion
@@ -53,7 +52,7 @@ class Mounting:
         self.frame = own.base_frame or (ON_ROAD if math.isnan(own.mount_z) else LINK)
         # what was published last
         self.mount: Mount | None = None
-        self._pose = endpoints.publisher('~/mount')
+        self._pose = endpoints.latched('~/mount')
         self._sent: Mount | None = None
         self._waiting: tuple[Mount, str] | None = None
         self._since = time.monotonic()
@@ -64,9 +63,9 @@ class Mounting:
             endpoints.subscription(TF_STATIC, self._listen)
             endpoints.timer(LISTEN_S / 2, self.tick)
 
-    def _publisher(self, endpoints: Endpoints) -> Publisher | None:
+    def _publisher(self, endpoints: Endpoints) -> Callable[[Any], None] | None:
         try:
-            return endpoints.publisher(TF_STATIC)
+            return endpoints.latched(TF_STATIC)
         except ImportError:
             self._warn('publish_tf is not possible with ROS 2 from pip, which has no tf2_msgs: '
                        'install ROS 2 from apt, or give the output of dashcalib export --to tf '
@@ -78,7 +77,7 @@ class Mounting:
         self.mount = mount
         if mount is None:
             return
-        self._pose.publish(self._message(mount))
+        self._pose(self._message(mount))
         if self._transforms is not None and mount.verdict == 'accepted':
             self._waiting = mount, self._own.camera_frame or frame_id
 
@@ -92,7 +91,7 @@ class Mounting:
         elif self._sent is None or differs(mount, self._sent):
             self._sent = mount
             assert self._transforms is not None
-            self._transforms.publish(message_class(PUBLISHED[TF_STATIC].type)(
+            self._transforms(message_class(PUBLISHED[TF_STATIC].type)(
                 transforms=self._tree(mount, frame)))
             self._log.info(f'static transforms {self.frame} -> {link_of(frame)} -> {frame}: '
                            f'{mount_text(mount)}')

@@ -43,7 +43,7 @@ class Checking:
         self._found = NOT_YET
         # why there is no camera
         self._problem = f'no camera_info on {self._given_topic} yet'
-        self._answers = endpoints.publisher('~/check')
+        self._answers = endpoints.latched('~/check')
         mask = read_mask(Path(settings.own.mask_file)) if settings.own.mask_file else None
         self.drive = Drive(endpoints, settings, camera_name, mask, self)
         endpoints.subscription('camera_info', self._on_info)
@@ -191,7 +191,7 @@ class Checking:
         values = answer_dict(found, tuple(self.drive.changes().values()))
         if self._given is None:
             values['reasons'] = self._warnings()
-        self._answers.publish(diagnostic(
+        self._answers(diagnostic(
             self._endpoints.node, 'check of a calibration', self._camera_name, _level(found),
             f'the calibration: {found.answer}', flat_texts(values)))
 

@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.guard_condition import GuardCondition
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -42,23 +42,45 @@ class Endpoints:
     at the start. All entities can have their QoS overridden.
     """
 
-    def __init__(self, node: Node, log: Log, complaints: Complaints,
+    def __init__(self, node: LifecycleNode, log: Log, complaints: Complaints,
                  given: Mapping[str, Any]) -> None:
         self.node, self.log, self.complaints, self.given = node, log, complaints, given
         # not the ROS clock: timers must also run while a simulation is paused
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._ends = ExitStack()
+        # by the name of the latched topic
+        self._latest: dict[str, tuple[Publisher, Any]] = {}
 
     def publisher(self, name: str) -> Publisher:
-        """Make the publisher of a topic of PUBLISHED.
+        """Make the publisher of a topic of PUBLISHED; silent while the node is inactive.
 
         Raises ImportError where the package of its messages is missing.
         """
         about = PUBLISHED[name]
-        made = self.node.create_publisher(message_class(about.type), name, profile(about),
-                                          qos_overriding_options=OVERRIDES)
-        self.at_end(self.node.destroy_publisher, made)
+        make, destroy = (
+            (self.node.create_publisher, self.node.destroy_publisher) if about.always else
+            (self.node.create_lifecycle_publisher, self.node.destroy_lifecycle_publisher))
+        made: Publisher = make(message_class(about.type), name, profile(about),
+                               qos_overriding_options=OVERRIDES)
+        self.at_end(destroy, made)
         return made
+
+    def latched(self, name: str) -> Callable[[Any], None]:
+        """Make the publisher of a latched topic; return what publishes a message on it.
+
+        The last one is published again when the node is activated. Raises as publisher().
+        """
+        publisher = self.publisher(name)
+
+        def publish(message: Any) -> None:
+            self._latest[name] = publisher, message
+            publisher.publish(message)
+        return publish
+
+    def activate(self) -> None:
+        """Publish what is latched: nobody has heard it while the node was inactive."""
+        for publisher, message in self._latest.values():
+            publisher.publish(message)
 
     def subscription(self, name: str, callback: Callable[[Any], None], topic: str = ''
                      ) -> Subscription:

@@ -16,7 +16,7 @@ class Topic:
     """A topic. name: as the code has it, before remapping; type: of its messages.
 
     about: what it has, for users. depth, latched, reliable: the quality of service; all are kept
-    last. programs: that have it.
+    last. programs: that have it. always: published while the node is inactive, too.
     """
 
     name: str
@@ -26,6 +26,7 @@ class Topic:
     latched: bool = False
     reliable: bool = True
     programs: tuple[str, ...] = PROGRAMS
+    always: bool = False
 
     @property
     def qos(self) -> str:
@@ -62,7 +63,8 @@ PUBLISHED = _by_name(
     Topic('~/rectified/compressed', 'sensor_msgs/msg/CompressedImage',
           'the picture that P of camera_info describes, while someone subscribes', 1),
     Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray',
-          'the state and what is missing, once a second'))
+          'the state and what is missing, once a second, also while the node is inactive',
+          always=True))
 
 # the names of the last three are those of parameters, which name the topics
 SENSORS = ('imu_topic', 'odom_topic', 'fix_topic')

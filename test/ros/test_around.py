@@ -165,16 +165,21 @@ def test_a_managed_node_listens_only_while_it_is_active(managed):
         assert ask(changer, request).success
 
     change(Transition.TRANSITION_CONFIGURE)
-    # the kept calibration stays latched while it is inactive
-    camera.until(lambda: camera.latched, node=node)
     camera.until(lambda: camera.status and 'inactive' in camera.status.message, node=node)
-    assert camera.images.get_subscription_count() == 0
+    camera.spin(1.0)
+    # nothing but /diagnostics speaks while it is inactive
+    assert camera.images.get_subscription_count() == 0 and not camera.latched
     change(Transition.TRANSITION_ACTIVATE)
+    camera.until(lambda: camera.latched, node=node)
     camera.connect(node)
     stream(camera, 3)
     camera.until(lambda: len(camera.infos) == 3, node=node)
     change(Transition.TRANSITION_DEACTIVATE)
     camera.until(lambda: camera.images.get_subscription_count() == 0, node=node)
+    heard = len(camera.latched)
+    change(Transition.TRANSITION_ACTIVATE)
+    camera.until(lambda: len(camera.latched) == heard + 1, node=node)
+    change(Transition.TRANSITION_DEACTIVATE)
     change(Transition.TRANSITION_CLEANUP)
     assert ask(getter, GetState.Request()).current_state.id == (
         State.PRIMARY_STATE_UNCONFIGURED)
@@ -184,6 +189,11 @@ def test_a_managed_node_listens_only_while_it_is_active(managed):
     camera.connect(node)
     stream(camera, 3, 10)
     camera.until(lambda: len(camera.infos) == 6, node=node)
+    # as nav2's manager does at the end
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP,
+                       Transition.TRANSITION_UNCONFIGURED_SHUTDOWN):
+        change(transition)
+    assert ask(getter, GetState.Request()).current_state.id == State.PRIMARY_STATE_FINALIZED
     assert node.stop() == 0 and 'Traceback' not in node.text
 
 

@@ -46,9 +46,9 @@ class FakeEndpoints:
         self.node = SimpleNamespace(
             get_clock=lambda: SimpleNamespace(now=lambda: SimpleNamespace(to_msg=Time)))
 
-    def publisher(self, name):
+    def latched(self, name):
         message_class(PUBLISHED[name].type)
-        return SimpleNamespace(publish=lambda message: self.published.append((name, message)))
+        return lambda message: self.published.append((name, message))
 
     def subscription(self, name, callback, topic=''):
         self.heard[topic or name] = callback
