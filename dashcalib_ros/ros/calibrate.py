@@ -9,6 +9,7 @@ from std_msgs.msg import Header
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError, coded
+from dashcalib_ros.formats import calibrated_camera
 from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import Calibration, NamedCamera
@@ -18,7 +19,7 @@ from dashcalib_ros.ros.car import Mounting
 from dashcalib_ros.ros.commit import Commit, driver_services
 from dashcalib_ros.ros.diagnostics import ERROR, OK, WARN, Health
 from dashcalib_ros.ros.drive import Drive
-from dashcalib_ros.ros.endpoints import Endpoints
+from dashcalib_ros.ros.endpoints import Answer, Endpoints
 from dashcalib_ros.ros.images import Source
 from dashcalib_ros.ros.settings import Settings
 from dashcalib_ros.ros.state import Judgement, judge, outcome_text, sigma_text
@@ -57,9 +58,10 @@ class Calibrating:
         self._counted: frozenset[tuple[int, TurnId]] = frozenset()
         mask = read_mask(Path(own.mask_file)) if own.mask_file else None
         self.drive = Drive(endpoints, settings, camera_name, mask, self)
-        for name, action in (('calibrate', self.drive.calibrate), ('reset', self.reset),
-                             ('save', self.save)):
-            endpoints.service(f'~/{name}', action)
+        endpoints.service('~/calibrate', self.drive.calibrate)
+        endpoints.service('~/calibrate_now', self.drive.calibrate_now)
+        endpoints.service('~/reset', self.reset)
+        endpoints.service('~/save', self.save)
         self._load()
         self._check_writable()
         self.summary = (f'learning the camera {camera_name!r} from the turns seen on '
@@ -178,6 +180,13 @@ class Calibrating:
                 judged.confirmed or not self.drive.learner.extend()):
             # the next calibration must be independent: it uses new turns only
             self.drive.learner.restart()
+
+    def outcome(self, result: Result) -> Answer:
+        """Return whether it is accepted, and the numbers or the reasons."""
+        verdict = result.calibration.verdict
+        if verdict.level == 'accepted':
+            return True, f'accepted: {sigma_text(calibrated_camera(result.calibration, ""))}'
+        return False, f'{verdict.level}: {"; ".join(verdict.reasons)}'
 
     def _adopt(self, calibration: Calibration) -> None:
         source = self.drive.source

@@ -6,6 +6,7 @@ from contextlib import ExitStack
 from importlib import import_module
 from typing import Any
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.guard_condition import GuardCondition
@@ -14,12 +15,15 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from dashcalib_ros.errors import coded
 from dashcalib_ros.ros.diagnostics import Complaints, Log
 from dashcalib_ros.ros.interface import PUBLISHED, SUBSCRIBED, Topic
 
+# success and a message
+Answer = tuple[bool, str]
 # history, depth and reliability; not durability, as a latched topic that is not latched would
 # break its readers
 OVERRIDES = QoSOverridingOptions.with_default_policies()
@@ -92,17 +96,21 @@ class Endpoints:
         self.at_end(self.node.destroy_subscription, made)
         return made
 
-    def service(self, name: str, action: Callable[[], tuple[bool, str]]) -> None:
-        """Offer a service; action: returns success and a message."""
-        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def service(self, name: str, action: Callable[[], Answer | Future]) -> None:
+        """Offer a service; action: returns success and a message, or what will have them."""
+        async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             try:
-                response.success, response.message = action()
+                found = action()
+                response.success, response.message = (
+                    await found if isinstance(found, Future) else found)
             except Exception as error:  # a client waits for ever for an answer that does not come
                 self.complaints.failure('failed_callbacks', error)
                 response.success = False
                 response.message = f'failed: {coded(error)}; see the log of the node'
             return response
-        self.at_end(self.node.destroy_service, self.node.create_service(Trigger, name, answer))
+        # of a group of its own: nothing else waits for an answer that takes its time
+        self.at_end(self.node.destroy_service, self.node.create_service(
+            Trigger, name, answer, callback_group=ReentrantCallbackGroup()))
 
     def timer(self, period_s: float, callback: Callable[[], None]) -> Callable[[], object]:
         """Call back again and again; return what ends that."""

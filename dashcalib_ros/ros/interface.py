@@ -56,8 +56,8 @@ PUBLISHED = _by_name(
     Topic(TF_STATIC, 'tf2_msgs/msg/TFMessage',
           'with publish_tf: base_frame to camera_link to the optical frame when the mounting is '
           'accepted, and again after it moved', 1, latched=True, programs=(CALIBRATOR,)),
-    Topic('~/turn_magnitude', 'geometry_msgs/msg/Vector3Stamped',
-          'x: how much the car turns, relative to the image width; for plots'),
+    Topic('~/turn_magnitude', 'std_msgs/msg/Float64',
+          'how much the car turns, relative to the image width; for plots'),
     Topic('~/overlay/compressed', 'sensor_msgs/msg/CompressedImage',
           'tracked points, ego vehicle and state, while someone subscribes', 1),
     Topic('~/rectified/compressed', 'sensor_msgs/msg/CompressedImage',
@@ -105,8 +105,9 @@ class Service:
 
 
 SERVICES = (
-    Service('~/calibrate', 'calibrates with the turns that exist; the result is in the log and in '
-                           '/diagnostics'),
+    Service('~/calibrate', 'calibrates with the turns that exist, and answers when it is done: '
+                           'success where the result is accepted, or says right or wrong'),
+    Service('~/calibrate_now', 'begins the same and answers at once'),
     Service('~/reset', 'forgets the turns, also stored ones, and moves the calibration aside'),
     Service('~/save', 'writes the file of the calibration again', (CALIBRATOR,)))
 # that a calibrator calls with commit

@@ -548,7 +548,7 @@ class Drive(drive.Drive):
     def publish_while_stopped(self):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.1)
-        self._magnitude.publish(drive.Vector3Stamped())
+        self._magnitude.publish(drive.Float64())
     def _tick(self):
         if kind == 'timer' and self._intake.received == 2:
             raise ZeroDivisionError('odd tick')
