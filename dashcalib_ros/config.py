@@ -382,7 +382,9 @@ def _check(name: str, spec: dataclasses.Field[Any], value: Any) -> None:
     if type(value) is not expected and not (expected is float and _is_exact(value)):
         raise ConfigError('E-CONFIG-TYPE',
                           f'{name} must be of type {expected.__name__}, not {value!r}')
-    if isinstance(value, float) and not math.isfinite(value):
+    # NaN is allowed where it stands for 'not known', as a default
+    unknown = isinstance(value, float) and math.isnan(value) and spec.default != spec.default
+    if isinstance(value, float) and not (unknown or math.isfinite(value)):
         raise ConfigError('E-CONFIG-FINITE', f'{name} must be a finite number, not {value!r}')
     low, high = spec.metadata['minimum'], spec.metadata['maximum']
     if (low is not None and value < low) or (high is not None and value > high):

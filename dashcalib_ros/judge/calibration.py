@@ -16,7 +16,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.camera.remap import rectify
-from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices
+from dashcalib_ros.camera.rotation import OPTICAL, quaternion, rotation_matrices
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
@@ -242,9 +242,7 @@ class Mount:
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
         """Return the same rotation as (x, y, z, w), as a transform base_link -> camera has it."""
-        from scipy.spatial.transform import Rotation
-        x, y, z, w = Rotation.from_matrix(self.rotation).as_quat().tolist()
-        return x, y, z, w
+        return quaternion(self.rotation)
 
     def apart(self, other: Mount) -> dict[str, tuple[float, float]]:
         """Return how far each angle that both know is from the other's, and the sigma, degrees."""

@@ -104,34 +104,36 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
             if not self._starting:
                 self.complaints.failure('failed_callbacks', error)
             return TransitionCallbackReturn.ERROR
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Subscribe the images."""
-        assert self.role is not None
+        """Let the publishers speak, and subscribe the images."""
+        assert self.role is not None and self._endpoints is not None
+        result = super().on_activate(state)
+        self._endpoints.activate()
         self.role.drive.images.start()
-        return TransitionCallbackReturn.SUCCESS
+        return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; turns and calibration stay."""
         assert self.role is not None
         self.role.drive.images.stop()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free all that configure made."""
         self._release()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free all that configure made, for good."""
         self._release()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_shutdown(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free all that configure made: it may be configured again."""
         self._release()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_error(state)
 
     def _configure(self) -> None:
         self.complaints = Complaints(self._log.warning)

@@ -15,7 +15,7 @@ from dashcalib_ros.ros.interface import (
     SUBSCRIBED,
     Topic,
 )
-from dashcalib_ros.ros.settings import CHANGEABLE, specs
+from dashcalib_ros.ros.settings import CHANGEABLE, specs, yaml_value
 
 PAGE = """\
 # Topics, services and parameters
@@ -73,10 +73,10 @@ def _parameter(name: str, spec: dataclasses.Field[Any]) -> tuple[str, ...]:
     values = (' '.join(about['choices']) if about['choices'] else kind
               if about['minimum'] is None else
               f'{kind}, {about["minimum"]:.10g} to {about["maximum"]:.10g}')
-    default = f'{spec.default}'.lower() if isinstance(spec.default, bool) else f'{spec.default}'
+    default = '' if spec.default == '' else f'`{yaml_value(spec.default)}`'
     programs = tuple(each for each in PROGRAMS if name in specs(each))
-    return (f'`{name}`{" *" if name in CHANGEABLE else ""}', f'`{default}`' if default else '',
-            values, _of(programs), about['reason'])
+    return (f'`{name}`{" *" if name in CHANGEABLE else ""}', default, values, _of(programs),
+            about['reason'])
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:

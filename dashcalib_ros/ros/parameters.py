@@ -4,6 +4,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
@@ -137,10 +138,11 @@ def _descriptor(name: str, spec: dataclasses.Field[Any]) -> ParameterDescriptor:
         read_only=name not in CHANGEABLE,
         additional_constraints=f'one of {", ".join(about["choices"])}' if about['choices'] else '')
     low, high = about['minimum'], about['maximum']
-    if low is not None and isinstance(spec.default, float):
+    # rclpy's range has no place for NaN; with_changes() has checked it
+    if low is not None and isinstance(spec.default, float) and not math.isnan(spec.default):
         descriptor.floating_point_range = [
             FloatingPointRange(from_value=float(low), to_value=float(high))]
-    elif low is not None:
+    elif low is not None and isinstance(spec.default, int):
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
     return descriptor
 
