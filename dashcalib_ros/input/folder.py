@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from functools import partial
 from itertools import islice, pairwise
 from math import nan
@@ -18,6 +18,7 @@ from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError, Notice, counted
 from dashcalib_ros.input.source import (
     IMAGE_SUFFIXES,
+    LAST_NS,
     FrameSource,
     Picture,
     Reading,
@@ -307,8 +308,8 @@ def _cells(line: str) -> list[str]:
 def _value(cell: str) -> Decimal | None:
     """Return a number, or a date and time in s since 1970; None for another text."""
     if len(cell) <= DIGITS and NUMBER.fullmatch(cell):
-        with suppress(InvalidOperation):
-            return Decimal(cell.replace(',', '.'))
+        value = Decimal(cell.replace(',', '.'))
+        return value if abs(value) <= LAST_NS else None
     ns = dated_ns(cell)
     return None if ns is None else Decimal(ns).scaleb(-9)
 

@@ -129,7 +129,7 @@ def in_ns(values: Sequence[Decimal | None], unit: str = '', listed: bool = True)
     """
     there = sorted(value for value in values if value is not None)
     steps = [b - a for a, b in pairwise(there)]
-    if not steps:
+    if not steps or max(abs(there[0]), abs(there[-1])) > LAST_NS:
         return None
     step, size = median(steps), median(map(abs, there))
     whole = all(value == int(value) for value in there)
@@ -195,10 +195,12 @@ def _read(stems: Sequence[str]) -> Iterator[tuple[list[Decimal | None], str, boo
     split = [re.split(r'(\d+)', stem) for stem in stems]
     # the same text between the numbers; 12 beside 12.5 is one number
     usual, count = Counter(tuple(each[::2]) for each in split).most_common(1)[0]
-    if count < (1 - LACKING) * len(stems):
+    if count < len(stems):
         plain = [re.fullmatch(r'(\D*)(\d+(?:\.\d+)?)(\D*)', stem) for stem in stems]
         if None not in plain and len({each.group(1, 3) for each in plain if each}) == 1:
             yield [each and Decimal(each[2]) for each in plain], '', True
+            return
+    if count < (1 - LACKING) * len(stems):
         return
     groups = list(zip(*(each[1::2] if tuple(each[::2]) == usual else [''] * (len(usual) - 1)
                         for each in split), strict=True))
@@ -212,7 +214,7 @@ def _read(stems: Sequence[str]) -> Iterator[tuple[list[Decimal | None], str, boo
         if part < len(groups) and usual[part] in ('.', ',', '_', '-'):
             digits = {len(text) for text in groups[part] if text}
             whole, parts = numbers(place), numbers(part)
-            if usual[part] in '.,' or len(digits) == 1:
+            if max(digits) <= 9 and (usual[part] in '.,' or len(digits) == 1):
                 yield [None if n is None or m is None else n + m.scaleb(-len(text))
                        for n, m, text in zip(whole, parts, groups[part], strict=True)
                        ], '' if usual[part] in '.,' else 'seconds', True
