@@ -6,8 +6,8 @@ the camera cannot be told from one of its mounting (Hagemann et al.).
 """
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,8 +15,8 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera.camera import Camera
 
-if TYPE_CHECKING:
-    from dashcalib_ros.camera.field import Field
+# what moves pixels (n, 2)
+Moved = Callable[[Floats], Floats] | None
 
 # columns, rows: enough for a smooth field, and as in the benchmarks
 GRID = (25, 15)
@@ -74,21 +74,21 @@ def mapping_error(camera: Camera, reference: Camera) -> float | None:
     return None if found is None else found.rms
 
 
-def apart(camera: Camera, reference: Camera, field: Field | None = None,
-          reference_field: Field | None = None) -> Apart | None:
+def apart(camera: Camera, reference: Camera, observed: Moved = None, ideal: Moved = None
+          ) -> Apart | None:
     """Return how far the images of the same rays are apart in both cameras.
 
-    field, reference_field: what each leaves over.
+    observed: of the camera's field, and ideal: of the reference's; see Field.
     The rays are those of a grid over the reference's image, without those that no camera of this
     kind can see (unseen_share()). None when the reference has no ray for a pixel of the grid, when
     the camera cannot see one of the others, and where none is left.
     """
     pixels = grid_of(reference)
-    ideal = pixels if reference_field is None else reference_field.ideal(pixels)
-    return apart_at(camera, reference.rays(ideal), pixels, field)
+    rays = reference.rays(pixels if ideal is None else ideal(pixels))
+    return apart_at(camera, rays, pixels, observed)
 
 
-def apart_at(camera: Camera, rays: Floats, pixels: Floats, field: Field | None = None
+def apart_at(camera: Camera, rays: Floats, pixels: Floats, observed: Moved = None
              ) -> Apart | None:
     """Return how far the camera's images of rays (n, 3) are from the pixels (n, 2) that see them.
 
@@ -104,7 +104,7 @@ def apart_at(camera: Camera, rays: Floats, pixels: Floats, field: Field | None =
     def off(rays: Floats) -> Floats:
         with np.errstate(all='ignore'):
             seen = camera.project(rays)
-            return np.asarray((seen if field is None else field.observed(seen)) - pixels)
+            return np.asarray((seen if observed is None else observed(seen)) - pixels)
 
     # Gauss-Newton: SciPy's optimiser takes longer to load than this takes
     best = off(rays)

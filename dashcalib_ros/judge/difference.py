@@ -298,7 +298,9 @@ def difference_between(given: NamedCamera, found: NamedCamera) -> Difference:
     return Difference(
         given.camera, found.camera, a.params - b.params,
         np.sum(covariances, axis=0) if covariances else None,
-        apart(given.camera, found.camera, given.field, found.field),
+        apart(given.camera, found.camera,
+              None if given.field is None else given.field.observed,
+              None if found.field is None else found.field.ideal),
         PictureSigma(float(np.hypot.reduce([each.rms for each in sigmas])),
                      float(np.hypot.reduce([each.worst for each in sigmas]))) if sigmas else None)
 
