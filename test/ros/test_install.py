@@ -76,6 +76,20 @@ def test_the_shipped_parameters_are_the_defaults():
     assert float(commented['scene.loss_px']) == 0.5 and commented['queue_size'] == '10'
 
 
+UNIT = re.compile(
+    r'\b(px|m?s|k?Hz|m?m|km/h|m/s|rad(/s)?|degrees|ratio|share|fraction|factor|times|sigmas?|'
+    r'deviations?|processes|contradictions|turns?|images?|frames?|points?|tracks?|iterations?|'
+    r'steps?|rounds|pairs)\b|[°%]')
+
+
+def test_each_number_has_its_unit():
+    """In the last part of its name, or first in its reason."""
+    for name, spec in specs().items():
+        if type(spec.default) in (int, float) and name != 'seed':
+            reason = spec.metadata['reason'].partition(';')[0]
+            assert UNIT.search(reason) or UNIT.search(name.rpartition('_')[2]), name
+
+
 def read(arguments):
     """Return the settings, and the names of parameters, of a node with these arguments."""
     rclpy.init(args=['calibrator', '--ros-args', *arguments])
