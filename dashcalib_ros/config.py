@@ -164,7 +164,7 @@ class IntrinsicsConfig:
     """Scenes -> the parameters of the lens."""
 
     loss: float = expert(
-        0.5, 'scale of the Cauchy loss, in units of the median reprojection error', 0.1, 100.0)
+        0.5, 'scale of the Cauchy loss, as a factor of the median reprojection error', 0.1, 100.0)
     profile_tracks: int = expert(
         120, 'tracks per turn for the focal profile around the result', 20, 5000)
     aspect_sigma: float = expert(
@@ -202,8 +202,8 @@ class VerdictConfig:
         45.0, 'degrees; maximum roll of the images; above: weak; 180: for a rotated camera',
         0.0, 180.0)
     max_aspect: float = expert(
-        0.015, 'maximum difference of fy / fx from 1; above: weak; 20 ms rolling shutter: 0.04',
-        0.0, 1.0)
+        0.015, 'maximum difference of the ratio fy / fx from 1; above: weak; 20 ms rolling '
+               'shutter: 0.04', 0.0, 1.0)
     max_leverage: float = expert(
         0.9, 'maximum share of one turn in the information about fx; above: weak',
         0.0, 1.0)

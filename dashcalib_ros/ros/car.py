@@ -1,7 +1,7 @@
 """The car around the camera: its sensors come in; how the camera sits on it goes out.
 
-That is a pose, and static transforms (REP-103, REP-105). What sensors measure is kept where their
-topics are set, and used at each calibration.
+That is a pose, and static transforms (REP-103, REP-105). What sensors measure is kept where they
+are subscribed, and used at each calibration.
 """
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dashcalib_ros.input.motion import values_in
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report.wording import mount_text
 from dashcalib_ros.ros.endpoints import Endpoints, message_class
-from dashcalib_ros.ros.interface import PUBLISHED, TF_STATIC
+from dashcalib_ros.ros.interface import PUBLISHED, SENSORS, TF_STATIC
 from dashcalib_ros.ros.settings import NodeConfig
 
 # s; within this time others publish that they have the frame
@@ -170,20 +170,24 @@ def differs(mount: Mount, other: Mount) -> bool:
 
 
 def subscribe_sensors(endpoints: Endpoints, own: NodeConfig, add: AddMeasurement) -> None:
-    """Subscribe to the sensors whose topics are set, and pass on what they measure.
+    """Subscribe to the sensors that are to be used, and pass on what they measure.
 
     Raises ConfigError for an invalid topic name.
     """
-    for name, option in (('imu_topic', 'imu'), ('odom_topic', 'odom'), ('fix_topic', 'gps')):
-        topic = getattr(own, name)
-        if not topic:
+    for name, option in SENSORS.items():
+        # as parameters named the topics up to version 0.2
+        topic = getattr(own, f'{name}_topic')
+        if not (topic or getattr(own, f'use_{name}')):
             continue
         try:
             endpoints.subscription(name, partial(_pass_on, add, option), topic)
         except NameValidationException as error:
             raise ConfigError('E-TOPIC-NAME-INVALID',
-                              f'{name} {topic!r} is not a valid topic name: use a name such '
-                              f'as /car/{option}') from error
+                              f'{name}_topic {topic!r} is not a valid topic name: use a name such '
+                              f'as /car/{name}') from error
+        if topic:
+            endpoints.complaints.once(f'{name}_topic is deprecated: start the node with -p '
+                                      f'use_{name}:=true -r {name}:={topic} instead')
 
 
 def _pass_on(add: AddMeasurement, option: str, message: Any) -> None:

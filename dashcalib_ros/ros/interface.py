@@ -66,8 +66,9 @@ PUBLISHED = _by_name(
           'the state and what is missing, once a second, also while the node is inactive',
           always=True))
 
-# the names of the last three are those of parameters, which name the topics
-SENSORS = ('imu_topic', 'odom_topic', 'fix_topic')
+# topics of the car's own sensors, which are subscribed with use_imu and so on, and the options of
+# the command that have the same
+SENSORS = {'imu': 'imu', 'odom': 'odom', 'fix': 'gps'}
 SUBSCRIBED = _by_name(
     Topic('image_raw', 'sensor_msgs/msg/Image',
           'or image_raw/compressed with image_transport:=compressed; with video the first of '
@@ -79,10 +80,11 @@ SUBSCRIBED = _by_name(
           'with publish_tf: a frame that has another parent gets none', 100, latched=True,
           programs=(CALIBRATOR,)),
     # best effort also receives from reliable publishers; a second of a fast gyro
-    Topic('imu_topic', 'sensor_msgs/msg/Imu', 'independent evidence for fx', 400, reliable=False),
-    Topic('odom_topic', 'nav_msgs/msg/Odometry', 'the speed, for the height of the camera', 400,
+    Topic('imu', 'sensor_msgs/msg/Imu', 'with use_imu: independent evidence for fx', 400,
           reliable=False),
-    Topic('fix_topic', 'sensor_msgs/msg/NavSatFix', 'independent evidence for fx', 400,
+    Topic('odom', 'nav_msgs/msg/Odometry', 'with use_odom: the speed, for the height of the '
+                                           'camera', 400, reliable=False),
+    Topic('fix', 'sensor_msgs/msg/NavSatFix', 'with use_fix: independent evidence for fx', 400,
           reliable=False))
 
 # what rclpy publishes and offers for each node with a lifecycle and parameters

@@ -9,7 +9,6 @@ from dashcalib_ros.ros.interface import (
     OF_RCLPY,
     PROGRAMS,
     PUBLISHED,
-    SENSORS,
     SERVICES,
     SET_CAMERA_INFO,
     SUBSCRIBED,
@@ -64,8 +63,8 @@ def page() -> str:
 
 def _topics(topics: Iterable[Topic]) -> str:
     return _table(('topic', 'type', 'QoS', 'program', ''), (
-        (f'the name that `{topic.name}` has' if topic.name in SENSORS else f'`{topic.name}`',
-         f'`{topic.type}`', topic.qos, _of(topic.programs), topic.about) for topic in topics))
+        (f'`{topic.name}`', f'`{topic.type}`', topic.qos, _of(topic.programs), topic.about)
+        for topic in topics))
 
 
 def _parameter(name: str, spec: dataclasses.Field[Any]) -> tuple[str, ...]:

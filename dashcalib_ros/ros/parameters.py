@@ -22,7 +22,14 @@ from rclpy.parameter import Parameter
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.formats.ros import CAMERA_NAME
-from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, Settings, specs, with_changes
+from dashcalib_ros.ros.settings import (
+    CHANGEABLE,
+    NodeConfig,
+    Settings,
+    ros_value,
+    specs,
+    with_changes,
+)
 
 RELIABILITIES = ('best_effort', 'reliable')
 
@@ -64,7 +71,7 @@ def declare(node: Node, program: str, given: Mapping[str, Any]) -> Settings:
     for name, spec in known.items():
         if not spec.metadata['expert'] or name in given:
             # the checked value, which rclpy would refuse itself where 3 stands for 3.0
-            value = values[name]
+            value = ros_value(spec, values[name])
             node.declare_parameter(
                 name, float(value) if isinstance(spec.default, float) else value,
                 _descriptor(name, spec), ignore_override=True)

@@ -111,12 +111,15 @@ class NodeConfig:
     mount_z: float = setting(
         math.nan, 'm above base_frame, measured by hand; .nan: the height above the road, which '
                   'is estimated where the speed is known', -50.0, 50.0)
-    imu_topic: str = setting(
-        '', 'sensor_msgs/Imu of the car, independent evidence for fx; empty: none')
-    odom_topic: str = setting(
-        '', 'nav_msgs/Odometry, whose speed gives the height of the camera; empty: none')
-    fix_topic: str = setting(
-        '', 'sensor_msgs/NavSatFix, independent evidence for fx; empty: none')
+    use_imu: bool = setting(
+        False, 'subscribe imu (sensor_msgs/Imu of the car), independent evidence for fx')
+    use_odom: bool = setting(
+        False, 'subscribe odom (nav_msgs/Odometry), whose speed gives the height of the camera')
+    use_fix: bool = setting(
+        False, 'subscribe fix (sensor_msgs/NavSatFix), independent evidence for fx')
+    imu_topic: str = expert('', 'deprecated: set use_imu, and remap imu with -r imu:=TOPIC')
+    odom_topic: str = expert('', 'deprecated: set use_odom, and remap odom with -r odom:=TOPIC')
+    fix_topic: str = expert('', 'deprecated: set use_fix, and remap fix with -r fix:=TOPIC')
     queue_size: int = expert(
         10, 'images that may wait for detection, one second of them; then the oldest is dropped',
         1, 1000)
@@ -153,11 +156,22 @@ def specs(program: str = CALIBRATOR) -> dict[str, dataclasses.Field[Any]]:
 
 def with_changes(core: Config, own: NodeConfig, values: Mapping[str, Any]
                  ) -> tuple[Config, NodeConfig]:
-    """Return both with settings changed by name; raises ConfigError."""
+    """Return both with settings changed by name; raises ConfigError.
+
+    values: as parameters have them, see ros_value(), or as the core has them.
+    """
     names = {spec.name for spec in dataclasses.fields(NodeConfig)}
+    lists = {name for name, spec in describe() if spec.metadata['pattern']}
+    values = {name: ','.join(map(str, value)) if name in lists and not isinstance(
+        value, (int, str)) else value for name, value in values.items()}
     return (core.replace({name: value for name, value in values.items() if name not in names}),
             dataclasses.replace(own, **{name: value for name, value in values.items()
                                         if name in names}))
+
+
+def ros_value(spec: dataclasses.Field[Any], value: Any) -> Any:
+    """Return a setting's value as a parameter has it: the core has a list of numbers as a text."""
+    return [int(each) for each in value.split(',')] if spec.metadata['pattern'] else value
 
 
 def help_text(program: str) -> str:
@@ -242,9 +256,10 @@ def _line(name: str, spec: dataclasses.Field[Any]) -> str:
         note += f'; {about["minimum"]:.10g} to {about["maximum"]:.10g}'
     if name in CHANGEABLE:
         note += '; may be changed while the node runs'
+    value = yaml_value(ros_value(spec, spec.default))
     comment = textwrap.fill(note, 99, initial_indent='    # ', subsequent_indent='    # ')
     # the line of one for experts is a comment, too: a node has it only where it is set
-    return f'{comment}\n    {"# " if about["expert"] else ""}{name}: {yaml_value(spec.default)}\n'
+    return f'{comment}\n    {"# " if about["expert"] else ""}{name}: {value}\n'
 
 
 def yaml_value(value: object) -> str:

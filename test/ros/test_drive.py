@@ -60,7 +60,7 @@ def driven(ros_context, rendered, tmp_path_factory):
     seen.drive, seen.frames = rendered
     # other tests keep the machine busy: a queue of 5 images would overrun
     seen.node = NodeProcess(home, '-p', 'qos_overrides./image_raw.subscription.depth:=50',
-                            commit=True, commit_timeout=SOON, imu_topic='/imu', **QUICK)
+                            commit=True, commit_timeout=SOON, use_imu=True, **QUICK)
     seen.bench = bench = Bench(ros_context)
     seen.committed = []
     seen.gyro = bench.node.create_publisher(Imu, '/imu', 400)

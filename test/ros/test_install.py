@@ -32,6 +32,7 @@ from dashcalib_ros.ros.interface import (
     OF_RCLPY,
     PROGRAMS,
     PUBLISHED,
+    SENSORS,
     SERVICES,
     SUBSCRIBED,
 )
@@ -70,9 +71,23 @@ def test_the_shipped_parameters_are_the_defaults():
     assert repr(values) == repr({name: expected[name] for name in values})
     assert set(values) == set(expected)
     # those for experts are lines that are commented out
-    commented = dict(re.findall(r'^    # ([a-z_.0-9]+): (\S+)$', text, re.MULTILINE))
+    commented = dict(re.findall(r'^    # ([a-z_.0-9]+): (\S+|\[.*\])$', text, re.MULTILINE))
     assert set(commented) == experts and len(values) < len(experts)
     assert float(commented['scene.loss_px']) == 0.5 and commented['queue_size'] == '10'
+
+
+UNIT = re.compile(
+    r'\b(px|m?s|k?Hz|m?m|km/h|m/s|rad(/s)?|degrees|ratio|share|fraction|factor|times|sigmas?|'
+    r'deviations?|processes|contradictions|turns?|images?|frames?|points?|tracks?|iterations?|'
+    r'steps?|rounds|pairs)\b|[°%]')
+
+
+def test_each_number_has_its_unit():
+    """In the last part of its name, or first in its reason."""
+    for name, spec in specs().items():
+        if type(spec.default) in (int, float) and name != 'seed':
+            reason = spec.metadata['reason'].partition(';')[0]
+            assert UNIT.search(reason) or UNIT.search(name.rpartition('_')[2]), name
 
 
 def read(arguments):
@@ -98,6 +113,22 @@ def test_a_file_may_have_full_names_or_sections(tmp_path, ros_context):
 def test_an_empty_list_of_another_node_is_left_alone(ros_context):
     settings, _ = read(['-p', 'filters:=[]', '-p', 'turns.wanted:=3', '-p', 'mount_x:=1'])
     assert settings.core.turns.wanted == 3 and settings.own.mount_x == 1.0
+
+
+@pytest.mark.parametrize(('given', 'classes'), [
+    ('[7, 13]', '7,13'), ('[13]', '13'), ('13', '13'), ("'63, 64'", '63, 64')])
+def test_classes_are_an_array_of_integers(ros_context, given, classes):
+    """Or, as up to version 0.2, a text."""
+    name = 'mask.segmentation_classes'
+    rclpy.init(args=['calibrator', '--ros-args', '-p', f'{name}:={given}'])
+    node = Node('read')
+    try:
+        settings = declare(node, CALIBRATOR, given_parameters('calibrator'))
+        assert settings.core.mask.segmentation_classes == classes
+        assert list(node.get_parameter(name).value) == [int(n) for n in classes.split(',')]
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 def test_what_is_not_known_can_be_said(ros_context):
@@ -176,7 +207,7 @@ def test_the_page_of_the_interface_is_that_of_a_running_node(start_node, make_be
     def expected(table):
         # tf2 and the sensors: with parameters; of a video, the type is another
         return {full(name): [topic.type] for name, topic in table.items()
-                if program in topic.programs and name != '/tf_static' and '_topic' not in name}
+                if program in topic.programs and name not in ('/tf_static', *SENSORS)}
 
     of_rclpy = {full(name) for name in OF_RCLPY['topics']}
     # the node's own lists come one after the other, a moment later
@@ -246,7 +277,7 @@ def ask(bench, node, kind, name, request):
 def test_the_permissions_are_what_the_nodes_use():
     """No more than the table of the interface, which is compared with running nodes, and no less.
 
-    The video's topics and the sensors' depend on parameters.
+    The video's topics depend on parameters.
     """
     policy = ElementTree.parse(REPOSITORY / 'config' / 'sros2_policy.xml')
     rest = {'/clock', 'image_raw/compressed'}
@@ -257,8 +288,7 @@ def test_the_permissions_are_what_the_nodes_use():
             return {each.text for each in profile.findall(f"{kind}s[@{access}='ALLOW']/{kind}")}
 
         def of(table, program=program):
-            return {name for name, topic in table.items()
-                    if program in topic.programs and '_topic' not in name}
+            return {name for name, topic in table.items() if program in topic.programs}
 
         assert allowed('topic', 'publish') == of(PUBLISHED) | set(OF_RCLPY['topics'])
         assert allowed('topic', 'subscribe') == of(SUBSCRIBED) | rest
@@ -317,20 +347,18 @@ bench.spin(2)
     bench.until(lambda: bench.count('received') - before >= 45, what='45 of 60 images', node=node)
 
 
-@pytest.mark.parametrize(('name', 'kind'), [
-    ('calibrator', 'Node'), ('cameras', 'Node'), ('calibrator_lifecycle', 'LifecycleNode')])
-def test_launch_files_start_a_crashed_node_again_with_a_limit(name, kind):
-    """They are read, not run: launch is not on the package index."""
-    code = ast.parse((REPOSITORY / 'launch' / f'{name}.launch.py').read_text())
+def test_the_launch_file_starts_a_crashed_node_again_with_a_limit():
+    """It is read, not run: launch is not on the package index. The others include it."""
+    code = ast.parse((REPOSITORY / 'launch' / 'calibrator.launch.py').read_text())
     call = next(each for each in ast.walk(code) if isinstance(each, ast.Call)
-                and isinstance(each.func, ast.Name) and each.func.id == kind)
+                and isinstance(each.func, ast.Name) and each.func.id == 'LifecycleNode')
     given = {each.arg: each.value for each in call.keywords}
     assert given['package'].value == 'dashcalib_ros'
     assert (given['respawn'].value, given['respawn_delay'].value,
             given['respawn_max_retries'].value) == (True, 2.0, 5)
-    managed = any(isinstance(each, ast.Constant) and each.value == 'autostart'
-                  for each in ast.walk(given['parameters']))
-    assert managed is (kind == 'LifecycleNode')
+    for other in ('cameras', 'calibrator_lifecycle'):
+        text = (REPOSITORY / 'launch' / f'{other}.launch.py').read_text()
+        assert "'calibrator.launch.py'" in text and 'IncludeLaunchDescription(' in text
 
 
 def test_the_launch_file_in_xml_is_the_other_one():

@@ -212,25 +212,31 @@ def stamped(kind, second):
     return message
 
 
-def test_sensors_are_kept_as_streams():
+@pytest.mark.parametrize('names', [('imu', 'odom', 'fix'), ('/car/imu', '/car/odom', '/car/fix')])
+def test_sensors_are_kept_as_streams(names):
     node, buffer = FakeEndpoints(None, None, None, {}), SensorBuffer()
-    own = NodeConfig(imu_topic='/imu', odom_topic='/odom', fix_topic='/fix')
+    old = names[0] != 'imu'
+    # parameters name the topics for one release more
+    own = NodeConfig(**dict(zip(('imu_topic', 'odom_topic', 'fix_topic'), names, strict=True))
+                     if old else {'use_imu': True, 'use_odom': True, 'use_fix': True})
     subscribe_sensors(node, own, buffer.add)
+    assert len(node.lines) == (3 if old else 0)
+    assert all('deprecated' in line and '-r' in line for line in node.lines)
     for second in range(100, 130):
         imu, odometry, fix = (stamped(kind, second) for kind in (Imu, Odometry, NavSatFix))
         imu.angular_velocity.y = 0.01 * second
         odometry.twist.twist.linear.x = -3.0
         fix.latitude, fix.longitude = 49.0 + 1e-5 * (second - 100), 8.4
-        for topic, message in (('/imu', imu), ('/odom', odometry), ('/fix', fix)):
+        for topic, message in zip(names, (imu, odometry, fix), strict=True):
             node.heard[topic](message)
     # doubled, late, no fix, no numbers
-    node.heard['/imu'](stamped(Imu, 110))
+    node.heard[names[0]](stamped(Imu, 110))
     lost = stamped(NavSatFix, 131)
     lost.status.status = -1
-    node.heard['/fix'](lost)
+    node.heard[names[2]](lost)
     nowhere = stamped(NavSatFix, 132)
     nowhere.latitude = math.nan
-    node.heard['/fix'](nowhere)
+    node.heard[names[2]](nowhere)
     found = buffer.stream()
     assert found.warnings == () and len(found.rate.stamps_s) == 30
     assert found.rate.values[-1, 1] == pytest.approx(1.29) and found.speed.values[0, 0] == 3.0
