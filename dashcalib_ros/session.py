@@ -313,7 +313,7 @@ def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
 
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
     of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
-    fps: images per second of a folder (default 10), or to override the rate of a video.
+    fps: images per second of a folder without times (default 10), or instead of a video's rate.
     config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
     topic: the image topic of a bag; needed only when it has several.
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
@@ -346,7 +346,7 @@ def check(given: Given, path: Paths, fps: float | None = None, config: Settings 
     reads, or a Radial, Brown, Rational or Fisheye of the drive's pictures.
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
     of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
-    fps: images per second of a folder (default 10), or to override the rate of a video.
+    fps: images per second of a folder without times (default 10), or instead of a video's rate.
     config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
     topic: the image topic of a bag; needed only when it has several.
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.

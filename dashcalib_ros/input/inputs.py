@@ -75,8 +75,8 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     """Open a recorded drive. The kind of input is detected from the content of the files.
 
     path: a ROS 2 bag (folder, .mcap, .db3, with or without zstd), a ROS 1 .bag, a video file, or a
-    folder of images, ordered by name (2.png before 10.png). Several of these are one drive of one
-    camera: a sequence, in its own order, or a folder of videos or bags, or a pattern
+    folder of images, ordered by time or name (2.png before 10.png). Several of these are one drive
+    of one camera: a sequence, in its own order, or a folder of videos or bags, or a pattern
     (drives/*.mp4). The files of a folder or a pattern are ordered by the naming rule of the
     camera's maker, otherwise by time of recording, otherwise by name; a warning states which rule
     was used. So is a sequence in alphabetical order, as shells list it: 10.mp4, 2.mp4. A turn
@@ -84,7 +84,7 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     skipped, with a warning.
     topic: the image topic of a bag, needed only if the bag has several; or the number of a stream
     of a video ('2').
-    fps: image rate in Hz, of a folder (default 10), or to replace the time stamps of a video.
+    fps: image rate in Hz, of a folder without times (default 10), or instead of a video's stamps.
     start_s, duration_s: part of the drive to use, in seconds; None: up to its end.
 
     Raises InputError if there is nothing to read, or if the topic is ambiguous.
