@@ -48,6 +48,8 @@ ROLLING, ONE_TURN = 1.35, 1.5
 LEFT_SHIFT = 4.0
 # what matters: of the width; of 1; px of 1000 px of width
 MATTERS: Mapping[Kind, float] = {'shift': 0.004, 'zoom': 0.004, 'bend': 0.3}
+# sigmas of a slow shift, of the width, among which the evidence chooses, and the nats it takes
+SHIFT_SIZES, SHIFT_NATS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016), 3.0
 # noise variances of a track by which a kind of lens must predict turns better
 LEAST_GAIN = 30.0
 # the same of another kind, of its cost: fisheyes have 0.13 and more, windscreens up to 0.06
@@ -77,8 +79,8 @@ class Candidate:
 def costs_of(now: Estimate, loss_px: float) -> list[Quadratic]:
     """Return each turn's cost about what turns share, at the noise; images' shifts follow."""
     variance = now.noise(loss_px).variance * now.inflation
-    normals = [normal_equations(scene, now.imaging, loss_px, now.moves, variance=variance)
-               for scene in now.scenes]
+    normals = [normal_equations(scene, now.imaging, loss_px, scene.turn in now.imaging.images,
+                                variance=variance) for scene in now.scenes]
     return [cost.at_noise(variance) for cost in about_shared(now, normals, variance)]
 
 
@@ -207,7 +209,8 @@ def fixed_camera_tests(found: Estimate) -> tuple[FixedCameraTest, ...]:
         prior.score, (0, len(normals[0].shared.score) - len(prior.score))))
     own = np.arange(len(now.prior().score))
     shifts = [crop_prior(scene, variance, now.imaging.images.get(
-        scene.turn, np.zeros((len(scene.tracks.frames), IMAGE)))) for scene in now.scenes]
+        scene.turn, np.zeros((len(scene.tracks.frames), IMAGE))), now.shift_sigma)
+              for scene in now.scenes]
     zooms = [zoom_prior(scene, variance) for scene in now.scenes]
 
     def solved(images: Sequence[ImagePrior] | None, places: Ints) -> _Step:
@@ -226,9 +229,9 @@ def fixed_camera_tests(found: Estimate) -> tuple[FixedCameraTest, ...]:
     if abs(now.imaging.readout_s) > COUPLED_READOUT_S:
         more *= ROLLING
     # a stabilised picture goes on moving
-    moving = shifts if now.moves else None
+    moving = shifts if now.imaging.images else None
     tests = [test('shift', solved(shifts, own), fixed,
-                  LEFT_SHIFT if now.moves else more * CLEAR['shift'], width),
+                  LEFT_SHIFT if now.imaging.images else more * CLEAR['shift'], width),
              test('zoom', solved(zooms, own), fixed, more * CLEAR['zoom'], 1.0),
              test('bend', solved(moving, np.arange(len(prior.score))), solved(moving, own),
                   CLEAR['bend'], width / 1000)]
@@ -253,6 +256,39 @@ def _solved(normals: Sequence[Normal], prior: Quadratic, variance: float,
         each.step(normal, np.asarray(places), step)
         for each, normal in zip(images, normals, strict=True))
     return _Step(gain + float(total.score @ step), chance + total.chance, step, of_images)
+
+
+def shift_size(found: Estimate) -> float:
+    """Return the sigma of a slow shift of the images that the evidence favours, of the width.
+
+    0 where a fixed picture is as likely. The evidence is the marginal likelihood: the shifts, and
+    what turns share, are at their optimum.
+    """
+    now = found.with_tracks(FIRST_TRACKS)
+    loss_px = now.loss_px()
+    unit = now.noise(loss_px).variance * now.inflation
+    normals = [normal_equations(scene, now.imaging, loss_px, True, variance=unit, clusters=False)
+               for scene in now.scenes]
+    still = [np.zeros((len(scene.tracks.frames), IMAGE)) for scene in now.scenes]
+
+    def nats(size: float) -> float:
+        logs, costs = 0.0, [now.prior()]
+        for scene, images, normal in zip(now.scenes, still, normals, strict=True):
+            if not size:
+                costs.append(normal.shared.at_noise(unit))
+                continue
+            prior = crop_prior(scene, unit, images, size)
+            own = prior.of(normal)
+            logs += (float(own.score @ own.covariance @ own.score) / unit
+                     - float(np.linalg.slogdet(own.hessian)[1])
+                     + float(np.linalg.slogdet(prior.precision)[1]))
+            costs.append(prior.eliminated(normal).at_noise(unit))
+        total = Quadratic.together(costs)
+        return 0.5 * (logs + float(total.score @ total.optimum)
+                      - float(np.linalg.slogdet(total.hessian)[1]))
+
+    best = max(SHIFT_SIZES, key=nats)
+    return best if nats(best) - nats(0.0) > SHIFT_NATS else 0.0
 
 
 def moves(tests: Sequence[FixedCameraTest]) -> bool:

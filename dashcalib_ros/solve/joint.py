@@ -20,6 +20,7 @@ from dashcalib_ros.solve.evidence import (
     costs_of,
     fixed_camera_tests,
     moves,
+    shift_size,
 )
 from dashcalib_ros.solve.imaging import imaging_with, lens_like
 from dashcalib_ros.solve.linear import IMAGE
@@ -122,6 +123,9 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
     if config.intrinsics.crop_rounds and moves(tests):
         progress('testing whether the picture moves', 0.0)
         best = _steadied(best, measured, config)
+        tests = fixed_camera_tests(best)
+    elif config.intrinsics.crop_rounds and (size := shift_size(best)):
+        best = _wandering(best, size)
         tests = fixed_camera_tests(best)
     return _solution(best, unlike, start.profile, tried, tests, progress)
 
@@ -246,6 +250,18 @@ def _steadied(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config)
     for steps in LAST_STEPS if now.scenes else ():
         now = optimised(now.retriangulated(), 0.0, steps)
     return now if len(now.scenes) == len(found.scenes) else found
+
+
+def _wandering(found: Estimate, size: float) -> Estimate:
+    """Return the optimum where each image's picture may be shifted slowly, by a sigma of size.
+
+    size: of the width. What such shifts do to the lens cannot be excluded, and sigma contains it.
+    """
+    still = {scene.turn: np.zeros((len(scene.tracks.frames), IMAGE)) for scene in found.scenes}
+    now = replace(found, shift_sigma=size, imaging=replace(found.imaging, images=still))
+    for steps in LAST_STEPS:
+        now = optimised(now.retriangulated(), 0.0, steps)
+    return now
 
 
 def _posterior(found: Estimate) -> Posterior:

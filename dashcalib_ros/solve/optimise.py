@@ -27,6 +27,7 @@ from dashcalib_ros.solve.linear import (
     residuals,
 )
 from dashcalib_ros.solve.prior import (
+    CROP_SIGMA,
     LEAST_LOSS_PX,
     NOT_SQUARE,
     NOT_SQUARE_NATS,
@@ -57,8 +58,9 @@ class Estimate:
 
     scenes: structures, each with its tracks as measured. centred: the camera that priors and
     bounds are about. focal_reach: ratio by which focal lengths may be off its own. field_sigma: of
-    the prior of the field's directions, px; aspect_sigma: of that of fy / fx. inflation: of the
-    noise, by errors that the observations of a track share.
+    the prior of the field's directions, px; aspect_sigma: of that of fy / fx; shift_sigma: of that
+    of the images' shifts, of the width. inflation: of the noise, by errors that the observations
+    of a track share.
     """
 
     imaging: Imaging
@@ -68,6 +70,7 @@ class Estimate:
     focal_reach: float
     field_sigma: float = 0.1
     aspect_sigma: float = 0.0
+    shift_sigma: float = CROP_SIGMA
     inflation: float = 2.0
 
     @property
@@ -88,11 +91,6 @@ class Estimate:
     def seen_by_lens(self) -> list[Scene]:
         """Return the turns with the tracks that the lens alone would have seen."""
         return [self.imaging.as_lens_sees(scene) for scene in self.scenes]
-
-    @property
-    def moves(self) -> bool:
-        """Return whether each image's picture may be shifted."""
-        return bool(self.imaging.images)
 
     def retriangulated(self, least_px: float = 0.0) -> Estimate:
         """Return it with every track triangulated anew; turns without points are dropped.
@@ -128,13 +126,14 @@ class Estimate:
         """Return the priors of the lens, the readout and the field, from the present values."""
         return prior_of_all(self.imaging, self.centred, self.aspect_sigma, self.field_sigma)
 
-    def image_priors(self, variance: float) -> list[ImagePrior]:
-        """Return for each turn the prior of its images' shifts; empty where none move.
+    def image_priors(self, variance: float) -> list[ImagePrior | None]:
+        """Return for each turn the prior of its images' shifts; None where its pictures are fixed.
 
         variance: of a residual, px^2.
         """
-        return [crop_prior(scene, variance, self.imaging.images[scene.turn])
-                for scene in self.scenes] if self.moves else []
+        images = self.imaging.images
+        return [crop_prior(scene, variance, images[scene.turn], self.shift_sigma)
+                if scene.turn in images else None for scene in self.scenes]
 
     def cost(self, loss_px: float, variance: float) -> float:
         """Return the robust cost of all residuals and of the priors, in units of the noise."""
@@ -144,7 +143,7 @@ class Estimate:
         prior = self.prior()
         away = np.linalg.solve(prior.hessian, prior.score)
         images = sum(float(each.values @ each.precision @ each.values)
-                     for each in self.image_priors(1.0))
+                     for each in self.image_priors(1.0) if each is not None)
         shaking = sum(
             float(np.sum((each @ shake_precision(
                 self.imaging.axes[turn], self.imaging.shaken_s)) * each))
@@ -202,8 +201,9 @@ def _step(now: Estimate, loss_px: float, free: Ints | None, choose: bool
 
 def _normals(now: Estimate, loss_px: float, variance: float, clusters: bool = False
              ) -> list[Normal]:
-    return [normal_equations(scene, now.imaging, loss_px, now.moves, safe=True, variance=variance,
-                             clusters=clusters) for scene in now.scenes]
+    return [normal_equations(scene, now.imaging, loss_px, scene.turn in now.imaging.images,
+                             safe=True, variance=variance, clusters=clusters)
+            for scene in now.scenes]
 
 
 def _settled(now: Estimate, loss_px: float, variance: float) -> Estimate:
@@ -215,9 +215,7 @@ def _settled(now: Estimate, loss_px: float, variance: float) -> Estimate:
 
 def about_shared(now: Estimate, normals: Sequence[Normal], variance: float) -> list[Quadratic]:
     """Return each turn's cost about what turns share, px^2; its images' shifts follow."""
-    if not now.moves:
-        return [normal.cost for normal in normals]
-    return [prior.eliminated(normal)
+    return [normal.cost if prior is None else prior.eliminated(normal)
             for prior, normal in zip(now.image_priors(variance), normals, strict=True)]
 
 
@@ -284,12 +282,11 @@ def chosen_field_sigma(cost: Quadratic, imaging: Imaging) -> float:
 def _with_images(now: Estimate, normals: Sequence[Normal], move: Floats, variance: float
                  ) -> list[Floats]:
     """Return each turn's whole step: of its images' parameters, then of what turns share."""
-    if not now.moves:
-        return [move] * len(normals)
     everything, found = np.arange(len(move)), []
     for prior, normal in zip(now.image_priors(variance), normals, strict=True):
         images = np.zeros(IMAGE * normal.images)
-        images[prior.free] = prior.step(normal, everything, move)
+        if prior is not None:
+            images[prior.free] = prior.step(normal, everything, move)
         found.append(np.concatenate([images, move]))
     return found
 
@@ -309,7 +306,7 @@ def _moved(now: Estimate, normals: Sequence[Normal], moves: Sequence[Floats], pa
         still = np.zeros((len(scene.tracks.frames), SHAKE))
         shaking[scene.turn] = normal.eliminated.shaken(
             shaking.get(scene.turn, still), move, part)
-        if now.moves:
+        if scene.turn in images:
             images[scene.turn] = images[scene.turn].copy()
             images[scene.turn][normal.eliminated.keyframes] += (
                 part * move[:-count].reshape(-1, IMAGE))

@@ -27,6 +27,8 @@ CENTRE_SIGMA = 0.02
 FOCAL_BOUND, CENTRE_BOUND, DISTORTION_BOUND = 0.15, (0.2, 0.3), 1.0
 # prior sigma of a stabiliser's crop, of the width, and how long it holds it, s
 CROP_SIGMA, CROP_TIME_S = 0.03, 1.0
+# the same of a shift that is smaller, in units of that time
+WANDER_TIMES = 1.5
 # prior sigmas of the zoom: of one image, of a stretch, of a turn
 ZOOM_IMAGE, ZOOM_STRETCH, ZOOM_TURN = 0.01, 0.02, 0.03
 
@@ -63,14 +65,17 @@ def bounds_of(camera: Camera, focal_reach: float = FOCAL_BOUND) -> tuple[Floats,
     return _undistorted(camera) - reach, _undistorted(camera) + reach
 
 
-def crop_prior(scene: Scene, variance: float, images: Floats) -> ImagePrior:
-    """Return the prior of the shifts of a turn's images, as a stabiliser makes them.
+def crop_prior(scene: Scene, variance: float, images: Floats, size: float = CROP_SIGMA
+               ) -> ImagePrior:
+    """Return the prior of the shifts of a turn's images.
 
-    They are smooth in time. variance: of a residual, px^2. images: (k, 3) the present values.
+    variance: of a residual, px^2. images: (k, 3) the present values. size: their sigma, of the
+    width: CROP_SIGMA as a stabiliser makes them; smaller ones wander slowly and smoothly.
     """
-    keyframes = used_keyframes(scene)
-    spread = (CROP_SIGMA * scene.tracks.image_size[0])**2 * (
-        np.exp(-_apart(scene)) + 1e-6 * np.eye(len(keyframes)))
+    keyframes, apart = used_keyframes(scene), _apart(scene)
+    smooth = np.exp(-apart if size >= CROP_SIGMA else -0.5 * (apart / WANDER_TIMES)**2)
+    spread = (size * scene.tracks.image_size[0])**2 * (
+        smooth + 1e-6 * np.eye(len(keyframes)))
     inner = np.asarray(np.linalg.inv(spread) * variance)
     return ImagePrior(image_places(keyframes, 0, 1), np.asarray(np.kron(np.eye(2), inner)),
                       images[keyframes, :2].T.ravel())
