@@ -45,6 +45,12 @@ sys.exit(main(sys.argv[1] if named else 'calibrator', sys.argv[1 + named:]))
 """]
 
 
+# for a driver's process: Fast DDS's name of the variable, and that of Kilted's
+LARGE_IMAGES = dict.fromkeys(
+    ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'),
+    str(REPOSITORY / 'config' / 'fastdds_large_images.xml'))
+
+
 def ros_environment(home):
     """Return what keeps a process on this machine, in this run, and strict."""
     return {

@@ -62,7 +62,9 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
             self._starting = False
             self.settings = declare(self, program, given)
             self.create_timer(LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
-            # those of rclpy itself
+            # those of rclpy itself, which has no other way: where a callback raises, the client
+            # waits for ever (rclcpp issue 1581, of both libraries), and up to Jazzy rclpy raises
+            # for a transition that there is not (rclpy issue 1209)
             for service in self.services:
                 service.callback = self._answering(service.callback)
             self.add_on_set_parameters_callback(self._on_parameters)
@@ -203,7 +205,10 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
         return SetParametersResult(successful=True)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters as rclpy does; refuse unknown and read-only ones with the cure."""
+        """Set parameters as rclpy does; refuse unknown and read-only ones with the cure.
+
+        rclpy refuses these before it asks any callback, and without saying what to do.
+        """
         try:
             check_changeable(self, self._program, (each.name for each in parameter_list))
         except ConfigError as error:

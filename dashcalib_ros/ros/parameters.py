@@ -35,7 +35,10 @@ RELIABILITIES = ('best_effort', 'reliable')
 
 
 def given_parameters(program: str) -> dict[str, Any]:
-    """Return the parameters that a program's node is given at the start, known or not."""
+    """Return the parameters that a program's node is given at the start, known or not.
+
+    rclpy tells them only by declaring all, without ranges and for good: on a node of their own.
+    """
     make = functools.partial(Node, program, enable_rosout=False, start_parameter_services=False)
     try:
         probe = make(automatically_declare_parameters_from_overrides=True)

@@ -24,7 +24,7 @@ from ament_index_python import get_package_prefix, get_package_share_directory
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
 from rclpy.node import Node, NodeNameNonExistentError
-from ros_bench import QUICK_COMMAND, REPOSITORY, SOON, Bench, NodeProcess
+from ros_bench import LARGE_IMAGES, QUICK_COMMAND, REPOSITORY, SOON, Bench, NodeProcess
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.ros.interface import (
@@ -338,10 +338,9 @@ for n in range(60):
 bench.spin(2)
 """
     before = bench.count('received')
-    profile = REPOSITORY / 'config' / 'fastdds_large_images.xml'
     done = subprocess.run(
         [sys.executable, '-c', camera], capture_output=True, text=True, timeout=2 * SOON,
-        env={**os.environ, 'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile)})
+        env={**os.environ, **LARGE_IMAGES})
     assert done.returncode == 0 and 'XML' not in done.stdout + done.stderr, done.stderr
     # without the profile 4 of these 60 arrive
     bench.until(lambda: bench.count('received') - before >= 45, what='45 of 60 images', node=node)
