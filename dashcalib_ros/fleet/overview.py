@@ -70,6 +70,9 @@ def overview_html(cameras: Rows, clips: Rows) -> str:
         _reasons('Cameras that are not accepted', 'cameras', [
             (code, reason, row['camera']) for row in cameras if row['verdict'] != 'accepted'
             for reason, code in zip_longest(row['reasons'], row['reason_codes'], fillvalue='')]),
+        _reasons('No prior from the camera model', 'cameras', [
+            ('', row['prior_note'], row['camera']) for row in cameras
+            if row['verdict'] != 'accepted' and row['prior_note'] and not row['other_mode']]),
         _listed(cameras)]
     return template('overview.html').render(
         cameras=len(cameras), clips=len(clips), titles=TITLES, sections=sections,

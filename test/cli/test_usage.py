@@ -13,6 +13,7 @@ import subprocess
 import sys
 import unicodedata
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -150,6 +151,16 @@ def test_json_is_the_same_flag_of_each_command():
 def test_the_names_that_help_has_are_those_of_the_tables():
     assert tuple(DEMOS) == LENSES and tuple(EXPORTS) == KINDS
     assert (AUTO, *(model.model for model in calibrated_models())) == MODELS
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_documents_name_every_kind_of_export(kind):
+    docs = Path(__file__).parents[2] / 'docs'
+    [line] = re.findall(r'^dashcalib export calibration --to (opencv .*)$',
+                        (docs / 'usage.md').read_text(), re.MULTILINE)
+    assert re.search(rf'\b{kind}\b', line)
+    exports = (docs / 'formats.md').read_text().partition('### Exports')[2].partition('\n### ')[0]
+    assert f'`{kind}`' in exports
 
 
 def test_help_imports_nothing_heavy():
