@@ -49,7 +49,8 @@ def imaging_of(camera: Camera, scene: Scene, readout_s: float, few: int = 5) -> 
         found, readout_s=readout_s, basis=found.basis[:, :few],
         directions=0.02 * rng.normal(size=few),
         images={scene.turn: rng.normal(size=(count, 3)) * (0.5, 0.5, 1e-4)},
-        shaking={scene.turn: 0.01 * rng.normal(size=(count, 3))} if readout_s else {})
+        shaking={scene.turn: 0.01 * readout_s * rng.normal(size=(count, 3))} if readout_s else {},
+        shaken_s=readout_s)
 
 
 def numeric(scene: Scene, imaging: Imaging, loss_px: float, by_image: bool
@@ -87,7 +88,8 @@ def numeric(scene: Scene, imaging: Imaging, loss_px: float, by_image: bool
     normal, pull = weighted.T @ weighted, weighted.T @ base
     if shaking:
         own = slice(sizes[0], sizes[0] + shaking)
-        precision = VARIANCE * np.kron(np.eye(k), shake_precision(imaging.axes[turn]))
+        precision = VARIANCE * np.kron(np.eye(k), shake_precision(
+            imaging.axes[turn], imaging.shaken_s))
         normal[own, own] += precision
         pull[own] -= precision @ imaging.shaking[turn].ravel()
     inner = np.linalg.pinv(normal[:-sum(sizes[3:]), :-sum(sizes[3:])], rcond=1e-11, hermitian=True)
