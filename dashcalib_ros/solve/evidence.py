@@ -289,8 +289,9 @@ def shift_size(found: Estimate) -> float:
         return 0.5 * (logs + float(total.score @ total.optimum)
                       - float(np.linalg.slogdet(total.hessian)[1]))
 
-    best = max(SHIFT_SIZES, key=nats)
-    return best if nats(best) - nats(0.0) > SHIFT_NATS else 0.0
+    found_nats = {size: nats(size) for size in (0.0, *SHIFT_SIZES)}
+    best = max(SHIFT_SIZES, key=found_nats.__getitem__)
+    return best if found_nats[best] - found_nats[0.0] > SHIFT_NATS else 0.0
 
 
 def moves(tests: Sequence[FixedCameraTest]) -> bool:

@@ -203,10 +203,9 @@ class LocalPoints:
     """Points of the n used observations in the camera's axes.
 
     rotated: (n, 3) the world's points, rotated. still: (n, 3) at the time of the middle row;
-    local: (n, 3) at the time of their rows. turning: (n, 3) rad of the camera, from the first row
-    to the last. by_readout:
-    (n, 3) how far they move for a second of readout. late: (n,) when their rows are exposed, in
-    readouts after the middle one. motion: of the camera.
+    local: (n, 3) at the time of their rows. turning: (n, 3) rad by which the camera turns from the
+    first row to the last. by_readout: (n, 3) how far they move for a second of readout. late: (n,)
+    when their rows are exposed, in readouts after the middle one. motion: of the camera.
     """
 
     rotated: Floats
