@@ -58,7 +58,7 @@ class Asked:
 
 def command(manifest: Path, out: Path, *options: str) -> list[str]:
     """Return the command of a batch."""
-    return [sys.executable, '-m', 'dashcalib_ros.cli', 'batch', str(manifest), '--out', str(out),
+    return [sys.executable, '-m', 'dashcalib_ros', 'batch', str(manifest), '--out', str(out),
             *options]
 
 

@@ -446,7 +446,7 @@ def stores(folder: Path, tries: Sequence[int]) -> Iterator[None]:
 
 
 def dashcalib(*arguments: object) -> list[str]:
-    return [sys.executable, '-m', 'dashcalib_ros.cli', *map(str, arguments)]
+    return [sys.executable, '-m', 'dashcalib_ros', *map(str, arguments)]
 
 
 def manifests(folder: Path, tries: Sequence[int]) -> Iterator[None]:

@@ -21,10 +21,10 @@ from typing import Any
 from mapping import is_fisheye, mapping_error, model_of
 
 from dashcalib_ros import Calibrator, Config
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.detect import Turn
 from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.errors import DashcalibError
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input import Frame
 from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection

@@ -39,10 +39,9 @@ from measure import commit, complain, done, isolated, load, parser_with, save, t
 from result_tables import write_table
 
 from dashcalib_ros import Calibrator, Config, open_frames
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, plain_values
 from dashcalib_ros.demo import Drive
 from dashcalib_ros.demo.vehicle import MARGIN_S
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.input.poses import read_poses
 

@@ -176,7 +176,7 @@ def main() -> None:
     text = seen.pop('calibration')
     print(json.dumps(seen, indent=1))
     with tempfile.TemporaryDirectory() as out:
-        subprocess.run([sys.executable, '-m', 'dashcalib_ros.cli', 'run', str(args.bag), '--out',
+        subprocess.run([sys.executable, '-m', 'dashcalib_ros', 'run', str(args.bag), '--out',
                         out], check=False, stdout=subprocess.DEVNULL)
         result = json.loads((Path(out) / 'result.json').read_text())
     print('dashcalib run:', result['verdict'], result['reasons'])

@@ -26,7 +26,7 @@ import rclpy
 import with_tests  # noqa: F401
 from measure import commit, unit_s
 from result_tables import write_table
-from ros_bench import REPOSITORY, Bench, NodeProcess, image_message, ros_environment
+from ros_bench import LARGE_IMAGES, Bench, NodeProcess, image_message, ros_environment
 from sensor_msgs.msg import CompressedImage
 
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
@@ -132,8 +132,7 @@ def measure(minutes: float, rate: float, preview: bool) -> str:
     node = NodeProcess(home, contradictions=20, publish_stale=True)
     camera = subprocess.Popen(
         [sys.executable, __file__, '--publish', '--minutes', str(minutes), '--rate', str(rate)],
-        env={**os.environ, 'FASTRTPS_DEFAULT_PROFILES_FILE':
-             str(REPOSITORY / 'config' / 'fastdds_large_images.xml')})
+        env={**os.environ, **LARGE_IMAGES})
     memory: list[float] = []
     try:
         bench.until(lambda: bench.count('received') > 0, 300.0, node=node)

@@ -30,7 +30,7 @@ import rclpy
 import with_tests  # noqa: F401
 from measure import commit
 from node_latency import LENS, SIZE, Listener, cpu_s, resident_mb
-from ros_bench import REPOSITORY, Bench, NodeProcess, image_message, ros_environment
+from ros_bench import LARGE_IMAGES, Bench, NodeProcess, image_message, ros_environment
 
 from dashcalib_ros.demo import Drive, DriveSpec
 
@@ -104,8 +104,7 @@ def driver(folder: Path, mounting: str, seed: int) -> subprocess.Popen[bytes]:
     """Start the driver."""
     return subprocess.Popen(
         [sys.executable, __file__, '--publish', str(folder), mounting, str(seed)],
-        env={**os.environ, 'FASTRTPS_DEFAULT_PROFILES_FILE':
-             str(REPOSITORY / 'config' / 'fastdds_large_images.xml')})
+        env={**os.environ, **LARGE_IMAGES})
 
 
 def measure(minutes: float, restart_s: float, folder: Path) -> str:

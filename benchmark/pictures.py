@@ -141,7 +141,7 @@ def report() -> None:
         sys.exit('the picture of the report needs Chromium; install it')
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / 'demo' / 'report.html'
-        subprocess.run([sys.executable, '-m', 'dashcalib_ros.cli', 'demo', '--quiet', '--out',
+        subprocess.run([sys.executable, '-m', 'dashcalib_ros', 'demo', '--quiet', '--out',
                         str(page.parent)], check=True)
         subprocess.run([browser, *BROWSER, f'--user-data-dir={folder}/profile',
                         f'--screenshot={DOCS / "report.png"}', page.as_uri()], check=True)

@@ -34,9 +34,10 @@ from dashcalib_ros.input.poses import Poses, read_poses
 from dashcalib_ros.judge import trivial_guess
 from dashcalib_ros.judge.odometry import TurnPath as TruePath
 from dashcalib_ros.judge.odometry import angle_deg, length, odometry, path_files
+from dashcalib_ros.problem.observations import Structure, Tracks
 from dashcalib_ros.reconstruct.chain import chain_scene
-from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure
-from dashcalib_ros.reconstruct.tracks import Tracks, track_turn
+from dashcalib_ros.reconstruct.scene import Profile, Scene
+from dashcalib_ros.reconstruct.tracks import track_turn
 from dashcalib_ros.solve.start import scene_with
 
 # frames of a window, from one to the next, and between two keyframes

@@ -177,7 +177,7 @@ def command(bag: Path) -> dict[str, Any]:
         return used.ru_utime + used.ru_stime
 
     with tempfile.TemporaryDirectory() as folder:
-        line = [sys.executable, '-m', 'dashcalib_ros.cli', 'run', str(bag), '--out', folder]
+        line = [sys.executable, '-m', 'dashcalib_ros', 'run', str(bag), '--out', folder]
         began, before, peak = time.perf_counter(), spent_s(), 0.0
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         seconds, cpu_s = time.perf_counter() - began, spent_s() - before

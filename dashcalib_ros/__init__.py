@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from dashcalib_ros.formats.export import export
     from dashcalib_ros.input import Frame
     from dashcalib_ros.input.inputs import open_frames
+    from dashcalib_ros.judge import Check
     from dashcalib_ros.pipeline import Calibrator
-    from dashcalib_ros.report import AcceptedCalibration, Calibration, Verdict
-    from dashcalib_ros.report.compare import compare
+    from dashcalib_ros.report import AcceptedCalibration, Calibration, NamedCamera, Verdict
+    from dashcalib_ros.report.compare import Comparison, compare
     from dashcalib_ros.session import calibrate, check
 
     __version__: str
@@ -32,22 +33,24 @@ from dashcalib_ros.limits import PIXELS
 # OpenCV reads it when it is loaded; image headers are checked before decoding, too
 os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(PIXELS))
 
-__all__ = ['AcceptedCalibration', 'Brown', 'Calibration', 'Calibrator', 'Camera', 'Config',
-           'ConfigError', 'DashcalibError', 'Fisheye', 'Frame', 'InputError', 'NotAcceptedError',
-           'OutputError', 'Radial', 'Rational', 'Verdict', 'WorkerError', '__version__',
-           'calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames']
+__all__ = ['AcceptedCalibration', 'Brown', 'Calibration', 'Calibrator', 'Camera', 'Check',
+           'Comparison', 'Config', 'ConfigError', 'DashcalibError', 'Fisheye', 'Frame',
+           'InputError', 'NamedCamera', 'NotAcceptedError', 'OutputError', 'Radial', 'Rational',
+           'Verdict', 'WorkerError', '__version__', 'calibrate', 'check', 'compare', 'export',
+           'load_camera', 'open_frames']
 
-_HOMES = {'Calibrator': 'pipeline', 'Config': 'config', 'Frame': 'input',
-          'calibrate': 'session', 'check': 'session', 'export': 'formats',
-          'load_camera': 'formats', 'open_frames': 'input.inputs',
-          **dict.fromkeys(('AcceptedCalibration', 'Calibration', 'Verdict', 'compare'), 'report'),
+_HOMES = {'Calibrator': 'pipeline', 'Check': 'judge', 'Comparison': 'report.compare',
+          'Config': 'config', 'Frame': 'input', 'calibrate': 'session', 'check': 'session',
+          'export': 'formats', 'load_camera': 'formats', 'open_frames': 'input.inputs',
+          **dict.fromkeys(('AcceptedCalibration', 'Calibration', 'NamedCamera', 'Verdict',
+                           'compare'), 'report'),
           **dict.fromkeys(('Brown', 'Camera', 'Fisheye', 'Radial', 'Rational'), 'camera'),
           **dict.fromkeys(('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError',
                            'OutputError', 'WorkerError'), 'errors')}
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)
 
 
 def __getattr__(name: str) -> Any:

@@ -164,7 +164,7 @@ class IntrinsicsConfig:
     """Scenes -> the parameters of the lens."""
 
     loss: float = expert(
-        0.5, 'scale of the Cauchy loss, in units of the median reprojection error', 0.1, 100.0)
+        0.5, 'scale of the Cauchy loss, as a factor of the median reprojection error', 0.1, 100.0)
     profile_tracks: int = expert(
         120, 'tracks per turn for the focal profile around the result', 20, 5000)
     aspect_sigma: float = expert(
@@ -202,8 +202,8 @@ class VerdictConfig:
         45.0, 'degrees; maximum roll of the images; above: weak; 180: for a rotated camera',
         0.0, 180.0)
     max_aspect: float = expert(
-        0.015, 'maximum difference of fy / fx from 1; above: weak; 20 ms rolling shutter: 0.04',
-        0.0, 1.0)
+        0.015, 'maximum difference of the ratio fy / fx from 1; above: weak; 20 ms rolling '
+               'shutter: 0.04', 0.0, 1.0)
     max_leverage: float = expert(
         0.9, 'maximum share of one turn in the information about fx; above: weak',
         0.0, 1.0)
@@ -253,10 +253,10 @@ class MonitorConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """All settings; frozen. Config().replace({'turns.wanted': 8}) returns a copy with changes.
+    """All settings; frozen. Config.of({'turns.wanted': 8}, seed=1) has these, and the defaults.
 
-    Config.from_mapping() takes the content of a YAML file; flat() returns all settings by name.
-    Raises ConfigError for a value that has the wrong type, is NaN or is out of range.
+    replace() returns a copy with changes; flat() returns all settings by name. Raises ConfigError
+    for a value that has the wrong type, is NaN or is out of range.
     """
 
     seed: int = expert(
@@ -287,6 +287,12 @@ class Config:
     fleet: FleetConfig = field(default_factory=FleetConfig)
 
     def __post_init__(self) -> None:
+        for group in dataclasses.fields(self):
+            value = getattr(self, group.name)
+            if isinstance(group.default_factory, type) and not isinstance(
+                    value, group.default_factory):
+                raise ConfigError('E-CONFIG-TYPE', f'{group.name} is a group of settings: use '
+                                  f"Config.of({{'{group.name}.NAME': VALUE}}), not {value!r:.80}")
         for name, spec, value in _settings(self):
             _check(name, spec, value)
 
@@ -295,11 +301,14 @@ class Config:
         return {name: value for name, _, value in _settings(self)}
 
     def replace(self, changes: Mapping[str, Any]) -> Config:
-        """Return a copy with settings changed by full name; raises ConfigError."""
+        """Return a copy with settings changed by name: nested or dotted, as in a YAML file.
+
+        Raises ConfigError.
+        """
         known = {name: spec for name, spec, _ in _settings(self)}
         top: dict[str, Any] = {}
         nested: dict[str, dict[str, Any]] = {}
-        for name, value in changes.items():
+        for name, value in _dotted(changes, known):
             if name not in known:
                 near = difflib.get_close_matches(name, known, NEAREST, 0.0)
                 raise ConfigError('E-CONFIG-UNKNOWN', f'unknown setting {name!r}: did you mean '
@@ -316,17 +325,29 @@ class Config:
         return dataclasses.replace(self, **top)
 
     @classmethod
-    def from_mapping(cls, data: Mapping[str, Any]) -> Config:
-        """Return a Config from nested or dotted names, as in a YAML file."""
-        flat: dict[str, Any] = {}
-        for key, value in data.items():
-            if isinstance(value, Mapping):
-                flat.update({f'{key}.{inner}': item for inner, item in value.items()})
-            elif value is None and dataclasses.is_dataclass(getattr(cls(), str(key), None)):
-                continue  # a section of which every line is a comment
-            else:
-                flat[str(key)] = value
-        return cls().replace(flat)
+    def of(cls, settings: Config | Mapping[str, Any] | None = None, /, **more: Any) -> Config:
+        """Return a Config: the one given, or the defaults with the settings of a mapping.
+
+        settings: names may be nested or dotted, as in a YAML file. more: further settings, such as
+        model='fisheye'. Raises ConfigError.
+        """
+        config = settings if isinstance(settings, Config) else cls().replace(
+            {} if settings is None else settings)
+        return config.replace(more) if more else config
+
+
+def _dotted(changes: Mapping[str, Any], known: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the settings of a mapping, each with its full name. Raises ConfigError."""
+    if not isinstance(changes, Mapping):
+        raise ConfigError('E-CONFIG-TYPE', f"settings must be a mapping such as "
+                                           f"{{'turns.wanted': 8}}, not {changes!r:.80}")
+    groups = {group.name for group in dataclasses.fields(Config)} - {*known}
+    for key, value in changes.items():
+        if isinstance(value, Mapping) and key not in known:
+            yield from ((f'{key}.{inner}', item) for inner, item in value.items())
+        # None: a group of which every line is a comment
+        elif value is not None or key not in groups:
+            yield str(key), value
 
 
 def describe() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
@@ -361,7 +382,9 @@ def _check(name: str, spec: dataclasses.Field[Any], value: Any) -> None:
     if type(value) is not expected and not (expected is float and _is_exact(value)):
         raise ConfigError('E-CONFIG-TYPE',
                           f'{name} must be of type {expected.__name__}, not {value!r}')
-    if isinstance(value, float) and not math.isfinite(value):
+    # NaN is allowed where it stands for 'not known', as a default
+    unknown = isinstance(value, float) and math.isnan(value) and spec.default != spec.default
+    if isinstance(value, float) and not (unknown or math.isfinite(value)):
         raise ConfigError('E-CONFIG-FINITE', f'{name} must be a finite number, not {value!r}')
     low, high = spec.metadata['minimum'], spec.metadata['maximum']
     if (low is not None and value < low) or (high is not None and value > high):

@@ -6,6 +6,10 @@ docs/messages.md lists them.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from typing import TypeVar
+
+T = TypeVar('T')
 
 # control characters, line ends among them, and those that turn the direction of writing
 HIDDEN = re.compile(r'[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]')
@@ -21,10 +25,26 @@ def one_line(error: BaseException, limit: int = 160) -> str:
     return shortened(' '.join(str(error).split()) or type(error).__name__, limit)
 
 
-def coded(error: Exception, limit: int = 1000) -> str:
-    """Return an error's message on one line, with its code at the end if it has one."""
-    code = error.code if isinstance(error, DashcalibError) else ''
-    return one_line(error, limit) + (f' [{code}]' if code else '')
+def coded(message: Exception | Notice, limit: int = 1000) -> str:
+    """Return a message on one line, with its code at the end if it has one."""
+    text = shortened(message, limit) if isinstance(message, str) else one_line(message, limit)
+    code = message.code if isinstance(message, (DashcalibError, Notice)) else ''
+    return text + (f' [{code}]' if code else '')
+
+
+def spared(what: str, lost: list[Notice], make: Callable[..., T], *arguments: object) -> T | None:
+    """Return what a function returns; where it raises, None, with a line about it in lost.
+
+    For all that comes after a solution: a plot, a sensor or a picture must not cost the result.
+    """
+    try:
+        return make(*arguments)
+    except Exception as error:
+        reason = str(error) and f': {one_line(error)}'
+        lost.append(Notice('E-PART-MISSING', f'{what} could not be made, and the rest of the '
+                           f'result does not depend on it ({type(error).__name__}{reason}); '
+                           f'report this, with the input if you can'))
+        return None
 
 
 class Notice(str):

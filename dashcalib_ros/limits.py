@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import stat
 import zipfile
 from collections.abc import Iterator
@@ -53,6 +54,8 @@ YAML_VALUES = 300_000
 YAML_DEPTH = 30
 # of a clip of a fleet, in so many files: a day of 4K video, or of images at 10 Hz
 CLIP_BYTES, CLIP_FILES = 2**38, 1_000_000
+# of a list of the times of a folder's images
+LIST_BYTES = 2**27
 # of a CSV of motion sensors: ten hours of a gyro at 100 Hz
 MOTION_BYTES = 2**29
 # of a GPX: ten hours at 10 Hz; its levels, and names of elements and attributes: some have 50
@@ -90,6 +93,16 @@ def check_pixels(width: int, height: int, what: str = 'an image') -> None:
         raise InputError('E-IMAGE-TOO-LARGE',
                          f'{what} has {width}x{height} pixels; the limits are '
                          f'{PIXELS // 10**6} million pixels and {SIDE} per side: reduce its size')
+
+
+def path_of(given: object, cure: str = 'pass the path of a file or of a folder') -> Path:
+    """Return the path that a user gave. Raises InputError for what is none, or an empty one."""
+    if not isinstance(given, (str, os.PathLike)):
+        raise InputError('E-PATH-TYPE',
+                         f'a path must be a str or a Path, not {given!r:.80}: {cure}')
+    if given == '':  # Path('') would be the current folder
+        raise InputError('E-PATH-EMPTY', f'the path is empty: {cure}; the current folder is .')
+    return Path(given)
 
 
 def check_file(path: Path, what: str = '', limit: int | None = None) -> None:

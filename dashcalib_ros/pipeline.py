@@ -6,25 +6,28 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import TracebackType
+from typing import Any
 
 from dashcalib_ros import judge
-from dashcalib_ros.arrays import Floats, Mask
+from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera, searched
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Turn, TurnId
 from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.errors import InputError, Notice
+from dashcalib_ros.errors import InputError, Notice, spared
 from dashcalib_ros.input import Frame
+from dashcalib_ros.input.decode import mask_of
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.poses import Poses
 from dashcalib_ros.input.source import size_text
-from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading
+from dashcalib_ros.judge import CalibrationData, Check, Monitor, Odometry, Reading, Verdict
 from dashcalib_ros.judge.agreement import contradicting_turns, turns_of_earlier_cameras
 from dashcalib_ros.judge.check import CALIBRATION
 from dashcalib_ros.judge.conclude import (
     Evidence,
     conclude,
     evidence_of_detection,
+    outlook,
     turns_that_stood,
 )
 from dashcalib_ros.judge.monitor import readings_of
@@ -37,7 +40,7 @@ from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.workers.child import ChildWorker
 from dashcalib_ros.workers.pool import ScenePool
-from dashcalib_ros.workers.worker import InlineWorker, Progress, Worker
+from dashcalib_ros.workers.worker import InlineWorker, Progress, Worker, WorkerDiedError
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,23 @@ class Status:
     two_cameras: str = ''
 
 
+@dataclass(frozen=True)
+class Outlook:
+    """The turns of a drive, and what a calibration of it can come to at best.
+
+    turns: of this drive, the best first. yaws_deg: of the turns that a calibration would use, by
+    their ids, those of earlier drives too. verdict: accepted where their number and their angles
+    are enough; their pictures decide the rest. start_s: stamp of the first image.
+    """
+
+    frames: int
+    turns: tuple[Turn, ...]
+    yaws_deg: Mapping[TurnId, float]
+    verdict: Verdict
+    warnings: tuple[Notice, ...]
+    start_s: float
+
+
 class Calibrator:
     """Learns a camera from the turns of a drive.
 
@@ -78,12 +98,12 @@ class Calibrator:
     None before, and where there is none.
     """
 
-    def __init__(self, config: Config | None = None, mask: Mask | None = None,
+    def __init__(self, config: Config | Mapping[str, Any] | None = None, mask: Any = None,
                  verbose: bool = False, live: bool = False, use_stored: bool = True,
                  warn: Callable[[Notice], None] = lambda notice: None, inline: bool = False,
                  on_trouble: Callable[[str], None] = lambda text: None,
                  on_wait: Callable[[], bool] | None = None) -> None:
-        """mask: (h, w), False where the ego vehicle is.
+        """config, mask: as for calibrate().
 
         live: children run at low priority, and push() never waits for them; offline it does, so
         that few turns are in memory at a time. use_stored: False does not load the turns in
@@ -93,13 +113,15 @@ class Calibrator:
         does not end what runs. on_trouble: called with one line for each child that died or hangs,
         and for each turn that is tried again after that, from any thread. on_wait: called again
         and again while a worker is waited for; it may push() a frame, so that a live drive goes
-        on, and returns whether it did something. Raises ConfigError for an unknown model.
+        on, and returns whether it did something. Raises ConfigError, InputError.
         """
-        config = config or Config()
+        config, mask = Config.of(config), mask_of(mask)
         searched(config.model)
         self.solution: Solution | None = None
         self._live = live
         self._motion: SensorStream | None = None
+        # what the calibration under way has to do without
+        self._lost: list[Notice] = []
         self._detect_s = 0.0
         self._started = time.monotonic()
         # what turns say of the camera that watch() was asked about last, resized
@@ -158,12 +180,26 @@ class Calibrator:
             found = self._calibrate(progress, final, started)  # with more turns
         return found
 
+    def outlook(self, progress: Progress | None = None) -> Outlook:
+        """Reconstruct the best turns, as calibrate() does, and say whether they are enough.
+
+        The drive is over: no push() may follow.
+        """
+        self.detection.finish()
+        scenes = self.scenes.wanted(progress or (lambda stage, done: None), final=True)
+        evidence = self._evidence(time.monotonic(), SensorComparison())
+        return Outlook(self.detection.frames, self.turns(),
+                       {scene.turn: scene.yaw_deg for scene in scenes},
+                       outlook(scenes, evidence, self.scenes.config.verdict),
+                       evidence.warnings, self.detection.start_s)
+
     def close(self) -> None:
         """End threads and child processes; a calibrate() elsewhere raises WorkerError."""
         self.detection.close()
         self.workers.close()
 
     def _calibrate(self, progress: Progress, final: bool, started: float) -> Calibration:
+        self._lost = []
         scenes, solution = self._solve(progress, final)  # scenes -> one camera
         sensors = self._compare_sensors(solution, progress)
         solution = sensors.solution
@@ -177,7 +213,8 @@ class Calibrator:
         """Return the scenes that count, and the camera that explains them; None without any."""
         config = self.scenes.config
         while scenes := self.scenes.wanted(progress, final):
-            stood = turns_that_stood(scenes, self._motion, self.detection.start_s)
+            stood = spared('what the speed says of the turns', self._lost, turns_that_stood,
+                           scenes, self._motion, self.detection.start_s)
             if stood:
                 self.scenes.exclude(stood)
                 continue
@@ -201,9 +238,12 @@ class Calibrator:
         if solution is None or self._motion is None:
             return SensorComparison(solution)
         progress('evaluating the motion sensors', 0.0)
-        found: SensorComparison = self.workers.run(
+        found: SensorComparison | None = spared(
+            'the comparison with the motion sensors', self._lost, self.workers.run,
             compare_sensors, solution, self._motion, self.detection.start_s, self.scenes.config)
-        return found
+        if self.workers.closed:
+            raise WorkerDiedError('E-CALIBRATOR-CLOSED', 'the calibrator is closed')
+        return found or SensorComparison(solution)
 
     def _judge(self, sensors: SensorComparison, started: float) -> Calibration:
         # the solution itself is judged
@@ -219,7 +259,8 @@ class Calibrator:
                   'total': now - self._started}
         seen = evidence_of_detection(self.detection, self.scenes.built())
         return replace(
-            seen, timing=timing, warnings=(*seen.warnings, *self.scenes.warnings),
+            seen, timing=timing,
+            warnings=(*seen.warnings, *self.scenes.warnings, *self._lost),
             stored=self.scenes.stored_before, left_out=self.scenes.left_out(),
             pictures=None if self._live else self.workers.pictures(), motion=self._motion,
             sensors=sensors)

@@ -11,28 +11,30 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from dashcalib_ros.arrays import Mask
+from dashcalib_ros.camera import searched
 from dashcalib_ros.config import Config
-from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.errors import InputError, Notice, counted
-from dashcalib_ros.formats import Given, given_camera
+from dashcalib_ros.errors import InputError, Notice, counted, spared
+from dashcalib_ros.formats import Given, given_camera, load_camera
 from dashcalib_ros.input import Frame, FrameSource
-from dashcalib_ros.input.decode import check_mask, read_mask
+from dashcalib_ros.input.decode import check_mask, mask_of
 from dashcalib_ros.input.inputs import Paths, as_list, fits_bag, open_frames
 from dashcalib_ros.input.motion import SensorStream
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
 from dashcalib_ros.input.poses import Poses, track_poses
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Check, Odometry
-from dashcalib_ros.pipeline import Calibrator
+from dashcalib_ros.judge.calibration import Material
+from dashcalib_ros.limits import path_of
+from dashcalib_ros.pipeline import Calibrator, Outlook
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.workers.worker import Progress
 
 MaskOrPath = str | os.PathLike[str] | npt.NDArray[Any] | None
 MotionOrPath = str | os.PathLike[str] | SensorStream | None
+Settings = Config | Mapping[str, Any] | None
 # s between two looks whether an image has been read
 READING_S = 0.01
 
@@ -79,11 +81,20 @@ def open_drive(path: Paths, topic: str | None = None, fps: float | None = None,
 
     sensor_topics: of a bag, by imu, gps and odom. Raises InputError.
     """
-    valid, paths = _valid(mask), as_list(path)
+    valid, paths = mask_of(mask), as_list(path)
     source = open_frames(paths, topic, fps, start_s, duration_s)
-    sensors = motion if isinstance(motion, SensorStream) else drive_motion(
-        paths, motion, sensor_topics, start_s, topic)
+    if isinstance(motion, SensorStream):
+        return Recording(source, valid, _on_clock_of(source, motion))
+    sensors = drive_motion(paths, motion, sensor_topics, topic)
+    if sensors is not None:
+        sensors = _on_clock_of(source, sensors)
+        # it counts from the drive's first image, not from the first one that is used
+        sensors = sensors if sensors.absolute else sensors.shifted(-start_s)
     return Recording(source, valid, sensors)
+
+
+def _on_clock_of(source: FrameSource, sensors: SensorStream) -> SensorStream:
+    return sensors.on_clock_of(source.begin_ns, source.recorded, source.length_ns)
 
 
 def calibrate_drive(drive: Recording, config: Config | None = None,
@@ -92,6 +103,14 @@ def calibrate_drive(drive: Recording, config: Config | None = None,
     observer = observer or Observer()
     with _learned(drive, config, observer, verbose) as calibrator:
         return with_source(calibrator.calibrate(observer.show), drive.source)
+
+
+def outlook_of(drive: Recording, config: Config | None = None,
+               observer: Observer | None = None) -> Outlook:
+    """Find the turns of a recorded drive, and say whether they are enough for a calibration."""
+    observer = observer or Observer()
+    with _learned(drive, config, observer, False) as calibrator:
+        return calibrator.outlook(observer.show)
 
 
 def check_drive(drive: Recording, named: NamedCamera, config: Config | None = None,
@@ -111,11 +130,35 @@ def check_drive(drive: Recording, named: NamedCamera, config: Config | None = No
             return Checked(check, calibration)  # it explains no motion either
         changes = tuple(str(change) for change in calibrator.watch(given).changes)
         if track is not None:
-            track = track.since(calibration.start_s)
+            track = _on_clock_of(drive.source, track).since(calibration.start_s)
             assert track.position is not None
             poses = track_poses(track.position, calibration.start_s)
         odometry = None if poses is None else calibrator.odometry(given, poses, observer.show)
     return Checked(check, calibration, changes, odometry)
+
+
+@contextmanager
+def in_order(given: Given, path: Paths) -> Iterator[None]:
+    """Let an InputError of opening both say, where it is so, that they are exchanged."""
+    try:
+        yield
+    except InputError as error:
+        paths = as_list(path)
+        if len(paths) == 1 and _is_calibration(paths[0]) and not _is_calibration(given):
+            raise InputError('E-ARGUMENTS-EXCHANGED',
+                             f'{paths[0]} is a calibration, and {given} is none: exchange them, '
+                             f'the calibration comes first') from error
+        raise
+
+
+def _is_calibration(given: Given) -> bool:
+    """Return whether this is a calibration, and no drive: a bag may be both."""
+    if not isinstance(given, (str, os.PathLike)):
+        return True
+    try:
+        return not fits_bag(Path(given)) and bool(load_camera(given))
+    except (InputError, OSError):
+        return False
 
 
 @contextmanager
@@ -126,19 +169,19 @@ def _learned(drive: Recording, config: Config | None, observer: Observer, verbos
     try:
         if drive.motion is not None:
             calibrator.sense(drive.motion)
-        feed(calibrator, drive, observer)
+        _feed(calibrator, drive, observer)
         yield calibrator
     finally:
         with observer.closing():
             calibrator.close()
 
 
-def feed(taker: Calibrator | Detection, drive: Recording, observer: Observer) -> int:
-    """Push every frame of the drive, and return how many there were.
+def _feed(taker: Calibrator, drive: Recording, observer: Observer) -> None:
+    """Push every frame of the drive.
 
     Raises InputError for a mask of another size.
     """
-    number, count = 0, drive.source.count
+    count = drive.source.count
     observer.show('reading', None)
     for number, frame in enumerate(_read_ahead(drive.source), 1):
         if number == 1:
@@ -146,15 +189,13 @@ def feed(taker: Calibrator | Detection, drive: Recording, observer: Observer) ->
         taker.push(frame)
         observer.show('reading', min(number / count, 1.0) if count else None,
                       f'frame {number}, {counted(len(taker.turns()), "turn")}')
-    return number
 
 
 def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
                  chosen: Mapping[str, str | None] = MappingProxyType({}),
-                 start_s: float = 0.0, topic: str | None = None) -> SensorStream | None:
+                 topic: str | None = None) -> SensorStream | None:
     """Return the sensors' data of the file motion, else of the bags; None if there is none.
 
-    start_s: where the used part of the drive starts; a CSV counts from the drive's first image.
     chosen: the bag's topics by imu, gps and odom; topic: its image topic. Raises InputError for a
     file of another kind, and for a topic that does not exist.
     """
@@ -163,8 +204,7 @@ def drive_motion(path: Paths, motion: str | os.PathLike[str] | None = None,
         if wanted:
             raise InputError('E-MOTION-TWICE', '--imu, --gps and --odom choose topics of a bag: '
                                                'omit them or --motion')
-        found = read_motion(Path(motion))
-        return found if found.absolute else found.shifted(-start_s)
+        return read_motion(path_of(motion))
     try:
         bags = [each for each in map(Path, as_list(path)) if each.exists() and fits_bag(each)]
         return bag_motion(bags, wanted, topic) if bags else None
@@ -199,21 +239,12 @@ def _close(frames: Generator[Frame, None, None]) -> None:
             return
 
 
-def _valid(mask: MaskOrPath) -> Mask | None:
-    if mask is None or isinstance(mask, (str, os.PathLike)):
-        return None if mask is None else read_mask(Path(mask))
-    if mask.ndim != 2:
-        raise InputError('E-MASK-SHAPE', f'the mask has the shape {mask.shape}: pass an array of '
-                                         f'shape (height, width)')
-    return np.asarray(mask) > 0
-
-
 def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
     """Return the calibration with its input's name and warnings, its pictures in colour.
 
     What the input contradicts is the first reason of one that is not accepted: it may be why.
     """
-    verdict, material = calibration.verdict, calibration.material
+    verdict, material, lost = calibration.verdict, calibration.material, list[Notice]()
     doubts = source.contradictions if verdict.level != 'accepted' else ()
     new = tuple(line for line in source.warnings
                 if line not in (*doubts, *calibration.warnings))
@@ -223,11 +254,8 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
                           cures=(*cures, *verdict.cures),
                           codes=(*(each.code for each in doubts), *verdict.codes))
     if material is not None:
-        shown = material.pictures
-        images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})
-        material = replace(material, pictures={
-            turn: each.coloured(images[each.frame]) if each.frame in images else each
-            for turn, each in shown.items()})
+        coloured = spared('the pictures in colour', lost, _in_colour, material, source)
+        material = coloured or material
     stored = calibration.camera and source.stored(calibration.camera)
     if stored:
         values = ', '.join(f'{name} {value:.2f}' for name, value in zip(
@@ -237,7 +265,16 @@ def with_source(calibration: Calibration, source: FrameSource) -> Calibration:
             f'({size_text(stored.image_size)}): {values}, and the same distortion'),)
     return replace(calibration, verdict=verdict, material=material,
                    input_name=calibration.input_name or source.name,
-                   warnings=(*new, *calibration.warnings))
+                   warnings=(*new, *calibration.warnings, *lost))
+
+
+def _in_colour(material: Material, source: FrameSource) -> Material:
+    """Return the same with the input's pictures, where they can be read again."""
+    shown = material.pictures
+    images = source.in_colour({each.frame: each.stamp_ns for each in shown.values()})
+    return replace(material, pictures={
+        turn: each.coloured(images[each.frame]) if each.frame in images else each
+        for turn, each in shown.items()})
 
 
 # for Python ---------------------------------------------------------------------------------
@@ -253,57 +290,80 @@ class _Progress(Observer):
         if self._progress is not None:
             self._progress(stage, share or 0.0)
 
+    def __enter__(self) -> _Progress:
+        return self
 
-def calibrate(path: Paths, fps: float | None = None,
-              config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.show('done', 1.0)
+
+
+def _settings(config: Settings, model: str | None) -> Config:
+    found = Config.of(config) if model is None else Config.of(config, model=model)
+    searched(found.model)  # raises for an unknown model before any work begins
+    return found
+
+
+def calibrate(path: Paths, fps: float | None = None, config: Settings = None,
+              topic: str | None = None, start_s: float = 0.0,
               duration_s: float | None = None, mask: MaskOrPath = None,
-              progress: Progress | None = None, motion: MotionOrPath = None) -> Calibration:
+              progress: Progress | None = None, motion: MotionOrPath = None,
+              model: str | None = None) -> Calibration:
     """Calibrate a recorded drive.
 
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
     of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
-    fps: images per second of a folder (default 10), or to override the rate of a video.
-    config: the settings; None: Config().
+    fps: images per second of a folder without times (default 10), or instead of a video's rate.
+    config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
     topic: the image topic of a bag; needed only when it has several.
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
     mask: the part of the pictures that is not used (bonnet, burnt-in text): the path of a picture
     that is black there, or an array (height, width) that is 0 or False there; it is added to the
     automatic mask.
-    progress: called with the name of the stage and the fraction done, 0 to 1.
+    progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
     motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
     a stream. None: the topics of the bag, if path is one.
+    model: the lens model, over that of config: radial, brown, fisheye, or auto.
 
     Returns a Calibration: its verdict.level is 'accepted', 'weak' or 'refused', and its camera is
     None if it is refused; accepted() returns it, or raises. Raises InputError for input that
     cannot be read, ConfigError for a bad setting, WorkerError if a child process cannot run.
     """
+    settings = _settings(config, model)
     drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
-    return calibrate_drive(drive, config, _Progress(progress))
+    with _Progress(progress) as observer:
+        return calibrate_drive(drive, settings, observer)
 
 
-def check(given: Given, path: Paths, fps: float | None = None,
-          config: Config | None = None, topic: str | None = None, start_s: float = 0.0,
+def check(given: Given, path: Paths, fps: float | None = None, config: Settings = None,
+          topic: str | None = None, start_s: float = 0.0,
           duration_s: float | None = None, mask: MaskOrPath = None,
-          progress: Progress | None = None, motion: MotionOrPath = None) -> Check:
+          progress: Progress | None = None, motion: MotionOrPath = None,
+          model: str | None = None) -> Check:
     """Check whether a calibration fits a recorded drive.
 
     given: the calibration: a Calibration, what load_camera() returns, the path of a file that it
     reads, or a Radial, Brown, Rational or Fisheye of the drive's pictures.
     path: a ROS 2 bag (folder, .mcap, .db3), a ROS 1 .bag, a video, a folder of images, or several
     of these of one camera (a sequence, a folder of videos, or a pattern such as 'clips/*.mp4').
-    fps: images per second of a folder (default 10), or to override the rate of a video.
-    config: the settings; None: Config().
+    fps: images per second of a folder without times (default 10), or instead of a video's rate.
+    config: the settings: a Config, or a mapping such as {'turns.wanted': 8}; None: the defaults.
     topic: the image topic of a bag; needed only when it has several.
     start_s, duration_s: the part of the drive to use, in seconds; None: to its end.
     mask: the part of the pictures that is not used: the path of a picture that is black there, or
     an array (height, width) that is 0 or False there.
-    progress: called with the name of the stage and the fraction done, 0 to 1.
+    progress: called with the name of a stage and its fraction done, 0 to 1; at last 'done', 1.0.
     motion: data of the car's own sensors: the path of a CSV, a GPX file or a KITTI oxts folder, or
     a stream. None: the topics of the bag, if path is one.
+    model: the lens model, over that of config: radial, brown, fisheye, or auto.
 
     Returns a Check: its answer is 'right', 'differs' (good enough for the uses in its good_for),
     'wrong' or 'cannot tell', with reasons. Raises InputError for what cannot be read, ConfigError
     for a bad setting, WorkerError where a child process cannot run.
     """
-    drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
-    return check_drive(drive, given_camera(given), config, _Progress(progress)).check
+    settings = _settings(config, model)
+    with in_order(given, path):
+        drive = open_drive(path, topic, fps, start_s, duration_s, mask, motion)
+        named = given_camera(given)
+    with _Progress(progress) as observer:
+        return check_drive(drive, named, settings, observer).check

@@ -18,6 +18,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+# that there is no room: on the disk, for this user, or for a file of this size (ulimit -f)
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # of temporary folders, wherever they are
 FOLDER = 'dashcalib'
 

@@ -2,25 +2,25 @@
 
 ros2 launch dashcalib_ros cameras.launch.py \
     cameras:="front:=/front/image_raw rear:=/rear/image_raw"
+
+The other arguments are calibrator.launch.py's, and the same for all cameras. What one camera has
+alone is below /NAME/calibrator in the parameter file.
 """
 import re
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import (
+    DeclareLaunchArgument,
+    GroupAction,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+)
+from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 
-ARGUMENTS = (
-    ('cameras', None, 'NAME:=IMAGE_TOPIC of each camera, with spaces between them; the topics '
-                      'without /compressed'),
-    ('image_transport', 'raw', 'raw, compressed or video; overrides the parameter file'),
-    ('use_sim_time', 'false', 'true for a bag played with --clock; overrides the parameter file'),
-    ('config', PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'config',
-                                     'calibrator.yaml']),
-     'the parameter file; what one camera has alone is below /NAME/calibrator in it'),
-)
+ONE = PathJoinSubstitution([FindPackageShare('dashcalib_ros'), 'launch', 'calibrator.launch.py'])
 # a name is a namespace, and part of a file's name
 CAMERA = re.compile(r'([A-Za-z][A-Za-z0-9_]*):=(/?[A-Za-z][A-Za-z0-9_/]*)')
 
@@ -47,23 +47,21 @@ def cameras_in(text):
 
 def calibrators(context):
     """Return a calibrator for each camera; camera_info is beside the camera's images."""
-    value = {name: LaunchConfiguration(name) for name, _, _ in ARGUMENTS}
-    return [
-        Node(
-            package='dashcalib_ros', executable='calibrator', name='calibrator', namespace=name,
-            output='screen', respawn=True, respawn_delay=2.0, respawn_max_retries=5,
-            parameters=[value['config'], {
-                # its calibration has a file of this name
-                'camera_name': name, 'image_transport': value['image_transport'],
-                'use_sim_time': value['use_sim_time']}],
-            remappings=[('image_raw', topic),
-                        ('camera_info', topic.rpartition('/')[0] + '/camera_info')])
-        for name, topic in cameras_in(value['cameras'].perform(context)).items()]
+    found = []
+    for name, topic in cameras_in(LaunchConfiguration('cameras').perform(context)).items():
+        own = {
+            # its calibration has a file of this name
+            'namespace': name, 'camera_name': name, 'image': topic,
+            'camera_info': topic.rpartition('/')[0] + '/camera_info'}
+        # a group each: the arguments of one camera are not those of the next
+        found.append(GroupAction([IncludeLaunchDescription(
+            PythonLaunchDescriptionSource(ONE), launch_arguments=own.items())]))
+    return found
 
 
 def generate_launch_description():
     """Start one calibrator for each camera, in the camera's namespace."""
     return LaunchDescription([
-        *(DeclareLaunchArgument(name, default_value=default, description=about)
-          for name, default, about in ARGUMENTS),
+        DeclareLaunchArgument('cameras', description='NAME:=IMAGE_TOPIC of each camera, with '
+                              'spaces between them; the topics without /compressed'),
         OpaqueFunction(function=calibrators)])

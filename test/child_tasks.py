@@ -12,8 +12,8 @@ import numpy as np
 
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.problem.observations import Tracks
 from dashcalib_ros.reconstruct.scene import Draft, Profile, Start
-from dashcalib_ros.reconstruct.tracks import Tracks
 
 
 class AwkwardError(Exception):

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Vector3Stamped
 from processes import processes_of
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -43,6 +43,12 @@ pipeline._load_judging = lambda: None
 named = sys.argv[1] in interface.PROGRAMS
 sys.exit(main(sys.argv[1] if named else 'calibrator', sys.argv[1 + named:]))
 """]
+
+
+# for a driver's process: Fast DDS's name of the variable, and that of Kilted's
+LARGE_IMAGES = dict.fromkeys(
+    ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'),
+    str(REPOSITORY / 'config' / 'fastdds_large_images.xml'))
 
 
 def ros_environment(home):
@@ -124,7 +130,7 @@ class Bench:
                     (CameraInfo, 'camera_info', self.on_info, 1000),
                     (CameraInfo, 'calibrator/calibration', self.latched.append, latched),
                     (DiagnosticArray, '/diagnostics', self._on_diagnostics, 10),
-                    (Vector3Stamped, 'calibrator/turn_magnitude', self.magnitudes.append, 100)):
+                    (Float64, 'calibrator/turn_magnitude', self.magnitudes.append, 100)):
                 self.node.create_subscription(kind, name, call, profile)
 
     def on_info(self, message):
@@ -179,8 +185,8 @@ class Bench:
         """Wait until diagnostics have counted so many."""
         self.until(lambda: self.count(key) >= at_least, what=f'{key} >= {at_least}', node=node)
 
-    def call(self, name, node, kind=Trigger):
-        """Call one of the node's services and return the answer.
+    def call(self, name, node, kind=Trigger, limit=SOON):
+        """Call one of the node's services and return the answer; limit: s that it may take.
 
         A service that does not know the client's reader yet loses its answer, and says so
         (rmw_fastrtps issue 842): only then it is asked again.
@@ -195,7 +201,7 @@ class Bench:
                 futures.append(client.call_async(kind.Request()))
             return next((future for future in futures if future.done()), None)
 
-        future = self.until(answer, what=f'the answer of {name}', node=node)
+        future = self.until(answer, limit, f'the answer of {name}', node)
         self.node.destroy_client(client)
         return future.result()
 

@@ -9,9 +9,9 @@ from synthetic import LENS, SIZE, synthetic_turn
 
 from dashcalib_ros.camera import Camera, Radial
 from dashcalib_ros.config import Config
+from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.solve import solve
-from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.solve.solution import Solution
 
 CONFIG = Config().replace({'intrinsics.profile_tracks': 60})

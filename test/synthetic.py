@@ -7,8 +7,8 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera, Fisheye, Radial
 from dashcalib_ros.detect import TurnId
-from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure, retriangulated
-from dashcalib_ros.reconstruct.tracks import Tracks
+from dashcalib_ros.problem.observations import Structure, Tracks
+from dashcalib_ros.reconstruct.scene import Profile, Scene, retriangulated
 
 SIZE = (800, 450)
 LENS = Radial(SIZE, 520.0, 521.0, 407.0, 219.0, -0.28, 0.09)

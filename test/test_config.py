@@ -127,7 +127,7 @@ def test_an_integer_is_a_fine_float():
 
 def test_an_integer_is_a_fine_float_in_yaml_and_in_python():
     text = 'motion: {rate: 12}\nverdict:\n  min_yaw_deg: 70\nturns.half_width: 2\n'
-    config = Config.from_mapping(yaml.safe_load(text))
+    config = Config.of(yaml.safe_load(text))
     assert (config.motion.rate, config.verdict.min_yaw_deg, config.turns.half_width) == (12, 70, 2)
     made = Config(motion=MotionConfig(rate=12), turns=TurnsConfig(half_width=2),
                   verdict=VerdictConfig(min_yaw_deg=70))
@@ -152,9 +152,25 @@ def test_a_config_made_directly_is_checked_too():
         Config(motion=MotionConfig(rate=math.nan))
 
 
+def test_a_group_is_no_setting():
+    for wrong in (8, {'wanted': 8}, VerdictConfig()):
+        with refused(ConfigError, 'E-CONFIG-TYPE', 'Config.of('):
+            Config(turns=wrong)
+
+
+def test_of_takes_a_config_a_mapping_and_more():
+    eight = Config.of({'turns.wanted': 8}, seed=2)
+    assert eight == Config().replace({'turns': {'wanted': 8}, 'seed': 2}) == Config.of(eight)
+    assert Config.of() == Config.of(None) == Config() and Config.of(eight, seed=0).seed == 0
+    assert Config.of(turns={'wanted': 8}, seed=2) == eight
+    for wrong in (3, 'settings.yaml', ['turns.wanted'], {3: 4}):
+        with refused(ConfigError, 'E-CONFIG-UNKNOWN' if wrong == {3: 4} else 'E-CONFIG-TYPE'):
+            Config.of(wrong)
+
+
 def test_nested_and_dotted_names_mean_the_same():
-    nested = Config.from_mapping({'turns': {'wanted': 3, 'half_width': 2.0}, 'seed': 7})
-    dotted = Config.from_mapping({'turns.wanted': 3, 'turns.half_width': 2.0, 'seed': 7})
+    nested = Config.of({'turns': {'wanted': 3, 'half_width': 2.0}, 'seed': 7})
+    dotted = Config.of({'turns.wanted': 3, 'turns.half_width': 2.0, 'seed': 7})
     assert nested == dotted
     assert (nested.turns.wanted, nested.turns.half_width, nested.seed) == (3, 2.0, 7)
     # what was not named keeps its default
@@ -163,14 +179,14 @@ def test_nested_and_dotted_names_mean_the_same():
 
 def test_a_section_without_lines_is_no_error():
     data = yaml.safe_load('turns:\n  # wanted: 3\nseed: 4\n')
-    assert Config.from_mapping(data) == Config().replace({'seed': 4})
+    assert Config.of(data) == Config().replace({'seed': 4})
 
 
 @pytest.mark.parametrize('data', [{'turns': 5}, {'turns': {'wanted': {'x': 1}}}, {3: 4},
                                   {'turns': {None: 1}}, {'nothing': None}])
 def test_yaml_of_another_shape(data):
     with pytest.raises(ConfigError):
-        Config.from_mapping(data)
+        Config.of(data)
 
 
 def test_replace_leaves_the_original_alone():
@@ -189,4 +205,4 @@ def test_replace_leaves_the_original_alone():
 
 def test_what_flat_gives_makes_the_same_config_again():
     config = Config().replace({'turns.wanted': 7, 'mask.enabled': False, 'motion.rate': 8})
-    assert Config.from_mapping(config.flat()) == config
+    assert Config.of(config.flat()) == config

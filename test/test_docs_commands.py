@@ -57,6 +57,7 @@ CANNOT_RUN = {
     'rviz2': "needs apt's ROS",
     'ROS_SECURITY_ENABLE=true': 'needs keys that ros2 security makes',
     'jupyter execute': 'takes a minute, and writes into examples/',
+    'python examples/play.py': 'test/ros/test_play.py plays a video to a node',
     'python benchmark/': 'takes minutes to hours: test_benchmark.py starts each with --help',
     'benchmark/': 'takes half an hour: it emulates another processor',
     'dashcalib batch s3://': 'needs a bucket and a cluster: test/fleet has both in memory',

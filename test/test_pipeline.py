@@ -16,6 +16,7 @@ import weakref
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
+import child_tasks
 import cv2
 import numpy as np
 import pytest
@@ -263,6 +264,25 @@ def test_the_stages_by_hand_give_what_the_calibrator_gives(frames, result):
     # where numpy has more than one thread, sums come in another order
     np.testing.assert_allclose(by_hand.camera.params, result.camera.params, rtol=1e-6)
     assert [turn.center for turn in by_hand.turns] == [turn.center for turn in result.turns]
+
+
+def test_what_fails_beside_the_solution_costs_itself_only(frames, monkeypatch):
+    def broken(*arguments):
+        raise IndexError('list index out of range')
+    with limited(Calibrator(QUICK)) as calibrator:
+        for frame in frames[:ONE_TURN]:
+            calibrator.push(frame)
+        sound = calibrator.calibrate()
+        calibrator.sense(SensorStream(rate=Samples(np.arange(9.0), np.zeros((9, 3)))))
+        for part in ('detect.detection.Detection.lines', 'detect.detection.Detection.straights',
+                     'pipeline.turns_that_stood'):
+            monkeypatch.setattr(f'dashcalib_ros.{part}', broken)
+        # in the child it raises
+        monkeypatch.setattr('dashcalib_ros.pipeline.compare_sensors', child_tasks.fail)
+        found = calibrator.calibrate()
+    codes = [each.code for each in found.warnings[len(sound.warnings):]]
+    assert codes == ['E-PART-MISSING'] * 4 and found.intrinsics == sound.intrinsics
+    assert found.mount is None and found.straight_lines is None
 
 
 def test_close_ends_a_calibration_that_runs(frames):

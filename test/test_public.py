@@ -4,6 +4,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import pickle
 import subprocess
 import sys
 import types
@@ -13,19 +14,36 @@ import cv2
 import numpy as np
 import pytest
 from fakes import stands_in_for
-from made_calibration import TRUTH, make_calibration
+from made_calibration import MOUNT, TRUTH, make_calibration
+from refused import refused
 
 import dashcalib_ros
-from dashcalib_ros import Calibrator, calibrate, check, compare, export, open_frames, session
+from dashcalib_ros import (
+    Calibration,
+    Calibrator,
+    Check,
+    Config,
+    ConfigError,
+    Frame,
+    Verdict,
+    calibrate,
+    check,
+    compare,
+    export,
+    load_camera,
+    open_frames,
+    session,
+)
 from dashcalib_ros.errors import DashcalibError, InputError, NotAcceptedError
+from dashcalib_ros.formats import given_camera
 from dashcalib_ros.input.motion import SensorStream
-from dashcalib_ros.judge import Check
 
 FUNCTIONS = ('calibrate', 'check', 'compare', 'export', 'load_camera', 'open_frames')
 ERRORS = ('ConfigError', 'DashcalibError', 'InputError', 'NotAcceptedError', 'OutputError',
           'WorkerError')
 NAMES = (*FUNCTIONS, *ERRORS, 'AcceptedCalibration', 'Calibration', 'Calibrator', 'Config',
-         'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye', 'Rational', 'Verdict')
+         'Check', 'Comparison', 'NamedCamera', 'Frame', 'Camera', 'Radial', 'Brown', 'Fisheye',
+         'Rational', 'Verdict')
 # what mypy --strict accepts of a user
 SCRIPT = """
 from dashcalib_ros import calibrate
@@ -35,7 +53,8 @@ print(found.camera.fx, found.sigma['fx'], found.K @ found.rays([[0.0, 0.0]])[0],
 
 
 def test_all_names_are_there_to_see():
-    assert {*NAMES, '__version__'} == set(dashcalib_ros.__all__) <= set(dir(dashcalib_ros))
+    assert {*NAMES, '__version__'} == set(dashcalib_ros.__all__)
+    assert dir(dashcalib_ros) == sorted(dashcalib_ros.__all__)
     assert dashcalib_ros.__version__[0].isdigit() or 'sources' in dashcalib_ros.__version__
 
 
@@ -58,6 +77,7 @@ class FakeCalibrator:
     """Takes note of what it is given."""
 
     def __init__(self, config=None, mask=None, verbose=False):
+        type(self).config = config
         type(self).mask, type(self).motion, type(self).frames = mask, None, 0
 
     def sense(self, motion):
@@ -104,11 +124,12 @@ def test_a_mask_and_the_progress(drive, tmp_path, run):
         run(drive, mask=given, progress=lambda stage, done, told=told: told.append((stage, done)))
         np.testing.assert_array_equal(FakeCalibrator.mask, mask > 0)
         assert told[:5] == [('reading', share) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
-        assert told[5] == ('solving', 1.0)
+        assert told[5][1] == 1.0 and told[-1] == ('done', 1.0)
     with pytest.raises(InputError, match='64x47'):
         run(drive, mask=mask[1:])
-    with pytest.raises(InputError, match='height, width'):
-        run(drive, mask=np.zeros((48, 64, 3)))
+    for wrong in (np.zeros((48, 64, 3)), 3, [['a', 'b']]):
+        with refused(InputError, 'E-MASK-SHAPE', 'height, width'):
+            run(drive, mask=wrong)
 
 
 @pytest.mark.parametrize('run', [calibrate, lambda path, **more: check(TRUTH, path, **more)])
@@ -127,9 +148,50 @@ def test_the_sensors_of_a_drive_are_heard(drive, tmp_path, run):
                                  lambda path: check(TRUTH, path)], ids=['run', 'open', 'check'])
 @pytest.mark.parametrize('path', [None, 3, b'drive.mp4', [None], ['a.mp4', 3]])
 def test_what_is_no_path_is_an_input_error(run, path):
-    with pytest.raises(InputError) as error:
+    with refused(InputError, 'E-PATH-TYPE'):
         run(path)
-    assert error.value.code == 'E-PATH-TYPE'
+
+
+def test_no_path_is_taken_for_the_current_folder(drive, monkeypatch):
+    monkeypatch.chdir(drive)
+    for use in (calibrate, open_frames, load_camera, Calibration.load, make_calibration().save,
+                lambda path: check(TRUTH, path), lambda path: check(path, drive),
+                lambda path: calibrate([drive, path]), lambda path: calibrate(drive, mask=path),
+                lambda path: calibrate(drive, motion=path)):
+        with refused(InputError, 'E-PATH-EMPTY'):
+            use('')
+    for use in (load_camera, Calibration.load, make_calibration().save,
+                lambda path: calibrate(drive, motion=path)):
+        with refused(InputError, 'E-PATH-TYPE', '3'):
+            use(3)
+
+
+@pytest.mark.parametrize('run', [calibrate, lambda path, **more: check(TRUTH, path, **more)])
+@pytest.mark.parametrize(('name', 'value', 'kind', 'code'), [
+    ('fps', 'x', InputError, 'E-INPUT-FPS'), ('fps', True, InputError, 'E-INPUT-FPS'),
+    ('start_s', '1:30', InputError, 'E-INPUT-START'),
+    ('duration_s', [3], InputError, 'E-INPUT-DURATION'), ('topic', 3, InputError, 'E-TOPIC-TYPE'),
+    ('config', 'settings.yaml', ConfigError, 'E-CONFIG-TYPE'),
+    ('config', {'turns.wanted': 'x'}, ConfigError, 'E-CONFIG-TYPE'),
+    ('config', {3: 4}, ConfigError, 'E-CONFIG-UNKNOWN'),
+    ('model', 'fishy', ConfigError, 'E-MODEL-UNKNOWN')])
+def test_a_wrong_argument_is_named(drive, run, name, value, kind, code):
+    with refused(kind, code):
+        run(drive, **{name: value})
+
+
+@pytest.mark.parametrize('run', [calibrate, lambda path, **more: check(TRUTH, path, **more)])
+def test_settings_are_a_config_or_a_mapping(drive, run):
+    for given in (Config.of({'turns.wanted': 8}, model='fisheye'),
+                  {'turns': {'wanted': 8}, 'model': 'fisheye'}):
+        run(drive, config=given)
+        assert FakeCalibrator.config == Config.of({'turns.wanted': 8, 'model': 'fisheye'})
+    run(drive, config={'model': 'radial'}, model='brown')
+    assert FakeCalibrator.config == Config(model='brown')
+    with Calibrator({'turns.wanted': 8}) as calibrator:
+        assert calibrator.scenes.config.turns.wanted == 8
+    with refused(InputError, 'E-MASK-SHAPE'):
+        Calibrator(mask=[1])
 
 
 def test_paths_that_come_one_by_one_are_a_drive(drive):
@@ -151,6 +213,52 @@ def test_a_calibration_is_given_in_any_form(drive, tmp_path):
         with pytest.raises(InputError) as error:
             use(None)
         assert error.value.code == 'E-CALIBRATION-TYPE'
+
+
+@pytest.mark.parametrize('image', [
+    'x.png', None, [[1, 2]], np.zeros(5), np.zeros((375, 1242), bool), np.zeros((375, 1242), int)])
+def test_what_is_no_image_is_not_undistorted(image):
+    with refused(InputError, 'E-IMAGE-TYPE'):
+        make_calibration().undistort(image)
+
+
+@pytest.mark.parametrize('name', ['rays', 'project', 'sigma_at'])
+@pytest.mark.parametrize('places', ['x', None, 3, [1, 2, 3, 4], [[1], [2, 3]]])
+def test_places_of_another_shape(name, places):
+    wide = make_calibration(picture_covariance=np.eye(9))
+    with refused(InputError, 'E-ARRAY-SHAPE', '(..., '):
+        getattr(wide, name)(places)
+
+
+def test_results_can_be_compared_and_be_keys_and_be_sent():
+    found = make_calibration(mount=MOUNT, details={'a': [1]})
+    one = Frame(0, 0, np.zeros((4, 6), np.uint8))
+    for result in (found, found.accepted(), found.verdict, TRUTH, Config(), compare(found, found),
+                   given_camera(found), Check('right', (), limits_px={'mapping': 1.0}), one):
+        assert len({result, result}) == 1
+        same = pickle.loads(pickle.dumps(result))
+        assert (same == result and hash(same) == hash(result)) == (result is not one)
+
+
+def test_results_are_plain_values_and_one_line():
+    found = make_calibration()
+    for result in (found, make_calibration('refused'), compare(found, TRUTH), given_camera(found),
+                   Check('right', ('so',), limits_px={'mapping': 1.0})):
+        assert json.loads(json.dumps(result.to_dict(), allow_nan=False)) == result.to_dict()
+    assert repr(compare(found, TRUTH)).startswith('Comparison(estimate and the radial camera: ')
+    assert repr(Check('right', ('so',))) == 'Check(right: so)'
+    for verdict in ('accepted', 'weak', 'refused'):
+        assert make_calibration(verdict).verdict.accepted == (verdict == 'accepted')
+    across, down, _ = found.field_of_view
+    assert (across, down) == found.camera.field_of_view[:2] and 20 < down < across < 100
+
+
+def test_a_notebook_shows_a_result():
+    weak = make_calibration('weak', verdict=Verdict('weak', ('<b>dark</b>',)))
+    page = weak._repr_html_()
+    assert '<b>weak</b>' in page and '&lt;b&gt;dark' in page and '721.54 px' in page
+    assert 'dark' in make_calibration(verdict=Verdict('refused', ('dark', 'few')),
+                                      camera=None)._repr_html_()
 
 
 def test_accepted_returns_the_same_result_or_raises_with_the_reasons():

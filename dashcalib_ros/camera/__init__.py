@@ -10,6 +10,7 @@ from dashcalib_ros.camera.models import (
     camera_from_ros,
     camera_of,
     larger_models,
+    misread,
     model_named,
     searched,
 )
@@ -18,4 +19,4 @@ from dashcalib_ros.camera.remap import RECTIFIED
 
 __all__ = ['AUTO', 'FISHEYE', 'MODELS', 'NO_DISTORTION', 'PINHOLE', 'RECTIFIED', 'Brown', 'Camera',
            'Fisheye', 'Radial', 'Rational', 'calibrated_models', 'camera_from_ros', 'camera_of',
-           'larger_models', 'model_named', 'ros_camera', 'ros_faults', 'searched']
+           'larger_models', 'misread', 'model_named', 'ros_camera', 'ros_faults', 'searched']

@@ -147,6 +147,23 @@ class Camera(ABC):
         """Return K (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @property
+    def field_of_view(self) -> tuple[float, float, float]:
+        """Return degrees from edge to edge through the picture's middle: horizontal, vertical.
+
+        Last comes the larger of both diagonals; NaN where not known. The two sides of one
+        direction may come to more than 180.
+        """
+        width, height = self.image_size
+        left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5
+        x, y = (width - 1) / 2, (height - 1) / 2
+        ends = np.array([[(left, y), (right, y)], [(x, top), (x, bottom)],
+                         [(left, top), (right, bottom)], [(left, bottom), (right, top)]])
+        with np.errstate(all='ignore'):
+            off_axis = np.degrees(np.arccos(np.clip(self.rays(ends)[..., 2], -1.0, 1.0)))
+            angles = off_axis.sum(axis=1)
+        return float(angles[0]), float(angles[1]), float(angles[2:].max())
+
     def widened(self) -> Camera:
         """Return the same camera in a wider model: its first parameters are this one's.
 

@@ -85,7 +85,10 @@ def _of_another_picture(camera: Camera, view: Floats) -> list[str]:
     size = np.array(camera.image_size)
     middle, low, high = (share * (size - 1) for share in (0.5, 0.25, 0.75))
     with np.errstate(all='ignore'):
-        seen = camera.rays(np.array([middle, low, high])) @ view.T
+        rays = camera.rays(np.array([middle, low, high]))
+        if not np.isfinite(rays).all():
+            return []  # of the distortion, and not of P
+        seen = rays @ view.T
         seen = seen[:, :2] / seen[:, 2:]
         away = np.abs(seen[0] - middle).max() / size[0]
         zoom = (seen[2] - seen[1]) / (high - low)

@@ -6,6 +6,7 @@ the camera cannot be told from one of its mounting (Hagemann et al.).
 """
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -14,10 +15,11 @@ import numpy as np
 from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera.camera import Camera
 
+# what moves pixels (n, 2)
+Moved = Callable[[Floats], Floats] | None
+
 # columns, rows: enough for a smooth field, and as in the benchmarks
 GRID = (25, 15)
-# the same, where a share of the picture is asked for
-FINE = (100, 60)
 # px; where a camera that is fitted does not see a ray, that counts as this
 UNSEEN_PX = 100.0
 # degrees off the axis; cameras that do not see behind are compared up to here
@@ -34,15 +36,6 @@ def grid_of(camera: Camera) -> Floats:
     width, height = camera.image_size
     u, v = np.meshgrid(np.linspace(0, width - 1, GRID[0]), np.linspace(0, height - 1, GRID[1]))
     return np.stack([u.ravel(), v.ravel()], -1)
-
-
-def rayless_share(camera: Camera) -> float:
-    """Return the share of the picture for which the model has no ray: it folds over before."""
-    columns, rows = ((np.arange(side) + 0.5) / side for side in FINE)
-    width, height = camera.image_size
-    pixels = np.stack(np.meshgrid(columns * width - 0.5, rows * height - 0.5), -1)
-    with np.errstate(all='ignore'):
-        return float(np.mean(~np.isfinite(camera.rays(pixels)).all(axis=-1)))
 
 
 @dataclass(frozen=True)
@@ -81,18 +74,22 @@ def mapping_error(camera: Camera, reference: Camera) -> float | None:
     return None if found is None else found.rms
 
 
-def apart(camera: Camera, reference: Camera) -> Apart | None:
+def apart(camera: Camera, reference: Camera, observed: Moved = None, ideal: Moved = None
+          ) -> Apart | None:
     """Return how far the images of the same rays are apart in both cameras.
 
+    observed: of the camera's field, and ideal: of the reference's; see Field.
     The rays are those of a grid over the reference's image, without those that no camera of this
     kind can see (unseen_share()). None when the reference has no ray for a pixel of the grid, when
     the camera cannot see one of the others, and where none is left.
     """
     pixels = grid_of(reference)
-    return apart_at(camera, reference.rays(pixels), pixels)
+    rays = reference.rays(pixels if ideal is None else ideal(pixels))
+    return apart_at(camera, rays, pixels, observed)
 
 
-def apart_at(camera: Camera, rays: Floats, pixels: Floats) -> Apart | None:
+def apart_at(camera: Camera, rays: Floats, pixels: Floats, observed: Moved = None
+             ) -> Apart | None:
     """Return how far the camera's images of rays (n, 3) are from the pixels (n, 2) that see them.
 
     None where apart() is.
@@ -106,7 +103,8 @@ def apart_at(camera: Camera, rays: Floats, pixels: Floats) -> Apart | None:
 
     def off(rays: Floats) -> Floats:
         with np.errstate(all='ignore'):
-            return np.asarray(camera.project(rays) - pixels)
+            seen = camera.project(rays)
+            return np.asarray((seen if observed is None else observed(seen)) - pixels)
 
     # Gauss-Newton: SciPy's optimiser takes longer to load than this takes
     best = off(rays)

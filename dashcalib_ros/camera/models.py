@@ -91,6 +91,17 @@ def camera_from_ros(image_size: tuple[int, int], distortion_model: str, k: npt.A
                      f'supported; calibrate the camera with one of {", ".join(ROS_MODELS)}')
 
 
+def misread(camera: Camera) -> Camera | None:
+    """Return the camera of the other family of lenses that CameraInfo's K and D would be.
+
+    None where D has more numbers than that.
+    """
+    d = camera.ros_distortion()
+    other = next(model for model in MODELS.values() if model.family != camera.family)
+    return None if any(d[4:]) else camera_from_ros(
+        camera.image_size, other.ros_model, camera.matrix.ravel(), d[:4])
+
+
 ROS_MODELS = tuple(dict.fromkeys(model.ros_model for model in MODELS.values()))
 # other names that ROS, Foxglove and Kalibr have for a model, or for one that contains it
 ALIASES = {'plumb_bob': ('rational_polynomial', 'radtan', 'radial_tangential'),

@@ -18,3 +18,10 @@ def rotation_matrices(vectors: Floats) -> Floats:
 def rotation_vectors(matrices: Floats) -> Floats:
     """Return the vectors (n, 3), rad, of rotation matrices (n, 3, 3); less than 1e-5 rad is 0."""
     return np.array([cv2.Rodrigues(matrix)[0][:, 0] for matrix in matrices]).reshape(-1, 3)
+
+
+def quaternion(matrix: Floats) -> tuple[float, float, float, float]:
+    """Return a rotation matrix (3, 3) as (x, y, z, w), as ROS has it."""
+    from scipy.spatial.transform import Rotation
+    x, y, z, w = Rotation.from_matrix(matrix).as_quat().tolist()
+    return x, y, z, w

@@ -15,6 +15,8 @@ from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.standard_streams import write_stdout
 
 PROGRAM = 'dashcalib'
+# other names of commands
+ALIASES = {'calibrate': 'run'}
 # exit codes
 ACCEPTED = 0
 WRONG = 1  # of check: the calibration does not fit the drive
@@ -54,7 +56,19 @@ class UsageError(DashcalibError):
 
 
 def arguments_of(argv: Sequence[str]) -> list[str]:
-    """Return the arguments for the parser. Raises UsageError for an unknown command."""
+    """Return the arguments for the parser.
+
+    Raises UsageError for an unknown command, and for an argument without a text.
+    """
+    argv = [ALIASES.get(each, each) for each in argv[:1]] + list(argv[1:])
+    for each in argv:
+        # an empty path would be the current folder
+        if each == '' or (each.startswith('--') and each.find('=') == len(each) - 1):
+            raise UsageError('E-ARGUMENT-EMPTY', f'{each or "an argument"} is empty: is a shell '
+                                                 f'variable not set? The current folder is .')
+        if each.startswith('-out'):  # -o with a folder ut
+            raise UsageError('E-ARGUMENT-UNKNOWN', f'unknown argument {each}: did you mean -o or '
+                                                   f'-{each}?')
     if argv and not argv[0].startswith('-') and argv[0] not in COMMANDS:
         raise UsageError('E-COMMAND-UNKNOWN',
                          f'unknown command {argv[0]!r}: {_command_for(argv[0])}')
@@ -139,17 +153,28 @@ def whole_numbers(between: str, count: int, like: str) -> Callable[[str], tuple[
     return numbers
 
 
-def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
+def number(what: str, fits: Callable[[float], bool], parse: Callable[[str], float] = float
+           ) -> Callable[[str], float]:
     """Return a type of argument: a finite number that fits. what: the range, for the message."""
     def value(text: str) -> float:
         try:
-            found = float(text)
+            found = parse(text)
         except ValueError:
             found = math.nan
         if not (math.isfinite(found) and fits(found)):
             raise argparse.ArgumentTypeError(f'must be {what}, not {text!r}')
         return found
     return value
+
+
+def _seconds(text: str) -> float:
+    """Return the seconds of 90, 1:30 or 0:01:30. Raises ValueError."""
+    *first, last = text.split(':')
+    seconds = float(last)
+    if len(first) > 2 or not all(each.isdecimal() for each in first) or (
+            first and not 0 <= seconds < 60):
+        raise ValueError(text)
+    return seconds + sum(60.0**place * int(each) for place, each in enumerate(reversed(first), 1))
 
 
 def path_or(cure: str) -> Callable[[str], Path]:
@@ -168,7 +193,8 @@ def count(text: str) -> int:
     return int(text)
 
 
-SECONDS = number('0 or more seconds', lambda value: value >= 0)
+SECONDS = number('0 or more seconds, such as 90 or 1:30', lambda value: value >= 0, _seconds)
+MORE_SECONDS = number('more than 0 seconds, such as 90 or 1:30', lambda value: value > 0, _seconds)
 POSITIVE = number('a positive number', lambda value: value > 0)
 
 
@@ -200,8 +226,10 @@ DRIVE: tuple[Argument, ...] = (
     ('--fps', {'type': POSITIVE, 'metavar': 'F',
                'help': 'images per second of a video or an image folder'}),
     ('--start', {'type': SECONDS, 'default': 0.0, 'metavar': 'S',
-                 'help': 'skip the first S seconds of the drive'}),
-    ('--duration', {'type': POSITIVE, 'metavar': 'S', 'help': 'use S seconds of the drive'}),
+                 'help': 'skip the first S seconds of the drive; 1:30 is 90'}),
+    ('--duration', {'type': MORE_SECONDS, 'metavar': 'S', 'help': 'use S seconds of the drive'}),
+    ('--end', {'type': MORE_SECONDS, 'metavar': 'S',
+               'help': 'end S seconds after the start of the recording'}),
     ('--turns', {'type': int, 'metavar': 'N', 'help': 'use N turns'}),
     ('--mask', {'type': Path, 'metavar': 'PNG',
                 'help': 'a picture of the size of the images; its black pixels are not used'}),
@@ -225,7 +253,7 @@ MOTION: tuple[Argument, ...] = (
 # what the shell may complete: argcomplete looks for it
 COMPLETED = {'--model': MODELS, '--to': KINDS}
 # a command takes only one of these
-EXCLUSIVE = ('--size', '--crop', '--workers', '--address', '--shard')
+EXCLUSIVE = ('--duration', '--end', '--size', '--crop', '--workers', '--address', '--shard')
 
 
 def out_folder(default: str, cure: str = '') -> Argument:
@@ -269,7 +297,8 @@ COMMANDS = {
             JSON, QUIET, VERBOSE), exit_codes=EXIT_HELP),
     'turns': Command(
         'dashcalib_ros.cli.run', 'find the turns of a drive, without calibrating',
-        'Lists the turns that a calibration would choose from, best first.',
+        'Lists the turns that a calibration would choose from, best first, with their angles, '
+        'and says whether they are enough.',
         'dashcalib turns drive.mp4 --start 60 --duration 300', (
             INPUT, *DRIVE, JSON, NO_PROGRESS)),
     'demo': Command(
@@ -328,7 +357,7 @@ COMMANDS = {
             ('--mount', {**FLAG, 'dest': 'mounting',
                          'help': 'a camera that was moved on the car is wrong, too'}),
             ('--out', {'type': path_or('--out must be a folder'), 'metavar': 'DIR',
-                       'help': 'with --poses: write a plot of the paths, and the paths for evo'}),
+                       'help': 'with --poses: write the paths as TUM files, for evo'}),
             JSON, NO_PROGRESS, VERBOSE), exit_codes=CHECK_EXIT_HELP),
     'batch': Command(
         'dashcalib_ros.cli.batch', 'calibrate many cameras from many clips',
@@ -370,8 +399,8 @@ def make_parser() -> Parser:
         alone = (own.add_mutually_exclusive_group()
                  if any(flag in EXCLUSIVE for flag, _ in command.arguments) else own)
         for flag, options in command.arguments:
-            action = (alone if flag in EXCLUSIVE else own).add_argument(flag, **options)
+            names = ('-o', flag) if flag == '--out' else (flag,)
+            action = (alone if flag in EXCLUSIVE else own).add_argument(*names, **options)
             if flag in COMPLETED:
-                names = COMPLETED[flag]
-                action.completer = lambda n=names, **_: n  # type: ignore[attr-defined]
+                action.completer = lambda n=COMPLETED[flag], **_: n  # type: ignore[attr-defined]
     return parser

@@ -21,7 +21,7 @@ from dashcalib_ros.fleet.clips import ClipResult
 from dashcalib_ros.fleet.engine import Engine, LocalEngine, RayEngine
 from dashcalib_ros.fleet.manifest import Row, read_manifest
 from dashcalib_ros.fleet.overview import duration
-from dashcalib_ros.fleet.storage import joined, remove, write
+from dashcalib_ros.fleet.storage import joined, masked, remove, write
 from dashcalib_ros.report.tables import line
 from dashcalib_ros.standard_streams import write_stderr, write_stdout
 from dashcalib_ros.workers.child import ChildWorker
@@ -37,15 +37,15 @@ def batch(args: argparse.Namespace) -> int:
     shard = shard_of(args.shard or '1/1')
     cameras = cameras_of(read_manifest(args.manifest, args.group_by), shard)
     # before hours of work, and not after them
-    probe = joined(args.out, '.writable')
-    write(probe, b'')
+    probe, out = joined(args.out, '.writable'), masked(args.out)
+    write(probe, b'yes\n')
     remove(probe)
     progress = _Progress(sum(len(each.rows) for each in cameras),
                          Screen(args.quiet, to_stderr=args.json), Stages(args.quiet))
     if not args.quiet:  # before workers start, which takes a while
         write_stderr(
             f'dashcalib: {counted(progress.clips, "clip")} of {counted(len(cameras), "camera")}; '
-            f'after Ctrl-C, the same command continues from what is in {args.out}')
+            f'after Ctrl-C, the same command continues from what is in {out}')
     with closing(_engine(args, config)) as engine:
         try:
             with progress.stages:
@@ -53,13 +53,13 @@ def batch(args: argparse.Namespace) -> int:
                                         progress.tell)
         except KeyboardInterrupt:
             warn([Notice('E-BATCH-INTERRUPTED', f'{progress.done} of '
-                         f'{counted(progress.clips, "clip")} are done and kept in {args.out}: the '
+                         f'{counted(progress.clips, "clip")} are done and kept in {out}: the '
                          f'same command continues from there')])
             raise
     name = '' if args.shard is None else f'-{shard[0]}-of-{shard[1]}'
     write(joined(args.out, f'effort{name}.json'), progress.effort_json(engine))
     if files:
-        progress.screen.show(line(f'written to {args.out}: ' + ', '.join(files)))
+        progress.screen.show(line(f'written to {out}: ' + ', '.join(files)))
     if args.json:
         write_stdout(json.dumps(_as_dict(cameras, files), indent=2, allow_nan=False))
     return _summarise(cameras, progress.screen)

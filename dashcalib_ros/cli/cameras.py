@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 from rich.console import Group
 
-from dashcalib_ros.camera.mapping import rayless_share
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.cli.arguments import ACCEPTED, UsageError
 from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.errors import Notice
 from dashcalib_ros.formats import export as exported
 from dashcalib_ros.formats import load_calibration, load_camera
 from dashcalib_ros.formats.export import EXPORTS, check_suffix, cropped, resized
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge.rig import rig_of
 from dashcalib_ros.report import compare as compare_cameras
@@ -31,10 +30,11 @@ def compare(args: argparse.Namespace) -> int:
     if args.rig:
         return _rig(args)
     found = compare_cameras(load_camera(args.a), load_camera(args.b))
+    warn((*found.a.warnings, *found.b.warnings))
     if args.html is not None:
         write_text(args.html, difference_html(found))
     if args.json:
-        write_stdout(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        write_stdout(json.dumps(found.to_dict(), indent=2, allow_nan=False))
     else:
         show(comparison(found))
         if args.html is not None:
@@ -62,6 +62,7 @@ def _rig(args: argparse.Namespace) -> int:
 def export(args: argparse.Namespace) -> int:
     """Write the camera to --out, or to standard output."""
     found = load_camera(args.calibration)
+    warn(found.warnings)
     camera, readout_ms = found.camera, found.readout_ms
     if args.size is not None:
         camera = resized(camera, args.size)
@@ -90,11 +91,6 @@ def export(args: argparse.Namespace) -> int:
             f'without it pixels are off by {np.sqrt(np.mean(lost**2)):.2f} px RMS and '
             f'{lost.max():.2f} px at the worst (of {size_text(found.image_size)}); export to '
             f'{others} to keep it')])
-    unseen = rayless_share(camera)
-    if unseen:
-        warn([Notice(
-            'E-EXPORT-FOLDS', f'{found.name} has no ray for {100 * unseen:.0f} % of the picture: '
-            f'there its model folds over; calibrate again, unless nothing is visible there')])
     if found.verdict == 'weak':
         warn([Notice('E-EXPORT-WEAK', f'{found.name} is weak: look at its standard deviations '
                      f'(sigma) before you use it')])

@@ -19,7 +19,7 @@ from dashcalib_ros.report import answer_dict, check_writable, write_text
 from dashcalib_ros.report.compare import mount_dict
 from dashcalib_ros.report.tables import TextTable, labelled, line
 from dashcalib_ros.report.wording import mounts_text
-from dashcalib_ros.session import check_drive
+from dashcalib_ros.session import check_drive, in_order
 from dashcalib_ros.standard_streams import write_stdout
 
 EXIT_CODES = {'right': ACCEPTED, 'differs': ACCEPTED, 'wrong': WRONG, 'cannot tell': NOT_ENOUGH}
@@ -41,7 +41,8 @@ def check(args: argparse.Namespace) -> int:
         args.input = [str(args.calibration)]
         named = load_with_faults(args.calibration, args.topic)
     else:
-        named = load_with_faults(args.calibration)
+        with in_order(args.calibration, args.input):
+            named = load_with_faults(args.calibration)
     if args.mounting and named.mount is None:
         raise UsageError('E-MOUNT-UNKNOWN',
                          f'{named.name} has no mounting of the camera: use a result.json or '
@@ -53,12 +54,14 @@ def check(args: argparse.Namespace) -> int:
             raise UsageError('E-OUT-WITHOUT-POSES',
                              '--out is for the paths that --poses compares; add --poses FILE')
         check_writable(args.out)
-    drive = open_drive(args)
+    with in_order(args.calibration, args.input):
+        drive = open_drive(args)
     with Stages(args.quiet) as stages:
         checked = check_drive(drive, named, config, stages, poses, track, args.verbose)
     found, motion = with_faults(checked.check, named.faults), checked.odometry
     calibration, changes = checked.calibration, checked.changes
-    warn((*drive.source.warnings, *calibration.warnings, *(track.warnings if track else ())))
+    warn((*named.warnings, *drive.source.warnings, *calibration.warnings,
+          *(track.warnings if track else ())))
     now, before = calibration.mount, named.mount
     if args.json:
         write_stdout(json.dumps(answer_dict(found, changes, motion, mount_dict(now, before)),
@@ -70,6 +73,7 @@ def check(args: argparse.Namespace) -> int:
         elif args.mounting:
             show(line('- mounting: this drive does not determine it; record a longer straight '
                       'stretch'))
+        show(line(f'next: {found.next_step}'))
     if motion is not None and args.out is not None:
         for name, text in path_files(motion).items():
             write_text(args.out / name, text)

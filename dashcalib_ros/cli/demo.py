@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from rich.console import RenderableType
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera import camera_of
 from dashcalib_ros.camera.mapping import Apart, apart_at, grid_of
 from dashcalib_ros.cli.arguments import exit_code
@@ -23,7 +24,6 @@ from dashcalib_ros.cli.terminal import Screen, Stages
 from dashcalib_ros.demo import DEMOS, Drive, demo_drive, render_to_bag
 from dashcalib_ros.errors import OutputError
 from dashcalib_ros.formats import calibrated_camera, result_dict
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.input.inputs import open_frames
 from dashcalib_ros.report import (
     Calibration,

@@ -23,7 +23,7 @@ FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads
 def read_config(args: argparse.Namespace) -> Config:
     """Return the settings from --config, --set, and --turns and the like; later ones count."""
     path: Path | None = getattr(args, 'config', None)
-    config = Config() if path is None else Config.from_mapping(_read_yaml(path))
+    config = Config() if path is None else Config.of(_read_yaml(path))
     changes = parse_settings(getattr(args, 'set', []))
     changes.update({name: getattr(args, flag) for flag, names in FLAGS.items() for name in names
                     if getattr(args, flag, None) is not None})
@@ -65,6 +65,12 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
 
 def open_drive(args: argparse.Namespace) -> Recording:
     """Open the drive, the mask and the sensors that the arguments name. Raises InputError."""
+    duration_s = args.duration
+    if args.end is not None:
+        duration_s = args.end - args.start
+        if duration_s <= 0:
+            raise InputError('E-INPUT-DURATION', f'--end {args.end:g} s is not after --start '
+                                                 f'{args.start:g} s')
     topics = {name: getattr(args, name, None) for name in ('imu', 'gps', 'odom')}
-    return session.open_drive(args.input, args.topic, args.fps, args.start, args.duration,
+    return session.open_drive(args.input, args.topic, args.fps, args.start, duration_s,
                               args.mask, getattr(args, 'motion', None), topics)

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import os
 import signal
 import sys
@@ -128,7 +127,8 @@ def _interrupted() -> int:
 
 def _os_error(error: OSError) -> DashcalibError:
     where = f' ({error.filename})' if error.filename else ''
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    from dashcalib_ros.whole_files import FULL
+    if error.errno in FULL:
         return OutputError('E-DISK-FULL', f'no space is left on the disk{where}; free some, or '
                                           f'set TMPDIR to another disk')
     return InputError('E-FILE-ACCESS', f'{error.strerror or error}{where}; check the path and its '

@@ -1,25 +1,26 @@
-"""dashcalib run, and turns (detection only)."""
+"""dashcalib run, and turns: what a run would use, without calibrating."""
 from __future__ import annotations
 
 import argparse
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
 from rich.console import Group
 from rich.text import Text
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.cli.arguments import ACCEPTED, exit_code
 from dashcalib_ros.cli.drive import open_drive, read_config
 from dashcalib_ros.cli.terminal import Screen, Stages, show, warn
-from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.errors import InputError, Notice, OutputError, counted
+from dashcalib_ros.errors import InputError, Notice, counted, spared
 from dashcalib_ros.formats import result_json
-from dashcalib_ros.formats.ours import codes_of, plain_values
+from dashcalib_ros.formats.ours import codes_of
 from dashcalib_ros.input import FrameSource
+from dashcalib_ros.pipeline import Outlook
 from dashcalib_ros.report import Calibration, Written, output_folder, write_results
-from dashcalib_ros.report.files import ACCEPTED as ACCEPTED_FILE
 from dashcalib_ros.report.tables import (
     TextTable,
     conclusion,
@@ -27,8 +28,8 @@ from dashcalib_ros.report.tables import (
     next_step,
     summary,
 )
-from dashcalib_ros.report.wording import NEXT
-from dashcalib_ros.session import calibrate_drive, feed
+from dashcalib_ros.report.wording import cures, objections, optional
+from dashcalib_ros.session import calibrate_drive, outlook_of
 from dashcalib_ros.standard_streams import write_stdout
 
 
@@ -44,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
             calibration = calibrate_drive(drive, config, stages, args.verbose)
         try:
             written = write_results(calibration, args.out, created=now())
-        except OutputError:
-            # a full disk must not hide what an hour of work has found
+        except Exception:
+            # neither a full disk nor a defect may hide what an hour of work has found
             _show(args, calibration, screen, Written(()))
             raise
     _show(args, calibration, screen, written)
@@ -57,11 +58,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _show(args: argparse.Namespace, calibration: Calibration, screen: Screen, written: Written
           ) -> None:
-    warn_of(calibration, written)
+    lost: list[Notice] = []
+    shown = spared('the summary', lost, summary, calibration)
+    warn_of(calibration, replace(written, lost=(*written.lost, *lost)))
     if args.json:
         write_stdout(result_json(calibration).rstrip('\n'))
     files = [files_line(args.out, written.files)] if written.files else []
-    screen.show(conclusion(calibration.verdict), summary(calibration), *files)
+    screen.show(conclusion(calibration.verdict), *([] if shown is None else [shown]), *files)
 
 
 def _check_bag(args: argparse.Namespace, source: FrameSource) -> None:
@@ -93,11 +96,10 @@ def files_line(folder: Path, files: Sequence[Path]) -> Text:
 
 def warn_of(calibration: Calibration, written: Written) -> None:
     """Print the calibration's warnings, and whether an earlier calibration was renamed."""
-    warn(calibration.warnings)
+    warn((*calibration.warnings, *written.lost))
     if written.set_aside is not None:
-        old = written.set_aside.with_name(ACCEPTED_FILE)
         warn([Notice('E-CALIBRATION-RENAMED',
-                     f'the earlier calibration {old} was renamed to {written.set_aside}')])
+                     f'an earlier calibration was renamed to {written.set_aside}')])
 
 
 def now() -> str:
@@ -105,43 +107,55 @@ def now() -> str:
     return datetime.now(timezone.utc).isoformat(timespec='seconds')
 
 
-COLUMNS = ('at s', 'frame', 'from', 'to', 'images', 'prominence')
+COLUMNS = ('at s', 'frame', 'from', 'to', 'images', 'prominence', 'yaw °')
 PROMINENCE = ('prominence: how far a turn stands out from the driving before and after it, as a '
-              'fraction of the picture width; frames are counted from 0')
+              'fraction of the picture width; frames are counted from 0; yaw: of the turns that '
+              'a calibration would use')
+# degrees; drives without such a turn are accepted or weak, and turns alone do not tell which
+SHARP_DEG = 30.0
 
 
 def turns(args: argparse.Namespace) -> int:
-    """List the turns found, best first. The exit code is 0, also if there are none."""
+    """List the turns, best first, and say whether they are enough; the exit code is 0."""
     config = read_config(args)
     drive = open_drive(args)
-    source, detection = drive.source, Detection(config, drive.mask)
     with Stages(args.quiet) as stages:
-        frames = feed(detection, drive, stages)
-    detection.finish()
-    found = detection.turns()
-    warnings = (*source.warnings, *detection.warnings())
+        found = outlook_of(drive, config, stages)
+    warnings = (*drive.source.warnings, *found.warnings)
     warn(warnings)
+    yaws = found.yaws_deg
     if args.json:
         write_stdout(json.dumps(plain_values({
-            'input': source.name, 'frames': frames,
+            'input': drive.source.name, 'frames': found.frames,
             'turns': [{'center': turn.center, 'first': turn.first, 'last': turn.last,
                        'stamp': turn.stamp_s, 'prominence': turn.prominence,
-                       'images': turn.images} for turn in found],
+                       'images': turn.images, 'yaw_deg': yaws.get(turn.id)}
+                      for turn in found.turns],
+            'yaw_deg': sum(yaws.values()), 'verdict_at_best': found.verdict.level,
+            'reasons': found.verdict.reasons, 'reason_codes': found.verdict.codes,
             'warnings': warnings, 'warning_codes': codes_of(warnings)}), indent=2,
             allow_nan=False))
         return ACCEPTED
-    if found:
+    if found.turns:
         show(TextTable(COLUMNS, [
-            (f'{turn.stamp_s - detection.start_s:.1f}', str(turn.center), str(turn.first),
-             str(turn.last), str(turn.images), f'{turn.prominence:.4f}') for turn in found]))
+            (f'{turn.stamp_s - found.start_s:.1f}', str(turn.center), str(turn.first),
+             str(turn.last), str(turn.images), f'{turn.prominence:.4f}',
+             optional(yaws.get(turn.id), 0)) for turn in found.turns]))
         show(line(PROMINENCE))
-    show(Group(*map(line, _conclusion(len(found), config.turns.wanted, frames))))
+    show(Group(*map(line, _enough(found))))
     return ACCEPTED
 
 
-def _conclusion(found: int, wanted: int, frames: int) -> tuple[str, str]:
-    """Return what was found, and what to do next."""
-    return (f'{counted(found, "turn")} found in {counted(frames, "frame")}; a calibration uses '
-            f'the best {wanted}',
-            'next: dashcalib run with the same INPUT' if found else
-            f'next: {NEXT["refused"]}')
+def _enough(found: Outlook) -> tuple[str, str]:
+    """Return whether the turns are enough, with their degrees, and what to do next."""
+    yaws, verdict = found.yaws_deg.values(), found.verdict
+    text = f'{counted(len(found.turns), "turn")} found in {counted(found.frames, "frame")}'
+    if yaws:
+        text += (f'; a calibration would use {len(yaws)}, of {sum(yaws):.0f}° in all, the '
+                 f'sharpest of {max(yaws):.0f}°')
+    if not verdict.accepted:
+        return (f'{text}: not enough, the result would be {verdict.level}: '
+                f'{"; ".join(what for _, what, _ in objections(verdict)[:len(verdict.told)])}',
+                f'next: {cures(verdict)[0]}')
+    gentle = '' if max(yaws) >= SHARP_DEG else ', but without a sharp turn it may be weak'
+    return f'{text}: enough for a calibration{gentle}', 'next: dashcalib run with the same INPUT'

@@ -45,7 +45,16 @@ class Bend:
     @property
     def sigmas(self) -> float:
         """Return the difference of lines and camera, in standard deviations of both together."""
-        return abs(self.k1) / float(np.hypot(self.sigma, self.camera_sigma or 0.0))
+        return abs(self.k1) / self._both
+
+    @property
+    def _both(self) -> float:
+        return float(np.hypot(self.sigma, self.camera_sigma or 0.0))
+
+    @property
+    def change(self) -> str:
+        """Return the clause of what the lines ask for, with the sigma of both together."""
+        return f'they would be straight with k1 changed by {self.k1:+.3f} ± {self._both:.3f}'
 
 
 # place of k1 among the parameters, in every model

@@ -12,7 +12,7 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detector import TurnDetector
 from dashcalib_ros.detect.edges import LineCollector, Lines
 from dashcalib_ros.detect.estimator import MotionEstimator, TrackedPoints
-from dashcalib_ros.detect.one_camera import APART, OtherCamera
+from dashcalib_ros.detect.one_camera import APART, OtherCamera, TwoPictures
 from dashcalib_ros.detect.straights import PAIRS, Straights
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import InputError, Notice
@@ -53,6 +53,7 @@ class Detection:
         self.standing = False
         self._config = config
         self._motion = MotionEstimator(config.motion, config.mask, mask)
+        self._two_pictures = TwoPictures()
         self._lines = LineCollector(beside=beside)
         # more turns than wanted replace those without a scene; --turns may be above the capacity
         self._turns = TurnDetector(replace(
@@ -77,7 +78,8 @@ class Detection:
         """Take the next frame; return the turns that are new. They do not change any more.
 
         Raises InputError where its size differs from the first one's or from the mask's, where it
-        is not a grey image of bytes, and where the stamps cannot be nanoseconds.
+        is not a grey image of bytes, where the stamps cannot be nanoseconds, and where all images
+        show two pictures.
         """
         _check_image(frame)
         self._check_size(frame)
@@ -89,6 +91,7 @@ class Detection:
             return []
         self.standing = motion.standing
         if not motion.standing:
+            self._two_pictures.push(frame.image, frame.stamp_ns)
             self._lines.push(frame.image, frame.stamp_ns)
         return self._turns.push(frame, motion)
 

@@ -11,6 +11,8 @@ the road shifts and turns the picture a little, now to one side, now to the othe
 Another lens zooms the picture, another mounting shifts or turns it, each time by the same; of
 another view no point is found again. Measured on rendered and real drives (lessons.md): sound
 cameras zoom by 0.1 % and shift by 1 px, a lens 3 % longer by 3.0 ± 0.1 %.
+
+Both pictures of a stereo camera may also be in one image: then one half shows what the other does.
 """
 from __future__ import annotations
 
@@ -18,11 +20,14 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Mask
 from dashcalib_ros.detect.continuity import MIN_POINTS, fitted_steps
 from dashcalib_ros.detect.points import Tracking, follow_points
+from dashcalib_ros.errors import InputError
+from dashcalib_ros.input.stamps import Looks
 
 APART = 'record each camera separately, with one topic per camera'
 
@@ -152,3 +157,65 @@ def _off(at: Floats, to_between: Floats, to_after: Floats, half: float) -> Float
     found = fitted_steps(design, to_between, np.zeros(5), np.array(
         [SPEED_PRIOR, *[CAMERA_PRIOR] * 4]))
     return np.asarray(found.params[1:] / half)
+
+
+# px: least width and height of half an image, side of a patch, how far apart the rows may be; of
+# the width, how far apart the columns may be
+HALF, PATCH, ROWS, COLUMNS = (160, 100), 20, 2, 0.25
+# patches of a half that tell, at the least; correlation of those that are found in the other half,
+# and their share; images that all show it. Of one camera's pictures 0 to 0.54 are found, mostly
+# none, of stereo pictures 0.86 to 1
+LEAST_PATCHES, FOUND_AGAIN, LEAST_SHARE, ALL = 12, 0.8, 0.7, 5
+
+
+class TwoPictures:
+    """Looks once a second whether the images show two pictures, side by side or stacked."""
+
+    def __init__(self) -> None:
+        self._looks = Looks()
+        self._shown = {'side by side': 0, 'one above the other': 0}
+        self._found: InputError | None = None
+
+    def push(self, image: GreyImage, stamp_ns: int) -> None:
+        """Take an image of a moving car; raises InputError where all so far show two pictures."""
+        if self._shown and self._found is None and self._looks.due(stamp_ns):
+            self._look(image)
+        if self._found is not None:
+            raise self._found
+
+    def _look(self, image: GreyImage) -> None:
+        height, width = image.shape[0] // 2, image.shape[1] // 2
+        halves = {'side by side': (image[:, :width], image[:, -width:]),
+                  'one above the other': (image[:height], image[-height:])}
+        for how in list(self._shown):
+            share = _share(*halves[how])
+            if share is None:
+                continue
+            self._shown[how] += 1
+            if share < LEAST_SHARE:
+                del self._shown[how]
+            elif self._shown[how] >= ALL:
+                crop = 'iw/2:ih:0:0' if how == 'side by side' else 'iw:ih/2:0:0'
+                self._found = InputError(
+                    'E-TWO-PICTURES', f'each image shows two pictures {how}, as of a stereo '
+                    f'camera: cut one of them out (ffmpeg -i IN -vf crop={crop} OUT.mp4; in ROS '
+                    f'image_proc crop_decimate) and calibrate that')
+
+
+def _share(one: GreyImage, other: GreyImage) -> float | None:
+    """Return the share of patches of a picture that another one shows, None for too few."""
+    height, width = one.shape
+    scale = max(HALF[0] / width, HALF[1] / height)
+    size = round(width * scale), round(height * scale)
+    apart = round(COLUMNS * size[0])
+    small, there = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (one, other))
+    corners = cv2.goodFeaturesToTrack(small, 40, 0.05, PATCH // 2, blockSize=7)
+    half, found = PATCH // 2, []
+    for x, y in (np.empty((0, 2), int) if corners is None else np.rint(corners[:, 0]).astype(int)):
+        top, left = y - half - ROWS, x - half
+        if top < 0 or left < 0 or top + PATCH + 2 * ROWS > size[1] or left + PATCH > size[0]:
+            continue
+        patch = small[y - half:y + half, left:left + PATCH]
+        around = there[top:top + PATCH + 2 * ROWS, max(0, left - apart):left + PATCH + apart]
+        found.append(cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED).max() > FOUND_AGAIN)
+    return float(np.mean(found)) if len(found) >= LEAST_PATCHES else None

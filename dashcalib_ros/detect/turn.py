@@ -1,7 +1,7 @@
 """A turn: a stretch of the drive that the calibration uses."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dashcalib_ros.input import Frame
 
@@ -11,11 +11,12 @@ class TurnId:
     """Identifies a turn in one run. Turns of earlier drives sort before those of this one.
 
     of_this_drive: False for a stored turn of an earlier drive. number: the index of the center
-    frame; for a stored turn, its place among the stored turns.
+    frame; for a stored turn, its place among the stored turns. clip: of a fleet that has it.
     """
 
     of_this_drive: bool
     number: int
+    clip: str = field(default='', compare=False)
 
     @classmethod
     def at(cls, center: int) -> TurnId:
@@ -23,9 +24,9 @@ class TurnId:
         return cls(True, center)
 
     @classmethod
-    def stored(cls, place: int) -> TurnId:
-        """Return the turn of an earlier drive at this place among the stored ones."""
-        return cls(False, place)
+    def stored(cls, place: int, clip: str = '') -> TurnId:
+        """Return the turn of an earlier drive, or of a clip, at this place among those stored."""
+        return cls(False, place, clip)
 
     def __str__(self) -> str:
         return (f'the turn at frame {self.number}' if self.of_this_drive

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 from dashcalib_ros.config import Config
@@ -28,10 +29,20 @@ from dashcalib_ros.fleet.clips import (
 from dashcalib_ros.fleet.engine import DiedError, Engine, Task
 from dashcalib_ros.fleet.fuse import fuse
 from dashcalib_ros.fleet.manifest import Row
-from dashcalib_ros.fleet.storage import is_url, joined, read, remove, stamp, write
+from dashcalib_ros.fleet.storage import (
+    is_folder,
+    is_url,
+    joined,
+    listed,
+    masked,
+    read,
+    remove,
+    stamp,
+    write,
+)
 from dashcalib_ros.judge.conclude import versions
-from dashcalib_ros.report import write_results
-from dashcalib_ros.report.files import ACCEPTED, WEAK
+from dashcalib_ros.report import Written, write_results
+from dashcalib_ros.report.files import REPORT
 from dashcalib_ros.whole_files import temporary_folder
 
 
@@ -249,11 +260,24 @@ def publish_camera(name: str, found: lens_prior.ModelPrior | None,
     place = joined(out, tables.camera_folder(result.camera))
     if is_url(place):
         with temporary_folder() as scratch:
-            files = write_results(final.calibration, scratch, yaml_name).files
-            for path in files:
-                write(joined(place, path.name), path.read_bytes())
-        for file in {ACCEPTED, WEAK} - {path.name for path in files}:
-            remove(joined(place, file))
+            lost = _exchanged(place, scratch, lambda: write_results(
+                final.calibration, scratch, yaml_name, place=masked(place))).lost
     else:
-        write_results(final.calibration, place, yaml_name)
-    return tables.camera_row(result, final, clips)
+        lost = write_results(final.calibration, place, yaml_name).lost
+    row = tables.camera_row(result, final, clips)
+    return {**row, 'warnings': [*row['warnings'], *lost]}
+
+
+def _exchanged(place: str, scratch: Path, change: Callable[[], Written]) -> Written:
+    """Change the calibrations of a store's folder in a folder of this machine."""
+    there = listed(place) if is_folder(place) else []
+    for name in (each.rpartition('/')[2] for each in there):
+        if name.startswith(('calibration.', REPORT)):
+            (scratch / name).write_bytes(read(joined(place, name)) or b'')
+    before = {path.name for path in scratch.iterdir()}
+    written = change()
+    for path in sorted(scratch.iterdir(), key=lambda path: path.name == REPORT):
+        write(joined(place, path.name), path.read_bytes())
+    for name in sorted(before - {path.name for path in scratch.iterdir()}):
+        remove(joined(place, name))
+    return written

@@ -13,13 +13,22 @@ from pathlib import Path
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detection import detect
 from dashcalib_ros.detect.one_camera import APART
-from dashcalib_ros.errors import DashcalibError, InputError, WorkerError, coded, one_line
+from dashcalib_ros.errors import (
+    DashcalibError,
+    InputError,
+    Notice,
+    OutputError,
+    WorkerError,
+    coded,
+    one_line,
+)
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.storage import (
     clip_files,
     is_url,
     joined,
     local_copy,
+    masked,
     read,
     stamp,
     write,
@@ -37,11 +46,14 @@ from dashcalib_ros.store.scene_file import (
     decoded,
     encoded,
 )
+from dashcalib_ros.whole_files import FULL
 
 # settings by which a clip's scenes do not change
 LATER = ('intrinsics.', 'verdict.', 'fleet.')
 LATER_NAMES = ('threads', 'rectified', 'turns.store')
 GONE = coded(InputError('E-CLIP-MISSING', 'there is no such file; check the path'))
+# what is gathered of a clip; 2: its upright lines, too
+GATHERED = 2
 # characters of an error in a table, without its code
 LONGEST = 300
 # bytes of a file that are hashed at a time
@@ -78,14 +90,17 @@ def looked_at(row: Row, out: str, config: Config) -> ClipResult | None:
     A file of this machine that has gone, or never was, costs two looks and no task.
     """
     if row.problem:
-        return ClipResult(row.problem, again=True)
+        return ClipResult(coded(Notice('E-MANIFEST-ROW', row.problem)), again=True)
     if is_url(row.place) or os.path.lexists(row.place) or read(clip_file(row, out, config)):
         return None
     return ClipResult(GONE)
 
 
 def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
-    """Read a clip, unless that was done; never raises what a clip can cause."""
+    """Read a clip, unless that was done; never raises what a clip can cause.
+
+    Raises OutputError where there is no room, for the output or for the copy of a clip.
+    """
     name, now = clip_file(row, out, config), ''
     try:
         # before it is read: what changes later is read again
@@ -93,10 +108,18 @@ def gather_clip(row: Row, out: str, config: Config) -> ClipResult:
         return _earlier(name, out, now) or _noted(name, _gathered(row, out, config, now))
     except InputError as error:
         return _noted(name, ClipResult(coded(error, LONGEST), now))
+    except OutputError:
+        raise
     except DashcalibError as error:  # not the clip's own fault
         return ClipResult(coded(error, LONGEST))
     except OSError as error:
-        return ClipResult(f'this machine cannot read it: {one_line(error)}')
+        if error.errno in FULL:
+            raise OutputError('E-SCRATCH-FULL',
+                              f'no space is left for the copy of a clip ({one_line(error)}); free '
+                              f'some, or set TMPDIR to another disk, and start the command again: '
+                              f'it continues where it stopped') from error
+        return ClipResult(coded(Notice('E-FILE-ACCESS',
+                                       f'this machine cannot read it: {one_line(error)}')))
 
 
 def set_aside(row: Row, out: str, config: Config) -> ClipResult:
@@ -109,7 +132,7 @@ def set_aside(row: Row, out: str, config: Config) -> ClipResult:
 
 def clip_file(row: Row, out: str, config: Config) -> str:
     """Return the place of the file about what became of a clip."""
-    key = hash_of([row.place, settings_hash(config, row.fps, row.topic)])
+    key = hash_of([masked(row.place), settings_hash(config, row.fps, row.topic)])
     return joined(out, f'clips/{key[:2]}/{key}.json')
 
 
@@ -135,10 +158,7 @@ def _earlier(name: str, out: str, now: str) -> ClipResult | None:
 
 def _noted(name: str, result: ClipResult) -> ClipResult:
     if result.stamp:
-        try:
-            write(name, json.dumps(asdict(result), sort_keys=True).encode())
-        except DashcalibError as error:
-            return ClipResult(coded(error, LONGEST))
+        write(name, json.dumps(asdict(result), sort_keys=True).encode())
     return result
 
 
@@ -194,7 +214,7 @@ def settings_hash(config: Config, fps: float | None, topic: str | None) -> str:
     """Return a hash of all that a clip's scenes depend on beside its content."""
     used = {name: value for name, value in config.flat().items()
             if not name.startswith(LATER) and name not in LATER_NAMES}
-    return hash_of([FORMAT, used, fps, topic])[:16]
+    return hash_of([FORMAT, GATHERED, used, fps, topic])[:16]
 
 
 def content_hash(path: Path) -> str:
@@ -244,4 +264,4 @@ def gather(path: Path, content: str, fps: float | None, topic: str | None, confi
                      for line in (*source.warnings, *detection.warnings()))
     return SceneFile(Origin(detection.size, detection.scale), tuple(turns), len(best), content,
                      settings_hash(config, fps, topic), detection.frames, detection.seconds,
-                     warnings)
+                     warnings, detection.lines())

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any
 
-from dashcalib_ros.errors import DashcalibError, WorkerError, one_line
+from dashcalib_ros.errors import DashcalibError, OutputError, WorkerError, one_line
 from dashcalib_ros.fleet.storage import needs
 from dashcalib_ros.whole_files import remove_leftovers
 from dashcalib_ros.workers.worker import (
@@ -75,7 +75,8 @@ class Engine(ABC):
     def outcomes(self) -> Iterator[tuple[Any, Any]]:
         """Yield (about, outcome), until no task is left; tasks may be submitted meanwhile.
 
-        An outcome is what the function returned, or the DashcalibError that it raised.
+        An outcome is what the function returned, or the DashcalibError that it raised. Raises
+        OutputError: where there is no room for results, no others are wanted.
         """
         while self._waiting or self._running:
             places = self._places()
@@ -91,6 +92,8 @@ class Engine(ABC):
                                        f'{one_line(found)}')
                 if found is None:
                     self.submit(task, first=True)
+                elif isinstance(found, OutputError):
+                    raise found
                 elif isinstance(found, BaseException):
                     yield task.about, _known(found)
                 else:
@@ -204,6 +207,8 @@ class RayEngine(Engine):
         """Yield the outcomes; see Engine. Raises WorkerError when Ray itself has ended."""
         try:
             yield from super().outcomes()
+        except OutputError:
+            raise
         except Exception as error:  # of many kinds, none of them ours
             raise WorkerError('E-RAY-ENDED',
                               f'Ray has ended ({one_line(error)}); start the command again: it '

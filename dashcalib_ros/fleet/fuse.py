@@ -12,21 +12,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dashcalib_ros.config import Config
+from dashcalib_ros.detect import Bend, Lines
+from dashcalib_ros.detect.bend import GROUP_S
 from dashcalib_ros.detect.straights import StraightCollector
 from dashcalib_ros.detect.turn import TurnId
-from dashcalib_ros.errors import Notice, counted
+from dashcalib_ros.errors import Notice, coded, counted, spared
 from dashcalib_ros.fleet.solved import ClipShare, Estimate, Solved
 from dashcalib_ros.input.source import size_text
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.agreement import focal_of, turns_of_another_camera
-from dashcalib_ros.judge.conclude import Evidence, conclude
+from dashcalib_ros.judge.conclude import Evidence, conclude, straight_lines
 from dashcalib_ros.judge.verdict import Grounds, lacks_knowledge_only
 from dashcalib_ros.reconstruct.repeated import without_repeated
 from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.robust import weighted_median
 from dashcalib_ros.solve import solve
 from dashcalib_ros.solve.solution import Solution
-from dashcalib_ros.store.scene_file import Origin, SceneFile, StoredTurn
+from dashcalib_ros.store.scene_file import MOST_LINES, Origin, SceneFile, StoredTurn
 
 Clips = Mapping[str, SceneFile]
 
@@ -63,24 +65,27 @@ def fuse(camera: str, make: str, clips: Clips, config: Config) -> Solved:
         left_out.update(of_another)
     kept = _without(clips, left_out)
     evidence = _evidence(kept, origin, [turns[scene.turn].stored for scene in scenes], left_out)
+    lines = spared('the check of straight lines', [], straight_lines, solution, evidence)
     calibration = replace(conclude(solution, evidence, config), input_name=camera)
     if solution is None:
-        calibration = replace(calibration,
-                              verdict=Verdict('refused', (_nothing_found(kept),)))
+        why = _nothing_found(kept)
+        calibration = replace(calibration, verdict=Verdict('refused', (why,), codes=(why.code,)))
     shares = dict.fromkeys(clips, ClipShare())
     shares.update({turns[turn].clip: ClipShare(
-        left_out=f'shows the same pictures as {turns[other].clip}')
+        left_out=coded(Notice('E-CLIP-REPEATED',
+                              f'shows the same pictures as {turns[other].clip}')))
         for turn, other in sorted(repeated.items(), reverse=True)})
     shares.update(own)
-    shares.update({name: ClipShare(left_out=why) for name, why in left_out.items()})
-    return Solved(camera, make, calibration, _estimate(solution, origin, config), shares)
+    shares.update({name: ClipShare(left_out=coded(why)) for name, why in left_out.items()})
+    return Solved(camera, make, calibration, _estimate(solution, origin, config, lines), shares)
 
 
-def _without(clips: Clips, left_out: Mapping[str, str]) -> Clips:
+def _without(clips: Clips, left_out: Mapping[str, Notice]) -> Clips:
     return {name: clip for name, clip in clips.items() if name not in left_out}
 
 
-def _estimate(solution: Solution | None, origin: Origin, config: Config) -> Estimate | None:
+def _estimate(solution: Solution | None, origin: Origin, config: Config, lines: Bend | None
+              ) -> Estimate | None:
     """Return the camera in px of the input, also where it is refused; None without a solution."""
     if solution is None:
         return None
@@ -91,18 +96,18 @@ def _estimate(solution: Solution | None, origin: Origin, config: Config) -> Esti
         solution.carried(solution.posterior.alike.covariance) * units,
         solution.picture.times(px),
         solution.reprojection_error_px * px,
-        lacks_knowledge_only(Grounds(solution, config.verdict)))
+        lacks_knowledge_only(Grounds(solution, config.verdict, lines)))
 
 
-def _same_content(clips: Clips) -> dict[str, str]:
+def _same_content(clips: Clips) -> dict[str, Notice]:
     """Return the clips with the same content as another, which count once."""
     first: dict[str, str] = {}
-    return {name: f'has the same content as {first[clip.content]}'
+    return {name: Notice('E-CLIP-REPEATED', f'has the same content as {first[clip.content]}')
             for name, clip in clips.items()
             if first.setdefault(clip.content, name) != name}
 
 
-def _other_origins(clips: Clips) -> dict[str, str]:
+def _other_origins(clips: Clips) -> dict[str, Notice]:
     """Return the clips with another image size than most: a calibration holds for one.
 
     Pictures that were resized differently, with other settings, are of another size, too.
@@ -113,10 +118,11 @@ def _other_origins(clips: Clips) -> dict[str, str]:
         return sum(map(bool, turns)), sum(turns), len(turns), str(origin)
 
     main = max({clip.origin for clip in clips.values()}, key=weight, default=Origin((0, 0)))
-    return {name: f'is {size_text(clip.origin.image_size)}, and most clips of this camera are '
-                  f'{size_text(main.image_size)}'
+    return {name: Notice('E-CLIP-OTHER-SIZE', f'is {size_text(clip.origin.image_size)}, and most '
+                         f'clips of this camera are {size_text(main.image_size)}')
             if clip.origin.image_size != main.image_size else
-            'was gathered with another max_width or min_width than most clips of this camera'
+            Notice('E-CLIP-OTHER-SETTINGS', 'was gathered with another max_width or min_width '
+                   'than most clips of this camera')
             for name, clip in clips.items() if clip.origin != main}
 
 
@@ -125,12 +131,12 @@ def _numbered(clips: Clips) -> dict[TurnId, ClipTurn]:
     found: dict[TurnId, ClipTurn] = {}
     for name, clip in clips.items():
         for turn in clip.turns:
-            key = TurnId.stored(len(found))
+            key = TurnId.stored(len(found), name)
             found[key] = ClipTurn(name, replace(turn, scene=replace(turn.scene, turn=key)))
     return found
 
 
-def _chosen(turns: Mapping[TurnId, ClipTurn], left_out: Mapping[str, str], config: Config
+def _chosen(turns: Mapping[TurnId, ClipTurn], left_out: Mapping[str, Notice], config: Config
             ) -> tuple[list[Scene], dict[TurnId, TurnId]]:
     """Return the scenes to use, and which turns repeat others.
 
@@ -154,32 +160,48 @@ def _chosen(turns: Mapping[TurnId, ClipTurn], left_out: Mapping[str, str], confi
 
 
 def _evidence(clips: Clips, origin: Origin, stored: Sequence[StoredTurn],
-              left_out: Mapping[str, str]) -> Evidence:
-    """Return what the judge needs beside the solution: of clips, only their turns are left."""
+              left_out: Mapping[str, Notice]) -> Evidence:
+    """Return what the judge needs beside the solution, of clips without pictures."""
     return Evidence(
         image_size=origin.image_size, scale=origin.scale,
         frames=sum(clip.frames for clip in clips.values()), stored=tuple(stored),
         warnings=tuple(Notice('E-CLIP-LEFT-OUT', f'the clip {name} was left out: it {why}')
                        for name, why in sorted(left_out.items())),
         turns=(), built={}, magnitudes=np.zeros((0, 2)), mask=None, timing={},
+        lines=_lines_of(clips),
         straights=StraightCollector().straights())  # none: the turns' paths stand in
 
 
-def _nothing_found(clips: Clips) -> str:
+def _lines_of(clips: Clips) -> Lines | None:
+    """Return the upright lines of all clips, as of one drive through one clip after the other."""
+    found = [clip.lines for clip in clips.values() if clip.lines is not None and len(clip.lines)]
+    if not found:
+        return None
+    stamps = [found[0].stamps_s]
+    for lines in found[1:]:
+        # clips may count from 0 each, but what is apart in time is apart in place, too
+        stamps.append(lines.stamps_s - lines.stamps_s[0] + stamps[-1][-1] + 2 * GROUP_S)
+    whole = Lines(np.concatenate([lines.points for lines in found]), np.concatenate(stamps))
+    return whole.chosen(np.arange(len(whole)) % -(-len(whole) // MOST_LINES) == 0)
+
+
+def _nothing_found(clips: Clips) -> Notice:
     if not clips:
-        return 'none of its clips could be read'
+        return Notice('E-NO-CLIP', 'none of its clips could be read')
     turns = sum(clip.found for clip in clips.values())
     scenes = sum(len(clip.turns) for clip in clips.values())
     what = counted(len(clips), 'clip')
     if not turns:
-        return f'no turn was found in {what}; add clips in which the car turns at crossings'
+        return Notice('E-NO-TURN', f'no turn was found in {what}; add clips in which the car '
+                                   f'turns at crossings')
     if not scenes:
-        return f'none of the {turns} turns in {what} could be reconstructed'
-    return f'no common camera explains the {scenes} turns of {what}'
+        return Notice('E-NO-SCENE', f'none of the {turns} turns in {what} could be reconstructed')
+    return Notice('E-NO-COMMON-CAMERA',
+                  f'no common camera explains the {counted(scenes, "turn")} of {what}')
 
 
 def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn],
-                  shares: Mapping[str, ClipShare]) -> dict[str, str]:
+                  shares: Mapping[str, ClipShare]) -> dict[str, Notice]:
     """Return the clips, less than half of all, that are of another camera, and why.
 
     Two things show it: the cost of a clip's turns, and the fx of these turns alone.
@@ -189,8 +211,8 @@ def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn],
     of_another = turns_of_another_camera(solution.misfits)
     used = Counter(turns[key].clip for key in solution.misfits)
     against = Counter(turns[key].clip for key in of_another)
-    found = {clip: f'shows another camera: the cost of its turns is {worst:.1f} times as high '
-                   f'with this camera as with one of their own'
+    found = {clip: Notice('E-CLIP-OTHER-CAMERA', f'shows another camera: the cost of its turns is '
+                          f'{worst:.1f} times as high with this camera as with one of their own')
              for clip, count in sorted(against.items()) if 2 * count >= used[clip]
              for worst in [max(solution.misfits[key] for key in of_another
                                if turns[key].clip == clip)]}
@@ -204,7 +226,7 @@ def contradicting(solution: Solution | None, turns: Mapping[TurnId, ClipTurn],
 OTHER_FOCAL, OTHER_FOCAL_SHARE = 4.0, 0.05
 
 
-def _other_focal(shares: Mapping[str, ClipShare]) -> dict[str, str]:
+def _other_focal(shares: Mapping[str, ClipShare]) -> dict[str, Notice]:
     """Return the clips whose own fx is clearly off the median of all, each counted about once."""
     known = [(clip, share.fx, share.fx_sigma) for clip, share in sorted(shares.items())
              if share.fx and share.fx_sigma]
@@ -214,8 +236,8 @@ def _other_focal(shares: Mapping[str, ClipShare]) -> dict[str, str]:
     tolerance = OTHER_FOCAL_SHARE * fx
     middle = weighted_median(fx, 1 / (sigma**2 + tolerance**2))
     limit = np.maximum(tolerance, OTHER_FOCAL * sigma)
-    return {known[n][0]: f'shows another camera: fx from its turns alone is {fx[n]:.0f} px, and '
-                         f'{middle:.0f} px from most clips'
+    return {known[n][0]: Notice('E-CLIP-OTHER-CAMERA', f'shows another camera: fx from its turns '
+                                f'alone is {fx[n]:.0f} px, and {middle:.0f} px from most clips')
             for n in np.flatnonzero(np.abs(fx - middle) > limit)}
 
 

@@ -27,8 +27,9 @@ COLUMNS = ('clip', 'camera', 'make', 'fps', 'topic', 'time')
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A clip. number: of the manifest's row, from 1. place: its path or URL; clip: as written.
+    """A clip. number: of the manifest's row, from 1. place: its path or URL.
 
+    clip: as written, without credentials; place, which may have some, is nowhere shown or kept.
     camera: '' where it is unknown, then the clip is a camera of its own. make: '' where unknown.
     time_s: when it was recorded, s since 1970; None where unknown. problem: why this row cannot
     be used, '' if it can.
@@ -62,22 +63,24 @@ def read_manifest(place: str, group_by: str | None = None) -> list[Row]:
     except re.error as error:
         raise ConfigError('E-GROUP-BY-INVALID', f'--group-by {shortened(group_by or "")} is not '
                                                 f'a regular expression ({error})') from error
-    reader = next((each for suffix, each in READERS.items() if place.lower().endswith(suffix)),
+    name, shown = storage.bare(place), storage.masked(place)
+    reader = next((each for suffix, each in READERS.items() if name.lower().endswith(suffix)),
                   None)
     if reader is None or storage.is_folder(place):
-        rows = [Row(number, found, found) for number, found in enumerate(_found(place), 1)]
+        rows = [Row(number, storage.masked(found), found)
+                for number, found in enumerate(_found(place), 1)]
     else:
         data = storage.read(place, MANIFEST_BYTES)
         if data is None:
-            raise InputError('E-MANIFEST-MISSING', f'there is no manifest {place}; check the path')
-        folder = posixpath.dirname(place)
+            raise InputError('E-MANIFEST-MISSING', f'there is no manifest {shown}; check the path')
+        folder = posixpath.dirname(name)
         rows = [_row(number, values, folder) for number, values in enumerate(
-            islice(reader(place, data), MANIFEST_ROWS + 1), 1)]
+            islice(reader(shown, data), MANIFEST_ROWS + 1), 1)]
         if len(rows) > MANIFEST_ROWS:
-            raise InputError('E-MANIFEST-TOO-LONG', f'{place} has more than {MANIFEST_ROWS} rows: '
+            raise InputError('E-MANIFEST-TOO-LONG', f'{shown} has more than {MANIFEST_ROWS} rows: '
                                                     f'divide it into parts')
     if not rows:
-        raise InputError('E-MANIFEST-EMPTY', f'{place} names no clip; use a CSV with a column '
+        raise InputError('E-MANIFEST-EMPTY', f'{shown} names no clip; use a CSV with a column '
                                              f'clip, a folder of clips, or a glob in quotes')
     return rows if pattern is None else [_grouped(row, pattern) for row in rows]
 
@@ -87,10 +90,11 @@ def _found(place: str) -> list[str]:
     if storage.is_pattern(place):
         return storage.listed(place)
     if not storage.is_folder(place):
+        shown = storage.masked(place)
         if storage.stamp(place) is None:
-            raise InputError('E-MANIFEST-MISSING', f'there is no manifest {place}; check the path')
+            raise InputError('E-MANIFEST-MISSING', f'there is no manifest {shown}; check the path')
         raise InputError('E-MANIFEST-UNKNOWN-TYPE',
-                         f'{place} is not a manifest: use a .csv, .jsonl or .parquet file, a '
+                         f'{shown} is not a manifest: use a .csv, .jsonl or .parquet file, a '
                          f'folder of clips, or a glob in quotes')
     found = storage.listed(place)
     if found and all(name.lower().endswith(tuple(IMAGE_SUFFIXES)) for name in found):
@@ -109,7 +113,10 @@ Values = Mapping[str, Any] | str
 
 
 def _csv(place: str, data: bytes) -> Iterator[Values]:
-    reader = csv.reader(io.StringIO(_text_of(place, data).replace('\0', ''), newline=''))
+    text = _text_of(place, data).replace('\0', '')
+    # a spreadsheet writes semicolons where the comma is in numbers
+    mark = max(',;\t', key=text.partition('\n')[0].count)
+    reader = csv.reader(io.StringIO(text, newline=''), delimiter=mark)
     try:
         head = [name.strip().lower() for name in next(reader, [])]
         if 'clip' not in head:
@@ -169,7 +176,8 @@ def _row(number: int, values: Values, folder: str) -> Row:
         '' if values.get(name) is None else str(values[name]).strip() for name in COLUMNS)
     if not clip:
         return Row(number, '', '', camera, make, problem='names no clip')
-    row = Row(number, clip, storage.joined(folder, clip), camera, make, topic=topic or None)
+    row = Row(number, storage.masked(clip), storage.joined(folder, clip), camera, make,
+              topic=topic or None)
     try:
         return replace(row, fps=_rate(fps) if fps else None, time_s=_time(time) if time else None)
     except ValueError as error:
@@ -178,8 +186,9 @@ def _row(number: int, values: Values, folder: str) -> Row:
 
 def _rate(text: str) -> float:
     with suppress(ValueError):
-        if 0 < float(text) <= 1000:
-            return float(text)
+        rate = float(text.replace(',', '.'))
+        if 0 < rate <= 1000:
+            return rate
     raise ValueError(f'fps must be above 0 and at most 1000, not {shortened(text, 40)}')
 
 

@@ -1,10 +1,10 @@
 """overview.html: the fleet on one page, with links to each camera's report."""
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 from urllib.parse import quote
 
@@ -65,11 +65,14 @@ def overview_html(cameras: Rows, clips: Rows) -> str:
                 [(_link(row), row['make'] or '', row['prior_note'])
                  for row in cameras if row['other_mode']]),
         _reasons('Clips that are not used', 'clips', [
-            (row['reason'], row['clip'] or f'row {row["row"]}')
+            (row['code'], row['reason'], row['clip'] or f'row {row["row"]}')
             for row in clips if row['status'] != 'used']),
         _reasons('Cameras that are not accepted', 'cameras', [
-            (reason, row['camera']) for row in cameras if row['verdict'] != 'accepted'
-            for reason in row['reasons']]),
+            (code, reason, row['camera']) for row in cameras if row['verdict'] != 'accepted'
+            for reason, code in zip_longest(row['reasons'], row['reason_codes'], fillvalue='')]),
+        _reasons('No prior from the camera model', 'cameras', [
+            ('', row['prior_note'], row['camera']) for row in cameras
+            if row['verdict'] != 'accepted' and row['prior_note'] and not row['other_mode']]),
         _listed(cameras)]
     return template('overview.html').render(
         cameras=len(cameras), clips=len(clips), titles=TITLES, sections=sections,
@@ -180,16 +183,15 @@ def _figure(caption: str, axes: Axes, parts: Sequence[str]) -> tuple[str, str]:
     return svg(axes.width, axes.height, caption, ''.join(parts)), caption
 
 
-def _reasons(title: str, what: str, found: Iterable[tuple[str, str]]) -> Section:
-    """Return how often each reason came, and with what; if only numbers differ, it is one."""
+def _reasons(title: str, what: str, found: Iterable[tuple[str, str, str]]) -> Section:
+    """Return how often each code came, with which reason first, and with what."""
     groups: dict[str, list[tuple[str, str]]] = {}
-    for reason, name in found:
-        plain = re.sub(r'\d+(\.\d+)?', 'N', reason.replace(name, '')) if name else reason
-        groups.setdefault(plain, []).append((reason, name))
-    ranked = sorted(groups.values(), key=lambda group: (-len(group), group[0]))
-    return Section(title, ('reason', 'how many', what),
-                   [(group[0][0], len(group), _names([name for _, name in group]))
-                    for group in ranked[:50]])
+    for code, reason, name in found:
+        groups.setdefault(code or reason, []).append((reason.removesuffix(f' [{code}]'), name))
+    ranked = sorted(groups.items(), key=lambda group: (-len(group[1]), group[0]))
+    return Section(title, ('reason', 'the first', 'how many', what),
+                   [(code, group[0][0], len(group), _names([name for _, name in group]))
+                    for code, group in ranked])
 
 
 def _names(names: Sequence[str]) -> str:

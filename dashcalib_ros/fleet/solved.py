@@ -21,17 +21,16 @@ from dashcalib_ros.judge.calibration import Condition
 from dashcalib_ros.solve.spread import PictureSigma
 
 # of the JSON text
-FORMAT = 3
-
+FORMAT = 4
 
 
 @dataclass(frozen=True)
 class ClipShare:
     """What a clip gave to its camera's calibration.
 
-    used: turns in the adjustment. left_out: why none is, '' otherwise. fx, fx_sigma: of its turns
-    alone, in px of the input, linearised at the camera's solution; None where unknown. The sigma
-    is that of their noise, without how much turns differ beyond it.
+    used: turns in the adjustment. left_out: why none is, with a code, '' otherwise. fx, fx_sigma:
+    of its turns alone, in px of the input, linearised at the camera's solution; None where
+    unknown. The sigma is that of their noise, without how much turns differ beyond it.
     """
 
     used: int = 0

@@ -1,10 +1,10 @@
 """Files here and on object stores, read and written whole: paths, and URLs such as s3://.
 
-Only URLs need fsspec.
+Only URLs need fsspec. A manifest may be a stranger's: of the many things that fsspec opens, only
+stores are opened, and no message or table has the credentials of a URL.
 """
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import posixpath
@@ -17,13 +17,23 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from dashcalib_ros.errors import ConfigError, InputError, OutputError, one_line
+from dashcalib_ros.errors import (
+    ConfigError,
+    DashcalibError,
+    InputError,
+    OutputError,
+    one_line,
+)
 from dashcalib_ros.input.inputs import named_like
 from dashcalib_ros.limits import CLIP_BYTES, CLIP_FILES, check_file, read_file
-from dashcalib_ros.whole_files import temporary_folder, write_whole
+from dashcalib_ros.whole_files import FULL, temporary_folder, write_whole
 
 URL = re.compile(r'[a-z][a-z0-9+.-]+://')
-FULL = (errno.ENOSPC, errno.EDQUOT)
+SCHEMES = ('s3', 'gs', 'az', 'abfs', 'http', 'https')
+# before the @; a key may have slashes, and what follows a host's colon may be its port. Of a store
+# of Azure a name without a colon is that of the container
+CREDENTIALS = re.compile(r'(?<=://)(?:[^/?#]*@|[^/@:?#]*:(?!\d+(?:[/?#]|$))[^@]*@)')
+CONTAINER = re.compile(r'(?:az|abfs)://[^/:@]*@')
 # bytes of one of our own files
 LARGEST = 2**28
 # by which an object store shows that a file changed
@@ -40,6 +50,23 @@ def joined(folder: str, name: str) -> str:
     return name if is_url(name) else posixpath.join(folder, name)
 
 
+def masked(place: str) -> str:
+    """Return a place as it may be shown: a URL without credentials, and a hash for its query."""
+    if '://' not in place:
+        return place
+    container = CONTAINER.match(place)
+    known = container.end() if container else 0
+    text = place[:known] + CREDENTIALS.sub('***@', place[known:])
+    name = bare(text)
+    query = hashlib.sha256(os.fsencode(text[len(name):])).hexdigest()[:8]
+    return name if name == text else f'{name}?***{query}'
+
+
+def bare(place: str) -> str:
+    """Return a URL without its query, which may be a signature; a path is itself."""
+    return re.split('[?#]', place)[0] if '://' in place else place
+
+
 def is_pattern(place: str) -> bool:
     """Return whether a place is a glob."""
     return any(sign in place for sign in '*?[')
@@ -50,20 +77,24 @@ def listed(place: str) -> list[str]:
     if is_url(place):
         system, path = _system(place)
         scheme = place.partition('://')[0]
-        with _store_errors(f'list {place}'):
+        with _store_errors('list', place):
             found = system.glob(path) if is_pattern(path) else system.ls(path, detail=False)
-        return sorted(f'{scheme}://{name}' for name in found)
+        return sorted(name if is_url(name) else f'{scheme}://{name}' for name in found)
     if is_pattern(place):
         return sorted(map(str, named_like(place)))
     return sorted(str(entry) for entry in Path(place).iterdir() if not entry.name.startswith('.'))
 
 
 def is_folder(place: str) -> bool:
-    """Return whether a place is a folder of this machine, or one of an object store."""
+    """Return whether a place is a folder of this machine, or one of an object store.
+
+    The web has none: to fsspec a page is one as soon as it has a link.
+    """
     if not is_url(place):
         return Path(place).is_dir()
     system, path = _system(place)
-    return bool(system.isdir(path))
+    with _store_errors('read', place):
+        return not is_url(path) and bool(system.isdir(path))
 
 
 def clip_files(path: Path) -> list[tuple[Path, os.stat_result]]:
@@ -110,7 +141,7 @@ def _stored_stamps(url: str) -> list[str]:
     """Return what changes with a file of a store, or with each of a folder; [] without one."""
     system, path = _system(url)
     entries: dict[str, Any] = {}
-    with _store_errors(f'read {url}'), suppress(FileNotFoundError):
+    with _store_errors('read', url), suppress(FileNotFoundError):
         about = system.info(path)
         entries = {'.': about} if about.get('type') != 'directory' else {
             name.removeprefix(path): each
@@ -130,9 +161,12 @@ def local_copy(place: str) -> Iterator[Path]:
         return
     system, path = _system(place)
     with temporary_folder() as scratch:
-        copy = scratch / posixpath.basename(path.rstrip('/'))
-        with _store_errors(f'copy {place}'):
-            system.get(path, str(copy), recursive=system.isdir(path))
+        copy = scratch / (posixpath.basename(bare(path).rstrip('/')) or 'clip')
+        with _store_errors('copy', place):
+            if is_folder(place):
+                system.get(path, str(copy), recursive=True)
+            else:
+                system.get_file(path, str(copy))  # get() takes a query for a pattern
         yield copy
 
 
@@ -142,11 +176,12 @@ def read(place: str, limit: int = LARGEST) -> bytes | None:
         return read_file(Path(place), limit) if Path(place).exists() else None
     system, path = _system(place)
     data = None
-    with _store_errors(f'read {place}'), suppress(FileNotFoundError):
+    with _store_errors('read', place), suppress(FileNotFoundError):
         data = bytes(system.cat_file(path, start=0, end=limit + 1))
     if data is not None and len(data) > limit:
-        raise InputError('E-FILE-TOO-LARGE', f'{place} is larger than {limit / 2**20:.0f} MB: '
-                                             f'check that it is the right file')
+        raise InputError('E-FILE-TOO-LARGE', f'{masked(place)} is larger than '
+                                             f'{limit / 2**20:.0f} MB: check that it is the right '
+                                             f'file')
     return data
 
 
@@ -159,9 +194,11 @@ def write(place: str, data: bytes) -> None:
         else:
             Path(place).parent.mkdir(parents=True, exist_ok=True)
             write_whole(Path(place), data)
-    except OSError as error:
-        what = f'cannot write {place}: {error.strerror or one_line(error)}'
-        if error.errno in FULL:
+    except DashcalibError:
+        raise
+    except Exception as error:  # stores have errors of their own
+        what = f'cannot write {masked(place)}: {_reason(error, place)}'
+        if getattr(error, 'errno', None) in FULL:
             raise OutputError('E-DISK-FULL', f'{what}; free some space and start the command '
                                              f'again: it continues where it stopped') from error
         raise OutputError('E-OUTPUT-NOT-WRITABLE',
@@ -179,28 +216,37 @@ def remove(place: str) -> None:
 
 
 @contextmanager
-def _store_errors(what: str) -> Iterator[None]:
+def _store_errors(what: str, url: str) -> Iterator[None]:
     """Raise InputError for what stores raise, each errors of its own; OSError for a full disk."""
     try:
         yield
     except Exception as error:
         if getattr(error, 'errno', None) in FULL:
             raise
-        raise InputError('E-ADDRESS-UNREADABLE', f'cannot {what} ({one_line(error)}); check '
-                                                   f'the address and your access to it') from error
+        raise InputError('E-ADDRESS-UNREADABLE',
+                         f'cannot {what} {masked(url)} ({_reason(error, url)}); check the address '
+                         f'and your access to it') from error
+
+
+def _reason(error: Exception, place: str) -> str:
+    """Return why a place cannot be used; what a library says may have the place's credentials."""
+    reason = getattr(error, 'strerror', None) or one_line(error)
+    return reason if masked(place) == place else type(error).__name__
 
 
 def _system(url: str) -> tuple[Any, str]:
     """Return fsspec's file system of a URL, and the path there; raises InputError."""
-    fsspec = needs('fsspec', f'{url.partition("://")[0]}:// addresses')
+    scheme, _, rest = url.partition('://')
+    if scheme not in SCHEMES or '://' in rest or '::' in url:
+        raise InputError('E-ADDRESS-REFUSED', f'{masked(url)} is not opened: use a path, or one '
+                                              f'address of {", ".join(SCHEMES)}')
+    fsspec = needs('fsspec', f'{scheme}:// addresses')
     try:
         system, path = fsspec.core.url_to_fs(url)
     except (ImportError, ValueError) as error:
-        raise InputError('E-ADDRESS-UNKNOWN', f'cannot use {url} ({one_line(error)}); use a '
-                                              f'kind of address that fsspec supports') from error
-    if 'file' in system.protocol:
-        raise InputError('E-ADDRESS-OF-LOCAL-FILE',
-                         f'{url} is a file of this machine: use its path')
+        raise InputError('E-ADDRESS-UNKNOWN',
+                         f'cannot use {masked(url)} ({_reason(error, url)}); install what fsspec '
+                         f'needs for it') from error
     return system, str(path)
 
 

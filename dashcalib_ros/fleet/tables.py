@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera import calibrated_models
-from dashcalib_ros.errors import visible
+from dashcalib_ros.errors import Notice, coded, counted, visible
 from dashcalib_ros.fleet.clips import ClipResult, hash_of
 from dashcalib_ros.fleet.manifest import Row
 from dashcalib_ros.fleet.solved import ClipShare, Final, Solved
 from dashcalib_ros.fleet.storage import has, joined, write
-from dashcalib_ros.formats.ours import plain_values
 from dashcalib_ros.judge.calibration import ANGLES
 from dashcalib_ros.store.scene_file import DATES_S
 
@@ -31,6 +31,9 @@ YEAR_S = 365.25 * 86400
 LEAST_CLIPS = 3
 # the end of a camera's folder whose name is not the camera's
 HASHED = re.compile(r'-[0-9a-f]{32}$')
+
+# the end of a text by coded()
+CODED = re.compile(r' \[(E-[A-Z0-9-]+)\]$')
 
 # how a text begins that a spreadsheet runs
 FORMULA = ('=', '+', '-', '@')
@@ -49,9 +52,10 @@ CAMERA_COLUMNS = {
                      'turns_used'), 'number'),
     'seconds': 'real', 'prior_units': 'number', 'prior_share': 'real', 'prior_note': 'text',
     'other_mode': 'flag', 'drift_percent_per_year': 'real', 'drift_sigma': 'real',
-    'reasons': 'texts', 'warnings': 'texts', 'folder': 'text'}
+    **dict.fromkeys(('reasons', 'reason_codes', 'warnings'), 'texts'), 'folder': 'text'}
 CLIP_COLUMNS = {
-    'row': 'number', **dict.fromkeys(('clip', 'camera', 'make', 'status', 'reason'), 'text'),
+    'row': 'number',
+    **dict.fromkeys(('clip', 'camera', 'make', 'status', 'reason', 'code'), 'text'),
     'width': 'number', 'height': 'number', 'frames': 'number', 'seconds': 'real',
     **dict.fromkeys(('turns', 'scenes', 'turns_used'), 'number'),
     **dict.fromkeys(('fx', 'sigma_fx_noise', 'time'), 'real'), 'content': 'text', 'file': 'text',
@@ -68,7 +72,7 @@ def camera_row(solved: Solved, final: Final, clips: Sequence[Mapping[str, Any]])
         'reprojection_error_px': c.reprojection_error_px, 'prior_units': final.prior_units,
         'prior_share': final.prior_share, 'prior_note': final.prior_note,
         'other_mode': final.other_mode, 'reasons': list(c.verdict.reasons),
-        'warnings': list(c.warnings)}
+        'reason_codes': list(c.verdict.codes), 'warnings': list(c.warnings)}
     if estimate is not None:
         row.update({f'sigma_{name}_alone': sigma for name, sigma in estimate.sigma.items()})
     if c.camera is not None and c.sigma is not None:
@@ -99,6 +103,7 @@ def failed_row(camera: str, make: str, clips: Sequence[Mapping[str, Any]], reaso
         'seconds': float(sum(row['seconds'] for row in clips)), 'prior_units': 0,
         'prior_share': 0.0, 'prior_note': '', 'other_mode': False,
         'drift_percent_per_year': drift, 'drift_sigma': drift_sigma, 'reasons': [reason],
+        'reason_codes': [_code(reason)],
         'warnings': [], 'folder': camera_folder(camera)}
 
 
@@ -118,15 +123,17 @@ def clip_rows(camera: str, make: str, clips: Sequence[tuple[Row, ClipResult]],
     for row, result in clips:
         share = shares.get(row.name, ClipShare())
         if result.file and first.setdefault(row.name, row.number) != row.number:
-            share = ClipShare(left_out=f'is the same clip as in row {first[row.name]}')
+            share = ClipShare(left_out=coded(Notice(
+                'E-CLIP-REPEATED', f'is the same clip as in row {first[row.name]}')))
         status, reason = _status(result, share)
         # videos count from 0, which is no date
         time = next((time for time in (row.time_s, result.time)
                      if time is not None and time > DATES_S), None)
         found.append({
             **vars(result), 'row': row.number, 'clip': row.clip, 'camera': camera,
-            'make': make or None, 'status': status, 'reason': reason, 'turns_used': share.used,
-            'fx': share.fx, 'sigma_fx_noise': share.fx_sigma, 'time': time})
+            'make': make or None, 'status': status, 'reason': reason, 'code': _code(reason),
+            'turns_used': share.used, 'fx': share.fx, 'sigma_fx_noise': share.fx_sigma,
+            'time': time})
     return found
 
 
@@ -138,10 +145,16 @@ def _status(result: ClipResult, share: ClipShare) -> tuple[str, str]:
     if share.used:
         return 'used', ''
     if not result.turns:
-        return 'no turn', 'the car does not turn, or does not move'
+        return 'no turn', coded(Notice('E-NO-TURN', 'the car does not turn, or does not move'))
     if not result.scenes:
-        return 'no scene', f'none of its {result.turns} turns could be reconstructed'
+        return 'no scene', coded(Notice(
+            'E-NO-SCENE', f'none of its {counted(result.turns, "turn")} could be reconstructed'))
     return 'not needed', 'other turns of the camera are used'
+
+
+def _code(reason: str) -> str:
+    found = CODED.search(reason)
+    return found[1] if found else ''
 
 
 def _drift(clips: Sequence[Mapping[str, Any]]) -> tuple[float | None, float | None]:

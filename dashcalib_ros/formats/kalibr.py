@@ -1,6 +1,7 @@
 """Kalibr's camchain.yaml."""
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,15 @@ def cameras(data: Any, path: Path) -> Cameras:
         return {'': partial(_read, data, path)}
     return {str(name): partial(_read, each, path) for name, each in data.items()
             if isinstance(each, dict) and KEY in each}
+
+
+def results(text: str, path: Path) -> Cameras:
+    """Refuse the text of results that Kalibr writes beside a camchain; see formats/table.py."""
+    if re.search(r'^\s*projection: \[.*\+-', text, re.MULTILINE):
+        raise InputError('E-KALIBR-RESULTS',
+                         f'{path} has the results of Kalibr in words, without the size of the '
+                         f'pictures; use the camchain YAML that Kalibr wrote beside it')
+    return {}
 
 
 def _read(data: Data, path: Path) -> Camera:

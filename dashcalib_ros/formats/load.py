@@ -7,20 +7,21 @@ from __future__ import annotations
 import os
 import re
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.camera.mapping import rayless_share
 from dashcalib_ros.errors import InputError, shortened
 from dashcalib_ros.formats import colmap, ros
 from dashcalib_ros.formats.ours import calibrated_camera
+from dashcalib_ros.formats.plausible import doubts
 from dashcalib_ros.formats.table import FORMATS
-from dashcalib_ros.formats.values import Cameras, Data, numbers_in
+from dashcalib_ros.formats.values import Cameras, Data, numbers_in, said_model
 from dashcalib_ros.input.inputs import fits_bag
-from dashcalib_ros.input.source import os_error, size_text
+from dashcalib_ros.input.source import os_error
 from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.limits import (
@@ -31,6 +32,7 @@ from dashcalib_ros.limits import (
     check_npz,
     parse_json,
     parse_yaml,
+    path_of,
     read_text,
 )
 
@@ -41,6 +43,8 @@ IN_FOLDER = ('result.json', 'calibration.yaml', 'cameras.bin', 'cameras.txt',
 KNOWN = ('a result.json (or its folder), a camera_info YAML, a file of OpenCV, Kalibr, COLMAP, '
          'nerfstudio, OpenSfM, mrcal or Gyroflow, a JSON of fx, fy, cx, cy, k1, k2, width and '
          'height, or a bag with camera_info')
+# names that promise a format: there it is worth a correction
+NAMED = ('.json', '.yaml', '.yml')
 Given = CalibrationData | NamedCamera | Camera | str | os.PathLike[str]
 
 
@@ -66,15 +70,11 @@ def load_camera(path: str | os.PathLike[str], name: str | None = None) -> NamedC
 def load_with_faults(path: str | os.PathLike[str], name: str | None = None) -> NamedCamera:
     """Read a camera as load_camera() does; what is wrong beside it (R, P) is in its faults."""
     found = _loaded(path, name)
-    if rayless_share(found.camera) == 1:
-        raise InputError('E-CALIBRATION-NO-RAY',
-                         f'{found.name} is of a lens that sees no ray in its picture of '
-                         f'{size_text(found.image_size)}; calibrate the camera again')
-    return found
+    return replace(found, warnings=doubts(found.camera, found.name))
 
 
 def _loaded(path: str | os.PathLike[str], name: str | None) -> NamedCamera:
-    text = os.fspath(path)
+    text = str(path_of(path))
     before, _, after = text.rpartition(':')
     # lexists() takes any text, also one that is too long for a name
     if name is None and before and os.path.lexists(before) and not os.path.lexists(text):
@@ -112,8 +112,13 @@ def _cameras_in(data: Any, path: Path) -> Cameras:
     for form in FORMATS.values():
         if form.in_data and (found := form.in_data(data, path)):
             return found
-    raise InputError('E-CALIBRATION-FORMAT',
-                     f'{path} is not a known camera calibration; use {KNOWN}')
+    raise _unknown(path, said_model(data))
+
+
+def _unknown(path: Path, model: str | None = None) -> InputError:
+    said = '' if model is None else f' (it says: {shortened(model, 40)})'
+    return InputError('E-CALIBRATION-FORMAT',
+                      f'{path} is not a known camera calibration{said}; use {KNOWN}')
 
 
 def _chosen(cameras: Cameras, name: str | None, path: str | Path) -> NamedCamera:
@@ -137,13 +142,14 @@ def _decoded(text: str, path: Path) -> Any:
     start = text.lstrip()[:1]
     if start == '<':
         return _xml(text, path)
-    if start in ('{', '['):
-        return parse_json(text, str(path))
     try:
-        return parse_yaml(_first_document(text), str(path))
+        return (parse_json(text, str(path)) if start in ('{', '[')
+                else parse_yaml(_first_document(text), str(path)))
     except InputError as error:
         if error.__cause__ is None:
-            raise  # a limit; the rest is what PyYAML cannot read
+            raise  # a limit; the rest is what the parser cannot read
+        if start != '{' and path.suffix.lower() not in NAMED:
+            raise _unknown(path) from error
         raise InputError(error.code, f'{error}; use {KNOWN}') from error
 
 

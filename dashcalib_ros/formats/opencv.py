@@ -4,7 +4,6 @@ Read from YAML, XML, JSON and .npz; written as cv2.FileStorage does.
 """
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,8 +21,12 @@ from dashcalib_ros.formats.values import (
     Cameras,
     Data,
     camera_with,
+    check_lens_kind,
     focal_and_centre,
     is_fisheye,
+    no_distortion,
+    plain_key,
+    read_matrix,
     read_numbers,
 )
 from dashcalib_ros.judge.difference import NamedCamera
@@ -51,7 +54,7 @@ class Entries:
 
     def __init__(self, data: Data, path: Path) -> None:
         self.data, self.path = data, path
-        self._keys = {re.sub('[^a-z0-9]', '', str(key).lower()): key for key in data}
+        self._keys = {plain_key(key): key for key in data}
 
     def __contains__(self, name: str) -> bool:
         return name in self._keys
@@ -91,17 +94,18 @@ def read(data: Data, path: Path, rectification: Sequence[str] = RECTIFICATION,
     rectification, projection: the names of ROS's R and P. Raises InputError.
     """
     entries = Entries(data, path)
-    k = entries.numbers(MATRIX, 4, 9)
-    k = k if len(k) == 9 else [k[0], 0, k[2], 0, k[1], k[3], 0, 0, 1]
-    d = entries.numbers(DISTORTION)
+    k = read_matrix(data, entries.key(*MATRIX), path)
+    given = entries.first(*DISTORTION)
+    named = isinstance(given, dict) and not isinstance(given.get('data'), list)
+    d = [] if named else entries.numbers(DISTORTION)
     r, p = entries.numbers(rectification, 0, 9), entries.numbers(projection, 0, 12)
-    size = _size_in(entries.first)
+    size = size_in(entries.first)
     kind, lens = entries.first('distortionmodel'), str(entries.first('cameramodel')).lower()
     ideal = 'distortionmodel' in entries and str(kind).lower() in NO_DISTORTION
-    if entries.key(*DISTORTION) is None and not ideal:
-        raise InputError('E-NO-DISTORTION',
-                         f'{path} has no distortion_coefficients; for pictures without '
-                         f'distortion, write 0 for each: distortion_coefficients: [0, 0, 0, 0, 0]')
+    check_lens_kind(lens, path)
+    if named or (entries.key(*DISTORTION) is None and not ideal):
+        raise no_distortion(data, 'no distortion_coefficients',
+                            ' for each: distortion_coefficients: [0, 0, 0, 0, 0]', path)
     if kind is None:
         fisheye = ('fisheye' in lens
                    or entries.first('fisheyemodel', 'fisheye') in (1, '1', True))
@@ -115,7 +119,7 @@ def read(data: Data, path: Path, rectification: Sequence[str] = RECTIFICATION,
     return NamedCamera(str(path), camera, faults=ros_faults(camera, k, r, p))
 
 
-def _size_in(first: Callable[..., Any]) -> Sequence[Any]:
+def size_in(first: Callable[..., Any]) -> Sequence[Any]:
     """Return width and height, as they are written. first: the first of these names' values."""
     for names, order in ((SIZES, 1), (SHAPES, -1)):
         both = first(*names)

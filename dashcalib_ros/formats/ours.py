@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
+from dashcalib_ros.arrays import Floats, plain_values
 from dashcalib_ros.camera import MODELS, Camera, Radial
 from dashcalib_ros.camera.field import BASIS, Field
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
@@ -24,10 +24,10 @@ from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, TurnId
 from dashcalib_ros.errors import DashcalibError, InputError, Notice, one_line
 from dashcalib_ros.formats import opencv, ros
+from dashcalib_ros.formats.plausible import check_lens
 from dashcalib_ros.formats.values import (
     Cameras,
     Data,
-    check_lens,
     read_number,
     read_pair,
     read_sigma,
@@ -47,7 +47,7 @@ from dashcalib_ros.judge.calibration import (
     Witnesses,
 )
 from dashcalib_ros.judge.difference import NamedCamera
-from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, read_text
+from dashcalib_ros.limits import JSON_BYTES, parse_json, parse_yaml, path_of, read_text
 from dashcalib_ros.solve.solution import LeftOut
 from dashcalib_ros.solve.spread import PictureSigma
 
@@ -104,7 +104,7 @@ def result_json(calibration: CalibrationData) -> str:
 
 def load_calibration(path: str | os.PathLike[str]) -> CalibrationData:
     """Read a result: see Calibration.load(). Settings that are unknown here are left out."""
-    place = Path(path)
+    place = path_of(path)
     place = place / 'result.json' if place.is_dir() else place
     text = read_text(place, JSON_BYTES)
     if text.lstrip().startswith('{'):
@@ -168,7 +168,7 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         sigma_px=made(PictureSigma, data.get('sigma_px')),
         stabiliser=made(Stabiliser, data.get('stabiliser')),
         field=None if field is None else LensField(
-            Field(size, np.array(field['coefficients'], np.float64)), bool(field['used']),
+            Field(size, np.array(field['coefficients'], np.float64)), _counts(field),
             field['rms_px'], field['worst_px'], field['sigma_px']),
         mount=_mount(data.get('mount')),
         held_out=tuple(held_out), straight_lines=made(Bend, data.get('straight_lines')),
@@ -179,27 +179,6 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
 def _frozen(value: Any) -> Any:
     """Return the value with tuples for its lists."""
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
-
-
-def plain_values(value: Any) -> Any:
-    """Return the value as types of strict JSON; NaN and infinity become None."""
-    if value is None or isinstance(value, bool):
-        return value
-    if isinstance(value, str):
-        return str(value)  # YAML has no place for a Notice
-    if isinstance(value, (np.ndarray, np.generic)):
-        return plain_values(value.tolist())
-    if isinstance(value, int):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return plain_values({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
-    if isinstance(value, Mapping):
-        return {str(key): plain_values(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain_values(item) for item in value]
-    return str(value)
 
 
 def _held_out_dict(turn: LeftOut) -> dict[str, Any]:
@@ -229,7 +208,7 @@ def _turn_dict(turn: TurnSummary | StoredTurnSummary) -> dict[str, Any]:
     values = dataclasses.asdict(turn)
     # a stored turn's id has a meaning in this run only
     return {('stamp' if key == 'stamp_s' else key): item for key, item in values.items()
-            if key != 'id'}
+            if key != 'id' and (key, item) != ('clip', '')}
 
 
 def calibration_yaml(calibration: CalibrationData, camera_name: str = ros.CAMERA_NAME,
@@ -321,7 +300,7 @@ def _no_intrinsics(name: str, verdict: Any, reasons: Any) -> InputError:
 def calibrated_camera(calibration: CalibrationData, name: str = 'estimate') -> NamedCamera:
     """Return the camera of a calibration. Raises InputError when it was refused."""
     if calibration.camera is None:
-        raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.reasons)
+        raise _no_intrinsics(name, calibration.verdict.level, calibration.verdict.told)
     shutter, field = calibration.rolling_shutter, calibration.field
     return NamedCamera(name, calibration.camera, calibration.sigma, calibration.verdict.level,
                        _of_camera(calibration, len(calibration.camera.params)),
@@ -361,9 +340,17 @@ def _covariance(details: Any, camera: Camera, sigma: Mapping[str, float] | None
     return None
 
 
+def _counts(field: Mapping[str, Any]) -> bool:
+    """Return whether a field is used; files of 0.2.0 call those below their sigma used, too."""
+    try:
+        return field.get('used') is True and not field['rms_px'] < field['sigma_px']
+    except (KeyError, TypeError):
+        return True
+
+
 def _used_field(data: Any, image_size: tuple[int, int]) -> Field | None:
     """Return result.json's field, None where there is none that is used."""
-    if not isinstance(data, Mapping) or data.get('used') is not True:
+    if not isinstance(data, Mapping) or not _counts(data):
         return None
     try:
         coefficients = np.array(data['coefficients'], np.float64)

@@ -1,4 +1,8 @@
-"""A plain JSON of fx, fy, cx, cy, coefficients by name, width and height."""
+"""Focal lengths and centre by name (fx, fy, cx, cy), with coefficients by name or as a list.
+
+They stand by themselves, or are an object in the file: one of several cameras, or of what other
+files have a matrix for.
+"""
 from __future__ import annotations
 
 from functools import partial
@@ -7,6 +11,7 @@ from typing import Any
 
 from dashcalib_ros.camera import FISHEYE, MODELS, NO_DISTORTION, Radial
 from dashcalib_ros.errors import InputError
+from dashcalib_ros.formats import opencv
 from dashcalib_ros.formats.values import (
     EQUIDISTANT,
     PLUMB_BOB,
@@ -14,6 +19,8 @@ from dashcalib_ros.formats.values import (
     Cameras,
     Data,
     camera_with,
+    check_lens_kind,
+    no_distortion,
     read_coefficients,
     read_number,
     read_sigma,
@@ -21,15 +28,39 @@ from dashcalib_ros.formats.values import (
 )
 from dashcalib_ros.judge.difference import NamedCamera
 
+# how files name fx, fy, cx and cy, in small letters without signs
+VIEW = (('fx', 'fu'), ('fy', 'fv'), ('cx', 'u0', 'cu', 'ppx'), ('cy', 'v0', 'cv', 'ppy'))
+MODEL = ('model', 'distortionmodel', 'intrinsictype', 'lensmodel', 'projectiontype')
+
 
 def cameras(data: Any, path: Path) -> Cameras:
-    """Return the camera of such a file; see formats/table.py."""
-    return {'': partial(_read, data, path)} if isinstance(data, dict) and 'fx' in data else {}
+    """Return the cameras of such a file; see formats/table.py."""
+    if not isinstance(data, dict):
+        return {}
+    if _has_view(data):
+        return {'': partial(_read, data, path)}
+    matrix = opencv.Entries(data, path).first(*opencv.MATRIX)
+    if matrix is not None and not _has_view(matrix):
+        return {}
+    return {str(name): partial(_read, {**data, **each}, path) for name, each in data.items()
+            if _has_view(each)}
+
+
+def _has_view(data: Any) -> bool:
+    return isinstance(data, dict) and opencv.Entries(data, Path()).key(*VIEW[0]) is not None
 
 
 def _read(data: Data, path: Path) -> NamedCamera:
     """Return the camera; coefficients after k2 may be omitted."""
-    name = data.get('model', data.get('distortion_model'))
+    entries = opencv.Entries(data, path)
+    view = [read_number(data, entries.key(*names) or names[0], path) for names in VIEW]
+    if isinstance(entries.first(*opencv.DISTORTION), (list, dict)):
+        return opencv.read({**data, 'camera_matrix': view}, path)
+    name = entries.first(*MODEL)
+    if name is None:
+        lens = str(entries.first('cameramodel', 'cameratype', 'type')).lower()
+        check_lens_kind(lens, path)
+        name = FISHEYE if 'fisheye' in lens else None
     ideal = isinstance(name, str) and name.lower() in NO_DISTORTION
     name = 'pinhole' if ideal else name
     models = [model for model in MODELS.values()
@@ -42,13 +73,12 @@ def _read(data: Data, path: Path) -> NamedCamera:
                          f'or "{RATIONAL}"')
     kind = (EQUIDISTANT if models[0].family == FISHEYE else
             PLUMB_BOB if name == PLUMB_BOB else RATIONAL)
-    missing = [] if ideal else [each for each in Radial.names()[4:] if each not in data]
+    known = Radial.names()[4:]
+    missing = [] if ideal else [each for each in known if each not in data]
     if missing:
         zeros = ', '.join(f'"{each}": 0' for each in missing)
-        raise InputError('E-NO-DISTORTION',
-                         f'{path} has no {" and no ".join(missing)}; for pictures without '
-                         f'distortion, write 0: {zeros}')
-    camera = camera_with((data.get('width'), data.get('height')),
-                         [read_number(data, key, path) for key in Radial.names()[:4]], kind,
+        raise no_distortion({key: value for key, value in data.items() if key not in known},
+                            f'no {" and no ".join(missing)}', f': {zeros}', path)
+    camera = camera_with(opencv.size_in(entries.first), view, kind,
                          read_coefficients(data, kind, path), path)
     return NamedCamera(str(path), camera, read_sigma(data.get('sigma'), camera))

@@ -19,7 +19,8 @@ import yaml
 from dashcalib_ros.camera import Camera, ros_camera, ros_faults
 from dashcalib_ros.camera.remap import SAME
 from dashcalib_ros.errors import ConfigError, InputError, shortened
-from dashcalib_ros.formats import opencv
+from dashcalib_ros.formats import opencv, plain
+from dashcalib_ros.formats.plausible import doubts
 from dashcalib_ros.formats.values import (
     Cameras,
     Data,
@@ -62,7 +63,8 @@ def camera_of_message(message: Any, name: str) -> NamedCamera:
         raise InputError('E-CALIBRATION-NUMBER',
                          f'{name} has numbers that are not finite; calibrate the camera again')
     camera = camera_with(size, focal_and_centre(k), str(message.distortion_model), d, name)
-    return NamedCamera(name, camera, faults=ros_faults(camera, k, r, p))
+    return NamedCamera(name, camera, faults=ros_faults(camera, k, r, p),
+                       warnings=doubts(camera, name))
 
 
 def echoed_cameras(data: Any, path: Path) -> Cameras:
@@ -97,11 +99,11 @@ def _check_whole(size: tuple[int, int], binning: Sequence[float], roi: Sequence[
 
 
 def ini_cameras(text: str, path: Path) -> Cameras:
-    """Return the cameras of an INI file: a line of words, then its numbers.
+    """Return the cameras of an INI file: ROS's, a line of words, then its numbers; or fx = 700.
 
     See formats/table.py.
     """
-    if not re.search(rf'^\s*\[{INI_IMAGE}\]\s*$', text, re.MULTILINE):
+    if not re.search(r'^\s*\[[^\[\]{}",]+\]\s*$', text, re.MULTILINE):
         return {}
     sections: dict[str, dict[str, Any]] = {}
     section: dict[str, Any] = {}
@@ -118,7 +120,11 @@ def ini_cameras(text: str, path: Path) -> Cameras:
             section[line] = values = []
         else:
             values += numbers
-    image = {key: values[0] for key, values in sections.pop(INI_IMAGE, {}).items() if values}
+    if INI_IMAGE not in sections:
+        return plain.cameras({name: {key: value[0] if len(value) == 1 else value
+                                     for key, value in each.items()}
+                              for name, each in sections.items()}, path)
+    image = {key: values[0] for key, values in sections.pop(INI_IMAGE).items() if values}
     return {name: partial(opencv.read, {**image, **section}, path)
             for name, section in sections.items()}
 

@@ -51,11 +51,11 @@ YAML, JSON = ('.yaml', '.yml', *TEXT), ('.json', *TEXT)
 # the first that has a camera in a content reads it: a lens profile of Gyroflow has a part that
 # looks like one of Kalibr, and opencv takes all with a camera matrix
 FORMATS = {
-    'plain': Format(in_data=plain.cameras),
     'ours': Format(in_data=ours.cameras),
+    'plain': Format(in_data=plain.cameras),
     'colmap': Format(colmap.cameras, None, colmap.write, TEXT),
     'gyroflow': Format(None, gyroflow.cameras, gyroflow.write, JSON, ('readout_ms',)),
-    'kalibr': Format(None, kalibr.cameras, kalibr.write, YAML),
+    'kalibr': Format(kalibr.results, kalibr.cameras, kalibr.write, YAML),
     'opensfm': Format(None, opensfm.cameras, opensfm.write, JSON),
     'nerfstudio': Format(None, nerfstudio.cameras, nerfstudio.write, JSON),
     'mrcal': Format(mrcal.cameras, None, mrcal.write, ('.cameramodel', *TEXT), ('field',)),

@@ -76,7 +76,9 @@ def _frame_name(source: str) -> str:
     """Return what the frames' names begin with: front for front/result.json and front.yaml."""
     place = Path(source)
     stem = place.stem if place.suffix and place.stem not in UNNAMED else place.parent.name
-    return 'camera' if stem in UNNAMED else re.sub(r'\W', '_', stem, flags=re.ASCII)
+    name = 'camera' if stem in UNNAMED else re.sub(r'\W', '_', stem, flags=re.ASCII)
+    # no link is its own parent
+    return f'{name}_camera' if f'{name}_link' == BASE else name
 
 
 def _rpy(mount: Mount) -> tuple[float, float, float]:

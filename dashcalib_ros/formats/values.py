@@ -6,12 +6,14 @@ other projections) is an InputError, and is never omitted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from dashcalib_ros.camera import (
     FISHEYE,
     MODELS,
+    NO_DISTORTION,
     Brown,
     Camera,
     Fisheye,
@@ -19,8 +21,9 @@ from dashcalib_ros.camera import (
     camera_from_ros,
 )
 from dashcalib_ros.errors import ConfigError, InputError, shortened
+from dashcalib_ros.formats.plausible import check_focal, check_lens
 from dashcalib_ros.judge.difference import NamedCamera
-from dashcalib_ros.limits import LENS_NUMBER, SIDE, check_pixels
+from dashcalib_ros.limits import SIDE, check_pixels
 
 Data = Mapping[str, Any]
 # the cameras of a file by their names, each as the function that reads it; one that returns a
@@ -28,13 +31,21 @@ Data = Mapping[str, Any]
 Cameras = Mapping[str, Callable[[], Camera | NamedCamera]]
 
 # ROS's distortion models; RATIONAL has all pinholes in it
-PLUMB_BOB, RATIONAL, EQUIDISTANT = 'plumb_bob', 'rational_polynomial', 'equidistant'
+ROS_MODELS = PLUMB_BOB, RATIONAL, EQUIDISTANT = (
+    'plumb_bob', 'rational_polynomial', 'equidistant')
 # the coefficients by name, in the order of D
 COEFFICIENTS = {RATIONAL: Rational.names()[4:], PLUMB_BOB: Brown.names()[4:],
                 EQUIDISTANT: Fisheye.names()[4:]}
-# of the picture, by which its middle is off: less than the first for width and height exchanged,
-# and more than the second as they are
-EXCHANGED, AS_GIVEN = 0.06, 0.1
+# how many coefficients of a pinhole programs write; less where those after k2 are 0
+COUNTS = (4, 5, 8, 12, 14)
+# ends of the keys by which files say what their lens model is, and how keys of coefficients look;
+# both in small letters without signs
+SAYS = ('model', 'intrinsictype', 'polymorphicname', 'projectiontype', 'distortiontype',
+        'lenstype', 'cameratype')
+# lenses that no model here has, where "camera_model" may be a product's name, too
+OTHERS = re.compile(r'\b(omni|mei|unified|e?ucm|ds|double.?sphere|kb[48]|fov|division|poly|ocam|'
+                    r'scaramuzza|cahvore?|spherical|equirect\w*|cylindrical|f.?theta)\b')
+COEFFICIENT = re.compile('dist(?!ance)|coef|radial|tangential|poly(?!morph)|xi$|[kp][0-9]$')
 
 
 def camera_with(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequence[float],
@@ -46,37 +57,27 @@ def camera_with(size: Sequence[Any], view: Sequence[float], kind: str, d: Sequen
     fx, fy, cx, cy = view
     check_focal(fx, fy, path)
     width, height = read_size(*size, path=path)
-    off, exchanged = (max(abs(cx / across - 0.5), abs(cy / down - 0.5))
-                      for across, down in ((width, height), (height, width)))
-    if exchanged < EXCHANGED and off > AS_GIVEN:
-        raise InputError('E-CALIBRATION-EXCHANGED',
-                         f'{path} is for pictures of {width}x{height}, but the centre ({cx:.0f}, '
-                         f'{cy:.0f}) is that of {height}x{width}: are width and height '
-                         f'exchanged? write the width first')
     try:
         camera = camera_from_ros((width, height), kind, [fx, 0, cx, 0, fy, cy, 0, 0, 1], d)
     except InputError as error:
         raise InputError(error.code, f'{path}: {error}') from error
+    if not is_fisheye(camera):
+        _check_count(d, path)
     check_lens(camera, path)
     return camera
 
 
-def check_lens(camera: Camera, path: object) -> None:
-    """Raise InputError for numbers that no lens has: nothing can be computed with them."""
-    check_focal(camera.fx, camera.fy, path)
-    for name, value in camera.named.items():
-        if abs(value) > LENS_NUMBER:
-            raise InputError('E-CALIBRATION-LENS',
-                             f'{path} has {name} = {value:.4g}, which no lens has; use a '
-                             f'calibration in px')
-
-
-def check_focal(fx: float, fy: float, path: object) -> None:
-    """Raise InputError for the focal lengths of a camera that is not calibrated."""
-    if not (fx > 0 and fy > 0):
-        raise InputError('E-CALIBRATION-EMPTY',
-                         f'{path} is uncalibrated: its focal length is not positive; calibrate '
-                         f'the camera')
+def _check_count(d: Sequence[float], path: object) -> None:
+    """Raise InputError for a number of coefficients that no program writes for a pinhole."""
+    if len(d) in COUNTS or not any(d[2:]):
+        return
+    if len(d) == 3:
+        raise InputError('E-LENS-AMBIGUOUS',
+                         f'{path} has 3 distortion coefficients, k1, k2, k3 or k1, k2, p1; write '
+                         f'all five: k1, k2, p1, p2, k3')
+    raise InputError('E-LENS-COEFFICIENTS',
+                     f'{path} has {len(d)} distortion coefficients; write 5 of them (k1, k2, p1, '
+                     f'p2, k3) or 8 (and k4, k5, k6)')
 
 
 def distortion_model(models: Mapping[str, str], name: Any, what: str, path: object) -> str:
@@ -86,10 +87,14 @@ def distortion_model(models: Mapping[str, str], name: Any, what: str, path: obje
     """
     kind = models.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise InputError('E-LENS-MODEL',
-                         f'{path} has {what} {shortened(repr(name))}, which is not supported; '
-                         f'calibrate or convert it as one of {", ".join(models)}')
+        raise _not_supported(path, what, name, models)
     return kind
+
+
+def _not_supported(path: object, what: str, name: Any, models: Iterable[str]) -> InputError:
+    return InputError('E-LENS-MODEL',
+                      f'{path} has {what} {shortened(repr(name))}, which is not supported; '
+                      f'calibrate or convert it as one of {", ".join(models)}')
 
 
 def read_coefficients(data: Data, kind: str, path: object) -> list[float]:
@@ -127,6 +132,44 @@ def is_fisheye(camera: Camera) -> bool:
 def focal_and_centre(k: Sequence[float]) -> list[float]:
     """Return fx, fy, cx, cy of K (9,); ros_faults() names what else it says."""
     return [k[0], k[4], k[2], k[5]]
+
+
+def read_matrix(data: Data, key: Any, path: object) -> list[float]:
+    """Return K (9,) of what data has at a key: fx, fy, cx, cy, or a matrix of 3x3, 3x4 or 4x4.
+
+    Raises InputError.
+    """
+    value = data[key]
+    if (isinstance(value, Mapping) and not isinstance(value.get('data'), list)) or (
+            isinstance(value, list) and any(isinstance(each, Mapping) for each in value)):
+        model = said_model(value, 'type') or said_model(data)
+        if model is not None and model.lower() not in (*MODELS, *ROS_MODELS, *NO_DISTORTION):
+            raise _not_supported(path, 'the lens model', model, ROS_MODELS)
+        raise InputError('E-CALIBRATION-NO-MATRIX',
+                         f'{path}: {key} is no matrix, and has no fx, fy, cx, cy; write those')
+    k = read_numbers(value, str(key), path, 4, 12, 16, 9)
+    if len(k) == 4:
+        return [k[0], 0, k[2], 0, k[1], k[3], 0, 0, 1]
+    if len(k) == 16 and k[12:] != [0, 0, 0, 1]:
+        raise _no_matrix(key, '0 0 0 1', path)
+    if len(k) > 9:
+        k = [*k[:3], *k[4:7], *k[8:11]]
+    if k[2] == k[3] == k[5] == 0 and k[8] == 1 and min(k[6:8]) > 0:
+        raise InputError('E-CALIBRATION-TRANSPOSED',
+                         f'{path}: {key} is transposed; write it as [fx, 0, cx, 0, fy, cy, 0, 0, '
+                         f'1]. MATLAB writes it so, and its centre is from 1: subtract 1 from cx '
+                         f'and cy')
+    if any(k[6:8]) or not k[8]:
+        raise _no_matrix(key, '0 0 1', path)
+    return k
+
+
+def _no_matrix(key: Any, row: str, path: object) -> InputError:
+    return InputError('E-CALIBRATION-NO-MATRIX',
+                      f'{path}: {key} is no matrix, as its last row is not {row} (Waymo has fx, '
+                      f'fy, cx, cy, k1, k2, p1, p2, k3 there); write its values by name, as in '
+                      f'{{"fx": 700, "fy": 700, "cx": 640, "cy": 360, "k1": 0, "k2": 0, "width": '
+                      f'1280, "height": 720}}')
 
 
 def read_size(width: Any, height: Any, *, path: object) -> tuple[int, int]:
@@ -211,6 +254,59 @@ def read_sigma(data: Any, camera: Camera) -> dict[str, float] | None:
         return {name: read_number(data, name, '') for name in camera.names()}
     except InputError:
         return None
+
+
+def plain_key(key: object) -> str:
+    """Return a key in small letters, without signs."""
+    return re.sub('[^a-z0-9]', '', str(key).lower())
+
+
+def said_model(data: Any, *more: str) -> str | None:
+    """Return what a file, or a part of it, calls its lens model; None where it does not say.
+
+    more: keys that mean it there, beside SAYS.
+    """
+    said = (value for key, value in _entries(data)
+            if isinstance(value, str) and value and plain_key(key).endswith((*SAYS, *more)))
+    return next(said, None)
+
+
+def check_lens_kind(lens: str, path: object) -> None:
+    """Raise InputError where the name of a camera is that of a lens that no model here has."""
+    if OTHERS.search(lens):
+        raise _not_supported(path, 'the lens model', lens, ROS_MODELS)
+
+
+def no_distortion(data: Data, what: str, cure: str, path: object) -> InputError:
+    """Return the error for a file without known coefficients: they may have other names.
+
+    what: is missing. cure: for a lens without distortion.
+    """
+    alike = [str(key) for key, value in _entries(data)
+             if COEFFICIENT.match(plain_key(key)) and _has_number(value)]
+    if alike:
+        return InputError('E-LENS-COEFFICIENTS',
+                          f'{path} has distortion in a form that is not known here: '
+                          f'{shortened(", ".join(dict.fromkeys(alike)))}; write it as '
+                          f'distortion_coefficients: [k1, k2, p1, p2, k3]')
+    return InputError('E-NO-DISTORTION', f'{path} has {what}; for pictures without distortion, '
+                                         f'write 0{cure}')
+
+
+def _entries(data: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield the keys and values of a file's data, and of what is in it."""
+    if isinstance(data, Mapping):
+        yield from data.items()
+    for each in (data.values() if isinstance(data, Mapping) else
+                 data if isinstance(data, list) else ()):
+        yield from _entries(each)
+
+
+def _has_number(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    return (any(map(_has_number, value)) if isinstance(value, list)
+            else isinstance(value, (int, float)) and not isinstance(value, bool))
 
 
 def unknown_model(name: Any, path: object) -> InputError:

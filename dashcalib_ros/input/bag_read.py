@@ -7,27 +7,30 @@ from __future__ import annotations
 
 import bz2
 import errno
+import heapq
 import os
 import shutil
 import struct
 import sys
+from array import array
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from io import BufferedReader, BytesIO
 from itertools import accumulate, chain, islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 from urllib.parse import quote
 
 import apsw
 import lz4.frame
+import numpy as np
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
-from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema, Statistics
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from rosbags import rosbag2
 from rosbags.interfaces import Connection
@@ -36,6 +39,7 @@ from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 from rosbags.typesys.msg import normalize_msgtype
 
 from dashcalib_ros.errors import InputError, one_line
+from dashcalib_ros.input.decode import ZSTD_MAGIC
 from dashcalib_ros.input.encodings import CDR, ENCODINGS, PROTOBUF, ROS1, message_of
 from dashcalib_ros.input.source import first_of
 from dashcalib_ros.limits import (
@@ -62,10 +66,15 @@ Damage = Callable[[str], None]
 PIECE = 2**20
 # of the head of a record of a ROS 1 bag's index
 INDEX_HEAD = 55
+# how an MCAP file and a ROS 1 bag begin
+_MCAP, _ROS1 = b'\x89MCAP0\r\n', b'#ROSBAG V2.0\n'
+# of a record of an MCAP file its kind and size; of a chunk its first and last time and its size
+# unpacked; of a message its channel, number and time
+_HEAD, _CHUNK, _MESSAGE = map(struct.Struct, ('<BQ', '<QQQ', '<HIQ'))
+T = TypeVar('T')
 UNPACKERS: dict[str, Callable[[], Any]] = {
     'zstd': zstd.ZstdDecompressor, 'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor}
-_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 
 def unpack(kind: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
@@ -89,13 +98,7 @@ class _Unpacking:
     """Lets the chunks of a file unpack to no more, together, than a recording has."""
 
     def __init__(self, path: Path) -> None:
-        self._limit = self._left = unpacked_limit(path)
-
-    def check(self, size: int) -> None:
-        """Raise InputError where so many bytes are too many."""
-        if size > self._left:
-            raise InputError('E-BAG-TOO-LARGE', f'its chunks decompress to more than '
-                             f'{self._limit / 2**20:.0f} MB, too large for a recording')
+        self._left = unpacked_limit(path)
 
     def through(self, unpacker: Callable[[bytes, int], bytes], data: bytes) -> bytes:
         """Return unpacked data, as unpack() does; raises InputError beyond the limit."""
@@ -116,29 +119,25 @@ def unpacked_limit(path: Path) -> int:
 class _WithinLimit:
     """Lets rosbags read within our limits, which it has not, while a reader of ours is open.
 
-    It finds its unpackers in two tables, and SQLite its limits in a list of hooks. What else uses
+    It finds its unpackers in a table, and SQLite its limits in a list of hooks. What else uses
     them in this process keeps its own as soon as the last reader is closed, in whatever order
     they are.
     """
 
     def __init__(self) -> None:
         self._readers = 0
-        self._tables: tuple[tuple[dict[str, Any], dict[str, Any]], ...] = (
-            (storage_mcap.DECOMPRESSORS, dict(storage_mcap.DECOMPRESSORS)),
-            (rosbag1.decompressors, dict(rosbag1.decompressors)))
+        self._own: dict[str, Any] = dict(rosbag1.decompressors)
 
     def __enter__(self) -> None:
         self._readers += 1
         apsw.connection_hooks.append(_whole)
-        for table, own in self._tables:
-            table.update({kind: partial(unpack, kind) for kind in own})
+        rosbag1.decompressors.update({kind: partial(unpack, kind) for kind in self._own})
 
     def __exit__(self, *error: object) -> None:
         self._readers -= 1
         apsw.connection_hooks.remove(_whole)
         if not self._readers:
-            for table, own in self._tables:
-                table.update(own)
+            rosbag1.decompressors.update(self._own)
 
 
 WITHIN_LIMIT = _WithinLimit()
@@ -181,44 +180,27 @@ def _whole(database: apsw.Connection) -> None:
 
 
 class _McapReader(storage_mcap.McapReader):
-    """rosbags' reader of an MCAP file that has an index of its chunks, within limits."""
+    """rosbags' reader of an MCAP file that has an index; its messages are those of McapFile."""
 
     def read_index(self) -> None:
-        """Read the index, and check it before anything is unpacked; raises InputError."""
+        """Read the index; raises InputError beyond limits."""
         if Path(str(self.path)).stat().st_size - self.data_end > INDEX_BYTES:
             raise InputError('E-BAG-INDEX', 'the index is too large')
         super().read_index()
-        sizes = [chunk.uncompressed_size for chunk in self.chunks]
-        _Unpacking(Path(str(self.path))).check(sum(sizes))
-        # the reader has all chunks of one time in memory
-        ends = sorted((time, size) for chunk in self.chunks for time, size in (
-            (chunk.message_start_time, chunk.uncompressed_size),
-            (chunk.message_end_time + 1, -chunk.uncompressed_size)))
-        if max(accumulate(size for _, size in ends), default=0) > max(
-                OVERLAPPING_BYTES, max(sizes, default=0)):
-            raise InputError('E-BAG-INDEX', 'too many chunks overlap')
+        if any(each.schema == '__schemaless__' for each in self.channels.values()):
+            raise InputError('E-BAG-TYPE-MISSING', 'the type of a topic is missing in the file')
 
-    def messages_scan(self, *which: Any) -> Generator[tuple[Connection, int, bytes], None, None]:
-        """Read a file without an index of its chunks, once it is known what they unpack to."""
-        _Unpacking(Path(str(self.path))).check(sum(self._chunk_sizes()))
-        yield from super().messages_scan(*which)
-
-    def _chunk_sizes(self) -> Iterator[int]:
-        assert self.bio is not None
-        place = self.data_start
-        while place < self.data_end:
-            self.bio.seek(place)
-            head = self.bio.read(33)
-            size = int.from_bytes(head[1:9], 'little')
-            if size > RECORD_BYTES and head[0] in (Opcode.CHUNK, Opcode.MESSAGE):
-                raise InputError('E-BAG-INDEX', 'a record is too large')
-            if head[0] == Opcode.CHUNK:
-                # behind the times of its first and last message
-                yield int.from_bytes(head[25:33], 'little')
-            place += 9 + size
+    def messages(self, connections: Collection[Connection], *limits: Any
+                 ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """Read all messages; raises InputError where some cannot be read."""
+        wanted = {each.id: each for each in connections}
+        for _, channel, message in mcap_contents(
+                Path(str(self.path)), refuse, {each.topic for each in connections}):
+            if channel.id in wanted:
+                yield wanted[channel.id], message.log_time, message.data
 
     def meta_scan(self) -> None:
-        """Leave a file without an index to scan_mcap()."""
+        """Leave a file without an index to McapFile."""
         raise InputError('E-BAG-INDEX', 'the file has no index')
 
 
@@ -381,7 +363,7 @@ def _complete(file: Path, journals: Sequence[Path], plain: Path) -> None:
 class Record:
     """A stored message.
 
-    msgtype: as ROS 2 writes it (sensor_msgs/msg/Image), also for ROS 1.
+    msgtype: as ROS 2 writes it (sensor_msgs/msg/Image), also for ROS 1; '' where it is missing.
     receive_ns: when the recorder got it, in nanoseconds.
     raw: serialised; encoding tells how (input/encodings.py), and of protobuf schema. Bags that
     compress each message have it compressed here.
@@ -398,7 +380,7 @@ class Record:
         """Return the message itself; raises InputError when its bytes make none."""
         try:
             raw = self.raw
-            if self.encoding == CDR and raw[:4] == _ZSTD_MAGIC:  # a CDR message never starts so
+            if self.encoding == CDR and raw[:4] == ZSTD_MAGIC:  # a CDR message never starts so
                 raw = unpack('zstd', raw, MESSAGE_BYTES)
             return message_of(self.msgtype, self.encoding, raw, self.schema)
         except InputError as error:
@@ -410,35 +392,79 @@ class Record:
 
 def message_counts(file: Path, damage: Damage) -> tuple[Counter[tuple[str, str]], bool]:
     """Return the numbers of messages by topic and type, and whether the file's index has them."""
-    counts = Counter[tuple[str, str]]()
     with unpacked(file, damage) as path:
         try:
-            with WITHIN_LIMIT, _reader(path) as reader:
-                for connection in reader.connections:
-                    counts[connection.topic, connection.msgtype] += connection.msgcount
             # what a journal has that cannot be used is not counted
-            return counts, path != file or not _journals(file)
+            return _counts_in_index(path), path != file or not _journals(file)
         except Exception:  # a damaged file makes rosbags raise nearly anything
             return Counter((record.topic, record.msgtype) for record in scan(path, damage)), False
 
 
+def _counts_in_index(path: Path) -> Counter[tuple[str, str]]:
+    if _magic(path).startswith(_MCAP):
+        with McapFile(path, refuse) as contents:
+            return contents.counts()
+    counts = Counter[tuple[str, str]]()
+    with WITHIN_LIMIT, _reader(path) as reader:
+        for connection in reader.connections:
+            counts[connection.topic, connection.msgtype] += connection.msgcount
+    return counts
+
+
 def records(file: Path, topics: Collection[str], damage: Damage) -> Iterator[Record]:
-    """Yield a file's messages of these topics, where they can be read.
+    """Yield a file's messages of these topics by time, where they can be read.
 
     Raises InputError, OSError.
     """
     with unpacked(file, damage) as path:
-        last_ns = -1
-        try:
-            for record in _indexed_records(path, topics):
-                last_ns = record.receive_ns
+        # of the last time, by topic
+        last_ns, given = -1, Counter[str]()
+        if not _magic(path).startswith(_MCAP):
+            try:
+                for record in _indexed_records(path, topics):
+                    if record.receive_ns > last_ns:
+                        last_ns, given = record.receive_ns, Counter()
+                    given[record.topic] += 1
+                    yield record
+                return
+            except Exception:  # a damaged file makes rosbags raise nearly anything
+                pass
+        for record in scan(path, damage, topics):
+            if record.receive_ns == last_ns and given[record.topic]:
+                given[record.topic] -= 1
+            elif record.receive_ns >= last_ns:
                 yield record
-            return
-        except Exception:  # a damaged file makes rosbags raise nearly anything
-            pass
-        for record in scan(path, damage):
-            if record.topic in topics and record.receive_ns > last_ns:
-                yield record
+
+
+def begin_ns(file: Path, topics: Collection[str]) -> int | None:
+    """Return the first time of a message of these topics in a file, None where there is none."""
+    return _begin_ns(file, frozenset(topics), file.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=10_000)
+def _begin_ns(file: Path, topics: Collection[str], _changed_ns: int) -> int | None:
+    return next((each.receive_ns for each in records(file, topics, lambda _: None)), None)
+
+
+def by_time(parts: Iterable[tuple[int, Callable[[], Iterable[T]]]], time_of: Callable[[T], int]
+            ) -> Iterator[T]:
+    """Yield what several parts have in the order of time; of the same time, in that of the parts.
+
+    parts: the first time of each, when it is opened, and what opens it. Each is in order itself.
+    """
+    waiting = sorted(((start, n, opened) for n, (start, opened) in enumerate(parts)),
+                     key=lambda part: part[:2], reverse=True)
+    active: list[tuple[int, int, T, Iterator[T]]] = []
+    while waiting or active:
+        if waiting and (not active or waiting[-1][:2] < active[0][:2]):
+            _, n, opened = waiting.pop()
+            rest = iter(opened())
+        else:
+            _, n, item, rest = heapq.heappop(active)
+            yield item
+        for item in rest:
+            heapq.heappush(active, (time_of(item), n, item, rest))
+            break
 
 
 def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
@@ -456,131 +482,333 @@ def _indexed_records(path: Path, topics: Collection[str]) -> Iterator[Record]:
 
 
 def _reader(path: Path) -> rosbag1.Reader | rosbag2.Reader:
-    with path.open('rb') as file:
-        return _Ros1Reader(path) if file.read(7) == b'#ROSBAG' else Reader2(path)
+    return _Ros1Reader(path) if _magic(path).startswith(_ROS1) else Reader2(path)
 
 
-def scan(path: Path, damage: Damage) -> Iterator[Record]:
-    """Yield all messages of a storage file; its first bytes tell its kind. Raises only OSError."""
+def _magic(path: Path) -> bytes:
     with path.open('rb') as file:
-        magic = file.read(16)
-    if magic.startswith(b'\x89MCAP0\r\n'):
-        yield from scan_mcap(path, damage)
-    elif magic.startswith(b'SQLite format 3\0'):
-        yield from scan_db3(path, damage)
-    elif magic.startswith(b'#ROSBAG V2.0\n'):
-        yield from scan_bag(path, damage)
+        return file.read(16)
+
+
+def scan(path: Path, damage: Damage, topics: Collection[str] | None = None) -> Iterator[Record]:
+    """Yield the messages of a storage file, whose first bytes tell its kind. Raises only OSError.
+
+    topics: of these; None: all.
+    """
+    magic = _magic(path)
+    if magic.startswith(_MCAP):
+        for found in mcap_contents(path, damage, topics):
+            yield record_of(*found)
+        return
+    if magic.startswith(b'SQLite format 3\0'):
+        found_in = scan_db3(path, damage)
+    elif magic.startswith(_ROS1):
+        found_in = scan_bag(path, damage)
     else:
         damage(f'{path.name} does not have the header of a bag')
-
-
-def scan_mcap(path: Path, damage: Damage) -> Iterator[Record]:
-    """Yield the messages of an MCAP file; a damaged chunk is left out, the next is tried."""
-    for schema, channel, message in mcap_contents(path, damage):
-        yield record_of(schema, channel, message)
+        return
+    yield from (record for record in found_in if topics is None or record.topic in topics)
 
 
 def record_of(schema: Schema | None, channel: Channel, message: Message) -> Record:
     """Return what an MCAP file stores, as a record."""
     encoding = channel.message_encoding
+    return Record(channel.topic, _type_in_mcap(schema, encoding), message.log_time, message.data,
+                  encoding, schema.data if schema and encoding == PROTOBUF else b'')
+
+
+def _type_in_mcap(schema: Schema | None, encoding: str) -> str:
     name = schema.name if schema else ''
+    if not name:
+        return ''
     name = normalize_msgtype(name) if '/' in name else name
     # an unsupported one is shown with the type
-    kind = name if encoding in ENCODINGS else f'{name} in {encoding or "no encoding"}'
-    return Record(channel.topic, kind, message.log_time, message.data, encoding,
-                  schema.data if schema and encoding == PROTOBUF else b'')
+    return name if encoding in ENCODINGS else f'{name} in {encoding or "no encoding"}'
 
 
-def mcap_contents(path: Path, damage: Damage) -> Iterator[tuple[Schema | None, Channel, Message]]:
-    """Yield the messages of an MCAP file with their topics and types, as scan_mcap() does."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    with path.open('rb') as file:
-        limit = min(path.stat().st_size, RECORD_BYTES)
-        repeated = _repeated(file, limit)
-        reader = StreamReader(file, emit_chunks=True, record_size_limit=limit)
-        for record in chain(repeated, _mcap_records(reader, _Unpacking(path), path.name, damage)):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message) and record.channel_id in channels:
-                channel = channels[record.channel_id]
-                yield schemas.get(channel.schema_id), channel, record
+def mcap_contents(path: Path, damage: Damage, topics: Collection[str] | None = None
+                  ) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """Yield the messages of an MCAP file by time, with their topics and types.
+
+    topics: of these; None: all.
+    """
+    with McapFile(path, damage, topics) as contents:
+        yield from contents.messages()
 
 
 def has_other_encodings(path: Path) -> bool:
     """Return whether an MCAP file's index names messages that are no CDR."""
     with path.open('rb') as file:
         return any(isinstance(each, Channel) and each.message_encoding != CDR
-                   for each in _repeated(file, min(path.stat().st_size, RECORD_BYTES)))
+                   for each in _summary(file, min(path.stat().st_size, RECORD_BYTES)))
 
 
-def _repeated(file: BinaryIO, limit: int) -> list[McapRecord]:
-    """Return the topics and types that an MCAP file repeats at its end, nothing if it is cut off.
+def refuse(damage: str) -> None:
+    """Raise InputError for what is damaged."""
+    raise InputError('E-BAG-DAMAGED', damage)
 
-    Else the first chunk, which has them too, would cost all others when it is broken.
+
+class _Place(NamedTuple):
+    """Where a chunk of an MCAP file is: its record begins and ends; size: unpacked.
+
+    counts: how many messages of each channel its index lists, which may be fewer than it has.
     """
+
+    place: int
+    end: int
+    start_ns: int
+    end_ns: int
+    size: int
+    counts: Mapping[int, int]
+
+
+class McapFile:
+    """The messages of an MCAP file, whether in chunks or not, in whatever order, indexed or not.
+
+    Where the index ends or leaves a gap, the heads of the records tell what is there. A damaged
+    chunk is left out and reported. topics: whose messages are wanted; None: all.
+    """
+
+    def __init__(self, path: Path, damage: Damage, topics: Collection[str] | None = None) -> None:
+        self._path, self._damage, self._topics = path, damage, topics
+        self._size = path.stat().st_size
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._statistics: Statistics | None = None
+        self._chunks: list[_Place] = []
+        # of messages that are in no chunk
+        self._times, self._places = array('Q'), array('Q')
+        self._unpacking = _Unpacking(path)
+
+    def __enter__(self) -> McapFile:
+        self._file = self._path.open('rb')
+        try:
+            self._find()
+        except BaseException:
+            self._file.close()
+            raise
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+
+    def counts(self) -> Counter[tuple[str, str]]:
+        """Return the numbers of messages by topic and type.
+
+        Raises InputError where the index has them not.
+        """
+        about = self._statistics
+        if about is None or sum(about.channel_message_counts.values()) != about.message_count:
+            raise InputError('E-BAG-INDEX', 'the file has no index')
+        counts = Counter[tuple[str, str]]()
+        for channel in self._channels.values():
+            kind = _type_in_mcap(self._schemas.get(channel.schema_id), channel.message_encoding)
+            counts[channel.topic, kind] += about.channel_message_counts.get(channel.id, 0)
+        return counts
+
+    def messages(self) -> Iterator[tuple[Schema | None, Channel, Message]]:
+        """Yield the messages by time; of the same time, in the order of the file."""
+        wanted = {each.id: (self._schemas.get(each.schema_id), each)
+                  for each in self._channels.values()
+                  if self._topics is None or each.topic in self._topics}
+        chunks = self._chunks
+        listed = sum((Counter(chunk.counts) for chunk in chunks), Counter[int]())
+        if self._statistics is not None and all(
+                listed[each] == self._statistics.channel_message_counts.get(each, 0)
+                for each in wanted):
+            chunks = [chunk for chunk in chunks if not wanted.keys().isdisjoint(chunk.counts)]
+        parts: list[tuple[int, Callable[[], Iterable[Message]]]]
+        parts = [(chunk.start_ns, partial(self._inside, chunk)) for chunk in chunks]
+        # all chunks of one time are in memory
+        ends = sorted((time, size) for chunk in chunks for time, size in (
+            (chunk.start_ns, chunk.size), (chunk.end_ns + 1, -chunk.size)))
+        if max(accumulate(size for _, size in ends), default=0) > max(
+                OVERLAPPING_BYTES, max((chunk.size for chunk in chunks), default=0)):
+            parts = [(0, lambda: chain.from_iterable(map(self._inside, chunks)))]
+        if self._times:
+            parts.append((min(self._times), self._outside))
+        for message in by_time(parts, lambda each: each.log_time):
+            if message.channel_id in wanted:
+                yield (*wanted[message.channel_id], message)
+
+    def _find(self) -> None:
+        """Find chunks, and messages that are in none."""
+        indexed, end = [], self._size
+        for record in _summary(self._file, min(self._size, RECORD_BYTES)):
+            if isinstance(record, Schema | Channel):
+                self._note(record)
+            elif isinstance(record, Statistics):
+                self._statistics = record
+            elif isinstance(record, ChunkIndex):
+                indexed.append(_indexed(record))
+        place = self._follow(indexed, end)
+        if place < end and indexed:
+            # the index is wrong, or a part between the chunks is damaged
+            place = self._follow([], end)
+        if place < end:
+            later = [chunk for chunk in sorted(indexed) if place < chunk.place < chunk.end <= end]
+            self._chunks += later
+            self._damage(f'{self._path.name} is {"damaged" if later else "truncated"} at byte '
+                         f'{place}')
+        about = self._statistics
+        if self._chunks and (about is None or len(self._channels) < about.channel_count or any(
+                each.schema_id and each.schema_id not in self._schemas
+                for each in self._channels.values())):
+            # chunks name the topics of later ones, which may have earlier messages
+            for chunk in self._chunks:
+                with suppress(Exception):  # reported when its messages are read
+                    for inner in self._records_in(chunk):
+                        self._note(inner)
+            self._unpacking = _Unpacking(self._path)
+
+    def _follow(self, indexed: Iterable[_Place], end: int) -> int:
+        """Find what is there up to the end, with the help of these chunks; return as _walk()."""
+        self._chunks.clear()
+        self._times, self._places = array('Q'), array('Q')
+        place = MAGIC_SIZE
+        for chunk in sorted(indexed):
+            place = self._walk(place, chunk.place)
+            if place != chunk.place:
+                return min(place, end - 1)
+            self._chunks.append(chunk)
+            place = chunk.end
+        return self._walk(place, end)
+
+    def _note(self, record: McapRecord) -> None:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels[record.id] = record
+
+    def _walk(self, place: int, until: int) -> int:
+        """Find what is from one place to another; return where what is whole ends.
+
+        That is `until` where the data end. Raises InputError beyond limits.
+        """
+        while place < until:
+            self._file.seek(place)
+            head = self._file.read(_HEAD.size + _CHUNK.size)
+            if len(head) < _HEAD.size:
+                return place
+            kind, size = _HEAD.unpack_from(head)
+            if kind in (Opcode.DATA_END, Opcode.FOOTER):
+                return until
+            end = place + _HEAD.size + size
+            if kind < Opcode.HEADER or end > until:
+                return place
+            if kind == Opcode.CHUNK and size > _CHUNK.size:
+                first, last, unpacked_size = _CHUNK.unpack_from(head, _HEAD.size)
+                self._chunks.append(_Place(place, end, first, last, unpacked_size, {}))
+            elif kind == Opcode.MESSAGE and size >= _MESSAGE.size + 8:
+                channel, _, time = _MESSAGE.unpack_from(head, _HEAD.size)
+                if self._topics is None or channel not in self._channels or (
+                        self._channels[channel].topic in self._topics):
+                    self._times.append(time)
+                    self._places.append(place)
+            elif kind in (Opcode.SCHEMA, Opcode.CHANNEL) and size <= INDEX_BYTES:
+                self._file.seek(place)
+                self._note(next(self._records(size)))
+            if len(self._times) + 32 * len(self._chunks) > INDEX_BYTES // 2:
+                raise InputError('E-BAG-INDEX', 'the file has too many records')
+            place = end
+        return place
+
+    def _records(self, limit: int) -> Iterator[McapRecord]:
+        return StreamReader(self._file, skip_magic=True, emit_chunks=True,
+                            record_size_limit=limit).records
+
+    def _outside(self) -> Iterator[Message]:
+        for n in np.argsort(self._times, kind='stable'):
+            self._file.seek(self._places[n])
+            try:
+                message = next(self._records(RECORD_BYTES))
+            except McapError as error:
+                self._damage(f'{self._path.name} has a message that is too large '
+                             f'({one_line(error)})')
+                continue
+            assert isinstance(message, Message)
+            yield message
+
+    def _inside(self, chunk: _Place) -> list[Message]:
+        try:
+            found = [each for each in self._records_in(chunk) if isinstance(each, Message)]
+        except Exception as error:  # also the unpackers' own errors
+            self._damage(f'{self._path.name} has a damaged chunk ({one_line(error)})')
+            return []
+        return sorted(found, key=lambda each: each.log_time)
+
+    def _records_in(self, chunk: _Place) -> list[McapRecord]:
+        """Return what is in a chunk; raises nearly anything where it is damaged."""
+        self._file.seek(chunk.place)
+        record = next(self._records(RECORD_BYTES))
+        if not isinstance(record, Chunk):
+            raise InputError('E-BAG-INDEX', 'the index is wrong')
+        plain = self._unpacking.through(
+            lambda data, left: unpack(record.compression, data, min(left, chunk.size)),
+            record.data)
+        return breakup_chunk(replace(record, compression='', data=plain), validate_crc=True)
+
+
+def _indexed(chunk: ChunkIndex) -> _Place:
+    """Return a chunk, of its record in the index."""
+    end = chunk.chunk_start_offset + chunk.chunk_length
+    offsets = sorted((place, channel) for channel, place in chunk.message_index_offsets.items())
+    ends = [place for place, _ in offsets[1:]] + [end + chunk.message_index_length]
+    # a record of the index has 15 bytes, and 16 for each message
+    counts = {channel: (after - place - 15) // 16
+              for (place, channel), after in zip(offsets, ends, strict=False)}
+    return _Place(chunk.chunk_start_offset, end + chunk.message_index_length,
+                  chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size,
+                  counts)
+
+
+def _summary(file: BinaryIO, limit: int) -> list[McapRecord]:
+    """Return the topics, types and index at an MCAP file's end, nothing if it is cut off."""
     try:
         file.seek(-FOOTER_SIZE - MAGIC_SIZE, os.SEEK_END)
         footer: Any = next(StreamReader(file, skip_magic=True, record_size_limit=limit).records)
-        if file.seek(0, os.SEEK_END) - footer.summary_start > INDEX_BYTES:
+        if not footer.summary_start or (
+                file.seek(0, os.SEEK_END) - footer.summary_start > INDEX_BYTES):
             return []
         file.seek(footer.summary_start)
-        reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=limit)
-        return [record for record in reader.records if isinstance(record, (Schema, Channel))]
+        return list(StreamReader(file, skip_magic=True, emit_chunks=True,
+                                 record_size_limit=limit).records)
     except Exception:  # there are no limits to what a damaged file makes of these numbers
         return []
-    finally:
-        file.seek(0)
 
 
-def _mcap_records(reader: StreamReader, unpacking: _Unpacking, name: str, damage: Damage
-                  ) -> Iterator[McapRecord]:
-    records = reader.records
-    while True:
-        # damaged lengths and texts come out as any of these: the library does not wrap them
-        try:
-            record = next(records, None)
-        except (McapError, struct.error, ValueError, MemoryError, OverflowError):
-            damage(f'{name} is truncated')
-            return
-        if record is None:
-            return
-        if not isinstance(record, Chunk):
-            yield record
-            continue
-        try:
-            plain = unpacking.through(partial(unpack, record.compression), record.data)
-            inner = breakup_chunk(replace(record, compression='', data=plain), validate_crc=True)
-        except Exception as error:  # also the unpackers' own errors
-            damage(f'{name} has a damaged chunk ({one_line(error)})')
-            continue
-        yield from inner
-
-
-_ROWS = '''
-    SELECT topic_id, timestamp, data FROM messages
-    WHERE typeof(timestamp) = 'integer' AND typeof(data) = 'blob' AND octet_length(data) <= ?'''
+_PLACES = '''
+    SELECT rowid, timestamp FROM messages WHERE typeof(timestamp) = 'integer' AND timestamp >= 0'''
+_ROW = '''
+    SELECT topic_id, data FROM messages
+    WHERE rowid = ? AND typeof(data) = 'blob' AND octet_length(data) <= ?'''
 
 
 def scan_db3(path: Path, damage: Damage) -> Iterator[Record]:
-    """Yield the messages of an SQLite bag, by row."""
+    """Yield the messages of an SQLite bag by time, without its index of times."""
     uri = f'file:{quote(str(path.absolute()))}?mode=ro&immutable=1'
     database = apsw.Connection(uri, apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI)
     left = path.stat().st_size
+    rows, times = array('q'), array('q')
     try:
         # else SQLite refuses a file that is shorter than its header says
         database.execute('PRAGMA writable_schema = ON')
         _limited(database)
-        topics = {key: (name, kind) for key, name, kind in
+        topics = {key: (str(name), str(kind or '')) for key, name, kind in
                   islice(database.execute('SELECT id, name, type FROM topics'), TOPICS)}
-        for topic, receive_ns, data in database.execute(_ROWS, (left,)):
-            left -= len(data)
-            if left < 0:
-                raise apsw.SQLError('its rows contain more than the file')
-            if topic in topics:
-                yield Record(*topics[topic], receive_ns, data)
+        try:
+            for row, receive_ns in islice(database.execute(_PLACES), left // 2):
+                rows.append(row)
+                times.append(receive_ns)
+        except apsw.Error as error:
+            damage(f'{path.name}: {one_line(error)}')
+        for n in np.argsort(times, kind='stable'):
+            for topic, data in database.execute(_ROW, (rows[n], left)):
+                left -= len(data)
+                if left < 0:
+                    raise apsw.SQLError('its rows contain more than the file')
+                if topic in topics:
+                    yield Record(*topics[topic], times[n], data)
     except apsw.Error as error:
         damage(f'{path.name}: {one_line(error)}')
     finally:

@@ -1,24 +1,32 @@
 """A bag as a drive: its files as one sequence of messages, and the images on one topic.
 
-A bag is an ordered list of storage files, each complete in itself: metadata.yaml has only their
-order and the expected number of messages. So a bag without metadata.yaml can be read, and a split
-bag with one broken file, too. Every file is read by its index (rosbags); where that fails, from
-its start to where it breaks (salvage).
+A bag is a list of storage files, each complete in itself: metadata.yaml has only their names, the
+types of topics and the expected number of messages. So a bag without metadata.yaml can be read,
+and a split bag with one broken file, too. Messages come by time, whatever the order of the files
+and of what is in them. Where an index fails, a file is read from its start to where it breaks.
 """
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import starmap
 from pathlib import Path, PurePath
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError, Notice, counted
-from dashcalib_ros.input.bag_read import Damage, Record, message_counts, records
+from dashcalib_ros.input.bag_read import (
+    Damage,
+    Record,
+    begin_ns,
+    by_time,
+    message_counts,
+    records,
+)
 from dashcalib_ros.input.decode import BitDepth, decode
 from dashcalib_ros.input.encodings import ENCODINGS, PICTURES
 from dashcalib_ros.input.packets import PacketDecoder, codec_of
@@ -43,6 +51,10 @@ CURE = ("repair it ('mcap recover', 'ros2 bag reindex', 'sqlite3 .recover', 'ros
 # reasons that no repair fixes
 NO_CURE = 'check that it is a recording, then copy it again or record it again'
 NO_RECORDING = re.compile('header of a bag|more than|too large|too many')
+# types of image_transport's messages that are not read
+VIDEO_TYPES = re.compile('image_transport|theora|h26[45]')
+# problems of files in a message
+TOLD = 12
 
 
 @dataclass(frozen=True)
@@ -64,21 +76,35 @@ class Topic:
 class Bag:
     """A bag that can be read.
 
-    files: in the order of time.
-    topics: sorted by name.
+    files: in the order of metadata.yaml, else by name.
+    topics: sorted by name; a type that is written nowhere is ''.
     indexed: the counts are from an index, not from reading all: fewer messages mean a loss.
     warnings: for the user, about the bag's files.
+    begins_ns: first times of messages in packed files, as metadata.yaml has them.
     """
 
     files: tuple[Path, ...]
     topics: tuple[Topic, ...]
     indexed: bool
     warnings: tuple[Notice, ...]
+    begins_ns: Mapping[Path, int] = field(default_factory=dict)
 
     def records(self, topics: Collection[str], damage: Damage) -> Iterator[Record]:
-        """Yield the messages of these topics, file by file; raises InputError, OSError."""
+        """Yield the messages of these topics by time; raises InputError, OSError."""
+        types = {topic.name: topic.msgtype for topic in self.topics}
+        parts, start_ns = [], 0
         for file in self.files:
-            yield from records(file, topics, damage)
+            if len(self.files) > 1 and (first_ns := self._begin_ns(file, topics)) is not None:
+                start_ns = first_ns
+            # a file of which nothing can be read says so in its place
+            parts.append((start_ns, partial(records, file, topics, damage)))
+        for record in by_time(parts, lambda each: each.receive_ns):
+            yield record if record.msgtype else replace(
+                record, msgtype=types.get(record.topic, ''))
+
+    def _begin_ns(self, file: Path, topics: Collection[str]) -> int | None:
+        # to unpack it once more would take as long as to read it
+        return self.begins_ns[file] if file in self.begins_ns else begin_ns(file, topics)
 
 
 def open_bag(path: Path) -> Bag:
@@ -86,6 +112,9 @@ def open_bag(path: Path) -> Bag:
     if not path.is_dir():
         check_file(path)
         topics, indexed = _topics_of((path,), path)
+        if not all(topic.msgtype for topic in topics):
+            beside = _metadata(path.parent / METADATA)
+            topics = _typed(topics, beside.topics if path in beside.files else ())
         return Bag((path,), topics, indexed, ())
     names = sorted((file.name for file in path.iterdir() if is_bag_file(file.name)), key=by_name)
     skipped = [name for name in names if not (path / name).is_file()]
@@ -94,12 +123,13 @@ def open_bag(path: Path) -> Bag:
     if skipped:
         warnings = [Notice('E-BAG-FILES-SKIPPED', f'{counted(len(skipped), "file")} in {path} '
                            f'skipped, not regular files: {first_of(skipped)}')]
-    listed, promised = _metadata(path / METADATA)
-    files = tuple(file for file in listed if file in present)
+    metadata = _metadata(path / METADATA)
+    files = tuple(file for file in metadata.files if file in present)
     if files:
         warnings += [Notice('E-BAG-FILE-MISSING', f'{file.name} is listed in metadata.yaml but '
                             f'does not exist: its images are lost')
-                     for file in listed if file not in present and file.name not in skipped]
+                     for file in metadata.files
+                     if file not in present and file.name not in skipped]
     elif present:
         files = present
         if (cameras := cameras_named([file.name for file in files])) > 1:
@@ -114,13 +144,22 @@ def open_bag(path: Path) -> Bag:
         raise InputError('E-BAG-NO-FILES',
                          f'{path} has no .mcap, .db3 or .bag file{why}: copy the '
                          f'whole folder')
-    if any(topic.is_image and topic.count for topic in promised):
-        return Bag(files, promised, True, tuple(warnings))
-    topics, indexed = _topics_of(files, path)
-    return Bag(files, topics, indexed, tuple(warnings))
+    topics, indexed = metadata.topics, True
+    if not any(topic.is_image and topic.count for topic in topics):
+        topics, indexed = _topics_of(files, path)
+        topics = _typed(topics, metadata.topics)
+    return Bag(files, topics, indexed, tuple(warnings), metadata.begins_ns)
 
 
-def _metadata(path: Path) -> tuple[tuple[Path, ...], tuple[Topic, ...]]:
+class _Metadata(NamedTuple):
+    """What metadata.yaml lists; begins_ns: of packed files."""
+
+    files: tuple[Path, ...] = ()
+    topics: tuple[Topic, ...] = ()
+    begins_ns: Mapping[Path, int] = MappingProxyType({})
+
+
+def _metadata(path: Path) -> _Metadata:
     """Return the files and topics that metadata.yaml lists, or nothing if it cannot be used."""
     try:
         text = read_text(path, YAML_BYTES)
@@ -133,9 +172,21 @@ def _metadata(path: Path) -> tuple[tuple[Path, ...], tuple[Topic, ...]]:
         for item in content['topics_with_message_count']:
             about = item['topic_metadata']
             counts[str(about['name']), str(about['type'])] += int(item['message_count'])
-    except (InputError, KeyError, TypeError, ValueError, OverflowError):
-        return (), ()
-    return files, _sorted(counts)
+        begins = {path.parent / PurePath(each['path']).name:
+                  int(each['starting_time']['nanoseconds_since_epoch'])
+                  for each in content.get('files') or () if each['path'].endswith('.zstd')}
+    except (InputError, KeyError, TypeError, ValueError, OverflowError, AttributeError):
+        return _Metadata()
+    return _Metadata(files, _sorted(counts), begins)
+
+
+def _typed(topics: tuple[Topic, ...], others: tuple[Topic, ...]) -> tuple[Topic, ...]:
+    """Return topics with the types that others of their name have where theirs is missing."""
+    types = {topic.name: topic.msgtype for topic in (*others, *topics) if topic.msgtype}
+    counts = Counter[tuple[str, str]]()
+    for topic in topics:
+        counts[topic.name, topic.msgtype or types.get(topic.name, '')] += topic.count
+    return _sorted(counts)
 
 
 def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], bool]:
@@ -148,14 +199,14 @@ def _topics_of(files: tuple[Path, ...], bag: Path) -> tuple[tuple[Topic, ...], b
         counts.update(found)
         indexed &= by_index
     if problems and not counts:
-        if NO_RECORDING.search(problems[0]):
-            raise InputError('E-BAG-NOT-A-RECORDING',
-                             f'{bag} cannot be read ({problems[0]}): {NO_CURE}')
-        raise InputError('E-BAG-DAMAGED', f'{bag} cannot be read ({problems[0]}): {CURE}')
+        why = first_of(problems, TOLD)
+        if all(map(NO_RECORDING.search, problems)):
+            raise InputError('E-BAG-NOT-A-RECORDING', f'{bag} cannot be read ({why}): {NO_CURE}')
+        raise InputError('E-BAG-DAMAGED', f'{bag} cannot be read ({why}): {CURE}')
     return _sorted(counts), indexed
 
 
-def _sorted(counts: Counter[tuple[str, str]]) -> tuple[Topic, ...]:
+def _sorted(counts: Mapping[tuple[str, str], int]) -> tuple[Topic, ...]:
     return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
 
@@ -233,14 +284,15 @@ class BagSource(FrameSource):
         if packets.waited:
             reading.warnings.append(Notice(
                 'E-VIDEO-BEGINS-LATE', f'the first {packets.waited} images of the video are '
-                f'skipped: they depend on images from before the recording'))
+                f'skipped: the key picture that they depend on is missing before them'))
 
     def _losses(self, read: int, damage: list[str]) -> list[Notice]:
         lost = (self._promised or 0) - read if self._bag.indexed else 0
         if not damage and lost <= 0:
             return []
-        why = f' ({"; ".join(damage[:2])}{" ..." if len(damage) > 2 else ""})' if damage else ''
-        return [Notice('E-BAG-IMAGES-LOST', f'the bag is damaged{why}: {read}' + (
+        why = (f'damaged or was not closed ({"; ".join(damage[:2])}'
+               f'{" ..." if len(damage) > 2 else ""})' if damage else 'incomplete')
+        return [Notice('E-BAG-IMAGES-LOST', f'the bag is {why}: {read}' + (
             ' images were read, the number of lost images is unknown' if not self._bag.indexed else
             f' of {self._promised} images were read, {lost} are lost' if lost > 0 else
             f' of {self._promised} images were read, none is lost'))]
@@ -259,6 +311,7 @@ def _header_ns(message: Any) -> int:
 def _choose(path: Path, bag: Bag, name: str | None) -> Topic:
     images = [topic for topic in bag.topics if topic.is_image]
     if not images:
+        _check_readable(path, bag)
         there = ', '.join(f'{topic.name} ({topic.msgtype})' for topic in bag.topics[:8])
         there = ' '.join(there.split())  # a damaged bag's names may hold anything
         raise InputError('E-BAG-NO-IMAGES', f'{path} has no image topic: it has '
@@ -278,6 +331,27 @@ def _choose(path: Path, bag: Bag, name: str | None) -> Topic:
         raise InputError('E-BAG-TOPIC-AMBIGUOUS', f'{path} has {len(filled)} image topics: choose '
                          f'one with --topic: {_listing(filled)}')
     return filled[0]
+
+
+def _check_readable(path: Path, bag: Bag) -> None:
+    """Raise InputError where a bag without image topics has images all the same."""
+    filled = [topic for topic in bag.topics if topic.count]
+    if untyped := [topic.name for topic in filled if not topic.msgtype]:
+        raise InputError(
+            'E-BAG-TYPE-MISSING', f'{path} lacks the message type of {first_of(untyped)}: put the '
+            f'metadata.yaml of the recording, which names it, beside the file')
+    for topic in filled:
+        base, _, transport = topic.name.rpartition('/')
+        if topic.msgtype in PICTURES:
+            raise InputError('E-IMAGE-DEPTH', f'{path} has only depth images ({topic.name}): '
+                             f'record the topic of a camera image')
+        if VIDEO_TYPES.search(topic.msgtype):
+            raise InputError(
+                'E-BAG-TRANSPORT', f'{path} has images as {transport} ({topic.msgtype}) only, '
+                f'which cannot be read: convert them while the bag is played (ros2 run '
+                f'image_transport republish --ros-args -p in_transport:={transport} -p '
+                f'out_transport:=compressed -r in/{transport}:={topic.name} -r '
+                f'out/compressed:={base}/compressed) and record {base}/compressed')
 
 
 def _listing(topics: list[Topic]) -> str:

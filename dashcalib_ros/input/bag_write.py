@@ -22,6 +22,7 @@ from dashcalib_ros.input.bag_read import (
     has_other_encodings,
     mcap_contents,
     record_of,
+    refuse,
     unpacked,
 )
 from dashcalib_ros.input.bag_storage import open_bag
@@ -33,7 +34,7 @@ from dashcalib_ros.whole_files import temporary_folder
 
 CAMERA_INFO = CAMERA_INFOS[0]
 # what image_transport adds to the name of a topic
-TRANSPORTS = ('compressed', 'ffmpeg', 'foxglove')
+TRANSPORTS = ('compressed', 'ffmpeg', 'foxglove', 'zstd')
 REPAIR = "repair the bag first ('ros2 bag convert', 'mcap recover', 'ros2 bag reindex')"
 
 
@@ -143,7 +144,7 @@ def _write_mixed(source: Path, image_topic: str, ros: RosCamera, out: Path) -> i
             CAMERA_INFO, 'ros2msg', definition.encode()))
         for path in open_bag(source).files:
             channels: dict[int, int] = {}
-            for schema, channel, message in mcap_contents(path, _refuse):
+            for schema, channel, message in mcap_contents(path, refuse):
                 if channel.topic == topic:
                     continue
                 if channel.id not in channels:
@@ -269,12 +270,8 @@ def _check_limits(path: Path) -> None:
     if path.is_dir():
         parse_yaml(read_text(path / METADATA, YAML_BYTES), str(path / METADATA))
     for file in open_bag(path).files:
-        with unpacked(file, _refuse):
+        with unpacked(file, refuse):
             pass
-
-
-def _refuse(damage: str) -> None:
-    raise InputError('E-BAG-DAMAGED', damage)
 
 
 def _camera_info(c: RosCamera, header: Any) -> bytes:

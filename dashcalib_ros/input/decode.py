@@ -9,9 +9,12 @@ import itertools
 import os
 import re
 import struct
+import sys
+import zlib
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -27,8 +30,14 @@ from dashcalib_ros.limits import (
     PNG_TEXTS,
     TIFF_ENTRIES,
     check_pixels,
+    path_of,
     read_file,
 )
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 # OpenCV reports every defect of a file on stderr; what a user must know comes as our own errors.
 # Who wants to see the rest sets OPENCV_LOG_LEVEL
@@ -39,6 +48,9 @@ if 'OPENCV_LOG_LEVEL' not in os.environ:
 
 _DEPTHS = (8, 10, 12, 14, 16)
 _JPEG_START, _JPEG_END = b'\xff\xd8', b'\xff\xd9'
+# bytes before the encoding in a message of zstd_image_transport
+_PACKED_HEAD = struct.calcsize('<IIBII')
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _JPEG_SCAN = b'\xff\xda'
 _PNG_START = b'\x89PNG\r\n\x1a\n'
 _TIFF_STARTS = (b'II*\0', b'MM\0*')
@@ -47,6 +59,8 @@ _PACKED = (b'zTXt', b'iTXt', b'iCCP')
 # how the EXIF data of a JPEG, a PNG and a WebP begin
 _EXIF = (b'Exif\0\0', b'eXIf', b'EXIF')
 _VIDEO_FORMATS = ('h264', 'h265', 'hevc', 'av1', 'vp9', 'theora')
+# what is in the format of compressed images that are read
+_FORMATS = ('jpeg', 'jpg', 'png', 'tif', 'webp', 'bmp', 'pgm', 'ppm', 'compressed')
 
 
 # of a 16-bit image: pixels between those that are looked at, and the percentiles of their range
@@ -156,6 +170,8 @@ def decode(message: Any, depth: BitDepth | None = None, colour: bool = False) ->
     Raises InputError for an unknown encoding, a size that does not fit the data, depth images,
     video streams, data that is cut off or damaged, and for more pixels than limits allow.
     """
+    if _is_packed(message):
+        message = _unpacked(message)
     if not hasattr(message, 'encoding'):
         # what turns images with their EXIF data are programs for photographs, not those of ROS
         pixels = decode_pixels(memoryview(message.data), _name(message), colour, as_stored=True)
@@ -179,11 +195,48 @@ def message_size(message: Any) -> tuple[int, int]:
 
     Raises InputError where there is no size in it, or one beyond the limits.
     """
+    if _is_packed(message):
+        message, _ = _packed_image(message)
     if hasattr(message, 'encoding'):
         width, height = int(message.width), int(message.height)
         check_pixels(width, height)
         return width, height
     return _encoded_size(memoryview(message.data), _name(message))
+
+
+def _is_packed(message: Any) -> bool:
+    """Tell whether this is a message of zstd_image_transport: a raw image that is packed."""
+    return str(getattr(message, 'format', '')).strip().lower() == 'zstd'
+
+
+def _packed_image(message: Any) -> tuple[Any, bytes]:
+    """Return the image, whose data is still packed, and that; raises InputError for damage."""
+    data = bytes(message.data)
+    try:
+        height, width, big, step, length = struct.unpack_from('<IIBII', data)
+        text = data[_PACKED_HEAD:_PACKED_HEAD + length]
+        encoding = text.decode('ascii')
+    except (struct.error, UnicodeDecodeError) as error:
+        raise _damaged('zstd image', len(data)) from error
+    return SimpleNamespace(height=height, width=width, is_bigendian=big, step=step,
+                           encoding=encoding), data[_PACKED_HEAD + length:]
+
+
+def _unpacked(message: Any) -> Any:
+    """Return the image of a message of zstd_image_transport; raises InputError for damage.
+
+    That transport packs by gzip, whatever its name says.
+    """
+    image, packed = _packed_image(message)
+    check_pixels(image.width, image.height)
+    limit = min(image.height * image.step, PICTURE_BYTES) + 1
+    try:
+        image.data = (zstd.ZstdDecompressor().decompress(packed, limit)
+                      if packed.startswith(ZSTD_MAGIC) else
+                      zlib.decompressobj(zlib.MAX_WBITS | 32).decompress(packed, limit))
+    except (zlib.error, zstd.ZstdError) as error:
+        raise _damaged('zstd image', len(packed)) from error
+    return image
 
 
 def _name(message: Any) -> str:
@@ -256,6 +309,10 @@ def decode_pixels(data: bytes | memoryview, what: str = 'image', colour: bool = 
 
 def _encoded_size(data: memoryview, what: str) -> tuple[int, int]:
     size = encoded_size(data)
+    if size is None and what.endswith(' image') and not any(
+            each in what.lower() for each in _FORMATS):
+        raise InputError('E-IMAGE-FORMAT', f'the format of {what!r} is not supported: publish or '
+                         f'record it as JPEG or PNG (ros2 run image_transport republish)')
     if size is None:
         raise _damaged(what, len(data))
     check_pixels(*size, what)
@@ -357,6 +414,23 @@ def read_mask(path: Path) -> Mask:
                          f'{what} is entirely black, so that nothing of the images '
                          f'is left; make the part to use white')
     return mask
+
+
+def mask_of(given: object) -> Mask | None:
+    """Return the mask that a user gave: a picture's path, or an array (height, width); or None.
+
+    Raises InputError.
+    """
+    if given is None:
+        return None
+    if isinstance(given, (str, os.PathLike)):
+        return read_mask(path_of(given))
+    mask = np.asarray(given)
+    if mask.ndim != 2 or mask.dtype.kind not in 'biuf':
+        raise InputError('E-MASK-SHAPE', f'the mask has the shape {mask.shape} of {mask.dtype}: '
+                                         f'pass the path of a picture, or numbers of shape '
+                                         f'(height, width)')
+    return np.asarray(mask > 0)
 
 
 def check_mask(mask: Mask | None, size: tuple[int, int]) -> None:

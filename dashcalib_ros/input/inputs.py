@@ -12,10 +12,10 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import pairwise, zip_longest
+from numbers import Real
 from pathlib import Path
 
-from dashcalib_ros.arrays import Pixels
 from dashcalib_ros.errors import InputError, Notice, counted
 from dashcalib_ros.input.source import (
     IMAGE_SUFFIXES,
@@ -30,7 +30,7 @@ from dashcalib_ros.input.source import (
     os_error,
     size_text,
 )
-from dashcalib_ros.limits import PICTURE_BYTES, check_file, read_file
+from dashcalib_ros.limits import check_file, path_of
 
 # what is known by its name, where its content does not tell; not whatever FFmpeg takes: it would
 # play a text file
@@ -63,6 +63,8 @@ MAKERS = {maker: re.compile(name, re.IGNORECASE) for maker, name in (
     ('Vantrue names', r'(?P<t>\d{8}_\d{6})_(?P<n>\d+)_(?:[A-Z]_)?(?P<c>[ABC])'))}
 # names of files in a message; of more only the first and the last are told
 TOLD = 12
+# missing files for each that is there, where they are numbered one by one
+MOST_MISSING = 3
 
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -73,20 +75,24 @@ def open_frames(path: Paths, topic: str | None = None, fps: float | None = None,
     """Open a recorded drive. The kind of input is detected from the content of the files.
 
     path: a ROS 2 bag (folder, .mcap, .db3, with or without zstd), a ROS 1 .bag, a video file, or a
-    folder of images, ordered by name (2.png before 10.png). Several of these are one drive of one
-    camera: a sequence, in its own order, or a folder of videos or bags, or a pattern
+    folder of images, ordered by time or name (2.png before 10.png). Several of these are one drive
+    of one camera: a sequence, in its own order, or a folder of videos or bags, or a pattern
     (drives/*.mp4). The files of a folder or a pattern are ordered by the naming rule of the
     camera's maker, otherwise by time of recording, otherwise by name; a warning states which rule
-    was used. A turn spans two files only if the second one continues the first one. A file that
-    cannot be read is skipped, with a warning.
+    was used. So is a sequence in alphabetical order, as shells list it: 10.mp4, 2.mp4. A turn
+    spans two files only if the second one continues the first one. A file that cannot be read is
+    skipped, with a warning.
     topic: the image topic of a bag, needed only if the bag has several; or the number of a stream
     of a video ('2').
-    fps: image rate in Hz, of a folder (default 10), or to replace the time stamps of a video.
+    fps: image rate in Hz, of a folder without times (default 10), or instead of a video's stamps.
     start_s, duration_s: part of the drive to use, in seconds; None: up to its end.
 
     Raises InputError if there is nothing to read, or if the topic is ambiguous.
     """
     _check_numbers(fps, start_s, duration_s)
+    if topic is not None and not isinstance(topic, str):
+        raise InputError('E-TOPIC-TYPE', f"topic must be a str, such as '/camera/image_raw' or "
+                                         f"'2' for a video's stream, not {topic!r:.80}")
     groups = [_expanded(os.fspath(each)) for each in as_list(path)]
     if not groups:
         raise InputError('E-INPUT-MISSING',
@@ -103,22 +109,24 @@ def as_list(path: Paths) -> list[str | os.PathLike[str]]:
     given = ([path] if isinstance(path, (str, os.PathLike)) else
              list(path) if isinstance(path, Iterable) else [path])
     for each in given:
-        if not isinstance(each, (str, os.PathLike)):
-            raise InputError('E-PATH-TYPE', f'a path must be a str or a Path, not {each!r:.80}: '
-                                            f'pass a bag, a video, a folder of images, or a list '
-                                            f'of these')
+        path_of(each, 'pass a bag, a video, a folder of images, or a list of these')
     return given
 
 
 def _check_numbers(fps: float | None, start_s: float, duration_s: float | None) -> None:
-    if fps is not None and not (math.isfinite(fps) and 0 < fps <= 1000):
-        raise InputError('E-INPUT-FPS',
-                         f'fps must be greater than 0 and at most 1000 Hz, not {fps!r}')
-    if not (math.isfinite(start_s) and start_s >= 0):
-        raise InputError('E-INPUT-START', f'the start must be 0 s or later, not {start_s!r}')
-    if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
-        raise InputError('E-INPUT-DURATION',
-                         f'the duration must be greater than 0 s, not {duration_s!r}')
+    if fps is not None and not (_is_number(fps) and 0 < fps <= 1000):
+        raise InputError('E-INPUT-FPS', f'fps must be a number greater than 0 and at most 1000 '
+                                        f'(Hz), not {fps!r:.80}')
+    if not (_is_number(start_s) and start_s >= 0):
+        raise InputError('E-INPUT-START',
+                         f'the start must be a number of seconds from 0 on, not {start_s!r:.80}')
+    if duration_s is not None and not (_is_number(duration_s) and duration_s > 0):
+        raise InputError('E-INPUT-DURATION', f'the duration must be a number of seconds greater '
+                                             f'than 0, not {duration_s!r:.80}')
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 @dataclass(frozen=True)
@@ -191,14 +199,14 @@ def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> F
     warnings = [Notice('E-FILES-OTHER',
                        f'{group.where}: {counted(group.others, "other file")} skipped')
                 for group in groups if group.others]
-    failures: list[InputError] = []
+    failures: dict[Path, InputError] = {}
     for group in groups:
         opened = []
         for path in group.paths:
             try:
                 opened.append(_open_one(path, topic, fps))
             except InputError as error:
-                failures.append(error)
+                failures[path] = error
         if len(opened) > 1:
             opened, by = _ordered(opened)
             if (cameras := _cameras(opened)) > 1:
@@ -207,20 +215,44 @@ def _joined(groups: Sequence[_Group], topic: str | None, fps: float | None) -> F
                                  f'matches the files of one camera')
             warnings.append(Notice(
                 'E-FILES-ORDERED',
-                f'{group.where}: {len(opened)} files, ordered by {by}: {_listed(opened)}'))
+                f'{group.where}: {len(opened)} files, ordered by {by}: {_listed(opened)}'
+                f'{_missing(opened)}'))
         parts += opened
     if len(parts) == len(groups):
-        ordered, by = _ordered(parts)
-        if by in MAKERS and ordered != parts:
+        ordered, by = _ordered(sorted(parts, key=lambda each: by_name(each.name)))
+        if by not in MAKERS and _as_shells_list(parts) and ordered != parts:
+            parts = ordered
+            warnings.append(Notice(
+                'E-FILES-ORDERED', f'{len(parts)} files in alphabetical order are used ordered by '
+                f'{by}: {_listed(parts)}{_missing(parts)}'))
+        elif by in MAKERS and ordered != parts:
             warnings.append(Notice(
                 'E-FILES-AS-GIVEN',
                 f'the files are used in the order of the arguments; ordered by {by} they are '
                 f'{_listed(ordered)}: pass their folder for that order'))
     if not parts:
-        more = f' (and {len(failures) - 1} more like it)' if len(failures) > 1 else ''
-        raise InputError(failures[0].code, f'none of the files can be read: {failures[0]}{more}')
+        raise _all_failed(failures)
     return JoinedSource(parts, (*warnings, *(
-        Notice('E-FILE-SKIPPED', f'one of the files is skipped: {each}') for each in failures)))
+        Notice('E-FILE-SKIPPED', f'one of the files is skipped: {each}')
+        for each in failures.values())))
+
+
+def _all_failed(failures: dict[Path, InputError]) -> InputError:
+    """Return the error for files of which none can be read: each is named, each reason once."""
+    reasons: dict[str, list[Path]] = {}
+    for path, error in failures.items():
+        words = str(error).replace(str(path), '').replace(path.name, '')
+        reasons.setdefault(words, []).append(path)
+    told = [f'{failures[path]}{f" (the same for {more})" if more else ""}'
+            for path, *rest in reasons.values() for more in [_names(rest)]]
+    first = next(iter(failures.values()))
+    return InputError(first.code, f'none of the files can be read: {"; ".join(told)}')
+
+
+def _as_shells_list(sources: Sequence[FrameSource]) -> bool:
+    """Tell whether files are in alphabetical order, where numbers in their names tell another."""
+    names = [source.name for source in sources]
+    return names == sorted(names) != sorted(names, key=by_name)
 
 
 def _ordered(sources: list[FrameSource]) -> tuple[list[FrameSource], str]:
@@ -249,8 +281,44 @@ def _cameras(sources: Sequence[FrameSource]) -> int:
 
 
 def _listed(sources: Sequence[FrameSource]) -> str:
-    names = [Path(source.name).name for source in sources]
+    return _names([Path(source.name) for source in sources])
+
+
+def _names(paths: Sequence[Path]) -> str:
+    names = _told_apart(paths)
     return ', '.join(names if len(names) <= TOLD else [*names[:TOLD - 2], '...', names[-1]])
+
+
+def _told_apart(paths: Sequence[Path]) -> list[str]:
+    """Return the names of files; where some have the same, those of the folders that differ."""
+    names = [path.name for path in paths]
+    if len(set(paths)) != len(paths) or len(set(names)) == len(names):
+        return names
+    parts = [path.parts for path in paths]
+    while len({each[-1] for each in parts}) == 1:
+        parts = [each[:-1] for each in parts]
+    while len({each[0] for each in parts}) == 1:
+        parts = [each[1:] for each in parts]
+    return ['/'.join(each) for each in parts]
+
+
+def _missing(sources: Sequence[FrameSource]) -> str:
+    """Return in words which files are missing among those that are numbered one by one."""
+    parts = [re.split('([0-9]+)', name)
+             for name in _told_apart([Path(source.name) for source in sources])]
+    differ = [n for n, column in enumerate(zip_longest(*parts)) if len(set(column)) > 1]
+    if len(differ) != 1 or differ[0] % 2 == 0:
+        return ''
+    place, digits = differ[0], parts[0][differ[0]]
+    numbers = sorted(int(each[place]) for each in parts)
+    steps = {b - a for a, b in pairwise(numbers)}
+    absent = numbers[-1] - numbers[0] + 1 - len(numbers)
+    if not 0 < absent <= MOST_MISSING * len(numbers) or (len(steps) == 1 and len(numbers) > 2):
+        return ''  # numbers that are times, or every tenth
+    width = len(digits) if digits.startswith('0') else 0
+    names = [''.join([*parts[0][:place], f'{n:0{width}d}', *parts[0][place + 1:]])
+             for n in range(numbers[0], numbers[-1]) if n not in numbers]
+    return f'; missing: {first_of(names, TOLD)}'
 
 
 def _open_one(place: Path, topic: str | None, fps: float | None) -> FrameSource:
@@ -281,7 +349,10 @@ def _opener_of(path: Path) -> Callable[[Path, str | None, float | None], FrameSo
     if is_video(path):
         from dashcalib_ros.input.video import VideoSource
         return VideoSource
-    return FolderSource if path.is_dir() else None
+    if path.is_dir():
+        from dashcalib_ros.input.folder import FolderSource
+        return FolderSource
+    return None
 
 
 def fits_bag(path: Path) -> bool:
@@ -314,75 +385,6 @@ def _head(path: Path) -> bytes:
 
 def _has_image_name(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES
-
-
-DEFAULT_FPS = 10.0  # Hz; the rate the paper works at
-
-
-class FolderSource(FrameSource):
-    """The images of a folder, by name; numbers in names count as numbers: 2.png before 10.png.
-
-    Stamps are index / fps. Raises InputError for a folder without images.
-    """
-
-    def __init__(self, path: Path, topic: str | None = None, fps: float | None = None) -> None:
-        names = [entry.name for entry in path.iterdir()]
-        self._path = path
-        self._names = sorted(filter(_is_image, names), key=by_name)
-        if not self._names:
-            raise _no_images(path, names)
-        if (cameras := cameras_named(self._names)) > 1:
-            raise InputError('E-INPUT-SEVERAL-CAMERAS', f'{path} has images of {cameras} cameras '
-                             f'({first_of(self._names)}): put the images of one camera into a '
-                             f'separate folder')
-        self._fps = fps or DEFAULT_FPS
-        warnings = []
-        if fps is None:
-            warnings.append(Notice(
-                'E-RATE-ASSUMED', f'{path} has no image rate, and {DEFAULT_FPS:g} images per '
-                f'second are assumed: specify another rate with --fps'))
-        if topic is not None:
-            warnings.append(Notice('E-TOPIC-IGNORED', f'{path} is a folder of images: the topic '
-                                   f'{topic} is ignored'))
-        if turned := self._turned():
-            warnings.append(Notice(
-                'E-IMAGES-ROTATED', f'{path} has images that are {turned} by their EXIF '
-                f'orientation: the calibration is valid for the images as they are shown'))
-        super().__init__(str(path), len(self._names), warnings=tuple(warnings))
-        self.length_ns = round(len(self._names) * 1e9 / self._fps)
-
-    def _turned(self) -> str:
-        """Return how the first picture is turned when it is shown; '' for not at all."""
-        from dashcalib_ros.input.decode import turned_text
-        with suppress(InputError):  # raised again when it is read
-            return turned_text(read_file(self._path / self._names[0], PICTURE_BYTES), '')
-        return ''
-
-    def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
-        from dashcalib_ros.input.decode import BitDepth, decode_file
-        depth = BitDepth()
-        reading.images = len(self._names)
-
-        def image(name: str, colour: bool = False) -> Pixels:
-            return decode_file(read_file(self._path / name, PICTURE_BYTES, name), depth, name,
-                               colour)
-
-        for index in range(math.ceil(start_ns * self._fps / 1e9), len(self._names)):
-            yield Picture(index, round(index * 1e9 / self._fps),
-                          partial(image, self._names[index]))
-
-
-def _is_image(name: str) -> bool:
-    return Path(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith('.')
-
-
-def _no_images(path: Path, names: list[str]) -> InputError:
-    if not names:
-        return InputError('E-FOLDER-EMPTY',
-                          f'{path} is empty: pass a folder of images, a bag or a video')
-    return InputError('E-FOLDER-NO-IMAGES', f'{path} has no images (png, jpg, bmp, tif, pgm, ppm, '
-                      f'webp) and is not a bag: it has {first_of(sorted(names))}; pass the folder '
-                      f'or the file with the images')
 
 
 def _check_recorded(text: str) -> None:
@@ -446,6 +448,12 @@ class JoinedSource(FrameSource):
         self.contradictions = tuple(dict.fromkeys(
             line for part in self._parts for line in part.contradictions))
         self.length_ns = None if None in lengths else sum(filter(None, lengths))
+        self.recorded = first.recorded
+
+    @property
+    def begin_ns(self) -> int | None:
+        """Return when the first recording began, None where that is not known."""
+        return self._parts[0].begin_ns
 
     def _pictures(self, reading: Reading, start_ns: int = 0) -> Generator[Picture, None, None]:
         place = _Place(start_ns)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy.typing as npt
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.errors import InputError, Notice, counted
+from dashcalib_ros.input.times import rising
 
 # s; stamps beyond it are times of day, since 1970
 EPOCH_S = 1e8
@@ -47,6 +49,16 @@ STANDING_MPS, DRIVING_MPS = 0.3, 3.0
 SPEED_OVER_S = 1.0
 # of NavSatStatus; -2 is unknown
 NO_FIX = -1
+# of an Imu's covariance: there is no such value in the message; and what is taken of it
+NO_DATA, NOTHING = -1, (np.nan, np.nan, np.nan)
+# s; a time of recording has whole seconds, and the first picture comes after it
+DOUBT_S = 1.5
+# s; stamps from the first image on may begin before it, by no more than that
+SECOND_S = 1.0
+# hours by which a clock may be off as it is of another time zone
+MOST_ZONES_H = 14
+# s, and samples; so few at an end, and so far from the others, are of another clock
+ANOTHER_CLOCK_S, STRAYS = 900.0, 2
 
 
 @dataclass(frozen=True)
@@ -74,8 +86,9 @@ class SensorStream:
 
     rate: (n, 3) rad/s about the sensor's own three axes, in any mounting. speed: (n, 1) m/s.
     position: (n, 3) m, east, north and up from the first. Stamps: s since the drive's first
-    image; absolute: since 1970, as bags and GPX have them.
-    warnings: what was skipped, one line each.
+    image; absolute: on the clock of the images, since 1970 as bags and GPX have them.
+    warnings: what was skipped, one line each. begin_s: time of day of the drive's first image, for
+    images without one; None: unknown. doubt_s: by how much that may be off.
     """
 
     rate: Samples | None = None
@@ -83,6 +96,8 @@ class SensorStream:
     position: Samples | None = None
     warnings: tuple[Notice, ...] = ()
     absolute: bool = False
+    begin_s: float | None = None
+    doubt_s: float = 0.0
 
     @property
     def empty(self) -> bool:
@@ -105,24 +120,81 @@ class SensorStream:
 
     def shifted(self, later_s: float) -> SensorStream:
         """Return the same with later stamps."""
-        moved = {kind: Samples(samples.stamps_s + later_s, samples.values)
-                 for kind, samples in self.kinds.items()}
-        return SensorStream(**moved, warnings=self.warnings, absolute=self.absolute)
+        moved: dict[str, Any] = {
+            kind: Samples(samples.stamps_s + later_s, samples.values)
+            for kind, samples in self.kinds.items()}
+        return replace(self, **moved)
+
+    @property
+    def first_s(self) -> float:
+        """Return the first stamp of all kinds."""
+        return min(float(samples.stamps_s[0]) for samples in self.kinds.values())
+
+    @property
+    def last_s(self) -> float:
+        """Return the last stamp of all kinds."""
+        return max(float(samples.stamps_s[-1]) for samples in self.kinds.values())
+
+    def on_clock_of(self, begin_ns: int | None, recorded: bool, length_ns: int | None
+                    ) -> SensorStream:
+        """Return the same with what a drive's images tell of their clock.
+
+        begin_ns: when the first one was taken. recorded: their stamps are of that clock; else it
+        is known to the second, and length_ns is how long they last.
+        """
+        if self.empty or begin_ns is None:
+            return self
+        begin_s = begin_ns / 1e9
+        if recorded:
+            # an uptime, of both: no time of the drive's begin is among the sensors' then
+            own = not self.absolute and self.first_s <= begin_s <= self.last_s < EPOCH_S
+            return replace(self, absolute=True) if own and self.first_s > SECOND_S else self
+        if not self.absolute or self.begin_s is not None:
+            return self
+        end_s = begin_s + (length_ns or 0) / 1e9
+        if begin_s < self.last_s and end_s > self.first_s:
+            return replace(self, begin_s=begin_s, doubt_s=DOUBT_S)
+        return replace(self, warnings=(*self.warnings, Notice(
+            'E-MOTION-OTHER-DAY', f'the time of recording of the images, '
+            f'{time_text(begin_s)}, is not among those of the motion sensors, which begin at '
+            f'{time_text(self.first_s)}{zone_text(self.first_s, self.last_s, begin_s, end_s)}')))
 
     def since(self, start_s: float) -> SensorStream:
         """Return the same, with stamps from a drive's first image on. start_s: its stamp.
 
-        Pictures without a time of day (a video's) begin where a stream with one begins.
+        Pictures without a time of day begin at begin_s, or where the stream does.
         """
         if not self.absolute or self.empty:
             return replace(self, absolute=False)
-        first = min(float(samples.stamps_s[0]) for samples in self.kinds.values())
+        first = self.first_s
+        if self.begin_s is not None and not first <= start_s <= self.last_s:
+            # of another clock than the sensors, or of none
+            own_s = 0.0 if start_s > EPOCH_S else start_s
+            return replace(self.shifted(-self.begin_s - own_s), absolute=False)
         if start_s > EPOCH_S or first <= EPOCH_S:
             return replace(self.shifted(-start_s), absolute=False)
-        return replace(self.shifted(start_s - first), absolute=False, warnings=(
+        return replace(self.shifted(-first - start_s), absolute=False, doubt_s=DOUBT_S, warnings=(
             *self.warnings, Notice(
                 'E-MOTION-NO-TIME-OF-DAY', 'the images have no time of day: the first sample of '
                 'the motion sensors is assigned to the first image')))
+
+
+def time_text(stamp_s: float) -> str:
+    """Return a time of day, UTC, for messages."""
+    return f'{datetime.fromtimestamp(stamp_s, timezone.utc):%Y-%m-%d %H:%M:%S}'
+
+
+def zone_text(first_s: float, last_s: float, begin_s: float, end_s: float) -> str:
+    """Return in words the time zone by which stamps are off; '' where that explains nothing.
+
+    first_s, last_s: of the sensor; begin_s, end_s: of the images.
+    """
+    for hours in sorted((n / 2 for n in range(-2 * MOST_ZONES_H, 2 * MOST_ZONES_H + 1) if n),
+                        key=lambda each: (each % 1, abs(each))):
+        if first_s - 3600 * hours <= end_s and last_s - 3600 * hours >= begin_s:
+            return (f': a time zone of {abs(hours):g} h? Their stamps would fit {abs(hours):g} h '
+                    f'{"earlier" if hours > 0 else "later"}')
+    return ''
 
 
 def in_seconds(stamps: Floats, what: str) -> tuple[Floats, tuple[Notice, ...]]:
@@ -156,10 +228,12 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
     latitude and longitude in degrees, and altitude in m. what: where they come from, for warnings.
     absolute: as SensorStream's.
     """
-    found: dict[str, Samples] = {}
+    found: dict[str, Any] = {}
     warnings: list[Notice] = []
     for kind, (stamps_s, rows) in values.items():
         stamps_s, rows = np.asarray(stamps_s, np.float64), np.asarray(rows, np.float64)
+        said = ~np.isnan(rows).all(axis=1) | ~np.isfinite(stamps_s)
+        stamps_s, rows = stamps_s[said], rows[said]
         if kind == 'position':
             nowhere = _nowhere(rows)
             stamps_s, rows = stamps_s[~nowhere], local_metres(*rows[~nowhere].T)
@@ -178,6 +252,12 @@ def sensor_stream(values: Mapping[str, tuple[Floats, Floats]], what: str,
             warnings.append(Notice(
                 'E-MOTION-STAMPS-EQUAL', f'several {NAMES[kind]} of {what} have the same time '
                 f'stamp: the first one of each is used'))
+        if samples is not None and (far := int(np.sum(
+                (stamps_s < samples.stamps_s[0] - ANOTHER_CLOCK_S)
+                | (stamps_s > samples.stamps_s[-1] + ANOTHER_CLOCK_S)))):
+            warnings.append(Notice(
+                'E-MOTION-OTHER-CLOCK', f'{far} of {len(stamps_s)} {NAMES[kind]} of {what} '
+                f'skipped: their time stamps are of another clock than those of the others'))
         if trouble:
             warnings.append(Notice('E-MOTION-NOT-USED',
                                    f'the {NAMES[kind]} of {what} are not used: {trouble}'))
@@ -198,14 +278,12 @@ NAMES = {'rate': 'angular rates', 'speed': 'speeds', 'position': 'positions'}
 def _cleaned(stamps_s: Floats, values: Floats, kind: str) -> tuple[Samples | None, str]:
     """Return the usable samples, and what is wrong with them, '' where nothing is."""
     if not len(stamps_s):
-        return None, 'there are none'
+        return None, 'the sensor sends none (a GPS without a fix, an IMU without a gyro)'
     if len(stamps_s) > SAMPLES:
         return None, f'there are more than {SAMPLES} of them'
     good = np.isfinite(stamps_s) & np.isfinite(values).all(axis=1)
-    # a clock that was set back: what follows until it has caught up is not used
-    ahead = np.where(good, stamps_s, -np.inf)
-    latest = np.maximum.accumulate(np.r_[-np.inf, ahead[:-1]]) if len(ahead) else ahead
-    good &= ahead > latest
+    # a clock that was set back, or one stamp of another clock
+    good[~_of_one_clock(np.where(good, stamps_s, np.nan))] = False
     count = int(good.sum())
     if count < max(LEAST_SAMPLES if kind == 'rate' else 2, (1 - DAMAGED) * len(good)):
         return None, f'{len(good) - count} of {len(good)} are damaged, repeated or out of order'
@@ -216,6 +294,19 @@ def _cleaned(stamps_s: Floats, values: Floats, kind: str) -> tuple[Samples | Non
     if kind == 'position' and not np.ptp(samples.values, axis=0).max() < FARTHEST_M:
         return None, 'they are too far apart for one drive'
     return samples, ''
+
+
+def _of_one_clock(stamps_s: Floats) -> npt.NDArray[np.bool_]:
+    """Return which of (n,) stamps are those of one clock, and rise; NaN is none."""
+    kept = np.array(rising(stamps_s.tolist()), int)
+    if len(kept) > 2 * STRAYS:
+        far = np.diff(stamps_s[kept]) > ANOTHER_CLOCK_S
+        first = int(np.flatnonzero(np.r_[True, far[:STRAYS]])[-1])
+        past = len(kept) - int(np.flatnonzero(np.r_[True, far[::-1][:STRAYS]])[-1])
+        kept = kept[first:past]
+    of_one = np.zeros(len(stamps_s), bool)
+    of_one[kept] = True
+    return of_one
 
 
 def local_metres(latitude: Floats, longitude: Floats, altitude: Floats) -> Floats:
@@ -255,20 +346,25 @@ def speeds_of(stream: SensorStream) -> Samples | None:
 def values_in(message: Any, option: str) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Yield the kinds of values in a message of ROS 1 or 2, as SensorBuffer takes them.
 
-    option: gps, imu or odom, by the message's type. A GPS without a fix says nothing.
+    option: gps, imu or odom, by the message's type. NaN of a GPS without a fix, and of an IMU that
+    says that it has no gyro.
     """
     if option == 'gps':
         place = (message.latitude, message.longitude, message.altitude)
-        if message.status.status != NO_FIX and np.isfinite(place[:2]).all():
-            yield 'position', place
+        known = message.status.status != NO_FIX and np.isfinite(place[:2]).all()
+        yield 'position', place if known else NOTHING
     elif option == 'imu':
         rate = message.angular_velocity
-        yield 'rate', (rate.x, rate.y, rate.z)
+        known = message.angular_velocity_covariance[0] != NO_DATA
+        yield 'rate', (rate.x, rate.y, rate.z) if known else NOTHING
     else:
         twist = message.twist
         twist = getattr(twist, 'twist', twist)
         yield 'odom_rate', (twist.angular.x, twist.angular.y, twist.angular.z)
         yield 'speed', (float(np.hypot(twist.linear.x, twist.linear.y)),)
+
+
+NO_VALUES = np.empty(0), np.empty((0, 3))
 
 
 class SensorBuffer:
@@ -294,7 +390,8 @@ class SensorBuffer:
         kept = {kind: list(rows) for kind, rows in tuple(self._kept.items())}
         found = {kind: (np.array([stamp for stamp, _ in rows]), np.array([row for _, row in rows]))
                  for kind, rows in kept.items()}
-        if 'odom_rate' in found:
-            # a gyro is better than what odometry makes of it
-            found.setdefault('rate', found.pop('odom_rate'))
+        by_odometry = found.pop('odom_rate', None)
+        # a gyro is better than what odometry makes of it
+        if by_odometry is not None and not np.isfinite(found.get('rate', NO_VALUES)[1]).any():
+            found['rate'] = by_odometry
         return sensor_stream(found, what, absolute=True)

@@ -1,12 +1,10 @@
 """Motion streams: from CSV, GPX, KITTI's oxts folders, inside videos, and a bag's own topics."""
 from __future__ import annotations
 
-import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
 from itertools import chain, islice
 from pathlib import Path
 from statistics import median
@@ -27,7 +25,8 @@ from dashcalib_ros.input.motion import (
     sensor_stream,
     values_in,
 )
-from dashcalib_ros.input.source import os_error
+from dashcalib_ros.input.source import by_name, os_error
+from dashcalib_ros.input.times import dated_ns, numbers_in, paired
 from dashcalib_ros.limits import (
     DIGITS,
     GPX_BYTES,
@@ -53,8 +52,6 @@ HEAD = f'stamp_s and any of {", ".join(chain(*COLUMNS.values()))}'
 OXTS_POSITION, OXTS_SPEED, OXTS_RATE, OXTS_VALUES = slice(0, 3), 8, slice(17, 20), 30
 # characters of a GPX that are parsed at once
 GPX_PIECE = 2**22
-# 2011-09-26T13:02:25.964Z: date, time, part of a second, zone
-STAMP = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(\.\d*)?(Z|[+-]\d\d:\d\d)?')
 # of a GoPro's blocks of GPS: the key of the kind of fix (2: without height, 3: with it), and s
 GOPRO_FIX, GOPRO_BLOCK_S = '0x47505346', 1.0
 # message types by the option that chooses one of their topics
@@ -267,15 +264,8 @@ def _gopro_fixes(block: Mapping[str, Any] | None) -> Iterator[tuple[float, ...]]
 
 def _epoch_s(text: str) -> float:
     """Return s since 1970 of a date and time, in UTC where it names no zone; NaN for none."""
-    found = STAMP.fullmatch(text.strip())
-    if found is None:
-        return np.nan
-    date, time, part, zone = found.groups()
-    try:
-        whole = datetime.fromisoformat(f'{date}T{time}{(zone or "Z").replace("Z", "+00:00")}')
-    except ValueError:
-        return np.nan
-    return whole.timestamp() + float(f'0{part or ""}')
+    ns = dated_ns(text)
+    return np.nan if ns is None else ns / 10**9
 
 
 def _oxts(folder: Path) -> SensorStream:
@@ -285,11 +275,18 @@ def _oxts(folder: Path) -> SensorStream:
         raise InputError('E-MOTION-FOLDER',
                          f'{folder} is not a folder of motion data: use a KITTI '
                          f'oxts folder (timestamps.txt and data/), a CSV or a GPX')
-    stamps = _kitti_stamps(inner / 'timestamps.txt')
-    files = sorted(file for file in (inner / 'data').iterdir() if file.suffix == '.txt')
+    lines = _kitti_stamps(inner / 'timestamps.txt')
+    files = sorted((file for file in (inner / 'data').iterdir() if file.suffix == '.txt'),
+                   key=lambda each: by_name(each.name))
     if len(files) > OXTS_FILES or len(files) < 2:
         raise InputError('E-MOTION-KITTI', f'{inner / "data"} has {len(files)} records: use a '
                          f'complete KITTI drive')
+    found = paired(numbers_in([file.stem for file in files]), lines)
+    if found is None:
+        raise InputError('E-MOTION-UNPAIRED', f'{inner} has {len(files)} records and '
+                         f'{len(lines) - lines.count(None)} time stamps in {len(lines)} lines of '
+                         f'timestamps.txt, which cannot be assigned: use a complete KITTI drive')
+    stamps = np.array([np.nan if ns is None else ns / 10**9 for ns in found])
     rows = np.full((len(files), OXTS_VALUES), np.nan)
     for row, file in zip(rows, files, strict=True):
         if not file.is_file():
@@ -297,23 +294,25 @@ def _oxts(folder: Path) -> SensorStream:
         values = _table([read_text(file, OXTS_BYTES).strip().replace(' ', ',')], OXTS_VALUES,
                         range(OXTS_VALUES))
         row[:] = values[0] if len(values) else np.nan
-    count = min(len(rows), len(stamps))
-    rows, stamps = rows[:count], stamps[:count]
-    pictures = [file for file in sorted(inner.parent.glob('image_0[0-3]/timestamps.txt'))]
-    first = _kitti_stamps(pictures[0])[0] if pictures else stamps[0]
-    return sensor_stream({
-        'rate': (stamps - first, rows[:, OXTS_RATE]),
-        'speed': (stamps - first, rows[:, OXTS_SPEED:OXTS_SPEED + 1]),
-        'position': (stamps - first, rows[:, OXTS_POSITION])}, str(folder))
+    pictures = sorted(inner.parent.glob('image_0[0-3]/timestamps.txt'))
+    first_ns = next((ns for place in (*pictures[:1], inner / 'timestamps.txt')
+                     for ns in _kitti_stamps(place) if ns is not None), 0)
+    return replace(sensor_stream({
+        'rate': (stamps, rows[:, OXTS_RATE]),
+        'speed': (stamps, rows[:, OXTS_SPEED:OXTS_SPEED + 1]),
+        'position': (stamps, rows[:, OXTS_POSITION])}, str(folder), absolute=True),
+        begin_s=first_ns / 10**9)
 
 
-def _kitti_stamps(path: Path) -> Floats:
-    """Return seconds from lines like 2011-09-26 13:02:25.964389445; NaN for other lines."""
-    found = [_epoch_s(line) for line in islice(read_lines(path, MOTION_BYTES), OXTS_FILES)]
+def _kitti_stamps(path: Path) -> list[int | None]:
+    """Return ns from lines like 2011-09-26 13:02:25.964389445; None for other lines."""
+    found = [dated_ns(line) for line in islice(read_lines(path, MOTION_BYTES), OXTS_FILES)]
+    while found and found[-1] is None:
+        found.pop()
     if not found:
         raise InputError('E-MOTION-KITTI',
                          f'{path} has no time stamps: use a complete KITTI drive')
-    return np.array(found)
+    return found
 
 
 def bag_motion(paths: Iterable[Path], chosen: Mapping[str, str | None],

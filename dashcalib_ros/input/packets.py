@@ -4,17 +4,27 @@ A packet needs those before it, back to a key picture: whoever comes later waits
 """
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import av
+from av.codec.codec import UnknownCodecError
 
-from dashcalib_ros.errors import InputError, shortened
+from dashcalib_ros.errors import InputError, one_line, shortened
 from dashcalib_ros.limits import PIXELS
 
 # FFmpeg's names, by what is in those that messages have: libx264, hevc_nvenc, h265
 CODECS = {'264': 'h264', 'avc1': 'h264', '265': 'hevc', 'hevc': 'hevc', 'av1': 'av1',
-          'vp9': 'vp9'}
+          'vp9': 'vp9', 'vp8': 'vp8', 'libvpx': 'vp8'}
+# decoders that need no hardware, of codecs whose own does
+SOFTWARE = {'av1': ('libdav1d', 'libaom-av1', 'libgav1')}
+# what a packet with a key picture has
+KEYS = {codec: re.compile(pattern, re.DOTALL) for codec, pattern in {
+    'h264': rb'\x00\x00\x01[\x25\x45\x65]', 'hevc': rb'\x00\x00\x01[\x20-\x2b]',
+    'av1': rb'\A(?:\x12\x00)?\x0a', 'vp9': rb'\A[\x80-\x83\x90-\x93\xa0-\xa3\xb0\xb1]',
+    'vp8': rb'\A...\x9d\x01\x2a'}.items()}
 # pictures that a decoder may hold back at the most
 HELD = 64
 THREADS = 2
@@ -35,15 +45,23 @@ def codec_of(message: Any) -> str | None:
     return found
 
 
+def _decoder(codec: str) -> Any:
+    """Return a decoder that needs no hardware, where there is one; raises InputError for none."""
+    for name in (*SOFTWARE.get(codec, ()), codec):
+        with suppress(UnknownCodecError):
+            return av.CodecContext.create(name, 'r')
+    raise InputError('E-VIDEO-CODEC', f'this FFmpeg cannot decode {codec}: publish h264 or hevc')
+
+
 class PacketDecoder:
     """Decodes packets in their order.
 
-    waited: for how many packets there was no key picture before them.
+    waited: for how many packets there was no key picture before them that could be decoded.
     """
 
     def __init__(self) -> None:
         self.waited = 0
-        self._begun = False
+        self._begun = self._keyed = False
         self._codec = ''
         self._context: Any = None
         self._taken: dict[int, Any] = {}
@@ -52,20 +70,23 @@ class PacketDecoder:
     def take(self, codec: str, data: Any, about: Any) -> list[tuple[Any, av.VideoFrame]]:
         """Take a packet; return what is shown now, each with what was said about its packet.
 
-        codec: FFmpeg's name. Raises InputError for a packet that is damaged.
+        codec: FFmpeg's name. Raises InputError for a packet that cannot be decoded.
         """
         if codec != self._codec:
-            self._codec, self._begun = codec, False
-            self._context = av.CodecContext.create(codec, 'r')
+            self._codec, self._begun, self._keyed = codec, False, False
+            self._context = _decoder(codec)
             self._context.options = {'max_pixels': str(PIXELS)}
             # by whole pictures they would be held back
             self._context.thread_type, self._context.thread_count = 'SLICE', THREADS
-        packet = av.Packet(bytes(data))
+        data = bytes(data)
+        packet = av.Packet(data)
         self._count += 1
         packet.pts = self._count
         self._taken[self._count] = about
         if len(self._taken) > HELD:
             del self._taken[next(iter(self._taken))]
+        self._keyed |= bool(KEYS[codec].search(data))
+        self.waited += not (self._begun or self._keyed)
         return self._shown(packet)
 
     def rest(self) -> list[tuple[Any, av.VideoFrame]]:
@@ -80,16 +101,20 @@ class PacketDecoder:
     def _shown(self, packet: av.Packet[Any] | None) -> list[tuple[Any, av.VideoFrame]]:
         try:
             frames: Sequence[av.VideoFrame] = self._context.decode(packet)
-        except (av.FFmpegError, ValueError) as error:
-            if self._begun:
+        except av.InvalidDataError as error:
+            if self._begun or self._keyed:
+                self._keyed = False  # what depends on it waits for the next one
                 raise InputError('E-VIDEO-PACKET',
                                  'a packet of the video is damaged: record it again') from error
             frames = []
+        except (av.FFmpegError, ValueError) as error:
+            raise InputError(
+                'E-VIDEO-DECODER', f"FFmpeg's decoder {self._context.name} fails "
+                f'({one_line(error)}): convert the video to H.264') from error
         found = []
         for frame in frames:
             # before it, the decoder makes up what it has not seen
             self._begun |= bool(frame.key_frame)
             if self._begun and frame.pts in self._taken:
                 found.append((self._taken.pop(frame.pts), frame))
-        self.waited += packet is not None and not self._begun
         return found

@@ -23,6 +23,8 @@ IMAGE_SUFFIXES = frozenset(
 
 BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
 METADATA = 'metadata.yaml'
+# of a name, by which it is not ordered
+ENDING = re.compile(r'\.[a-zA-Z]\w*$')
 # ns; what a stamp of 64 bits holds
 LAST_NS = 2**63 - 1
 # how others name the camera of several that record at a time: 2026-01-31_10-00-00-left_repeater,
@@ -38,8 +40,11 @@ CLOSE_NS = 1_000_000
 
 
 def by_name(name: str) -> tuple[list[tuple[int, str]], str]:
-    """Return a sort key for names in which numbers count as numbers: 2.png before 10.png."""
-    parts = re.findall(r'[0-9]+|[^0-9]+', name)
+    """Return a sort key for names in which numbers count as numbers: 2.png before 10.png.
+
+    A name is before its copies: X.jpg, X (1).jpg, X (2).jpg.
+    """
+    parts = re.findall(r'[0-9]+|[^0-9]+', ENDING.sub('', name))
     return [(int(part), '') if part[0] in '0123456789' else (-1, part) for part in parts], name
 
 
@@ -88,7 +93,8 @@ def os_error(path: Path, error: OSError) -> InputError:
                       f'disk, or copy it again')
 
 
-@dataclass(frozen=True)
+# arrays cannot be compared: frames are the same, or not
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One image of the drive.
 

@@ -140,14 +140,8 @@ class StampGate:
 
     def warnings(self) -> list[Notice]:
         """Return warnings about a recording's stamps for the user, one line each."""
-        found = []
-        if self.unstamped:
-            found.append(Notice('E-STAMP-MISSING', 'the image headers have no time stamps: the '
-                                'times of reception are used'))
-        if self.fault:
-            found.append(Notice('E-STAMP-WRONG', f'{self.fault}; from there on the times of '
-                                f'reception are used: fix the driver'))
-        elif self.repeated:
+        found = self.of_clock()
+        if self.repeated and not self.fault:
             found.append(Notice('E-STAMP-NOT-LATER', f'{counted(self.repeated, "image")} skipped: '
                                 f'the time stamps are not later than the previous ones'))
         if self.set_back:
@@ -155,6 +149,17 @@ class StampGate:
                 'E-STAMP-SET-BACK', f'the clock was set back {counted(self.set_back, "time")}, by '
                 f'up to {self.furthest_back_ns / 1e9:.1f} s: later time stamps are shifted'))
         return found
+
+    def of_clock(self) -> list[Notice]:
+        """Return what is wrong with the stamps now, so that times of reception are used."""
+        if self.unstamped:
+            return [Notice('E-STAMP-MISSING', 'the image headers have no time stamps: the times '
+                           'of reception are used, with which a rolling shutter may be missed; '
+                           'fix the driver')]
+        if self.fault:
+            return [Notice('E-STAMP-WRONG', f'{self.fault}; from there on the times of reception '
+                           f'are used: fix the driver')]
+        return []
 
     def _time(self, header_ns: int, received_ns: int) -> int | None:
         """Return the image's time, None if it has no stamp or one that is not later."""

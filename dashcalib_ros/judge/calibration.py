@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from dataclasses import field as default
 from typing import Any, Literal
@@ -15,7 +16,7 @@ from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import sensitivity
 from dashcalib_ros.camera.remap import rectify
-from dashcalib_ros.camera.rotation import OPTICAL, rotation_matrices
+from dashcalib_ros.camera.rotation import OPTICAL, quaternion, rotation_matrices
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.turn import TurnId
@@ -24,6 +25,8 @@ from dashcalib_ros.reconstruct.scene import Scene, TurnPicture
 from dashcalib_ros.solve.solution import LeftOut, Solution
 from dashcalib_ros.solve.spread import PictureSigma, sigma_over
 
+# what OpenCV moves the pixels of
+PIXEL_TYPES = ('uint8', 'uint16', 'int16', 'float32', 'float64')
 # after the point, in one line of text
 MOST_DIGITS = 9
 Level = Literal['accepted', 'weak', 'refused']
@@ -59,6 +62,16 @@ class Verdict:
     codes: tuple[str, ...] = ()
     conditions: tuple[Condition, ...] = ()
 
+    @property
+    def accepted(self) -> bool:
+        """Return whether the level is accepted."""
+        return self.level == 'accepted'
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Return the reasons to show: of a refused result the first, as the others follow."""
+        return self.reasons[:1] if self.level == 'refused' else self.reasons
+
 
 @dataclass(frozen=True)
 class TurnSummary:
@@ -91,7 +104,10 @@ class TurnSummary:
 
 @dataclass(frozen=True)
 class StoredTurnSummary:
-    """How a turn of an earlier drive was used. misfit: as for TurnSummary."""
+    """How a turn of an earlier drive, or of a fleet's clip, was used. misfit: as for TurnSummary.
+
+    clip: '' for an earlier drive.
+    """
 
     id: TurnId
     stamp_s: float
@@ -102,6 +118,7 @@ class StoredTurnSummary:
     misfit: float | None = None
     unused_because: str | None = None
     reprojection_error_px: float | None = None
+    clip: str = ''
 
 
 @dataclass(frozen=True)
@@ -157,9 +174,8 @@ class Witnesses:
 class LensField:
     """The smooth displacements over the picture that no lens model has, as of a windscreen.
 
-    field: zero where it is not used. used: whether turns that did not make it are predicted better
-    with it; where not, it is in the sigmas only. sigma_px: how far rays with the camera and the
-    field may be off over the picture, RMS.
+    used: whether it is as large as its sigma; where not, it is in the sigmas only. sigma_px: how
+    far rays with the camera and the field may be off over the picture, RMS.
     """
 
     field: Field
@@ -171,9 +187,8 @@ class LensField:
     @property
     def text(self) -> str:
         """Return the clause that stands beside the camera's parameters, without a verb."""
-        side = 'below' if self.rms_px < self.sigma_px else 'above'
         digits = 1 if self.rms_px >= 0.1 else 2
-        return (f'a smooth field of {self.rms_px:.{digits}f} px, {side} its sigma of '
+        return (f'a smooth field of {self.rms_px:.{digits}f} px, above its sigma of '
                 f'{self.sigma_px:.{digits}f} px')
 
 
@@ -202,7 +217,7 @@ class Mount:
     pitch_up_deg: float
     roll_right_deg: float | None
     height_m: float | None
-    sigma: Mapping[str, float | None]
+    sigma: Mapping[str, float | None] = default(hash=False)
     travel_px: tuple[float, float]
     travel_sigma_px: float
     straight_m: float
@@ -227,9 +242,7 @@ class Mount:
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
         """Return the same rotation as (x, y, z, w), as a transform base_link -> camera has it."""
-        from scipy.spatial.transform import Rotation
-        x, y, z, w = Rotation.from_matrix(self.rotation).as_quat().tolist()
-        return x, y, z, w
+        return quaternion(self.rotation)
 
     def apart(self, other: Mount) -> dict[str, tuple[float, float]]:
         """Return how far each angle that both know is from the other's, and the sigma, degrees."""
@@ -259,6 +272,16 @@ class Material:
     solution: Solution | None = None
     scenes: Mapping[TurnId, Scene] = default(default_factory=dict)
     pictures: Mapping[TurnId, TurnPicture] = default(default_factory=dict)
+
+
+def _places(given: npt.ArrayLike, columns: int, what: str) -> Floats:
+    """Return places (..., columns) that a user gave. Raises InputError for another shape."""
+    with suppress(TypeError, ValueError):
+        found = np.asarray(given, np.float64)
+        if found.shape[-1:] == (columns,):
+            return found
+    raise InputError('E-ARRAY-SHAPE', f'{what} must be numbers of the shape (..., {columns}), not '
+                                      f'{given!r:.80}')
 
 
 def _with_sigma(value: float, sigma: float) -> str:
@@ -295,18 +318,18 @@ class CalibrationData:
     verdict: Verdict
     image_size: tuple[int, int]
     camera: Camera | None
-    sigma: Mapping[str, float] | None
+    sigma: Mapping[str, float] | None = default(hash=False)
     turns: tuple[TurnSummary, ...]
     frames: int
     reprojection_error_px: float | None
-    timing: dict[str, float]
-    versions: dict[str, str]
+    timing: dict[str, float] = default(hash=False)
+    versions: dict[str, str] = default(hash=False)
     config: Config
     input_name: str = ''
     warnings: tuple[Notice, ...] = ()
-    magnitudes: Floats | None = None
-    mask: Mask | None = None
-    details: dict[str, Any] = default(default_factory=dict)
+    magnitudes: Floats | None = default(default=None, compare=False)
+    mask: Mask | None = default(default=None, compare=False)
+    details: dict[str, Any] = default(default_factory=dict, hash=False)
     stored_turns: tuple[StoredTurnSummary, ...] = ()
     rolling_shutter: Shutter | None = None
     sigma_px: PictureSigma | None = None
@@ -324,7 +347,7 @@ class CalibrationData:
     def __repr__(self) -> str:
         """Return one line: the verdict, the parameters with their sigmas, or the first reason."""
         if self.camera is None:
-            return f'Calibration({self.verdict.level}: {"; ".join(self.verdict.reasons[:1])})'
+            return f'Calibration({self.verdict.level}: {"; ".join(self.verdict.told)})'
         sigma = self.sigma or {}
         found = [f'{name} {_with_sigma(value, sigma.get(name, math.nan))}'
                  for name, value in self.camera.named.items()]
@@ -360,7 +383,7 @@ class CalibrationData:
         NaN where the camera has no viewing ray. Raises InputError as samples() does.
         """
         camera, covariance = self._posterior
-        at = np.asarray(pixels, np.float64).reshape(-1, 2)
+        at = _places(pixels, 2, 'pixels').reshape(-1, 2)
         found = np.full(len(at), np.nan)
         known = np.isfinite(camera.rays(at)[:, 0])
         found[known] = sigma_over(sensitivity(camera, at[known])[0], covariance)
@@ -393,7 +416,7 @@ class CalibrationData:
         With the field, where one is used. NaN where the lens has no ray. Raises InputError where
         there is no camera.
         """
-        found = np.asarray(pixels, np.float64)
+        found = _places(pixels, 2, 'pixels')
         return self._camera.rays(found if self._used_field is None
                                  else self._used_field.ideal(found))
 
@@ -403,20 +426,26 @@ class CalibrationData:
         With the field, where one is used. NaN where the lens does not see a point. Raises
         InputError where there is no camera.
         """
-        found = self._camera.project(np.asarray(points, np.float64))
+        found = self._camera.project(_places(points, 3, 'points'))
         return found if self._used_field is None else self._used_field.observed(found)
 
     @property
     def _used_field(self) -> Field | None:
         return self.field.field if self.field is not None and self.field.used else None
 
-    def undistort(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def undistort(self, image: npt.ArrayLike) -> npt.NDArray[Any]:
         """Return an image without distortion, as a camera with the matrix K sees it.
 
-        The field is taken out, too, where one is used. Raises InputError for an image of another
-        size, and where there is no camera.
+        image: (height, width) or (height, width, channels), as cv2.imread() returns it. The field
+        is taken out, too, where one is used. Raises InputError for what is no image or one of
+        another size, and where there is no camera.
         """
-        camera = self._camera
+        camera, image = self._camera, np.asarray(image)
+        if image.ndim not in (2, 3) or image.dtype not in PIXEL_TYPES:
+            raise InputError('E-IMAGE-TYPE', f'undistort() takes an array (height, width) or '
+                             f'(height, width, channels) of {", ".join(PIXEL_TYPES)}, not '
+                             f'{image.shape} of {image.dtype}: read a file with cv2.imread(), '
+                             f'which returns None where it cannot')
         if image.shape[1::-1] != camera.image_size:
             raise InputError('E-OTHER-IMAGE-SIZE',
                              f'the image has {image.shape[1]}x{image.shape[0]} pixels, and the '
@@ -428,8 +457,16 @@ class CalibrationData:
     def _camera(self) -> Camera:
         if self.camera is None:
             raise InputError('E-CALIBRATION-REFUSED', 'the calibration was refused: '
-                             f'{"; ".join(self.verdict.reasons)}')
+                             f'{"; ".join(self.verdict.told)}')
         return self.camera
+
+    @property
+    def field_of_view(self) -> tuple[float, float, float]:
+        """Return degrees across, down and along the longer diagonal, of the picture's middle.
+
+        Raises InputError where there is no camera.
+        """
+        return self._camera.field_of_view
 
     @property
     def intrinsics(self) -> dict[str, float] | None:

@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 from dataclasses import field as default
 from fractions import Fraction
 from shlex import quote
+from typing import Any
 
 import numpy as np
 
+from dashcalib_ros.arrays import plain_values
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import Bend, Lines, bend
@@ -19,6 +21,7 @@ from dashcalib_ros.judge.difference import (
     Difference,
     Use,
     difference_of,
+    misread_text,
     reasons_of,
 )
 from dashcalib_ros.judge.verdict import lines_contradict
@@ -26,7 +29,7 @@ from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import PictureSigma
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Check:
     """What a drive says of a calibration that was given.
 
@@ -42,7 +45,8 @@ class Check:
     given camera, of the cost with their own; None where it was not tried. straight_lines: what
     they say of the given camera; None where there are too few. bound_px: what the given camera's
     error stays below with 95 % confidence. limits_px: by use, what rms_px may be; bound_px may be
-    twice that. good_for: the uses that allow the difference.
+    twice that. good_for: the uses that allow the difference. cure: of what else is wrong than the
+    lens itself.
     """
 
     answer: Answer
@@ -56,10 +60,38 @@ class Check:
     loss: float | None = None
     straight_lines: Bend | None = None
     bound_px: float | None = None
-    limits_px: Mapping[Use, float] = default(default_factory=dict)
+    limits_px: Mapping[Use, float] = default(default_factory=dict, hash=False)
     good_for: tuple[Use, ...] = ()
+    cure: str = ''
+
+    @property
+    def next_step(self) -> str:
+        """Return what to do with the calibration."""
+        if self.answer == 'wrong':
+            return self.cure or REPLACE
+        if self.answer == 'cannot tell':
+            return 'check it with a drive of more and sharper turns before you replace it'
+        others = [use for use in self.limits_px if use not in self.good_for]
+        keep = f'keep it{" for " if self.good_for else ""}{", ".join(self.good_for)}'
+        if not others:
+            return keep
+        more = ('a drive with more turns may show whether it is good enough'
+                if self.answer == 'right' else REPLACE)
+        return f'{keep}; for {", ".join(others)}: {more}'
+
+    def __repr__(self) -> str:
+        """Return one line: the answer and its reasons."""
+        return f'Check({self.answer}: {"; ".join(self.reasons)})'
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as dicts, lists, text, finite numbers and None."""
+        return dict(plain_values(self))
 
 
+REPLACE = 'replace it with the calibration of this drive (dashcalib run)'
+
+FIT_SIZE = 'write it for pictures of the size of this drive (dashcalib export --size or --crop)'
+OTHER_MODEL = 'correct its distortion_model'
 # what messages call the file of a camera whose file they do not know
 CALIBRATION = 'CALIBRATION'
 
@@ -76,35 +108,41 @@ def check(given: Camera, image_size: tuple[int, int], solution: Solution | None,
         if given.image_size == image_size:
             return Check('cannot tell', tuple(
                 f'the drive has no accepted calibration of its own: {text}'
-                for text in verdict.reasons))
-        return Check('wrong', (size_reason(given, image_size, None, name),))
-    if not given.covers_picture():
-        return Check('wrong', ('its distortion folds over inside the picture: points near the '
-                               'corners have no place in it',))
+                for text in verdict.told))
+        return Check('wrong', (size_reason(given, image_size, None, name),), cure=FIT_SIZE)
     px = Scale.of(image_size, config).px
 
     def difference(camera: Camera) -> Difference:
         return difference_of(camera, solution, px)
 
+    if not given.covers_picture():
+        alike = (misread_text(given, None, difference) if given.image_size == image_size else '')
+        return Check('wrong', ('its distortion folds over inside the picture: points near the '
+                               'corners have no place in it', *filter(None, (alike,))),
+                     cure=OTHER_MODEL if alike else '')
     here = difference(replace(given, image_size=image_size))
     if given.image_size != image_size:
         # pixels of one size are no error in those of another
-        return Check('wrong', (size_reason(given, image_size, difference, name),))
+        return Check('wrong', (size_reason(given, image_size, difference, name),), cure=FIT_SIZE)
     loss = loss_of(given.resized(1 / px, solution.camera.image_size), solution, config)
     scaled = scaled_parameters(here, difference) if here.answer == 'wrong' else ''
-    reasons = (scaled,) if scaled else reasons_of(here)
+    alike = ('' if scaled or here.answer == 'right' else
+             misread_text(given, here.rms_px, difference))
+    reasons = (scaled,) if scaled else (*reasons_of(here), *filter(None, (alike,)))
     answer = here.answer
     if answer == 'wrong' and loss <= 0:
         # a calibration that explains the turns as well as their own is not contradicted by them
         answer, reasons = 'cannot tell', (UNDECIDED, *reasons[1:])
     return Check(answer, (*reasons, _loss_text(loss)), here.rms_px, here.worst_px, here.sigma_px,
                  here.told_apart, here.distance, here.limit, loss, bound_px=here.bound_px,
-                 limits_px=here.limits_px, good_for=here.good_for)
+                 limits_px=here.limits_px, good_for=here.good_for,
+                 cure=FIT_SIZE if scaled else OTHER_MODEL if alike else '')
 
 
 def with_faults(found: Check, faults: tuple[str, ...]) -> Check:
     """Return a check with the faults of what stands beside the camera: with any, it is wrong."""
-    return replace(found, answer='wrong', reasons=(*faults, *found.reasons)) if faults else found
+    return replace(found, answer='wrong', reasons=(*faults, *found.reasons), good_for=(),
+                   cure='correct what is wrong beside its lens') if faults else found
 
 
 def loss_of(given: Camera, solution: Solution, config: Config) -> float:
@@ -235,19 +273,17 @@ def with_lines(found: Check, given: Camera, lines: Lines, image_size: tuple[int,
     allowed = {'right': 0.0, 'differs': found.limits_px.get('detection', 0.0)}
     answer = ('cannot tell' if against and bent.picture_px > allowed.get(found.answer, np.inf)
               else found.answer)
-    return replace(found, answer=answer, straight_lines=bent, reasons=(
+    good_for = found.good_for if answer == found.answer else ()
+    return replace(found, answer=answer, straight_lines=bent, good_for=good_for, reasons=(
         *found.reasons, _lines_text(bent, against, config.verdict.max_line_sigmas)))
 
 
 def _lines_text(bent: Bend, against: bool, limit: float) -> str:
     """Return what lines say, and whether it counts; limit: sigmas from which on it may."""
-    text = (f'{bent.lines} upright lines (poles, edges of houses) indicate that its k1 is off: '
-            f'{bent.k1:+.3f} ± {bent.sigma:.3f} is missing, {bent.picture_px:.1f} px over the '
-            f'picture: {bent.sigmas:.1f} sigma, limit {limit:.1f}: ')
-    if against:
-        return text + 'they contradict its distortion'
-    if bent.sigmas > limit:
-        return text + 'real, but too few pixels to decide'
-    if bent.sigmas > DOUBT_SIGMAS:
-        return text + 'they lean against its distortion, but not enough to decide'
-    return text + 'they agree with its distortion'
+    what = ('contradict its distortion' if against else
+            'do not fit its distortion, but too few pixels to decide' if bent.sigmas > limit else
+            'lean against its distortion, but not enough to decide'
+            if bent.sigmas > DOUBT_SIGMAS else 'agree with its distortion')
+    return (f'{bent.lines} upright lines (poles, edges of houses) {what}: {bent.change}, '
+            f'{bent.picture_px:.1f} px over the picture, {bent.sigmas:.1f} sigma, limit '
+            f'{limit:.1f}')

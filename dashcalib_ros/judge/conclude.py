@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
 from importlib import metadata
@@ -19,7 +18,7 @@ from dashcalib_ros.detect.detection import Detection
 from dashcalib_ros.detect.one_camera import OtherCamera
 from dashcalib_ros.detect.straights import Straights
 from dashcalib_ros.detect.turn import Turn, TurnId
-from dashcalib_ros.errors import Notice, counted
+from dashcalib_ros.errors import Notice, counted, spared
 from dashcalib_ros.input.motion import SensorStream, speeds_of
 from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
@@ -93,15 +92,17 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
 
     scenes: in any order; a turn without one is listed as not reconstructed.
     """
-    other = detection.other_camera
+    other, lost = detection.other_camera, list[Notice]()
+    lines = spared('the search for straight lines', lost, detection.lines)
+    straights = spared('the search for straight driving', lost, detection.straights)
     return Evidence(
         image_size=detection.size or (0, 0), scale=detection.scale, frames=detection.frames,
         turns=detection.turns(), magnitudes=detection.magnitudes(), mask=detection.valid(),
         built={scene.turn: scene for scene in scenes if scene is not None}, timing={},
         # the verdict says it
-        warnings=tuple(each for each in detection.warnings() if each.code != 'E-TWO-CAMERAS'),
-        other_camera=other, start_s=detection.start_s, lines=detection.lines(),
-        straights=detection.straights())
+        warnings=(*(each for each in detection.warnings() if each.code != 'E-TWO-CAMERAS'),
+                  *lost),
+        other_camera=other, start_s=detection.start_s, lines=lines, straights=straights)
 
 
 def turns_that_stood(scenes: Sequence[Scene], motion: SensorStream | None, start_s: float
@@ -116,12 +117,16 @@ def turns_that_stood(scenes: Sequence[Scene], motion: SensorStream | None, start
 
 
 def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> CalibrationData:
-    """Return the calibration; a refused one has no intrinsics, so that they cannot be used."""
+    """Return the calibration; a refused one has no intrinsics, so that they cannot be used.
+
+    What is no part of the camera and of its verdict costs only itself where it fails, and a line.
+    """
+    lost: list[Notice] = []
     scenes = {turn.scene.turn: turn.scene for turn in evidence.stored} | evidence.built
     if solution is not None:
         solution = replace(solution, px=evidence.scale.px)
         scenes |= {scene.turn: scene for scene in solution.scenes}
-    lines = _straight_lines(solution, evidence, config)
+    lines = spared('the check of straight lines', lost, straight_lines, solution, evidence)
     witnesses = evidence.sensors.witnesses
     found = CalibrationData(
         verdict=(judge(solution, config.verdict, lines, True, witnesses, evidence.other_camera)
@@ -136,20 +141,38 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         stored_turns=tuple(_stored_summary(turn, scenes[turn.scene.turn], evidence, solution)
                            for turn in evidence.stored),
         start_s=evidence.start_s, witnesses=witnesses,
-        material=_material(scenes, solution, evidence))
+        material=spared('what the report draws', lost, _material, scenes, solution, evidence))
     if solution is None:
-        return found
+        return replace(found, warnings=(*found.warnings, *lost))
     crop_px = largest_crop(solution.crops) * solution.px if solution.crops else None
-    found = replace(found, details=_details(solution),
+    found = replace(found, details=spared('details', lost, _details, solution) or {},
                     stabiliser=None if crop_px is None else Stabiliser(largest_px=crop_px))
     if found.verdict.level != 'refused':
-        found = _with_numbers(found, solution, lines, evidence)
-    return replace(found, warnings=found.warnings + _warnings(found, solution))
+        found = _with_numbers(found, solution, lines, evidence, lost)
+    return replace(found, warnings=(*found.warnings, *_warnings(found, solution), *lost))
+
+
+def outlook(scenes: Sequence[Scene], evidence: Evidence, config: VerdictConfig) -> Verdict:
+    """Return the best verdict that the number of turns and their angles allow, as judge() counts.
+
+    scenes: that a calibration would use.
+    """
+    if not scenes:
+        return _verdict_without_solution(evidence, config)
+    # a gyro may confirm a single turn
+    gyro = evidence.motion is not None and evidence.motion.rate is not None
+    found = [turn_count(len(scenes), config, gyro),
+             yaw_in_all(sum(scene.yaw_deg for scene in scenes), config)]
+    other = evidence.other_camera
+    found = [two_cameras(other), *found] if other else found
+    return verdict_of(sorted(found, key=lambda each: each.level != 'refused'))
 
 
 def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None,
-                  evidence: Evidence) -> CalibrationData:
+                  evidence: Evidence, lost: list[Notice]) -> CalibrationData:
     """Return the calibration with what a refused one has not, in the input's pixels."""
+    held_out = spared('the comparison of each turn with the others', lost, cross_validation,
+                      solution) or ()
     px, camera = solution.px, solution.camera.resized(solution.px, evidence.image_size)
     units, wide = camera.units(px), camera.widened().units(px)
     return replace(
@@ -159,9 +182,10 @@ def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None
         picture_covariance=solution.wide_covariance * np.outer(wide, wide),
         reprojection_error_px=solution.reprojection_error_px * px,
         sigma_px=solution.picture.times(px),
-        held_out=tuple(each.times(px) for each in cross_validation(solution)),
+        held_out=tuple(each.times(px) for each in held_out),
         straight_lines=lines and lines.resized(px), field=_field(solution, evidence.image_size),
-        mount=_mount(solution, evidence, found.verdict.level, found.config),
+        mount=spared('the mounting', lost, _mount, solution, evidence, found.verdict.level,
+                     found.config),
         rolling_shutter=Shutter(1e3 * solution.readout_s, 1e3 * solution.readout_sigma_s)
         if solution.rolling else None)
 
@@ -179,7 +203,7 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
             'E-MODEL-CHOSEN',
             f'the lens model {model} was chosen by hand and may be why the result is {level}: '
             f'--model {AUTO} uses the one that fits the turns'))
-    if field is not None and field.rms_px >= max(REPORTED_FIELD_PX, field.sigma_px):
+    if field is not None and field.used and field.rms_px >= REPORTED_FIELD_PX:
         warnings.append(Notice(
             'E-FIELD-LARGE',
             f'the picture is bent by {field.rms_px:.1f} px (up to {field.worst_px:.1f} px), as by '
@@ -198,7 +222,7 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
     return tuple(warnings)
 
 
-def _straight_lines(solution: Solution | None, evidence: Evidence, config: Config) -> Bend | None:
+def straight_lines(solution: Solution | None, evidence: Evidence) -> Bend | None:
     """Return what straight lines say of the solution, in the resized images."""
     if solution is None or evidence.lines is None:
         return None
@@ -210,13 +234,11 @@ def _straight_lines(solution: Solution | None, evidence: Evidence, config: Confi
 
 
 def _mount(solution: Solution, evidence: Evidence, level: str, config: Config) -> Mount | None:
-    """Return how the camera sits on the car; a failure there must not cost the lens."""
+    """Return how the camera sits on the car; None where that was not asked for."""
     if evidence.straights is None or not config.mount.enabled:
         return None
-    with suppress(np.linalg.LinAlgError, ValueError):
-        return mount_of(evidence.straights, evidence.lines, solution, level,
-                        _speed(evidence, config))
-    return None
+    return mount_of(evidence.straights, evidence.lines, solution, level,
+                    _speed(evidence, config))
 
 
 def _speed(evidence: Evidence, config: Config) -> Speed | None:
@@ -248,9 +270,9 @@ def _field(solution: Solution, image_size: tuple[int, int]) -> LensField | None:
         return None
     px = solution.px
     sizes = px * solution.field.over(solution.camera)
-    return LensField(
-        solution.field.resized(px, image_size), True,
-        float(np.sqrt(np.mean(sizes**2))), float(sizes.max()), px * solution.rays_sigma_px)
+    rms_px, sigma_px = float(np.sqrt(np.mean(sizes**2))), px * solution.rays_sigma_px
+    return LensField(solution.field.resized(px, image_size), rms_px >= sigma_px, rms_px,
+                     float(sizes.max()), sigma_px)
 
 
 def _verdict_without_solution(evidence: Evidence, config: VerdictConfig) -> Verdict:
@@ -269,6 +291,12 @@ def _verdict_without_solution(evidence: Evidence, config: VerdictConfig) -> Verd
                         f'the car stood during all turns that were found ({turns}), according to '
                         f'its speed',
                         'drive through turns, or omit the speed if it is wrong')
+    elif any(turn not in evidence.left_out for turn in evidence.built):
+        found = Finding('E-UNDETERMINED', 'refused',
+                        'the turns could be reconstructed, but no camera follows from them: '
+                        'nothing in them limits the focal length, as where the camera slides past '
+                        'flat or distant things', 'drive through turns at crossings, past houses '
+                        'and parked cars, near and far')
     else:
         found = Finding('E-NO-SCENE', 'refused',
                         f'{counted(turns, "turn")} {"was" if turns == 1 else "were"} found, but '
@@ -295,7 +323,7 @@ def _stored_summary(turn: StoredTurn, scene: Scene, evidence: Evidence, solution
                     ) -> StoredTurnSummary:
     return StoredTurnSummary(
         id=scene.turn, stamp_s=turn.stamp_s, prominence=turn.prominence,
-        yaw_deg=turn.scene.yaw_deg, images=len(scene.tracks.frames),
+        yaw_deg=turn.scene.yaw_deg, images=len(scene.tracks.frames), clip=scene.turn.clip,
         **_use(scene.turn, scene, evidence, solution))
 
 

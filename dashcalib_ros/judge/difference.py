@@ -10,19 +10,19 @@ omitting them: how far the rest alone is from its own distribution.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as default
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from dashcalib_ros.arrays import Floats
-from dashcalib_ros.camera import Camera
+from dashcalib_ros.arrays import Floats, plain_values
+from dashcalib_ros.camera import Camera, misread
 from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import Apart, apart, as_model, sensitivity
-from dashcalib_ros.errors import InputError
+from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import PictureSigma, SigmaMap, sigma_over
@@ -53,7 +53,7 @@ CHANCE = 1e-3
 LEAST_SIGMA_PX = 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Difference:
     """A given camera beside one that was found, in px of the same pictures.
 
@@ -100,14 +100,21 @@ class Difference:
         real, and small enough. wrong: it is real, and larger than detection allows. cannot tell:
         the error may be too large, and nothing shows whether it is.
         """
-        same = (self.rms_px is not None and self.rms_px <= self.limits_px['metrology']
-                if self.told_apart is None else not self.told_apart)
-        if not same and (self.centre_off or self.rms_px is None
-                         or self.rms_px > self.limits_px['detection']):
+        if self._wrong:
             return 'wrong'
         if not self.good_for:
             return 'cannot tell'
-        return 'right' if same else 'differs'
+        return 'right' if self._same else 'differs'
+
+    @property
+    def _same(self) -> bool:
+        return (self.rms_px is not None and self.rms_px <= self.limits_px['metrology']
+                if self.told_apart is None else not self.told_apart)
+
+    @property
+    def _wrong(self) -> bool:
+        return not self._same and (self.centre_off or self.rms_px is None
+                                   or self.rms_px > self.limits_px['detection'])
 
     @property
     def matters(self) -> bool | None:
@@ -117,8 +124,9 @@ class Difference:
     @property
     def good_for(self) -> tuple[Use, ...]:
         """Return for which uses the given camera is near enough to the one that was found."""
-        return tuple(use for use, limit in self.limits_px.items() if self.rms_px is not None
-                     and self.rms_px <= limit and self.bound_px <= SURE * limit)
+        return () if self._wrong or self.rms_px is None else tuple(
+            use for use, limit in self.limits_px.items()
+            if self.rms_px <= limit and self.bound_px <= SURE * limit)
 
     @property
     def centre_off(self) -> bool:
@@ -164,10 +172,11 @@ class Difference:
         moves, pixels = sensitivity(model)
         return SigmaMap(pixels, sigma_over(moves, self.covariance))
 
-    def ways(self) -> Mapping[Way, Floats]:
+    def ways(self) -> Mapping[Way, tuple[Floats, Floats]]:
         """Return the fewest parts of the camera that explain the distance, the largest first.
 
-        Each with its offsets that are left when the other parts are as the drive says.
+        Each with its offsets that are left when the other parts are as the drive says, and their
+        sigmas.
         """
         left: list[Way] = ['focal length', 'centre', 'distortion']
         chosen: list[Way] = []
@@ -181,10 +190,12 @@ class Difference:
         places = np.array(self._places(chosen))
         rest = np.setdiff1d(np.arange(len(self.offsets)), places)
         # what the rest, as it is given, leads one to expect of the chosen parts
-        expected = self.covariance[np.ix_(places, rest)] @ np.linalg.solve(
-            self.covariance[np.ix_(rest, rest)], self.offsets[rest])
-        own = dict(zip(places.tolist(), self.offsets[places] - expected, strict=True))
-        return {way: np.array([own[place] for place in self._places([way])]) for way in chosen}
+        across = self.covariance[np.ix_(places, rest)]
+        follow = np.linalg.solve(self.covariance[np.ix_(rest, rest)], across.T).T
+        offsets = self.offsets[places] - follow @ self.offsets[rest]
+        sigmas = np.sqrt(np.diag(self.covariance[np.ix_(places, places)] - follow @ across.T))
+        own = {way: np.isin(places, self._places([way])) for way in chosen}
+        return {way: (offsets[mine], sigmas[mine]) for way, mine in own.items()}
 
     def _without(self, ways: Sequence[Way]) -> float:
         assert self.covariance is not None
@@ -240,12 +251,13 @@ class NamedCamera:
     field: what its lens model leaves over, where a result.json has one that is used. mount: how it
     sits on the car, where the file says. readout_ms: of a rolling shutter, from the first row to
     the last; None where the file has none.
-    faults: in words, of what else stands beside the camera (ROS's K, R and P).
+    faults: in words, of what else stands beside the camera (ROS's K, R and P). warnings: of what
+    is odd in the camera itself.
     """
 
     name: str
     camera: Camera
-    sigma: Mapping[str, float] | None = None
+    sigma: Mapping[str, float] | None = default(default=None, hash=False)
     verdict: str | None = None
     covariance: Floats | None = default(default=None, compare=False)
     sigma_px: PictureSigma | None = None
@@ -253,6 +265,7 @@ class NamedCamera:
     mount: Mount | None = default(default=None, compare=False)
     readout_ms: float | None = default(default=None, compare=False)
     faults: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = default(default=(), compare=False)
 
     def without_faults(self) -> NamedCamera:
         """Return it; raises InputError where something beside the camera is wrong."""
@@ -267,6 +280,11 @@ class NamedCamera:
         """Return (width, height) in pixels."""
         return self.camera.image_size
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as dicts, lists, text, finite numbers and None."""
+        values: dict[str, Any] = plain_values(self)
+        return {**values, 'camera': {'model': self.camera.model, **values['camera']}}
+
 
 def difference_between(given: NamedCamera, found: NamedCamera) -> Difference:
     """Compare two cameras of which there is no more than what their files say."""
@@ -280,7 +298,9 @@ def difference_between(given: NamedCamera, found: NamedCamera) -> Difference:
     return Difference(
         given.camera, found.camera, a.params - b.params,
         np.sum(covariances, axis=0) if covariances else None,
-        apart(given.camera, found.camera),
+        apart(given.camera, found.camera,
+              None if given.field is None else given.field.observed,
+              None if found.field is None else found.field.ideal),
         PictureSigma(float(np.hypot.reduce([each.rms for each in sigmas])),
                      float(np.hypot.reduce([each.worst for each in sigmas]))) if sigmas else None)
 
@@ -294,6 +314,25 @@ def _carried(covariance: Floats, camera: Camera, to: Camera) -> Floats:
     carry, *_ = np.linalg.lstsq(others[theirs].reshape(-1, others.shape[2]),
                                 moves[mine].reshape(-1, moves.shape[2]), rcond=None)
     return np.asarray(carry @ covariance @ carry.T)
+
+
+# of the distance; a camera read as one of the other family that is so much nearer is that one
+NEARER = 0.5
+
+
+def misread_text(given: Camera, rms_px: float | None, compare: Callable[[Camera], Difference]
+                 ) -> str:
+    """Return that a file has the wrong distortion model, where its numbers fit as the other one.
+
+    rms_px: between the given camera and the one that was found. compare: with that one.
+    """
+    other = misread(given)
+    read = None if other is None else compare(other)
+    if other is None or read is None or read.rms_px is None or not read.good_for or (
+            rms_px is not None and read.rms_px > NEARER * rms_px):
+        return ''
+    return (f'its distortion model may be wrong: read as {other.ros_model} instead of '
+            f'{given.ros_model}, it differs by {read.rms_px:.2f} px RMS')
 
 
 # of the width; a centre that is farther off looks like that of a part of the picture
@@ -362,38 +401,46 @@ def _blamed(found: Difference) -> Sequence[Way]:
 
 def reasons_of(found: Difference) -> tuple[str, ...]:
     """Return in words what the difference from a drive's own camera says."""
-    parts = ([_PARTS[way](found, offsets) for way, offsets in found.ways().items()]
+    parts = ([_PARTS[way](found, *off) for way, off in found.ways().items()]
              if _blamed(found) else [])
     return (*answers_of(found, 'the drive'), *(text for text in parts if text))
 
 
-def _focal(found: Difference, offsets: Floats) -> str:
-    shares = offsets / [found.found.fx, found.found.fy]
+def _focal(found: Difference, offsets: Floats, sigmas: Floats) -> str:
+    shares, sure = (100 * each / [found.found.fx, found.found.fy] for each in (offsets, sigmas))
     if max(abs(shares)) == 0:
         return ''
+
+    def text(share: float, sigma: float) -> str:
+        return f'{abs(share):.1f} ± {sigma:.1f} % too {"long" if share > 0 else "short"}'
+
     if abs(shares[0] - shares[1]) < 0.5 * max(abs(shares)):
-        share = float(shares.mean())
-        return (f'focal length: {100 * abs(share):.1f} % too {"long" if share > 0 else "short"}')
-    names = [f'{name} {100 * abs(share):.1f} % too {"long" if share > 0 else "short"}'
-             for name, share in zip(('fx', 'fy'), shares, strict=True)
+        return f'focal length: {text(shares.mean(), sure.max())}'
+    names = [f'{name} {text(share, sigma)}'
+             for name, share, sigma in zip(('fx', 'fy'), shares, sure, strict=True)
              if abs(share) > 0.25 * max(abs(shares))]
     return f'focal length: {", ".join(names)}'
 
 
-def _centre(found: Difference, offsets: Floats) -> str:
-    x, y = offsets
-    sides = [f'{abs(value):.1f} px too far {way[int(value > 0)]}'
-             for value, way in ((x, ('left', 'right')), (y, ('up', 'down')))
-             if abs(value) > 0.25 * max(abs(x), abs(y))]
+def _centre(found: Difference, offsets: Floats, sigmas: Floats) -> str:
+    sides = [f'{abs(value):.1f} ± {sigma:.1f} px too far {way[int(value > 0)]}'
+             for value, sigma, way in zip(offsets, sigmas, (('left', 'right'), ('up', 'down')),
+                                          strict=True)
+             if abs(value) > 0.25 * max(abs(offsets))]
     text = f'centre: {" and ".join(sides)}'
-    if max(abs(x), abs(y)) > CROPPED * found.given.image_size[0]:
+    if max(abs(offsets)) > CROPPED * found.given.image_size[0]:
         text += ': is the calibration for another part of the picture?'
     return text
 
 
-def _distortion(found: Difference, offsets: Floats) -> str:
-    names = found.found.names()[4:]
-    values = [f'{name} {value:+.3f}' for name, value in zip(names, offsets, strict=True)]
+def _distortion(found: Difference, offsets: Floats, sigmas: Floats) -> str:
+    off = list(zip(found.found.names()[4:], offsets, sigmas, strict=True))
+    # some compensate each other: what is known of them together may be known of none alone
+    shown = [each for each in off if abs(each[1]) > 2 * each[2]] or off
+    values = []
+    for name, value, sigma in shown:
+        digits = int(np.clip(1 - np.floor(np.log10(sigma)), 3, 6)) if sigma > 0 else 3
+        values.append(f'{name} {value:+.{digits}f} ± {sigma:.{digits}f}')
     return f'distortion: off by {", ".join(values)}'
 
 

@@ -6,6 +6,7 @@ RULES.
 """
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -17,6 +18,7 @@ from dashcalib_ros.config import VerdictConfig
 from dashcalib_ros.detect import Bend
 from dashcalib_ros.detect.one_camera import APART, OtherCamera
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.errors import Notice, counted, spared
 from dashcalib_ros.judge.agreement import (
     MAX_MISFIT,
     focal_disagreement,
@@ -102,11 +104,11 @@ def judge(solution: Solution, config: VerdictConfig, lines: Bend | None = None,
     would bring, where only knowledge is missing.
     """
     grounds = Grounds(solution, config, lines, witnesses or Witnesses(), other_camera)
-    findings = [found for rule in RULES if (found := rule(grounds)) is not None]
+    findings = [found for rule in RULES if (found := _found(rule, grounds)) is not None]
     findings.sort(key=lambda found: (not found.objects, found.objects and not found.cause,
                                      found.level != 'refused'))
     if outlook and findings[0].objects and lacks_knowledge_only(grounds):
-        first, more = findings[0].cure, next_turn(solution)
+        first, more = findings[0].cure, spared('the outlook', [], next_turn, solution) or ''
         findings = [replace(found, cure=first + (more and f' ({more})')) if found.cure == first
                     else found for found in findings]
     return verdict_of(findings)
@@ -128,9 +130,17 @@ def lacks_knowledge_only(grounds: Grounds) -> bool:
 
     Another focal length may explain them as well, but not clearly better.
     """
-    found = [rule(grounds) for rule in SOUND]
+    found = [_found(rule, grounds) for rule in SOUND]
     return (profile_contrast(grounds.solution) > -MIN_CONTRAST
             and not any(each is not None and each.objects for each in found))
+
+
+def _found(rule: Rule, grounds: Grounds) -> Finding | None:
+    """Return what a rule finds; one that fails costs no result, but that is not accepted."""
+    lost: list[Notice] = []
+    found = spared(f'the check {rule.__name__.strip("_")}', lost, rule, grounds)
+    return Finding('E-CHECK-FAILED', 'weak', str(lost[0]), 'calibrate again with the next release'
+                   ) if lost else found
 
 
 def _graded(refused: bool, weak: bool) -> Level:
@@ -169,11 +179,11 @@ def _yaw_of_turns(grounds: Grounds) -> Finding:
 
 def yaw_in_all(yaw_deg: float, config: VerdictConfig) -> Finding:
     """Judge the yaw of all turns together."""
-    least = config.min_yaw_deg
-    return Finding('E-LITTLE-YAW', _graded(yaw_deg < config.refused_yaw_deg,
-                                           yaw_deg < least),
-                   f'the turns have {yaw_deg:.0f}° of yaw in all, at least {least:.0f}° are '
-                   f'needed', MORE_TURNS).measured(
+    least, hardly = config.min_yaw_deg, yaw_deg < config.refused_yaw_deg
+    text = 'hardly a turn: those that could be used' if hardly else 'the turns'
+    return Finding('E-LITTLE-YAW', _graded(hardly, yaw_deg < least),
+                   f'{text} have {yaw_deg:.0f}° of yaw in all, at least {least:.0f}° are needed',
+                   MORE_TURNS).measured(
         'yaw of these turns together', f'{yaw_deg:.0f}°', f'at least {least:.0f}°')
 
 
@@ -206,9 +216,9 @@ def _far_from_profile(grounds: Grounds) -> Finding | None:
     if np.isclose(best, solution.camera.fx):
         return None
     return Finding('E-TWO-FOCAL-LENGTHS', 'refused',
-                   f'two ways to find the focal length contradict each other: '
-                   f'{solution.px * solution.camera.fx:.0f} px and about '
-                   f'{solution.px * best:.0f} px; neither can be trusted',
+                   f'two ways to find the focal length contradict each other, as where other '
+                   f'traffic fills the pictures: {solution.px * solution.camera.fx:.0f} px and '
+                   f'about {solution.px * best:.0f} px',
                    'record another drive, with sharper turns and less traffic')
 
 
@@ -232,13 +242,18 @@ def _relative_sigma(solution: Solution) -> float:
     return float(solution.sigma[0] / solution.camera.fx)
 
 
-def one_turn_dominates(grounds: Grounds) -> Finding:
-    """If one turn gives nearly all information about fx, the others cannot confirm it."""
+def one_turn_dominates(grounds: Grounds) -> Finding | None:
+    """If one turn gives nearly all information about fx, the others cannot confirm it.
+
+    Of a single turn the rule on the number of turns says all.
+    """
     shares, most = leverages(grounds.solution), grounds.config.max_leverage
+    if len(shares) < 2:
+        return None
     turn = max(shares, key=lambda turn: shares[turn])
     percent, confirmed = 100 * min(shares[turn], 1.0), gyro_confirms(grounds.solution)
     return Finding('E-ONE-TURN-DOMINATES',
-                   _graded(False, len(shares) > 1 and shares[turn] > most and not confirmed),
+                   _graded(False, shares[turn] > most and not confirmed),
                    f'no other turn confirms {_turns([turn])}, which gives {percent:.0f} % of the '
                    f'information about the focal length',
                    'drive another turn that is as sharp').measured(
@@ -275,15 +290,21 @@ def other_camera(grounds: Grounds) -> Finding:
         f'at most {MAX_MISFIT:.2g} times')
 
 
+# clips in a message
+NAMED = 3
+
+
 def _turns(turns: list[TurnId]) -> str:
     """Return the turns' names, for messages."""
     own = [str(turn.number) for turn in turns if turn.of_this_drive]
-    stored = len(turns) - len(own)
+    stored = Counter(turn.clip or 'earlier drives' for turn in turns if not turn.of_this_drive)
     names = []
     if own:
         names.append(f'the turn{"s" * (len(own) > 1)} at frame {", ".join(own)}')
-    if stored:
-        names.append(f'{stored} turn{"s" * (stored > 1)} of earlier drives')
+    if len(stored) > NAMED:
+        names.append(f'{counted(stored.total(), "turn")} of {len(stored)} clips')
+    else:
+        names += [f'{counted(count, "turn")} of {where}' for where, count in stored.items()]
     return ' and '.join(names)
 
 
@@ -502,8 +523,8 @@ def _lines_disagree(grounds: Grounds) -> Finding | None:
     glass = '' if solution.field is None else f', or {RAYS} if a curved windscreen bends them'
     return Finding('E-LINES-BENT', 'weak',
                    f'poles and the edges of houses are not straight with this distortion '
-                   f'({lines.lines} upright lines indicate k1 {lines.k1:+.3f}, {lines.sigmas:.0f} '
-                   f'times the sigma of the difference)', f'{MORE_TURNS}{glass}')
+                   f'({lines.lines} upright lines: {lines.change}, {lines.sigmas:.0f} sigma)',
+                   f'{MORE_TURNS}{glass}')
 
 
 def _sensors_disagree(grounds: Grounds) -> Finding | None:

@@ -25,10 +25,11 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.config import Config
-from dashcalib_ros.errors import Notice
-from dashcalib_ros.input.motion import Samples, SensorStream
+from dashcalib_ros.errors import Notice, one_line
+from dashcalib_ros.input.motion import Samples, SensorStream, zone_text
 from dashcalib_ros.judge.calibration import Witness, Witnesses
 from dashcalib_ros.judge.gyro_scale import (
+    FIXES,
     HEADING_SIGMA_DEG,
     JUMP,
     LEAST_NOISE_M,
@@ -39,8 +40,9 @@ from dashcalib_ros.judge.gyro_scale import (
     straight_between,
 )
 from dashcalib_ros.problem.blocks import lens_alone
+from dashcalib_ros.problem.observations import main_axis
 from dashcalib_ros.problem.steps import State
-from dashcalib_ros.reconstruct.scene import Scene, main_axis
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.robust import weighted_mean
 from dashcalib_ros.solve.optimise import loss_px_of
 from dashcalib_ros.solve.solution import Solution, with_measurement
@@ -81,22 +83,36 @@ def compare_sensors(solution: Solution | None, stream: SensorStream | None, star
         turns = [steps for scene in scenes
                  if len(scene.observed.keyframes) >= LEAST_KEYFRAMES
                  and (steps := steps_of(scene, solution, loss_px, start_s)) is not None]
+        apart = {kind: words for kind, samples in stream.kinds.items()
+                 if (words := _apart(samples, turns))}
+        late_s, own, doubt_s = 0.0, None, stream.doubt_s
+        if stream.rate is not None and doubt_s and turns:
+            late_s = _late_s(turns, stream.rate, doubt_s)
+            stream = stream.shifted(-late_s)
         if stream.rate is not None:
             fit = fit_to(turns, stream.rate)
             own = _own_scale(stream.rate, stream.position, config.motion.gyro_scale_sigma)
             fit = None if fit is None else fit.scaled(own.scale)
-            gyro, notice = _gyro(fit, solution, own)
+            gyro, notice = _gyro(fit, solution, own, apart.get('rate', ''))
+            if gyro is not None:
+                doubt_s = 0.0
+                gyro = replace(gyro, time_offset_s=(gyro.time_offset_s or 0.0) + late_s)
             notices += [own.contradiction, notice]
             if fit is not None and gyro is not None and gyro.agrees:
                 informed, notice = _informed(solution, fit, own, config)
                 notices.append(notice)
         if stream.position is not None:
-            gps, notice = _gps(turns, stream.position, solution)
-            notices.append(notice)
-    except (np.linalg.LinAlgError, ValueError, FloatingPointError) as error:
+            gps, notice = _gps(turns, stream.position, solution, apart.get('position', ''),
+                               doubt_s)
+            # it has its use where it tells the gyro's scale
+            notices.append(None if own is not None and own.by_gps else notice)
+        if 'speed' in apart:
+            notices.append(Notice('E-SPEED-NO-SAMPLES', f'the speed is not used: it has no '
+                                  f'samples during the turns, {apart["speed"]}'))
+    except Exception as error:
         notices.append(Notice(
             'E-SENSORS-NOT-COMPARED',
-            f'the motion sensors could not be compared with the turns ({error})'))
+            f'the motion sensors could not be compared with the turns ({one_line(error)})'))
     kept = solution if informed is None or (gps is not None and not gps.agrees) else informed
     return SensorComparison(kept, Witnesses(gyro, gps), tuple(filter(None, notices)))
 
@@ -178,13 +194,34 @@ LEAST_EXPLAINED = 0.9
 DEGREES = (40.0, 80.0)
 
 
-def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale
+def _apart(samples: Samples, turns: Sequence[Steps]) -> str:
+    """Return in words how far a sensor's samples are from all turns, '' where they are not."""
+    first_s, last_s = float(samples.stamps_s[0]), float(samples.stamps_s[-1])
+    begin_s = min((float(turn.stamps_s[0]) for turn in turns), default=first_s)
+    end_s = max((float(turn.stamps_s[-1]) for turn in turns), default=last_s)
+    if first_s < end_s and last_s > begin_s:
+        return ''
+    where = (f'they begin {first_s - end_s:.0f} s after the last turn' if first_s >= end_s else
+             f'they end {begin_s - last_s:.0f} s before the first turn')
+    return f'{where}{zone_text(first_s, last_s, begin_s, end_s) or ": check their clock"}'
+
+
+def _late_s(turns: Sequence[Steps], rate: Samples, doubt_s: float) -> float:
+    """Return about how late a gyro's stamps are, where no more is known than doubt_s."""
+    angles, tried = rate.integral, np.arange(-doubt_s, doubt_s + COARSE_S, COARSE_S)
+    return float(min(tried, key=lambda offset: _aligned(turns, angles, float(offset))[0]))
+
+
+def _gyro(fit: Fit | None, solution: Solution, own: _OwnScale, apart: str
           ) -> tuple[Witness | None, Notice | None]:
-    """Return what the gyro says, or why it says nothing."""
+    """Return what the gyro says, or why it says nothing. apart: as _apart() has it."""
+    if fit is None and apart:
+        return None, Notice('E-GYRO-NO-SAMPLES', f'the gyro is not used: it has no samples '
+                            f'during the turns, {apart}')
     if fit is None:
         return None, Notice(
-            'E-GYRO-NO-SAMPLES', 'the gyro is not used: it has no samples during the turns, '
-            'within 0.5 s of their time stamps: check its clock')
+            'E-GYRO-TURNS-LITTLE', f'the gyro is not used: the car turns less than '
+            f'{LEAST_TURNED_DEG:g} degrees where it has samples: record it without gaps, in turns')
     gyro = fit.gyro
     if abs(gyro.offset_s) >= LARGEST_OFFSET_S or not fit.explained >= LEAST_EXPLAINED:
         return None, Notice(
@@ -583,17 +620,34 @@ class _End:
 LEAST_GPS_DEG = 30.0
 
 
-def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
-         ) -> tuple[Witness | None, Notice | None]:
-    """Return what GPS headings say, from straight to straight, or why they say nothing."""
+def _gps(turns: Sequence[Steps], position: Samples, solution: Solution, apart: str,
+         doubt_s: float) -> tuple[Witness | None, Notice | None]:
+    """Return what GPS headings say, from straight to straight, or why they say nothing.
+
+    apart: as _apart() has it; doubt_s: by how much its clock may be off.
+    """
+    if apart:
+        return None, Notice('E-GPS-NO-SAMPLES', f'GPS is not compared with the turns: it has no '
+                            f'fixes during them, {apart}')
+    if doubt_s:
+        return None, Notice(
+            'E-GPS-CLOCK', 'GPS is not compared with the turns: its clock is not known to be that '
+            'of the images, within a fraction of a second: use images with time stamps')
     pairs = [pair for turn in turns if (pair := _ends(turn, position)) is not None]
     if not pairs:
-        return None, None
+        return None, Notice(
+            'E-GPS-NO-STRAIGHTS', f'GPS is not compared with the turns: in the images of no turn '
+            f'are {FIXES} fixes on {STRAIGHT_M:g} m of straight road both before and after it: '
+            f'use a receiver with more fixes per second, and turns between straights')
+    blurred = Notice(
+        'E-GPS-HEADINGS', f'GPS is not compared with the turns: no turn of {LEAST_GPS_DEG:g} '
+        f'degrees or more has headings that are known to {HEADING_SIGMA_DEG:g} degrees: drive '
+        f'turns with longer straights, under open sky')
     usual = float(np.median([each.off_m for pair in pairs for each in pair]))
     sound = [pair for pair in pairs
              if all(each.off_m <= max(JUMP * usual, LEAST_NOISE_M) for each in pair)]
     if not sound:
-        return None, None
+        return None, blurred
     straights = [each.straight for pair in sound for each in pair]
     noise_m = max(float(np.sqrt(sum(each.off_m2 for each in straights)
                                 / sum(each.freedom for each in straights))), LEAST_NOISE_M)
@@ -612,7 +666,7 @@ def _gps(turns: Sequence[Steps], position: Samples, solution: Solution
         sigmas.append(sigma)
         follow.append(after.follow - before.follow)
     if not ours:
-        return None, None
+        return None, blurred
     camera, gps = np.array(ours), np.array(measured)
     ratios, variances = camera / gps, (np.array(sigmas) / gps)**2
     mean = weighted_mean(ratios, variances)

@@ -214,11 +214,11 @@ class Lens(SharedBlock):
         if self.centred is None:
             return np.zeros((self.size, self.size)), np.zeros(self.size)
         mean, covariance = prior_of(self.centred, self.aspect_sigma)
-        information, off = np.linalg.inv(covariance), self.value - mean
+        information, off = np.asarray(np.linalg.inv(covariance)), self.value - mean
         if self.directions is None:
             return information, off
         inner = self.directions.T @ information @ self.directions
-        return inner, np.linalg.solve(inner, self.directions.T @ information @ off)
+        return inner, np.asarray(np.linalg.solve(inner, self.directions.T @ information @ off))
 
     def moved(self, step: Floats) -> Lens:
         return replace(self, camera=self.camera.with_params(self._after(step)))
@@ -313,7 +313,7 @@ class Shake(ImageBlock):
     def prior_of(self, stretch: Stretch) -> tuple[Floats, Floats]:
         used = stretch.observed.keyframes
         each = shake_precision(self.axes[stretch.turn], self.readout_s)
-        return np.kron(np.eye(len(used)), each), self.of(stretch)[used].ravel()
+        return np.asarray(np.kron(np.eye(len(used)), each)), self.of(stretch)[used].ravel()
 
     def anchored(self, imaging: Imaging) -> Shake:
         return replace(self, readout_s=imaging.readout_s,
@@ -439,13 +439,20 @@ class Bend(SharedBlock):
 
 # prior sigma of a stabiliser's crop, of the width, and how long it holds it, s
 CROP_SIGMA, CROP_TIME_S = 0.03, 1.0
+# of a smaller shift, which wanders smoothly: how long it holds, in units of that time
+WANDER_TIMES = 1.5
 # prior sigmas of the zoom: of one image, of a stretch, of a turn
 ZOOM_IMAGE, ZOOM_STRETCH, ZOOM_TURN = 0.01, 0.02, 0.03
 
 
 @dataclass(frozen=True)
 class Shift(ImageBlock):
-    """How far each image's picture is shifted in x and y, px, as a stabiliser does it."""
+    """How far each image's picture is shifted in x and y, px.
+
+    sigma: of the width. CROP_SIGMA as a stabiliser makes it; smaller ones wander smoothly.
+    """
+
+    sigma: float = CROP_SIGMA
 
     name: ClassVar[str] = 'shift'
     count: ClassVar[int] = 2
@@ -458,9 +465,10 @@ class Shift(ImageBlock):
         return xy if moved is None else np.asarray(xy - moved[observed.rows])
 
     def prior_of(self, stretch: Stretch) -> tuple[Floats, Floats]:
-        used = stretch.observed.keyframes
-        inner = np.linalg.inv((CROP_SIGMA * stretch.tracks.image_size[0])**2 * (
-            np.exp(-_apart(stretch)) + 1e-6 * np.eye(len(used))))
+        used, apart = stretch.observed.keyframes, _apart(stretch)
+        smooth = np.exp(-apart if self.sigma >= CROP_SIGMA else -0.5 * (apart / WANDER_TIMES)**2)
+        inner = np.linalg.inv((self.sigma * stretch.tracks.image_size[0])**2 * (
+            smooth + 1e-6 * np.eye(len(used))))
         return np.kron(inner, np.eye(2)), self.of(stretch)[used].ravel()
 
 
@@ -483,7 +491,7 @@ class Zoom(ImageBlock):
         used = stretch.observed.keyframes
         spread = (ZOOM_STRETCH**2 * np.exp(-_apart(stretch))
                   + ZOOM_IMAGE**2 * np.eye(len(used)) + ZOOM_TURN**2)
-        return np.linalg.inv(spread), self.of(stretch)[used].ravel()
+        return np.asarray(np.linalg.inv(spread)), self.of(stretch)[used].ravel()
 
 
 def _apart(stretch: Stretch) -> Floats:

@@ -127,12 +127,12 @@ def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
             np.concatenate([across[:, :POINT], across[:, POINT + own:]], axis=1),
             chunk.starts, axis=2)
         span = chunk.end - chunk.begin
-        some = np.zeros((POINT, own * span + size - POINT - own, len(chunk.points)))
-        some[:, :own * span].reshape(POINT, span, own, -1).transpose(0, 2, 1, 3)[
+        part = np.zeros((POINT, own * span + size - POINT - own, len(chunk.points)))
+        part[:, :own * span].reshape(POINT, span, own, -1).transpose(0, 2, 1, 3)[
             :, :, chunk.image, chunk.place] = across[:, POINT:POINT + own]
-        some[:, own * span:] = ends[:, POINT:]
+        part[:, own * span:] = ends[:, POINT:]
         points[chunk.points] = ends[:, :POINT].transpose(2, 0, 1)
-        mixed.append(some)
+        mixed.append(part)
     follow = None
     if coupled:
         used = observed.keyframes
@@ -221,9 +221,9 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
 
     variance: of a residual, px^2, against which the priors of images' blocks count. kept: blocks
     of images that are not eliminated, and have no prior. tracks: with by_track, each track being
-    one measurement; images: what observations of one image share is in it, too; at the optimum only:
-    elsewhere all of them ask for the same change. radius: how far the linearisation is trusted;
-    inf: it is not damped.
+    one measurement; images: what observations of an image share is in it, too, which holds at the
+    optimum only: elsewhere all of them ask for the same change. radius: how far the linearisation
+    is trusted; inf: it is not damped.
     """
     own, extras = linear.own, linear.extras
     whole, inverse = _without_points(linear, radius)
@@ -343,11 +343,11 @@ def _by_track(linear: Linear, inverse: Floats, response: Floats, first: Ints, re
         points = mixed[:, :span].transpose(0, 2, 1) @ follow[own * chunk.begin:own * chunk.end]
         points[:, :, len(kept):] += mixed[:, span:-1].transpose(0, 2, 1)
         points = np.einsum('cij,jcm->icm', inverse[chunk.points], points)
-        some = scores[chunk.observations]
+        theirs = scores[chunk.observations]
         for own_point, point in zip(each[:POINT, chunk.observations], points, strict=True):
-            some -= own_point[:, None] * point[chunk.place]
-        scores[chunk.observations] = some
-        by_track[chunk.points] = np.add.reduceat(some, chunk.starts, axis=0)
+            theirs -= own_point[:, None] * point[chunk.place]
+        scores[chunk.observations] = theirs
+        by_track[chunk.points] = np.add.reduceat(theirs, chunk.starts, axis=0)
     spread = by_track.T @ by_track
     if images:
         # a shutter's rows while the car shakes, or blur, move all that an image sees

@@ -83,7 +83,8 @@ class Observed:
     """n observations of a stretch, image by image.
 
     turn: the stretch. rows, columns: (n,) their keyframes and tracks; xy: (n, 2) px. keyframes:
-    (k,), tracks: (t,) those that are seen; image, point: (n,) their places among these. stamps_ns: (n,).
+    (k,), tracks: (t,) those that are seen; image, point: (n,) their places among these.
+    stamps_ns: (n,).
     """
 
     turn: TurnId

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -120,44 +120,86 @@ def optimised(start: S, how: Stepping,
               chosen: Callable[[S, int], S] = lambda now, n: now) -> S:
     """Return the state after steps that lower its cost.
 
-    chosen: the state before step n with the sizes of its priors; these hardly change.
+    chosen: the state before step n with the sizes of its priors; these hardly change. Raises
+    Undetermined.
     """
-    now, radius, shrink, failures = start, how.radius, 2.0, 0
+    now, trust = start, _Trust(how.radius)
     for n in range(how.steps):
         now = chosen(replace(now, imaging=now.imaging.anchored()), n)
         unit = how.unit or now.noise(how.loss_px).variance * now.inflation
         linear = [linearised(each, how.loss_px, safe=True) for each in now.seen]
-        before, gain, step = now.cost(how.loss_px, unit), -np.inf, None
-        while failures <= FAILURES:
-            trusted = radius == np.inf
-            try:
-                step = _Step.of(now, linear, unit, radius)
-            except np.linalg.LinAlgError:
-                if trusted:
-                    raise
-                step = None
-            for part in () if step is None else PARTS if trusted else (1.0,):
-                after = step.taken(now, part)
-                gain = before - after.cost(how.loss_px, unit)
-                if gain > (0.0 if trusted else WORTH * step.expected):
-                    break
-            else:
-                if abs(gain) <= how.tolerance * before:
-                    return replace(now, converged=True)
-                radius, shrink, failures = (
-                    min(radius / shrink, FIRST_RADIUS), 2 * shrink, failures + 1)
-                continue
-            break
-        if step is None or failures > FAILURES:
+        before = now.cost(how.loss_px, unit)
+        for _ in range(FAILURES + 1):
+            tried = _tried(now, linear, how.loss_px, unit, before, trust)
+            if tried.lowers or abs(tried.gain) <= how.tolerance * before:
+                break
+            trust = trust.less()
+        else:
             # no step lowers the cost: this is as low as it gets
             return now
-        now, shrink, failures = replace(
-            after, converged=part * step.shared_gain < REACHED), 2.0, 0
-        if (part * step.shared_gain < how.settled and trusted) or gain <= how.tolerance * before:
+        if not tried.lowers:
+            return replace(now, converged=True)
+        now = replace(tried.after, converged=tried.shared_gain < REACHED)
+        if ((tried.shared_gain < how.settled and trust.whole)
+                or tried.gain <= how.tolerance * before):
             break
-        radius = how.radius if how.radius == np.inf else min(
-            radius / max(1 / 3, 1 - (2 * gain / step.expected - 1)**3), LARGEST_RADIUS)
+        trust = _Trust(how.radius) if how.radius == np.inf else trust.more(tried.worth)
     return now
+
+
+@dataclass(frozen=True)
+class _Trust:
+    """The region in which the linearisation is trusted; shrink: what a failure divides it by."""
+
+    radius: float
+    shrink: float = 2.0
+
+    @property
+    def whole(self) -> bool:
+        """Return whether it is trusted everywhere: steps are not damped then."""
+        return self.radius == np.inf
+
+    def less(self) -> _Trust:
+        """Return the region after a step that did not lower the cost."""
+        return _Trust(min(self.radius / self.shrink, FIRST_RADIUS), 2 * self.shrink)
+
+    def more(self, worth: float) -> _Trust:
+        """Return the region after a step that gained so much of what was expected."""
+        return _Trust(min(self.radius / max(1 / 3, 1 - (2 * worth - 1)**3), LARGEST_RADIUS))
+
+
+@dataclass(frozen=True)
+class _Tried(Generic[S]):
+    """The state after a step that was tried, and by how much it lowers the cost.
+
+    worth: of what was expected; shared_gain: what the step of what is shared should gain.
+    """
+
+    after: S
+    lowers: bool = False
+    gain: float = -np.inf
+    worth: float = 0.0
+    shared_gain: float = 0.0
+
+
+def _tried(now: S, linear: Sequence[Linear], loss_px: float, unit: float, before: float,
+           trust: _Trust) -> _Tried[S]:
+    """Return the longest part of a step that lowers the cost, or the last one that was tried."""
+    try:
+        step = _Step.of(now, linear, unit, trust.radius)
+    except np.linalg.LinAlgError:
+        if trust.whole:
+            raise
+        return _Tried(now)
+    tried = _Tried(now)
+    for part in PARTS if trust.whole else (1.0,):
+        after = step.taken(now, part)
+        gain = before - after.cost(loss_px, unit)
+        tried = _Tried(after, gain > (0.0 if trust.whole else WORTH * step.expected), gain,
+                       gain / max(step.expected, 1e-300), part * step.shared_gain)
+        if tried.lowers:
+            break
+    return tried
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,9 @@ import numpy as np
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import SceneConfig
-from dashcalib_ros.reconstruct.bundle import Lens, Observed, adjusted
+from dashcalib_ros.problem.blocks import Imaging, Lens
+from dashcalib_ros.problem.observations import Stretch
+from dashcalib_ros.problem.steps import FIRST_RADIUS, State, Stepping, optimised
 from dashcalib_ros.reconstruct.scene import Scene, projected_px, retriangulated
 
 # steps of one adjustment at the most; 60 move fx by 0.03 % at the most, at twice the time
@@ -48,32 +50,33 @@ def adjust(scenes: Sequence[Scene], camera: Camera, solver: Solver, free: Free,
     focal_range: px, lowest and highest, for one focal length. Scenes without observations stay as
     they are.
     """
-    parts = [_observed(scene) for scene in _in_front(scenes)]
-    if not any(len(part.image) for part in parts):
+    parts = _in_front(scenes)
+    moving = tuple(part for part in parts if part.structure.used.any())
+    if not moving:
         return list(scenes), camera
-    lens = _lens(camera, free, focal_range)
-    moved, lens = adjusted([part for part in parts if len(part.image)], lens, solver.loss_px,
-                           solver.iterations, solver.tolerance)
-    found = iter(moved)
-    return _projected([_updated(scene, next(found)) if len(part.image) else scene
-                       for scene, part in zip(scenes, parts, strict=True)],
-                      lens.camera), lens.camera
+    found = optimised(
+        State(Imaging.of(_lens(camera, free, focal_range)), moving),
+        Stepping(solver.loss_px, solver.iterations, unit=1.0, tolerance=solver.tolerance,
+                 radius=FIRST_RADIUS))
+    moved = iter(found.stretches)
+    return _projected([_with_structure_of(next(moved), scene) if part.structure.used.any()
+                       else scene for scene, part in zip(scenes, parts, strict=True)],
+                      found.camera), found.camera
 
 
 def _lens(camera: Camera, free: Free, focal_range: tuple[float, float] | None) -> Lens:
+    if free == 'nothing':
+        return Lens(camera, held=True)
     count = len(camera.params)
-    low, high = np.full(count, -np.inf), np.full(count, np.inf)
-    low[4:], high[4:] = -MAX_DISTORTION, MAX_DISTORTION
-    each = {'nothing': 0, 'distortion': count - 4}.get(free, FIRST_COEFFICIENTS)
-    directions = np.eye(count)[:, 4:4 + each]
+    bounds = np.array([np.full(count, -np.inf), np.full(count, np.inf)])
+    bounds[:, 4:] = [[-MAX_DISTORTION], [MAX_DISTORTION]]
+    directions = np.eye(count)[:, 4:count if free == 'distortion' else 4 + FIRST_COEFFICIENTS]
     if free == 'one focal length':
         both = np.isin(np.arange(count), (0, 1)).astype(np.float64)
         directions = np.column_stack([both, directions])
-        low[:2], high[:2] = focal_range or (0.0, np.inf)
+        bounds[:, :2] = np.reshape(focal_range or (0.0, np.inf), (2, 1))
         camera = camera.with_focal(camera.fx)
-    if free != 'nothing':
-        camera = camera.with_params(np.clip(camera.params, low, high))
-    return Lens(camera, directions, low, high)
+    return Lens(camera.with_params(np.clip(camera.params, *bounds)), directions, bounds)
 
 
 def refined(scene: Scene, config: SceneConfig, reach: tuple[float, float] | None,
@@ -118,22 +121,9 @@ def _projected(scenes: Sequence[Scene], camera: Camera) -> list[Scene]:
     return found
 
 
-def _observed(scene: Scene) -> Observed:
-    structure = scene.structure
-    images, points = np.nonzero(structure.used)
-    keyframes, image = np.unique(images, return_inverse=True)
-    tracks, point = np.unique(points, return_inverse=True)
-    return Observed(image, point, scene.tracks.xy[images, points],
-                    structure.rotations[keyframes], structure.translations[keyframes],
-                    structure.points[tracks], keyframes, tracks)
-
-
-def _updated(scene: Scene, moved: Observed) -> Scene:
+def _with_structure_of(moved: Stretch, scene: Scene) -> Scene:
     """Return the scene with the poses and points that were adjusted."""
-    structure = scene.structure
-    rotations, translations, points = (each.copy() for each in (
-        structure.rotations, structure.translations, structure.points))
-    rotations[moved.keyframes], translations[moved.keyframes] = moved.rotations, moved.translations
-    points[moved.tracks] = moved.points
+    found = moved.structure
     return replace(scene, structure=replace(
-        structure, rotations=rotations, translations=translations, points=points))
+        scene.structure, rotations=found.rotations, translations=found.translations,
+        points=found.points))

@@ -12,9 +12,9 @@ from dashcalib_ros.arrays import Floats, Mask
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config, ReconstructConfig
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.problem.observations import Structure, Tracks
 from dashcalib_ros.reconstruct.geometry import Engine, engine_named
-from dashcalib_ros.reconstruct.scene import Profile, Scene, Structure, rays_of, triangulate
-from dashcalib_ros.reconstruct.tracks import Tracks
+from dashcalib_ros.reconstruct.scene import Profile, Scene, rays_of, triangulate
 
 # of the image width; the limit of a reprojection error while the lens is still unknown
 CHAIN_ERROR = 0.004

@@ -15,10 +15,11 @@ import numpy as np
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.problem.observations import Tracks
 from dashcalib_ros.reconstruct.adjust import refined
 from dashcalib_ros.reconstruct.chain import chain_scene
 from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
-from dashcalib_ros.reconstruct.tracks import Tracks, longest, spread, thinned
+from dashcalib_ros.reconstruct.tracks import longest, spread, thinned
 
 # how often a scene that leaves images or much else unexplained is chained anew, at the most
 COMPLETIONS = 2

@@ -14,7 +14,8 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera.rotation import rotation_matrices, rotation_vectors
-from dashcalib_ros.reconstruct.scene import Scene, main_axis
+from dashcalib_ros.problem.observations import main_axis
+from dashcalib_ros.reconstruct.scene import Scene
 from dashcalib_ros.robust import cauchy_fit, mad_sigma
 
 

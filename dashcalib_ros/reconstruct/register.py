@@ -15,8 +15,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Floats32, GreyImage, Ints, Mask
 from dashcalib_ros.camera import Camera
-from dashcalib_ros.reconstruct.scene import Structure
-from dashcalib_ros.reconstruct.tracks import Tracks
+from dashcalib_ros.problem.observations import Structure, Tracks
 from dashcalib_ros.robust import mad_sigma
 
 # px; patches are twice as wide, and one

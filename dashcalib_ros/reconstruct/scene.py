@@ -12,7 +12,6 @@ from dashcalib_ros.arrays import Floats, GreyImage, Mask, Pixels
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.problem.observations import Stretch, Tracks, main_axis
-from dashcalib_ros.problem.observations import Structure as Structure
 
 # cosine (11 degrees); a point farther off its viewing ray is an outlier, wherever it projects
 ALONG = 0.98

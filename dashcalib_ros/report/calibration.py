@@ -3,14 +3,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.errors import NotAcceptedError
-from dashcalib_ros.formats import load_calibration
+from dashcalib_ros.formats import load_calibration, result_dict
 from dashcalib_ros.judge import CalibrationData
+from dashcalib_ros.limits import path_of
 from dashcalib_ros.report.files import write_results
+from dashcalib_ros.report.page import notebook_html
+from dashcalib_ros.report.wording import PARAMETERS, parameter_rows
 
 
 @dataclass(frozen=True, repr=False)
@@ -35,10 +39,20 @@ class Calibration(CalibrationData):  # noqa: D101, it is the base's, which has t
     def save(self, folder: str | os.PathLike[str] = 'calibration') -> tuple[Path, ...]:
         """Write what `dashcalib run` writes into a folder, and return the files' paths.
 
-        These are result.json, report.html and calibration.yaml (calibration.weak.yaml where it is
-        weak, none where it is refused). Raises OutputError, which names the cure.
+        These are result.json, calibration.yaml (calibration.weak.yaml where it is weak, none where
+        it is refused), and report.html, unless there is no room for it. Raises OutputError, which
+        names the cure.
         """
-        return write_results(self, folder).files
+        return write_results(self, path_of(folder)).files
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of result.json: dicts, lists, text, finite numbers and None."""
+        return result_dict(self)
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the verdict with its reasons, and the parameters."""
+        return notebook_html(self.verdict.level, (*self.verdict.told, self.caveat), PARAMETERS,
+                             parameter_rows(self))
 
     def accepted(self) -> AcceptedCalibration:
         """Return the same calibration, whose camera and sigma are known not to be None.
@@ -47,7 +61,7 @@ class Calibration(CalibrationData):  # noqa: D101, it is the base's, which has t
         """
         if self.verdict.level != 'accepted':
             raise NotAcceptedError('E-NOT-ACCEPTED', f'the calibration is {self.verdict.level}: '
-                                                     f'{"; ".join(self.verdict.reasons)}')
+                                                     f'{"; ".join(self.verdict.told)}')
         return AcceptedCalibration(**vars(self))
 
 
@@ -56,7 +70,7 @@ class AcceptedCalibration(Calibration):
     """An accepted calibration, from Calibration.accepted(): camera and sigma are there."""
 
     camera: Camera
-    sigma: Mapping[str, float]
+    sigma: Mapping[str, float] = field(hash=False)
 
     @property
     def intrinsics(self) -> dict[str, float]:

@@ -9,16 +9,15 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from dashcalib_ros.errors import InputError, OutputError
+from dashcalib_ros.errors import InputError, Notice, OutputError, spared
 from dashcalib_ros.formats import calibration_yaml, load_camera, result_json
 from dashcalib_ros.formats.ros import CAMERA_NAME
 from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import NamedCamera
 from dashcalib_ros.report.page import report_html
-from dashcalib_ros.whole_files import prepared, remove_leftovers, sync, write_whole
+from dashcalib_ros.report.wording import ACCEPTED, WEAK, file_of
+from dashcalib_ros.whole_files import FULL, prepared, remove_leftovers, sync, write_whole
 
-ACCEPTED = 'calibration.yaml'
-WEAK = 'calibration.weak.yaml'
 RESULT = 'result.json'
 REPORT = 'report.html'
 TRUTH = 'truth.json'
@@ -29,31 +28,35 @@ NAMES = (ACCEPTED, WEAK, RESULT, REPORT, TRUTH, PROBE)
 
 @dataclass(frozen=True)
 class Written:
-    """The files written; set_aside: the new path of an earlier calibration.yaml, None if none."""
+    """The files written; set_aside: the new path of an earlier calibration, None if none.
+
+    lost: a line for each part of the report that could not be made, or for all of it.
+    """
 
     files: tuple[Path, ...]
     set_aside: Path | None = None
+    lost: tuple[Notice, ...] = ()
 
 
 def write_results(calibration: CalibrationData, out_dir: str | os.PathLike[str],
                   camera_name: str = CAMERA_NAME,
-                  created: str | None = None, truth: NamedCamera | None = None) -> Written:
+                  created: str | None = None, truth: NamedCamera | None = None,
+                  place: str | None = None) -> Written:
     """Write the result's files into out_dir, which is made if needed, and return their paths.
 
-    result.json and report.html are always written. An accepted calibration goes to
-    calibration.yaml, a weak one to calibration.weak.yaml, which no driver loads. An existing
-    calibration.yaml is set aside unless this one is accepted, and always if it is another
-    program's. Everything is written to temporary files before the first file is replaced: no file
-    is ever half-written. truth: for the report, where it is known. Raises OutputError.
+    First comes result.json. An accepted calibration goes to calibration.yaml, a weak one to
+    calibration.weak.yaml, which no driver loads. An existing calibration.yaml is set aside unless
+    this one is accepted, and no file of another program is overwritten or removed. All this is
+    written to temporary files before the first file is replaced: no file is ever half-written.
+    Then comes report.html: where it cannot be made or written, there is none, and a line says so.
+    truth: for the report, where it is known. place: where the folder will be found, None: there.
+    Raises OutputError.
     """
     folder = Path(out_dir)
     texts: dict[str, str] = {}
-    level = calibration.verdict.level
-    name = ACCEPTED if level == 'accepted' else WEAK
-    if level != 'refused':
-        texts[name] = calibration_yaml(calibration, camera_name, created)
+    if calibration.verdict.level != 'refused':
+        texts[file_of(calibration.verdict)] = calibration_yaml(calibration, camera_name, created)
     texts[RESULT] = result_json(calibration)
-    texts[REPORT] = report_html(calibration, truth, folder / name)
     with _output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with prepared(folder, {name: text.encode('utf-8', 'replace')
@@ -61,12 +64,28 @@ def write_results(calibration: CalibrationData, out_dir: str | os.PathLike[str],
             moved = None
             if ACCEPTED not in texts or not _is_ours(folder / ACCEPTED):
                 moved = set_aside(folder / ACCEPTED)
+            if not _is_ours(folder / WEAK):
+                if WEAK in texts:
+                    moved = set_aside(folder / WEAK) or moved
+            elif WEAK not in texts:
+                (folder / WEAK).unlink()
             for name, path in temporary.items():
                 path.replace(folder / name)
-            if WEAK not in texts:
-                (folder / WEAK).unlink(missing_ok=True)
+            # until there is this one's, there is none: it would be that of another result
+            if not (folder / REPORT).is_dir():
+                (folder / REPORT).unlink(missing_ok=True)
             sync(folder)
-    return Written(tuple(folder / name for name in texts), moved)
+    files = tuple(folder / name for name in texts)
+    lost: list[Notice] = []
+    page = spared(REPORT, lost, report_html, calibration, truth, place or str(out_dir), lost)
+    if page is not None:
+        try:
+            write_text(folder / REPORT, page)
+            files += (folder / REPORT,)
+        except OutputError as error:
+            lost.append(Notice('E-REPORT-NOT-WRITTEN', f'there is no {REPORT}, but all other '
+                               f'files are there: {error}'))
+    return Written(files, moved, tuple(lost))
 
 
 def write_text(path: str | Path, text: str | bytes) -> None:
@@ -161,7 +180,7 @@ def _output_errors(folder: Path) -> Iterator[None]:
 
 def _cannot_write(folder: Path, error: OSError) -> OutputError:
     what = f'cannot write to {folder}: {error.strerror or error}; '
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno in FULL:
         return OutputError('E-DISK-FULL', what + 'free some space or choose another output folder')
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return OutputError('E-NOT-WRITABLE', what + 'choose an output folder you may write to')

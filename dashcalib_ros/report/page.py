@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from shlex import quote
@@ -13,6 +13,7 @@ import numpy as np
 from dashcalib_ros.camera import FISHEYE, Camera
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.detector import MIN_PROMINENCE
+from dashcalib_ros.errors import Notice, spared
 from dashcalib_ros.formats import calibrated_camera
 from dashcalib_ros.judge import CalibrationData
 from dashcalib_ros.judge.difference import NamedCamera
@@ -31,8 +32,10 @@ from dashcalib_ros.report.lens import (
 from dashcalib_ros.report.turns import turn_rows, turn_sections
 from dashcalib_ros.report.wording import (
     ADVICE,
+    FOLDER,
     conditions,
     digits_of,
+    file_of,
     key_figures,
     next_steps,
     number,
@@ -53,31 +56,39 @@ MASK_ID = 'mask'
 
 
 def report_html(calibration: CalibrationData, truth: NamedCamera | None = None,
-                calibration_file: Path | None = None) -> str:
+                folder: str = FOLDER, lost: list[Notice] | None = None) -> str:
     """Return the page's text; all text from the input is escaped.
 
-    truth: to compare with, where it is known. calibration_file: where the camera is written.
+    truth: to compare with, where it is known. folder: where the result is written, a path or an
+    address. lost: takes a line for each part of the page that could not be made.
     """
-    c = calibration
+    c, lost = calibration, [] if lost is None else lost
     mask = None if c.mask is None or c.mask.all() else c.mask
     mask_id = None if mask is None else MASK_ID
-    against = (None if truth is None or c.camera is None
-               else compare(calibrated_camera(c), truth))
+    against = None if truth is None or c.camera is None else spared(
+        'the comparison with the truth', lost, compare, calibrated_camera(c), truth)
+    drawn = {
+        'snippets': spared('the lines to copy', lost, _snippets, c, folder),
+        'uncertainty': spared('the plot of the uncertainty', lost, uncertainty_of, c),
+        'slider': spared('the picture without distortion', lost, slider_of, c),
+        'drive': '' if c.magnitudes is None else spared(
+            'the plot of the drive', lost, magnitude_svg, c.magnitudes, c.turns,
+            c.start_s or None),
+        'turns': spared('the drawings of the turns', lost, turn_sections, c, mask_id, lost),
+        'evidence': [*(spared('the plots of the evidence', lost, evidence_of, c, mask_id) or ()),
+                     *(spared('the plot of the field', lost, field_of, c) or ())],
+        'mounting': spared('the drawings of the mounting', lost, mounting_of, c)}
     settings, defaults = c.config.flat(), Config().flat()
     return template('report.html').render(
         c=c, title=f'Calibration of {c.input_name}' if c.input_name else 'Calibration',
-        headline=ADVICE[c.verdict.level], figures=key_figures(c), steps=next_steps(c),
-        reasons=[what for _, what, _ in objections(c.verdict)], conditions=conditions(c.verdict),
+        headline=ADVICE[c.verdict.level], figures=key_figures(c), steps=next_steps(c, folder),
+        warnings=(*c.warnings, *lost), **drawn,
+        reasons=[what for _, what, _ in objections(c.verdict)], told=len(c.verdict.told),
+        conditions=conditions(c.verdict),
         parameters=parameter_rows(c),
         truth=[] if against is None else _truth_rows(against),
         truth_px='' if against is None else optional(against.mapping_px, 2, ' px'),
-        snippets=_snippets(c, calibration_file),
-        uncertainty=uncertainty_of(c), slider=slider_of(c),
-        min_prominence=MIN_PROMINENCE,
-        drive='' if c.magnitudes is None else magnitude_svg(c.magnitudes, c.turns,
-                                                            c.start_s or None),
-        turns=turn_sections(c, mask_id), rows=turn_rows(c),
-        evidence=[*evidence_of(c, mask_id), *field_of(c)], mounting=mounting_of(c),
+        min_prominence=MIN_PROMINENCE, rows=turn_rows(c),
         mount_verdict='' if c.mount is None else verdict_text(c.mount),
         facts=run_facts(c),
         mask='' if mask is None else mask_data_uri(mask), mask_id=MASK_ID,
@@ -93,7 +104,14 @@ def difference_html(found: Comparison) -> str:
         head=head, rows=rows, maps=_maps(found))
 
 
-@lru_cache(maxsize=3)
+def notebook_html(word: str, lines: Iterable[str], head: Sequence[str],
+                  rows: Iterable[Sequence[str]]) -> str:
+    """Return what a notebook shows of a result: its word, lines of text and a table."""
+    return template('notebook.html').render(word=word, lines=filter(None, lines), head=head,
+                                            rows=list(rows))
+
+
+@lru_cache(maxsize=4)
 def template(name: str) -> jinja2.Template:
     """Return a page's template."""
     # loaded here: only who writes a report needs it
@@ -105,7 +123,8 @@ def template(name: str) -> jinja2.Template:
 
 
 def _truth_rows(against: Comparison) -> list[tuple[str, ...]]:
-    return [(d.name, number(d.name, d.b), f'{d.difference:+.{digits_of(d.name)}f}',
+    return [(d.name, number(d.name, d.b),
+             '' if d.difference is None else f'{d.difference:+.{digits_of(d.name)}f}',
              '' if d.percent is None else f'{d.percent:+.2f} %', optional(d.z, 1))
             for d in against.differences]
 
@@ -115,14 +134,15 @@ def _text(values: Mapping[str, Any]) -> str:
                      for key, value in values.items())
 
 
-def _snippets(c: CalibrationData, path: Path | None) -> list[tuple[str, str, str]]:
+def _snippets(c: CalibrationData, folder: str) -> list[tuple[str, str, str]]:
     """Return how ROS drivers, OpenCV and COLMAP take the camera: an id, what for, text to copy."""
     if c.camera is None or not np.isfinite(c.camera.params).all():
         return []
-    name = 'calibration.yaml' if c.verdict.level == 'accepted' else 'calibration.weak.yaml'
-    url = (path or Path(name)).absolute().as_uri()
-    return [('use-ros', 'ROS 2 camera driver: the parameter', f'camera_info_url: {url}'),
-            ('use-opencv', 'OpenCV in Python', _opencv(c.camera)),
+    # a driver reads no file of an object store
+    ros = [] if '://' in folder else [
+        ('use-ros', 'ROS 2 camera driver: the parameter',
+         f'camera_info_url: {Path(folder, file_of(c.verdict)).absolute().as_uri()}')]
+    return [*ros, ('use-opencv', 'OpenCV in Python', _opencv(c.camera)),
             ('use-colmap', 'COLMAP', _colmap(c.camera))]
 
 

@@ -21,12 +21,14 @@ from dashcalib_ros.report.compare import (
     unseen_text,
 )
 from dashcalib_ros.report.wording import (
+    PARAMETERS,
     cures,
     number,
     objections,
     optional,
     parameter_rows,
     run_facts,
+    since_start,
 )
 
 # columns between two of a table
@@ -48,19 +50,30 @@ def summary(calibration: CalibrationData) -> RenderableType:
     c = calibration
     parts: list[RenderableType] = []
     if c.camera is not None:
-        parts.append(TextTable(('', 'estimate', 'sigma', 'relative'), parameter_rows(c)))
+        parts.append(TextTable(PARAMETERS, parameter_rows(c)))
         if c.caveat:
             parts += [line(c.caveat), line('')]
     if c.turns:
-        parts.append(TextTable(TURNS, [_turn_row(turn, c.start_s) for turn in c.turns]))
+        parts.append(TextTable(TURNS, [_turn_row(turn, c) for turn in c.turns]))
+        parts += [line(f'not used: {why}: the turn{"s" * (len(at) > 1)} at {", ".join(at)} s')
+                  for why, at in _unused(c).items()]
     return Group(*parts, *(line(f'{name}: {text}') for name, text in run_facts(c)))
 
 
+def _unused(c: CalibrationData) -> dict[str, list[str]]:
+    """Return why turns of this drive are not used, and when those were."""
+    found: dict[str, list[str]] = {}
+    for turn in c.turns:
+        if turn.unused_because:
+            found.setdefault(turn.unused_because, []).append(since_start(turn, c))
+    return found
+
+
 def conclusion(verdict: Verdict) -> RenderableType:
-    """Return the verdict, coloured, and its reasons."""
+    """Return the verdict, coloured, and its reasons; of a refused result the cause."""
     parts: list[RenderableType] = [labelled('verdict', verdict.level)]
     parts += [Padding.indent(line(f'{what} [{code}]' if code else what), 2)
-              for code, what, _ in objections(verdict)]
+              for code, what, _ in objections(verdict)[:len(verdict.told)]]
     return Group(*parts)
 
 
@@ -75,8 +88,8 @@ def next_step(verdict: Verdict) -> RenderableType:
     return Group(line(f'next: {first}'), *(line(f'also: {cure}') for cure in others))
 
 
-def _turn_row(turn: TurnSummary, start_s: float) -> tuple[str, ...]:
-    return (f'{turn.stamp_s - start_s:.1f}', f'{turn.first} to {turn.last}',
+def _turn_row(turn: TurnSummary, c: CalibrationData) -> tuple[str, ...]:
+    return (since_start(turn, c), f'{turn.first} to {turn.last}',
             optional(turn.yaw_deg, 1), f'{turn.registered} of {turn.images}',
             optional(turn.reprojection_error_px, 2), 'yes' if turn.used else 'no')
 

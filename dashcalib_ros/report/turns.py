@@ -10,6 +10,7 @@ from dashcalib_ros.arrays import Floats
 from dashcalib_ros.camera import Camera
 from dashcalib_ros.camera.camera import resized_pixels
 from dashcalib_ros.detect.turn import TurnId
+from dashcalib_ros.errors import Notice, spared
 from dashcalib_ros.judge import CalibrationData, TurnSummary
 from dashcalib_ros.judge.agreement import focal_of_turns, leverages, turns_of_another_camera
 from dashcalib_ros.judge.calibration import Material, StoredTurnSummary
@@ -64,17 +65,19 @@ class TurnSection:
     alone: str
 
 
-def turn_sections(c: CalibrationData, mask_id: str | None) -> list[TurnSection]:
-    """Return a section for each turn of which there is anything to see."""
+def turn_sections(c: CalibrationData, mask_id: str | None, lost: list[Notice]
+                  ) -> list[TurnSection]:
+    """Return a section for each turn of which there is anything to see; lost: as for spared()."""
     if c.material is None:
         return []
     alone, solution = _fx_alone(c), c.material.solution
     shares = leverages(solution) if alone and solution is not None else {}
     texts = {turn: _alone_text(fx, sigma, shares.get(turn, 0.0))
              for turn, (fx, sigma) in alone.items()}
-    found = [_section(turn, c, c.material, texts.get(turn.id, ''), mask_id)
-             for turn in c.all_turns]
-    return [each for each in found if each.picture or each.view]
+    found = [spared(f'the drawing of turn {name}', lost, _section, turn, c, c.material,
+                    texts.get(turn.id, ''), mask_id)
+             for turn, name in zip(c.all_turns, names(c).values(), strict=True)]
+    return [each for each in found if each and (each.picture or each.view)]
 
 
 def _fx_alone(c: CalibrationData) -> dict[TurnId, tuple[float, float]]:
@@ -96,7 +99,9 @@ def _fx_alone(c: CalibrationData) -> dict[TurnId, tuple[float, float]]:
 def names(c: CalibrationData) -> dict[TurnId, str]:
     """Return the turns' short names: numbers in the order of time, s1, s2 for stored ones."""
     own = {turn.id: str(n) for n, turn in enumerate(c.turns, 1)}
-    return own | {turn.id: f's{n}' for n, turn in enumerate(c.stored_turns, 1)}
+    # a fleet's clips are no earlier drives
+    return own | {turn.id: f'{"" if turn.clip else "s"}{n}'
+                  for n, turn in enumerate(c.stored_turns, 1)}
 
 
 def _section(turn: AnySummary, c: CalibrationData, material: Material,
@@ -104,7 +109,7 @@ def _section(turn: AnySummary, c: CalibrationData, material: Material,
     scene, shown = material.scenes.get(turn.id), material.pictures.get(turn.id)
     camera = material.solution.camera if turn.used and material.solution is not None else None
     drawn, magnified = ('', 0) if shown is None else picture_svg(shown, scene, camera, mask_id)
-    kind = 'Stored turn' if isinstance(turn, StoredTurnSummary) else 'Turn'
+    kind = 'Stored turn' if isinstance(turn, StoredTurnSummary) and not turn.clip else 'Turn'
     frame = None if shown is None else shown.frame
     return TurnSection(
         f'{kind} {names(c)[turn.id]}', _facts(turn, scene, c), turn.used, turn.unused_because,
@@ -112,7 +117,7 @@ def _section(turn: AnySummary, c: CalibrationData, material: Material,
 
 
 def _facts(turn: AnySummary, scene: Scene | None, c: CalibrationData) -> tuple[str, ...]:
-    facts = ['of an earlier drive' if isinstance(turn, StoredTurnSummary)
+    facts = [f'of {turn.clip or "an earlier drive"}' if isinstance(turn, StoredTurnSummary)
              else f'at {since_start(turn, c)} s, frames {turn.first} to {turn.last}']
     if turn.yaw_deg is not None:
         way = '' if scene is None else ' ' + direction(scene)
@@ -134,7 +139,7 @@ def turn_rows(c: CalibrationData) -> list[dict[str, str]]:
     apart = {each.turn: f'{each.px:.3g} px, {each.sigmas:.1f} sigmas' for each in c.held_out}
     rows = []
     for turn in c.all_turns:
-        row = {'turn': short[turn.id], 'at': 'earlier', 'frames': '-',
+        row = {'turn': short[turn.id], 'at': getattr(turn, 'clip', '') or 'earlier', 'frames': '-',
                'yaw': optional(turn.yaw_deg, 0, '°'), 'keyframes': str(turn.images),
                'error': optional(turn.reprojection_error_px, 2, ' px'),
                'held out': apart.get(turn.id, '-'),
@@ -155,8 +160,9 @@ def picture_svg(shown: TurnPicture, scene: Scene | None, camera: Camera | None,
     height, width = shown.image.shape[:2]
     drawn = picture(data_uri(shown.image), width, height) + mask_over(mask_id, width, height)
     magnified = 0
-    if scene is not None:
-        [at] = np.flatnonzero(scene.tracks.frames == shown.frame)[:1] or [0]
+    at = -1 if scene is None else int(np.searchsorted(scene.tracks.frames, shown.frame))
+    # of a picture that is no keyframe of the turn, no tracks are known
+    if scene is not None and shown.frame in scene.tracks.frames:
         px = width / scene.tracks.image_size[0]
         xy = resized_pixels(scene.tracks.xy, px)
         used = scene.structure.used

@@ -2,12 +2,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import posixpath
 from itertools import zip_longest
+from shlex import quote
 
 import numpy as np
 
-from dashcalib_ros.camera import Camera
 from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Condition, Mount, Witnesses
 from dashcalib_ros.judge.rig import Rig
@@ -17,6 +17,8 @@ ADVICE = {
     'weak': 'There are numbers, but they may be wrong: read the reasons first.',
     'refused': 'There is no calibration: this drive does not show enough.',
 }
+# where a calibration that others load is written, by its verdict, and the usual folder
+ACCEPTED, WEAK, FOLDER = 'calibration.yaml', 'calibration.weak.yaml', 'calibration'
 # where a verdict has no cures
 NEXT = {
     'accepted': 'use calibration.yaml in the camera driver; report.html has the details',
@@ -26,6 +28,13 @@ NEXT = {
 
 # parameters that are lengths in the picture; the others have no unit
 PIXELS = ('fx', 'fy', 'cx', 'cy')
+# head of the table of parameters
+PARAMETERS = ('', 'estimate', 'sigma', 'relative')
+
+
+def file_of(verdict: Verdict) -> str:
+    """Return the name of the file that has the camera of a result."""
+    return ACCEPTED if verdict.level == 'accepted' else WEAK
 
 
 def parameter_rows(calibration: CalibrationData) -> list[tuple[str, str, str, str]]:
@@ -45,8 +54,10 @@ def parameter_rows(calibration: CalibrationData) -> list[tuple[str, str, str, st
     return rows
 
 
-def number(name: str, value: float) -> str:
-    """Return a parameter's value with its significant digits and its unit."""
+def number(name: str, value: float | None) -> str:
+    """Return a parameter's value with its significant digits and its unit; a dash for None."""
+    if value is None:
+        return '-'
     return f'{value:.{digits_of(name)}f}' + (' px' if name in PIXELS else '')
 
 
@@ -55,7 +66,7 @@ def digits_of(name: str) -> int:
     if name in PIXELS:
         return 2
     # the coefficients of higher terms, and of a lens that is decentred, are small
-    return 4 if name in ('k1', 'k2') else 6
+    return 4 if name.partition(' ')[0] in ('k1', 'k2') else 6
 
 
 # of each angle of a mounting: its name, and where it goes when it is positive, and negative
@@ -147,57 +158,50 @@ def key_figures(c: CalibrationData) -> list[tuple[str, str, str]]:
     front.append(('focal length fx', f'{c.camera.fx:.1f} px',
                   (f'± {sigma:.1f} px, {100 * sigma / c.camera.fx:.2f} %'
                    if math.isfinite(sigma) else 'uncertainty unknown') + lone))
-    across, down, diagonal = (optional(angle, 1, '°') for angle in field_of_view(c.camera))
+    across, down, diagonal = (optional(angle, 1, '°') for angle in c.camera.field_of_view)
     front.append(('field of view', across, f'by {down}, diagonal {diagonal}'))
     return [*front, *found]
 
 
-def field_of_view(camera: Camera) -> tuple[float, float, float]:
-    """Return degrees from edge to edge through the picture's middle: horizontal, vertical.
-
-    Last comes the larger of both diagonals; NaN where not known. The two sides of one direction
-    may come to more than 180.
-    """
-    width, height = camera.image_size
-    left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5
-    x, y = (width - 1) / 2, (height - 1) / 2
-    ends = np.array([[(left, y), (right, y)], [(x, top), (x, bottom)],
-                     [(left, top), (right, bottom)], [(left, bottom), (right, top)]])
-    with np.errstate(all='ignore'):
-        off_axis = np.degrees(np.arccos(np.clip(camera.rays(ends)[..., 2], -1.0, 1.0)))
-        angles = off_axis.sum(axis=1)
-    return float(angles[0]), float(angles[1]), float(angles[2:].max())
-
-
 def cures(verdict: Verdict) -> tuple[str, ...]:
-    """Return what to do next, the likeliest to help first."""
-    return verdict.cures or (NEXT[verdict.level],)
+    """Return what to do next, the likeliest to help first; of a refused result that one."""
+    found = verdict.cures or (NEXT[verdict.level],)
+    return found[:1] if verdict.level == 'refused' else found
 
 
-def objections(verdict: Verdict) -> Iterator[tuple[str, str, str]]:
-    """Yield each reason of a verdict: its code, '' where it has none, what is wrong, the cure."""
+def objections(verdict: Verdict) -> list[tuple[str, str, str]]:
+    """Return each reason of a verdict: its code, '' where it has none, what is wrong, the cure."""
+    found = []
     for reason, code in zip_longest(verdict.reasons, verdict.codes, fillvalue=''):
         cure = next((cure for cure in verdict.cures if reason.endswith(f': {cure}')), '')
-        yield code, reason.removesuffix(f': {cure}'), cure
+        found.append((code, reason.removesuffix(f': {cure}'), cure))
+    return found
 
 
-def next_steps(c: CalibrationData) -> list[str]:
-    """Return what to do next, most useful first."""
+def next_steps(c: CalibrationData, folder: str = FOLDER) -> list[str]:
+    """Return what to do next, most useful first. folder: where the result is written."""
+    file = f'`{quote(posixpath.join(folder, file_of(c.verdict)))}`'
+    glass = [] if c.field is None or not c.field.used else [
+        'A windscreen, or a rectification, bends the picture beside the lens. In Python, '
+        f'`dashcalib_ros.Calibration.load({folder!r}).undistort(image)` removes this, too.']
     needed = c.config.verdict
     together = ('Short drives add up: with `--set turns.store=FOLDER`, each run uses the turns of '
                 'those before it.')
     if c.verdict.level == 'accepted':
-        steps = ['Use `calibration.yaml` in the camera driver, or copy the lines below.']
+        steps = [f'Use {file} in the camera driver, or copy the lines below.']
+        steps += glass
         if (c.sigma or {}).get('fx', 0.0) > 0.005 * (c.camera.fx if c.camera else 1.0):
             steps.append('It can become more exact: another drive with sharp turns lowers the '
                          'uncertainty. ' + together)
         return [*steps,
                 'To check it with another drive of the same camera: '
-                '`dashcalib check calibration DRIVE`.',
+                f'`dashcalib check {quote(folder)} DRIVE`.',
                 'Calibrate again when the lens, the zoom, the focus or the video mode changes. '
-                'Moving the camera on the car changes nothing here.']
+                'Moving the camera on the car changes ' + (
+                    'nothing here.' if c.mount is None else
+                    'the mounting only: drive again for it, also straight on.')]
     yaw = c.yaw_deg
-    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in c.verdict.cures]
+    steps = [f'{cure[0].upper()}{cure[1:]}.' for cure in cures(c.verdict)]
     if c.turns_used < c.config.turns.wanted or yaw < needed.min_yaw_deg:
         steps.append(f'For the next drive: {c.config.turns.wanted} turns of 60° or more, at town '
                      f'speed, in daylight. At least {needed.min_turns} turns and '
@@ -206,16 +210,18 @@ def next_steps(c: CalibrationData) -> list[str]:
     else:
         steps.append('For the next drive: turns of 60° or more, at town speed, in daylight, with '
                      'little traffic ahead.')
-    steps.append(together)
-    if c.verdict.level == 'weak':
-        steps.append('To use it all the same, rename `calibration.weak.yaml`; mind its sigmas.')
-    return steps
+    if c.verdict.level == 'refused':
+        return [' '.join(steps)]
+    return [*steps, together,
+            f'To use it all the same, rename {file}; mind its sigmas.', *glass]
 
 
 def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
     """Return what else is known of the run: a name, and a text."""
     facts = [('images', f'{c.frames} of {c.image_size[0]} × {c.image_size[1]} px')]
-    for name, turns in (('turns', c.turns), ('turns of earlier drives', c.stored_turns)):
+    clips = any(turn.clip for turn in c.stored_turns)
+    for name, turns in (('turns', c.turns), (
+            f'turns{" of earlier drives" * (not clips)}', c.stored_turns)):
         if turns:
             facts.append((name, f'{sum(turn.used for turn in turns)} of {len(turns)} used'))
     if c.camera is not None:
@@ -236,8 +242,8 @@ def run_facts(c: CalibrationData) -> list[tuple[str, str]]:
                                     'px, removed'))
     if c.straight_lines is not None:
         lines = c.straight_lines
-        facts.append(('upright lines', f'{lines.lines} found, bent by {lines.bend_px:.2f} px: k1 '
-                                       f'off by {lines.k1:+.4f} ± {lines.sigma:.4f}'))
+        facts.append(('upright lines', f'{lines.lines} found, bent by {lines.bend_px:.2f} px: '
+                                       f'{lines.change}'))
     if c.mask is not None and not c.mask.all():
         facts.append(('not used', f'{100 * (1 - float(np.mean(c.mask))):.1f} % of the picture, '
                                   f'which moves with the car (bonnet, pillar, burnt-in text)'))

@@ -9,6 +9,7 @@ from std_msgs.msg import Header
 from dashcalib_ros.camera import Camera, ros_camera
 from dashcalib_ros.detect import TurnId
 from dashcalib_ros.errors import InputError, OutputError, coded
+from dashcalib_ros.formats import calibrated_camera
 from dashcalib_ros.input.decode import read_mask
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import Calibration, NamedCamera
@@ -18,7 +19,7 @@ from dashcalib_ros.ros.car import Mounting
 from dashcalib_ros.ros.commit import Commit, driver_services
 from dashcalib_ros.ros.diagnostics import ERROR, OK, WARN, Health
 from dashcalib_ros.ros.drive import Drive
-from dashcalib_ros.ros.endpoints import Endpoints
+from dashcalib_ros.ros.endpoints import Answer, Endpoints
 from dashcalib_ros.ros.images import Source
 from dashcalib_ros.ros.settings import Settings
 from dashcalib_ros.ros.state import Judgement, judge, outcome_text, sigma_text
@@ -43,7 +44,7 @@ class Calibrating:
         endpoints.at_end(self._store.close)
         self._commit: Commit | None = None
         self._beside = endpoints.publisher('camera_info')
-        self._latched = endpoints.publisher('~/calibration')
+        self._latch = endpoints.latched('~/calibration')
         self._mounting = Mounting(endpoints, own)
         # what is published now, and how many were published beside images
         self._info: CameraInfo | None = None
@@ -57,10 +58,12 @@ class Calibrating:
         self._counted: frozenset[tuple[int, TurnId]] = frozenset()
         mask = read_mask(Path(own.mask_file)) if own.mask_file else None
         self.drive = Drive(endpoints, settings, camera_name, mask, self)
-        for name, action in (('calibrate', self.drive.calibrate), ('reset', self.reset),
-                             ('save', self.save)):
-            endpoints.service(f'~/{name}', action)
+        endpoints.service('~/calibrate', self.drive.calibrate)
+        endpoints.service('~/calibrate_now', self.drive.calibrate_now)
+        endpoints.service('~/reset', self.reset)
+        endpoints.service('~/save', self.save)
         self._load()
+        self._check_writable()
         self.summary = (f'learning the camera {camera_name!r} from the turns seen on '
                         f'{self.drive.images.topic}')
 
@@ -112,6 +115,18 @@ class Calibrating:
         self._use(wanted, confirmed=False)
         self._log.info(f'loaded {self._store.path}: {sigma_text(kept.camera)}; unconfirmed until '
                        f'turns agree with it')
+
+    def _check_writable(self) -> None:
+        """Raise OutputError where no calibration can be kept; one that is there is used, though.
+
+        It may be installed where the node may not write.
+        """
+        try:
+            self._store.check_writable()
+        except OutputError as error:
+            if self._kept is None:
+                raise
+            self._log.warning(coded(error))
 
     def begin_anew(self) -> None:
         """Drop the calibration in use, and begin with the file's."""
@@ -166,6 +181,13 @@ class Calibrating:
             # the next calibration must be independent: it uses new turns only
             self.drive.learner.restart()
 
+    def outcome(self, result: Result) -> Answer:
+        """Return whether it is accepted, and the numbers or the reasons."""
+        verdict = result.calibration.verdict
+        if verdict.level == 'accepted':
+            return True, f'accepted: {sigma_text(calibrated_camera(result.calibration, ""))}'
+        return False, f'{verdict.level}: {"; ".join(verdict.reasons)}'
+
     def _adopt(self, calibration: Calibration) -> None:
         source = self.drive.source
         kept = StoredCalibration.of(calibration, self._whose, source.frame_id if source else '',
@@ -206,7 +228,7 @@ class Calibrating:
         self._kept, self._stale, self._confirmed = kept, False, confirmed
         self._info = camera_info(kept.camera.camera, self._header(kept.frame_id or ''),
                                  self._core.rectified)
-        self._latched.publish(self._info)
+        self._latch(self._info)
         self._show_mount(kept.mount, kept.frame_id or '')
         self._watch()
         return self._info
@@ -223,7 +245,7 @@ class Calibrating:
         """Use no calibration, as at the start; the file stays where it is."""
         if self._info is not None:
             # K[0] = 0 says that it is uncalibrated (sensor_msgs)
-            self._latched.publish(CameraInfo(header=self._header(self._info.header.frame_id)))
+            self._latch(CameraInfo(header=self._header(self._info.header.frame_id)))
         self._kept, self._stale, self._info = None, False, None
         self._mounting.show(None, '')
         self._watch()

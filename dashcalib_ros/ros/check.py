@@ -1,11 +1,13 @@
 """The program that checks a driver's calibration with turns, and never changes it."""
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
@@ -17,7 +19,7 @@ from dashcalib_ros.report import NamedCamera, answer_dict
 from dashcalib_ros.ros.background import Goal, Result
 from dashcalib_ros.ros.diagnostics import OK, WARN, Health, diagnostic
 from dashcalib_ros.ros.drive import Drive
-from dashcalib_ros.ros.endpoints import Endpoints
+from dashcalib_ros.ros.endpoints import Answer, Endpoints
 from dashcalib_ros.ros.images import Source, SourceWatch
 from dashcalib_ros.ros.settings import Settings
 
@@ -43,11 +45,13 @@ class Checking:
         self._found = NOT_YET
         # why there is no camera
         self._problem = f'no camera_info on {self._given_topic} yet'
-        self._answers = endpoints.publisher('~/check')
+        self._answers = endpoints.latched('~/check')
         mask = read_mask(Path(settings.own.mask_file)) if settings.own.mask_file else None
         self.drive = Drive(endpoints, settings, camera_name, mask, self)
         endpoints.subscription('camera_info', self._on_info)
-        endpoints.service('~/calibrate', self._calibrate)
+        for name, action in (('calibrate', self.drive.calibrate),
+                             ('calibrate_now', self.drive.calibrate_now)):
+            endpoints.service(f'~/{name}', partial(self._calibrate, action))
         endpoints.service('~/reset', self._reset)
         self._watch()
         self.summary = (f'checking the camera {camera_name!r} with the turns seen on '
@@ -112,12 +116,17 @@ class Checking:
             # the next answer must be independent: it uses new turns only
             self.drive.learner.restart()
 
-    def _calibrate(self) -> tuple[bool, str]:
-        if self._given is None:
-            return False, self._problem
-        return self.drive.calibrate()
+    def outcome(self, result: Result) -> Answer:
+        """Return whether the driver's calibration is known to be right or wrong, and why."""
+        found = self._answer()
+        if result.check is None or result.given is not self._given:
+            return False, self._problem if self._given is None else NOT_YET.reasons[0]
+        return found.answer in SAYS, f'{found.answer}: {"; ".join(found.reasons)}'
 
-    def _reset(self) -> tuple[bool, str]:
+    def _calibrate(self, action: Callable[[], Answer | Future]) -> Answer | Future:
+        return (False, self._problem) if self._given is None else action()
+
+    def _reset(self) -> Answer:
         self._log.warning('reset by request: the turns are dropped')
         self.drive.forget()
         self.begin_anew()
@@ -173,6 +182,8 @@ class Checking:
             self._log.warning(f'the calibration on {topic} has changed: it is checked again')
         try:
             self._given = camera_of_message(message, topic)
+            for text in self._given.warnings:
+                self._log.warning(text)
             if self._given.faults:
                 self._log.warning(f'the calibration on {topic} is wrong: '
                                   f'{"; ".join(self._given.faults)}')
@@ -191,7 +202,7 @@ class Checking:
         values = answer_dict(found, tuple(self.drive.changes().values()))
         if self._given is None:
             values['reasons'] = self._warnings()
-        self._answers.publish(diagnostic(
+        self._answers(diagnostic(
             self._endpoints.node, 'check of a calibration', self._camera_name, _level(found),
             f'the calibration: {found.answer}', flat_texts(values)))
 

@@ -116,5 +116,6 @@ def diagnostic(node: Node, what: str, camera_name: str, level: bytes, message: s
         header=Header(stamp=node.get_clock().now().to_msg()),
         status=[DiagnosticStatus(
             level=level, message=message, hardware_id=camera_name,
-            name=f'{node.get_fully_qualified_name().strip("/")}: {what}',
+            # of two nodes of one name, too, each has a status of its own
+            name=f'{node.get_fully_qualified_name().strip("/")}: {what} ({camera_name})',
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])

@@ -12,8 +12,8 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, Protocol
 
-from geometry_msgs.msg import Vector3, Vector3Stamped
-from std_msgs.msg import Header
+from rclpy.task import Future
+from std_msgs.msg import Float64, Header
 
 from dashcalib_ros.arrays import Mask
 from dashcalib_ros.errors import DashcalibError, InputError
@@ -32,7 +32,7 @@ from dashcalib_ros.ros.background import (
 )
 from dashcalib_ros.ros.car import subscribe_sensors
 from dashcalib_ros.ros.diagnostics import ERROR, WARN, Health, diagnostic
-from dashcalib_ros.ros.endpoints import Endpoints
+from dashcalib_ros.ros.endpoints import Answer, Endpoints
 from dashcalib_ros.ros.images import CURES, ImageInput, Intake, Source, since_text
 from dashcalib_ros.ros.preview import Preview
 from dashcalib_ros.ros.settings import Settings
@@ -66,6 +66,9 @@ class Role(Protocol):
     def judge(self, result: Result) -> None:
         """Take a new calibration."""
 
+    def outcome(self, result: Result) -> Answer:
+        """Return what a calibration says, for who asked for it."""
+
     def show_changes(self) -> None:
         """Take that the turns show other changes of the camera in use than before."""
 
@@ -98,6 +101,9 @@ class Drive:
         # own sensors say of the last calibration
         self._moved = ''
         self._witnesses: list[str] = []
+        # by those who wait for a calibration
+        self._asked: list[Future] = []
+        endpoints.at_end(self._answer, False, 'the node was stopped')
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake = endpoints.guard_condition(self.catch_up)
         self._magnitude = endpoints.publisher('~/turn_magnitude')
@@ -134,11 +140,26 @@ class Drive:
         self.verdict, self._witnesses = None, []
         self.learner.restart(keep_stored)
         self._intake.forget()
+        self._answer(False, 'the turns were dropped meanwhile')
 
-    def calibrate(self) -> tuple[bool, str]:
+    def calibrate(self) -> Answer | Future:
+        """Calibrate with the present turns; return why not, or what will have the outcome."""
+        begun, text = self.calibrate_now()
+        if not begun:
+            return begun, text
+        self._asked.append(Future())
+        return self._asked[-1]
+
+    def calibrate_now(self) -> Answer:
         """Calibrate with the present turns; return whether that began, and a message."""
         refused = self.held or self.learner.request()
         return not refused, refused or 'started: /diagnostics and the log have the result'
+
+    def _answer(self, success: bool, text: str) -> None:
+        """Tell those who wait for a calibration what became of it."""
+        asked, self._asked = self._asked, []
+        for each in asked:
+            each.set_result((success, text))
 
     @property
     def source(self) -> Source | None:
@@ -254,12 +275,13 @@ class Drive:
     def _on_news(self, news: News) -> None:
         match news:
             case Measured():
-                self._magnitude.publish(Vector3Stamped(
-                    header=news.header, vector=Vector3(x=float(news.status.magnitude))))
+                self._magnitude.publish(Float64(data=float(news.status.magnitude)))
             case str():
                 self._log.info(news)
             case Trouble():
                 self._complaints.say(news.kind, news.text)
+                if news.kind == 'failed_calibrations':
+                    self._answer(False, news.text)
             case Watched():
                 self._on_watched(news)
             case Moved():
@@ -290,8 +312,11 @@ class Drive:
 
     def on_result(self, result: Result) -> None:
         """Take a calibration."""
-        if result.bank != self.learner.bank or self.held:
-            return  # a reset came in between, or nobody knows of which camera it is
+        if result.bank != self.learner.bank:
+            return  # a reset came in between
+        if self.held:  # nobody knows of which camera it is
+            self._answer(False, self.held)
+            return
         self.verdict = result.calibration.verdict
         self._witnesses = witness_texts(result.calibration.witnesses)
         for text in self._witnesses:
@@ -299,6 +324,7 @@ class Drive:
         for text in result.calibration.warnings:
             self._complaints.once(text)
         self._role.judge(result)
+        self._answer(*self._role.outcome(result))
 
     # diagnostics -------------------------------------------------------------------------------
 
@@ -322,7 +348,9 @@ class Drive:
         """Publish /diagnostics, and the state that the overlay shows."""
         images, learner, monitor = self.images, self.learner, self.monitor
         now, wanted = learner.activity.status, self._goal.config.turns.wanted
-        warnings = [*([self.held] if self.held else ()), *health.warnings]
+        clock = self._intake.clock
+        warnings = [*([self.held] if self.held else ()), *self._namesakes(), *health.warnings,
+                    *clock]
         verdict = self.verdict
         values = {
             'state': health.state,
@@ -336,7 +364,7 @@ class Drive:
             'turning magnitude': f'{now.magnitude:.4f}',
             'standing': now.standing,
             'verdict': verdict.level if verdict else '',
-            'reasons': '; '.join(verdict.reasons) if verdict else '',
+            'reasons': '; '.join(verdict.told) if verdict else '',
             **health.values,
             'warnings': '; '.join(warnings),
             'change': '; '.join(self.changes().values()),
@@ -346,6 +374,7 @@ class Drive:
             'topic': images.topic,
             'publishers': ', '.join(images.publishers),
             'reliability': images.reliability,
+            'time stamps': '; '.join(clock) or 'of the images',
             'motion sensors': '; '.join(self._witnesses),
             'received': self._intake.received,
             **{kind: self._complaints.counts[kind] for kind in (*CURES, *TROUBLES)},
@@ -354,6 +383,18 @@ class Drive:
         self._preview.show_state(message, health.camera.camera if health.camera else None)
         self._diagnostics.publish(diagnostic(
             self._endpoints.node, 'camera calibration', self._camera_name, level, message, values))
+
+    def _namesakes(self) -> list[str]:
+        """Return that another node has this one's name, in at most one line; log that once."""
+        node = self._endpoints.node
+        own = node.get_name(), node.get_namespace()
+        if node.get_node_names_and_namespaces().count(own) < 2:
+            return []
+        text = (f'another node is {node.get_fully_qualified_name()}, too: their services, '
+                f'parameters and latched topics collide; start each camera in a namespace of its '
+                f'own with -r __ns:=/front, and so on')
+        self._complaints.once(text)
+        return [text]
 
     def _level(self, health: Health, warnings: list[str]) -> tuple[bytes, str]:
         """Return the level of /diagnostics and its message: the worst of what is to be said."""

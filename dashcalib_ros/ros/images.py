@@ -162,6 +162,11 @@ class Intake:
         stamp = message.header.stamp
         return self._stamps.take(stamp.sec * 10**9 + stamp.nanosec, time.monotonic_ns())
 
+    @property
+    def clock(self) -> list[str]:
+        """Return why the stamps of the images are not used, in at most one line."""
+        return [f'{text} [{text.code}]' for text in self._stamps.of_clock()]
+
     def forget(self) -> None:
         """Begin anew with the stamps: turns and tracks were dropped."""
         self._stamps.forget()
@@ -172,9 +177,8 @@ class Intake:
         dropped: images dropped by the detection. why_lost: the causes of lost ones, with cures.
         """
         stamps = self._stamps
-        if stamps.fault:
-            self._complaints.once(f'{stamps.fault}: the times of reception are used instead; '
-                                  f'fix the driver')
+        for text in self.clock:
+            self._complaints.once(text)
         self._complaints.total('lost', stamps.lost, f'{CURES["lost"]}: {why_lost}')
         for kind, count in (('dropped', dropped), ('repeated', stamps.repeated),
                             ('unstamped', stamps.zero), ('set_back', stamps.set_back)):
@@ -355,8 +359,11 @@ class ImageInput:
                     'with the same ROS_DOMAIN_ID as this node')
         others = {info.topic_type for info in infos} - {self._kind}
         if others:
-            return (f'its publisher sends {", ".join(sorted(others))}: remap another topic with '
-                    f'-r image_raw:=TOPIC')
+            found = [_arguments(self.topic, kind) for kind in sorted(others)
+                     if _has_a_name(self.topic, kind)]
+            return (f'its publisher sends {", ".join(sorted(others))}: ' + (
+                f'start the node with {" or ".join(found)}' if found else
+                'remap another topic with -r image_raw:=TOPIC'))
         if self.reliability == 'reliable' and not all(map(_reliable, infos)):
             return ('its publisher is best effort, and a reliable subscription receives nothing '
                     'from it: set -p reliability:=auto')
@@ -370,17 +377,27 @@ class ImageInput:
         node = self._node
         own = {name for name, _ in node.get_publisher_names_and_types_by_node(
             node.get_name(), node.get_namespace())}
-        found = [(name, KINDS[kind]) for name, kinds in node.get_topic_names_and_types()
-                 for kind in kinds if kind in KINDS and name not in own and not self._drawn(name)]
-        return [f'-r image_raw:={_base(name)} -p image_transport:={transport}'
-                for name, transport in sorted(found) if node.count_publishers(name)
-                # image_transport knows a compressed topic by its name only
-                and (transport != 'compressed' or name.endswith('/compressed'))][:MOST_TOPICS]
+        found = [(name, kind) for name, kinds in node.get_topic_names_and_types()
+                 for kind in kinds if _has_a_name(name, kind) and name not in own
+                 and not self._drawn(name)]
+        return [_arguments(name, kind)
+                for name, kind in sorted(found) if node.count_publishers(name)][:MOST_TOPICS]
 
     def _drawn(self, topic: str) -> bool:
         """Return whether another node like this one draws what is on a topic, for people."""
         place, _, _ = _base(topic).rpartition('/')
         return bool(self._node.count_publishers(f'{place}/turn_magnitude'))
+
+
+def _has_a_name(topic: str, kind: str) -> bool:
+    """Return whether messages of a type are images that the node gets by the topic's name."""
+    # image_transport knows a compressed topic by its name only
+    return kind in KINDS and (kind != COMPRESSED or topic.endswith('/compressed'))
+
+
+def _arguments(topic: str, kind: str) -> str:
+    """Return the arguments with which the node gets the images of a topic."""
+    return f'-r image_raw:={_base(topic)} -p image_transport:={KINDS[kind]}'
 
 
 def _base(topic: str) -> str:

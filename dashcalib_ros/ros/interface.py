@@ -16,7 +16,7 @@ class Topic:
     """A topic. name: as the code has it, before remapping; type: of its messages.
 
     about: what it has, for users. depth, latched, reliable: the quality of service; all are kept
-    last. programs: that have it.
+    last. programs: that have it. always: published while the node is inactive, too.
     """
 
     name: str
@@ -26,6 +26,7 @@ class Topic:
     latched: bool = False
     reliable: bool = True
     programs: tuple[str, ...] = PROGRAMS
+    always: bool = False
 
     @property
     def qos(self) -> str:
@@ -50,21 +51,24 @@ PUBLISHED = _by_name(
           "whether the driver's calibration is right: values answer, reasons, changes, rms_px, …; "
           'WARN where it is wrong', 1, latched=True, programs=(CHECKER,)),
     Topic('~/mount', 'geometry_msgs/msg/PoseWithCovarianceStamped',
-          'how the camera sits in base_frame (REP-103)', 1, latched=True, programs=(CALIBRATOR,)),
+          "the pose of the camera's optical frame in base_frame (REP-103); what is not known is 0 "
+          'with a variance of 1e6 m²', 1, latched=True, programs=(CALIBRATOR,)),
     Topic(TF_STATIC, 'tf2_msgs/msg/TFMessage',
-          'with publish_tf: one transform from base_frame to camera_frame when the mounting is '
+          'with publish_tf: base_frame to camera_link to the optical frame when the mounting is '
           'accepted, and again after it moved', 1, latched=True, programs=(CALIBRATOR,)),
-    Topic('~/turn_magnitude', 'geometry_msgs/msg/Vector3Stamped',
-          'x: how much the car turns, relative to the image width; for plots'),
+    Topic('~/turn_magnitude', 'std_msgs/msg/Float64',
+          'how much the car turns, relative to the image width; for plots'),
     Topic('~/overlay/compressed', 'sensor_msgs/msg/CompressedImage',
           'tracked points, ego vehicle and state, while someone subscribes', 1),
     Topic('~/rectified/compressed', 'sensor_msgs/msg/CompressedImage',
           'the picture that P of camera_info describes, while someone subscribes', 1),
     Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray',
-          'the state and what is missing, once a second'))
+          'the state and what is missing, once a second, also while the node is inactive',
+          always=True))
 
-# the names of the last three are those of parameters, which name the topics
-SENSORS = ('imu_topic', 'odom_topic', 'fix_topic')
+# topics of the car's own sensors, which are subscribed with use_imu and so on, and the options of
+# the command that have the same
+SENSORS = {'imu': 'imu', 'odom': 'odom', 'fix': 'gps'}
 SUBSCRIBED = _by_name(
     Topic('image_raw', 'sensor_msgs/msg/Image',
           'or image_raw/compressed with image_transport:=compressed; with video the first of '
@@ -76,10 +80,11 @@ SUBSCRIBED = _by_name(
           'with publish_tf: a frame that has another parent gets none', 100, latched=True,
           programs=(CALIBRATOR,)),
     # best effort also receives from reliable publishers; a second of a fast gyro
-    Topic('imu_topic', 'sensor_msgs/msg/Imu', 'independent evidence for fx', 400, reliable=False),
-    Topic('odom_topic', 'nav_msgs/msg/Odometry', 'the speed, for the height of the camera', 400,
+    Topic('imu', 'sensor_msgs/msg/Imu', 'with use_imu: independent evidence for fx', 400,
           reliable=False),
-    Topic('fix_topic', 'sensor_msgs/msg/NavSatFix', 'independent evidence for fx', 400,
+    Topic('odom', 'nav_msgs/msg/Odometry', 'with use_odom: the speed, for the height of the '
+                                           'camera', 400, reliable=False),
+    Topic('fix', 'sensor_msgs/msg/NavSatFix', 'with use_fix: independent evidence for fx', 400,
           reliable=False))
 
 # what rclpy publishes and offers for each node with a lifecycle and parameters
@@ -102,8 +107,9 @@ class Service:
 
 
 SERVICES = (
-    Service('~/calibrate', 'calibrates with the turns that exist; the result is in the log and in '
-                           '/diagnostics'),
+    Service('~/calibrate', 'calibrates with the turns that exist, and answers when it is done: '
+                           'success where the result is accepted, or says right or wrong'),
+    Service('~/calibrate_now', 'begins the same and answers at once'),
     Service('~/reset', 'forgets the turns, also stored ones, and moves the calibration aside'),
     Service('~/save', 'writes the file of the calibration again', (CALIBRATOR,)))
 # that a calibrator calls with commit

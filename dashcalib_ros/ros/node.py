@@ -62,7 +62,9 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
             self._starting = False
             self.settings = declare(self, program, given)
             self.create_timer(LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
-            # those of rclpy itself
+            # those of rclpy itself, which has no other way: where a callback raises, the client
+            # waits for ever (rclcpp issue 1581, of both libraries), and up to Jazzy rclpy raises
+            # for a transition that there is not (rclpy issue 1209)
             for service in self.services:
                 service.callback = self._answering(service.callback)
             self.add_on_set_parameters_callback(self._on_parameters)
@@ -104,34 +106,36 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
             if not self._starting:
                 self.complaints.failure('failed_callbacks', error)
             return TransitionCallbackReturn.ERROR
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Subscribe the images."""
-        assert self.role is not None
+        """Let the publishers speak, and subscribe the images."""
+        assert self.role is not None and self._endpoints is not None
+        result = super().on_activate(state)
+        self._endpoints.activate()
         self.role.drive.images.start()
-        return TransitionCallbackReturn.SUCCESS
+        return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; turns and calibration stay."""
         assert self.role is not None
         self.role.drive.images.stop()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free all that configure made."""
         self._release()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free all that configure made, for good."""
         self._release()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_shutdown(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free all that configure made: it may be configured again."""
         self._release()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_error(state)
 
     def _configure(self) -> None:
         self.complaints = Complaints(self._log.warning)
@@ -201,7 +205,10 @@ class CameraNode(LifecycleNode):  # type: ignore[misc]
         return SetParametersResult(successful=True)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters as rclpy does; refuse unknown and read-only ones with the cure."""
+        """Set parameters as rclpy does; refuse unknown and read-only ones with the cure.
+
+        rclpy refuses these before it asks any callback, and without saying what to do.
+        """
         try:
             check_changeable(self, self._program, (each.name for each in parameter_list))
         except ConfigError as error:

@@ -9,13 +9,12 @@ from dashcalib_ros.ros.interface import (
     OF_RCLPY,
     PROGRAMS,
     PUBLISHED,
-    SENSORS,
     SERVICES,
     SET_CAMERA_INFO,
     SUBSCRIBED,
     Topic,
 )
-from dashcalib_ros.ros.settings import CHANGEABLE, specs
+from dashcalib_ros.ros.settings import CHANGEABLE, specs, yaml_value
 
 PAGE = """\
 # Topics, services and parameters
@@ -64,8 +63,8 @@ def page() -> str:
 
 def _topics(topics: Iterable[Topic]) -> str:
     return _table(('topic', 'type', 'QoS', 'program', ''), (
-        (f'the name that `{topic.name}` has' if topic.name in SENSORS else f'`{topic.name}`',
-         f'`{topic.type}`', topic.qos, _of(topic.programs), topic.about) for topic in topics))
+        (f'`{topic.name}`', f'`{topic.type}`', topic.qos, _of(topic.programs), topic.about)
+        for topic in topics))
 
 
 def _parameter(name: str, spec: dataclasses.Field[Any]) -> tuple[str, ...]:
@@ -73,10 +72,10 @@ def _parameter(name: str, spec: dataclasses.Field[Any]) -> tuple[str, ...]:
     values = (' '.join(about['choices']) if about['choices'] else kind
               if about['minimum'] is None else
               f'{kind}, {about["minimum"]:.10g} to {about["maximum"]:.10g}')
-    default = f'{spec.default}'.lower() if isinstance(spec.default, bool) else f'{spec.default}'
+    default = '' if spec.default == '' else f'`{yaml_value(spec.default)}`'
     programs = tuple(each for each in PROGRAMS if name in specs(each))
-    return (f'`{name}`{" *" if name in CHANGEABLE else ""}', f'`{default}`' if default else '',
-            values, _of(programs), about['reason'])
+    return (f'`{name}`{" *" if name in CHANGEABLE else ""}', default, values, _of(programs),
+            about['reason'])
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:

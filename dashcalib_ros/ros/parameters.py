@@ -4,6 +4,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
@@ -21,13 +22,23 @@ from rclpy.parameter import Parameter
 from dashcalib_ros.config import Config
 from dashcalib_ros.errors import ConfigError
 from dashcalib_ros.formats.ros import CAMERA_NAME
-from dashcalib_ros.ros.settings import CHANGEABLE, NodeConfig, Settings, specs, with_changes
+from dashcalib_ros.ros.settings import (
+    CHANGEABLE,
+    NodeConfig,
+    Settings,
+    ros_value,
+    specs,
+    with_changes,
+)
 
 RELIABILITIES = ('best_effort', 'reliable')
 
 
 def given_parameters(program: str) -> dict[str, Any]:
-    """Return the parameters that a program's node is given at the start, known or not."""
+    """Return the parameters that a program's node is given at the start, known or not.
+
+    rclpy tells them only by declaring all, without ranges and for good: on a node of their own.
+    """
     make = functools.partial(Node, program, enable_rosout=False, start_parameter_services=False)
     try:
         probe = make(automatically_declare_parameters_from_overrides=True)
@@ -63,7 +74,7 @@ def declare(node: Node, program: str, given: Mapping[str, Any]) -> Settings:
     for name, spec in known.items():
         if not spec.metadata['expert'] or name in given:
             # the checked value, which rclpy would refuse itself where 3 stands for 3.0
-            value = values[name]
+            value = ros_value(spec, values[name])
             node.declare_parameter(
                 name, float(value) if isinstance(spec.default, float) else value,
                 _descriptor(name, spec), ignore_override=True)
@@ -137,10 +148,11 @@ def _descriptor(name: str, spec: dataclasses.Field[Any]) -> ParameterDescriptor:
         read_only=name not in CHANGEABLE,
         additional_constraints=f'one of {", ".join(about["choices"])}' if about['choices'] else '')
     low, high = about['minimum'], about['maximum']
-    if low is not None and isinstance(spec.default, float):
+    # rclpy's range has no place for NaN; with_changes() has checked it
+    if low is not None and isinstance(spec.default, float) and not math.isnan(spec.default):
         descriptor.floating_point_range = [
             FloatingPointRange(from_value=float(low), to_value=float(high))]
-    elif low is not None:
+    elif low is not None and isinstance(spec.default, int):
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
     return descriptor
 

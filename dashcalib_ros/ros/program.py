@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import rclpy
 import rclpy.utilities
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
@@ -77,6 +78,8 @@ def spin(node: CameraNode, stopped: Callable[[], bool]) -> None:
                 wait_s = FIRST_WAIT_S
             except SetupError:
                 raise
+            except InvalidHandle:
+                pass  # an answer of a service that cleanup has taken back
             except Exception as error:
                 if node.blocked():
                     raise

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -96,24 +97,29 @@ class NodeConfig:
     publish_stale: bool = setting(
         False, 'continue to publish a calibration that new turns contradict')
     base_frame: str = setting(
-        'base_link', 'frame of the car, in which ~/mount gives the pose of the camera')
+        '', 'frame of the car for ~/mount and publish_tf; empty: base_link where mount_z is set, '
+            'else base_footprint, as the estimated height is above the road')
     publish_tf: bool = setting(
-        False, 'publish one static transform from base_frame to camera_frame when the mounting '
-               'is accepted')
+        False, 'publish static transforms from base_frame to the camera, when mounting and '
+               'position are known; not with ROS 2 from pip, which has no tf2_msgs')
     camera_frame: str = expert(
-        '', 'frame of the camera for publish_tf; empty: the frame_id of the images')
-    mount_x: float = setting(0.0, 'm ahead of base_frame, measured by hand', -50.0, 50.0)
+        '', 'optical frame of the camera for publish_tf; empty: the frame_id of the images')
+    mount_x: float = setting(
+        math.nan, 'm ahead of base_frame, measured by hand; .nan: not known', -50.0, 50.0)
     mount_y: float = setting(
-        0.0, 'm to the left of base_frame, measured by hand', -50.0, 50.0)
+        math.nan, 'm to the left of base_frame, measured by hand; .nan: not known', -50.0, 50.0)
     mount_z: float = setting(
-        0.0, 'm above base_frame, measured by hand; 0: the estimated height, which needs the '
-             'speed', -50.0, 50.0)
-    imu_topic: str = setting(
-        '', 'sensor_msgs/Imu of the car, independent evidence for fx; empty: none')
-    odom_topic: str = setting(
-        '', 'nav_msgs/Odometry, whose speed gives the height of the camera; empty: none')
-    fix_topic: str = setting(
-        '', 'sensor_msgs/NavSatFix, independent evidence for fx; empty: none')
+        math.nan, 'm above base_frame, measured by hand; .nan: the height above the road, which '
+                  'is estimated where the speed is known', -50.0, 50.0)
+    use_imu: bool = setting(
+        False, 'subscribe imu (sensor_msgs/Imu of the car), independent evidence for fx')
+    use_odom: bool = setting(
+        False, 'subscribe odom (nav_msgs/Odometry), whose speed gives the height of the camera')
+    use_fix: bool = setting(
+        False, 'subscribe fix (sensor_msgs/NavSatFix), independent evidence for fx')
+    imu_topic: str = expert('', 'deprecated: set use_imu, and remap imu with -r imu:=TOPIC')
+    odom_topic: str = expert('', 'deprecated: set use_odom, and remap odom with -r odom:=TOPIC')
+    fix_topic: str = expert('', 'deprecated: set use_fix, and remap fix with -r fix:=TOPIC')
     queue_size: int = expert(
         10, 'images that may wait for detection, one second of them; then the oldest is dropped',
         1, 1000)
@@ -150,11 +156,22 @@ def specs(program: str = CALIBRATOR) -> dict[str, dataclasses.Field[Any]]:
 
 def with_changes(core: Config, own: NodeConfig, values: Mapping[str, Any]
                  ) -> tuple[Config, NodeConfig]:
-    """Return both with settings changed by name; raises ConfigError."""
+    """Return both with settings changed by name; raises ConfigError.
+
+    values: as parameters have them, see ros_value(), or as the core has them.
+    """
     names = {spec.name for spec in dataclasses.fields(NodeConfig)}
+    lists = {name for name, spec in describe() if spec.metadata['pattern']}
+    values = {name: ','.join(map(str, value)) if name in lists and not isinstance(
+        value, (int, str)) else value for name, value in values.items()}
     return (core.replace({name: value for name, value in values.items() if name not in names}),
             dataclasses.replace(own, **{name: value for name, value in values.items()
                                         if name in names}))
+
+
+def ros_value(spec: dataclasses.Field[Any], value: Any) -> Any:
+    """Return a setting's value as a parameter has it: the core has a list of numbers as a text."""
+    return [int(each) for each in value.split(',')] if spec.metadata['pattern'] else value
 
 
 def help_text(program: str) -> str:
@@ -223,8 +240,7 @@ def _has_parameters(data: object) -> bool:
 
 
 def _row(name: str, spec: dataclasses.Field[Any]) -> str:
-    value = f'{spec.default}'.lower() if isinstance(spec.default, bool) else f'{spec.default!r}'
-    text = f'{spec.metadata["reason"]}; default {value}{_choices(spec)}'
+    text = f'{spec.metadata["reason"]}; default {yaml_value(spec.default)}{_choices(spec)}'
     return _wrapped(f'{name + (" *" if name in CHANGEABLE else ""):<19}', text)
 
 
@@ -240,10 +256,15 @@ def _line(name: str, spec: dataclasses.Field[Any]) -> str:
         note += f'; {about["minimum"]:.10g} to {about["maximum"]:.10g}'
     if name in CHANGEABLE:
         note += '; may be changed while the node runs'
-    value = yaml.safe_dump(spec.default, default_flow_style=True).split('\n')[0]
+    value = yaml_value(ros_value(spec, spec.default))
     comment = textwrap.fill(note, 99, initial_indent='    # ', subsequent_indent='    # ')
     # the line of one for experts is a comment, too: a node has it only where it is set
     return f'{comment}\n    {"# " if about["expert"] else ""}{name}: {value}\n'
+
+
+def yaml_value(value: object) -> str:
+    """Return a value as a file of parameters, and -p, have it."""
+    return yaml.safe_dump(value, default_flow_style=True).split('\n')[0]
 
 
 def _choices(spec: dataclasses.Field[Any]) -> str:

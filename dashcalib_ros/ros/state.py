@@ -51,7 +51,7 @@ def judge(new: CalibrationData, complete: bool, published: NamedCamera | None, c
                              contradictions, limits, 'give_up')
     if new.verdict.level != 'accepted' or new.camera is None or new.sigma is None:
         action: Action = 'wait' if published is None else 'keep'
-        return Judgement(action, '; '.join(new.verdict.reasons), contradictions)
+        return Judgement(action, '; '.join(new.verdict.told), contradictions)
     if published is None:
         return Judgement('adopt')
     against = contradicted(published.camera, published.sigma, new.camera, new.sigma)

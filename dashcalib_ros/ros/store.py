@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ from dashcalib_ros.formats.ros import matrix_block, yaml_text
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.report import Calibration, NamedCamera, set_aside, write_text
-from dashcalib_ros.whole_files import remove_leftovers
+from dashcalib_ros.whole_files import prepared, remove_leftovers
 
 # camera_info_manager's
 DEFAULT = 'file://${ROS_HOME}/camera_info/${NAME}.yaml'
@@ -144,6 +145,14 @@ class Store:
     """
 
     def __init__(self, path: Path, whose: CameraIdentity) -> None:
+        """Raises OutputError where the path cannot be that of a file."""
+        try:
+            if not stat.S_ISREG(path.stat().st_mode):
+                raise _not_written(path, 'it is a folder or a device, not a file')
+        except FileNotFoundError:
+            pass
+        except (OSError, ValueError) as error:
+            raise _not_written(path, error) from error
         self.path = path
         self._whose = whose
         self._lock: int | None = None
@@ -233,17 +242,27 @@ class Store:
         """Write it, completely or not at all; return a line about it. Raises OutputError."""
         if self.taken:
             raise OutputError('E-KEPT-IN-USE', self.taken)
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError('E-KEPT-NOT-WRITABLE',
-                              f'cannot create {self.path.parent}: {error.strerror}; set '
-                              f'camera_info_url to a place that you may write to') from error
+        self._make_folder()
         moved = None if self._ours else set_aside(self.path)
         self._write(kept)
         self._given_up = None
         return f'saved to {self.path}' + (
             f'; what another program wrote there is now {moved}' if moved else '')
+
+    def check_writable(self) -> None:
+        """Try to write beside the file, before the drive and not after it. Raises OutputError."""
+        self._make_folder()
+        try:
+            with prepared(self.path.parent, {self.path.name: b'yes\n'}):
+                pass
+        except OSError as error:
+            raise _not_written(self.path, error) from error
+
+    def _make_folder(self) -> None:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _not_written(self.path, error) from error
 
     def update(self, kept: StoredCalibration) -> None:
         """Write it where the file is still what this node read or wrote. Raises OutputError."""
@@ -281,6 +300,13 @@ class Store:
             return read_text(self.path, YAML_BYTES)
         except InputError:
             return None
+
+
+def _not_written(path: Path, why: Exception | str) -> OutputError:
+    reason = getattr(why, 'strerror', None) or str(why)
+    return OutputError('E-KEPT-NOT-WRITABLE',
+                       f'cannot write {path}: {reason}; set camera_info_url to a file in a folder '
+                       f'that you may write to')
 
 
 def implausible(kept: NamedCamera) -> str:

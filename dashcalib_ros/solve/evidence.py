@@ -37,6 +37,10 @@ ROLLING, ONE_TURN = 1.35, 1.5
 LEFT_SHIFT = 4.0
 # what matters: of the width; of 1; px of 1000 px of width
 MATTERS: Mapping[Kind, float] = {'shift': 0.004, 'zoom': 0.004, 'bend': 0.3}
+# times the loss of the solution: what a picture that moves leaves is in the tails
+TEST_LOSS = 2.0
+# sigmas of a slow shift, of the width, among which the evidence chooses, and the nats it takes
+SHIFT_SIZES, SHIFT_NATS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016), 3.0
 # noise variances of a track by which a kind of lens must predict turns better
 LEAST_GAIN = 30.0
 # the same of another kind, of its cost: fisheyes have 0.13 and more, windscreens up to 0.06
@@ -183,7 +187,7 @@ def fixed_camera_tests(found: Estimate) -> tuple[FixedCameraTest, ...]:
     With a part of the tracks.
     """
     now = found.with_tracks(FIRST_TRACKS)
-    loss_px, width = now.loss_px(), now.camera.image_size[0]
+    loss_px, width = TEST_LOSS * now.loss_px(), now.camera.image_size[0]
     variance, count = now.noise(loss_px).variance, len(now.imaging.names)
     shift, zoom = now.imaging.blocks.get(Shift.name, Shift()), Zoom()
     asked = now.having(shift, zoom, Bend())
@@ -222,26 +226,67 @@ def _solved(normals: Sequence[Normal], prior: Quadratic, variance: float,
     gain = chance = 0.0
     costs, wholes = [prior.of(places)], []
     for normal in normals:
-        first = len(normal.cost.score) - len(prior.score)
-        free = np.zeros(0, np.intp)
-        if isinstance(block, ImageBlock):
-            free = np.arange(first)[normal.places[block.name]]
-            precision, off = block.prior_of(normal.linear.stretch)
-        cost = normal.cost.of(np.concatenate([free, first + places]))
-        if len(free):
-            cost = Quadratic.together([cost, Quadratic.prior(
-                variance * precision, np.zeros(len(places)),
-                -variance * np.pad(precision @ off, (0, len(places))))])
-            own = cost.of(np.arange(len(free)))
-            gain += float(own.score @ own.covariance @ own.score) / variance
-            chance += own.chance / variance
-        wholes.append((cost, len(free)))
-        costs.append(cost.eliminated(len(free)).at_noise(variance))
+        cost, count = _with_images(normal, prior, variance, block, places)
+        own = cost.of(np.arange(count))
+        gain += float(own.score @ own.optimum) / variance
+        chance += own.chance / variance
+        wholes.append((cost, count))
+        costs.append(cost.eliminated(count).at_noise(variance))
     total = Quadratic.together(costs)
     step = total.optimum
     of_images = tuple(cost.moved(np.pad(step, (count, 0))).of(np.arange(count)).optimum
                       for cost, count in wholes if count)
     return _Step(gain + float(total.score @ step), chance + total.chance, step, of_images)
+
+
+def _with_images(normal: Normal, prior: Quadratic, variance: float, block: Block | None,
+                 places: Ints) -> tuple[Quadratic, int]:
+    """Return a turn's cost about a block's values of its images, with their prior, and the rest.
+
+    places: of what turns share. Also how many values there are; 0 where the block has none.
+    """
+    first = len(normal.cost.score) - len(prior.score)
+    if not isinstance(block, ImageBlock):
+        return normal.cost.of(first + places), 0
+    free = np.arange(first)[normal.places[block.name]]
+    precision, off = block.prior_of(normal.linear.stretch)
+    return Quadratic.together([
+        normal.cost.of(np.concatenate([free, first + places])), Quadratic.prior(
+            variance * precision, np.zeros(len(places)),
+            -variance * np.pad(precision @ off, (0, len(places))))]), len(free)
+
+
+def shift_size(found: Estimate) -> float:
+    """Return the sigma of a slow shift of the images that the evidence favours, of the width.
+
+    0 where a fixed picture is as likely. The evidence is the marginal likelihood: the shifts, and
+    what turns share, are at their optimum.
+    """
+    now = found.with_tracks(FIRST_TRACKS)
+    loss_px = now.loss_px()
+    unit = now.noise(loss_px).variance * now.inflation
+    normals = [normal_equations(linearised(each, loss_px), unit, (Shift.name,))
+               for each in now.having(Shift()).seen]
+    prior = now.imaging.prior()
+
+    def nats(block: Shift | None) -> float:
+        logs, costs = 0.0, [prior]
+        for normal in normals:
+            cost, count = _with_images(normal, prior, unit, block, np.arange(len(prior.score)))
+            if block is not None:
+                own = cost.of(np.arange(count))
+                precision, _ = block.prior_of(normal.linear.stretch)
+                logs += (float(own.score @ own.optimum) / unit
+                         - float(np.linalg.slogdet(own.hessian / unit)[1])
+                         + float(np.linalg.slogdet(precision)[1]))
+            costs.append(cost.eliminated(count).at_noise(unit))
+        total = Quadratic.together(costs)
+        return 0.5 * (logs + float(total.score @ total.optimum)
+                      - float(np.linalg.slogdet(total.hessian)[1]))
+
+    by_size = {size: nats(Shift(sigma=size)) for size in SHIFT_SIZES}
+    best = max(SHIFT_SIZES, key=by_size.__getitem__)
+    return best if by_size[best] - nats(None) > SHIFT_NATS else 0.0
 
 
 def moves(tests: Sequence[FixedCameraTest]) -> bool:

@@ -28,6 +28,7 @@ from dashcalib_ros.solve.evidence import (
     costs_of,
     fixed_camera_tests,
     moves,
+    shift_size,
 )
 from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate, optimised
 from dashcalib_ros.solve.solution import Solution
@@ -128,6 +129,9 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
         progress('testing whether the picture moves', 0.0)
         best = _steadied(best, measured, config)
         tests = fixed_camera_tests(best)
+    elif config.intrinsics.crop_rounds and (size := shift_size(best)):
+        best = _wandering(best, size)
+        tests = fixed_camera_tests(best)
     return _solution(best, unlike, start.profile, tried, tests, progress)
 
 
@@ -182,7 +186,7 @@ def _narrowed(found: Estimate, losses: Sequence[tuple[float, int]] = LOSSES
             return None
         now = optimised(now, least_px, steps, NEAR)
         # what was found first may be farther off than the bounds about it allow
-        now = now.about(now.imaging.lens.centred.with_focal(now.camera.fx))
+        now = now.about(now.centred.with_focal(now.camera.fx))
     return now
 
 
@@ -255,6 +259,17 @@ def _steadied(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config)
     return now if len(now.scenes) == len(found.scenes) else found
 
 
+def _wandering(found: Estimate, size: float) -> Estimate:
+    """Return the optimum where each image's picture may be shifted slowly, by a sigma of size.
+
+    size: of the width. What such shifts do to the lens cannot be excluded, and sigma contains it.
+    """
+    now = found.having(Shift(sigma=size))
+    for steps in LAST_STEPS:
+        now = optimised(now.retriangulated(), 0.0, steps)
+    return now
+
+
 def _posterior(found: Estimate) -> Posterior:
     """Return what the turns know at their optimum."""
     lens = found.camera
@@ -278,7 +293,7 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
     progress('trying other focal lengths', 0.0)
     around = profile_around(scenes, result.camera, coarse, config)
     count = len(result.camera.params)
-    place, centred = found.imaging.places[Readout.name], found.imaging.lens.centred
+    place, centred = found.imaging.places[Readout.name], found.centred
     return Solution(
         written=result, posterior=posterior, scenes=scenes, coarse=coarse, around=around,
         centred=type(result.camera).centred(

@@ -50,6 +50,12 @@ class Estimate(steps.State):
         """Return it with other blocks."""
         return replace(self, imaging=self.imaging.having(*blocks))
 
+    @property
+    def centred(self) -> Camera:
+        """Return the camera that the prior and the bounds of the lens are about."""
+        lens = self.imaging.lens
+        return lens.camera if lens.centred is None else lens.centred
+
     def about(self, centred: Camera) -> Estimate:
         """Return it with another camera that the prior and the bounds of the lens are about."""
         return self.having(replace(

@@ -20,12 +20,14 @@ import numpy.typing as npt
 from numpy.lib import format as npy
 
 from dashcalib_ros.camera import MODELS, camera_of
+from dashcalib_ros.detect.edges import IMAGES, KNOTS, MOST, Lines
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.errors import one_line, shortened
-from dashcalib_ros.input.scale import FULL_SIZE, MOST, Scale
+from dashcalib_ros.input import scale
+from dashcalib_ros.input.scale import FULL_SIZE, Scale
 from dashcalib_ros.limits import check_npz, check_pixels
-from dashcalib_ros.reconstruct.scene import Profile, Scene, Start, Structure, errors_px
-from dashcalib_ros.reconstruct.tracks import Tracks
+from dashcalib_ros.problem.observations import Structure, Tracks
+from dashcalib_ros.reconstruct.scene import Profile, Scene, Start, errors_px
 
 # a layout that older readers misunderstand needs a new number
 FORMAT = 1
@@ -36,6 +38,8 @@ LARGEST, LARGEST_UNPACKED = 2**25, 2**27
 MOST_TURNS, MOST_ARRAYS, MOST_WARNINGS = 50, 50, 100
 # keyframes times tracks of a turn, and focal lengths of its profile: likewise
 MOST_PLACES, MOST_RATIOS = 2_000_000, 1000
+# upright lines of a recording
+MOST_LINES = IMAGES * MOST
 # s; later stamps (this is in 2001) are dates, so that equal stamps mean the same moment
 DATES_S = 1e9
 # s; the last date that ROS's stamps in ns have
@@ -100,6 +104,7 @@ class SceneFile:
 
     found: turns that were found, also those that could not be reconstructed. content, settings:
     hexadecimal hashes of what it was made from, '' where unknown. frames, seconds: of the input.
+    lines: upright ones of the whole recording; None where they were not looked for.
     """
 
     origin: Origin
@@ -110,6 +115,7 @@ class SceneFile:
     frames: int = 0
     seconds: float = 0.0
     warnings: tuple[str, ...] = ()
+    lines: Lines | None = None
 
 
 def encoded(file: SceneFile) -> bytes:
@@ -139,6 +145,8 @@ def encoded(file: SceneFile) -> bytes:
                 'ratios': start.profile.ratios, 'costs': start.profile.costs,
                 'observations': start.profile.observations}.items()})
         arrays.update({f'turn{n}.{name}': value for name, value in values.items()})
+    if file.lines is not None:
+        arrays |= {'lines.points': file.lines.points, 'lines.stamps_s': file.lines.stamps_s}
     data = io.BytesIO()
     np.savez_compressed(data, allow_pickle=False, **arrays)
     return data.getvalue()
@@ -203,17 +211,32 @@ def _file(arrays: Arrays) -> SceneFile:
         origin, tuple(turns), max(_count(about.get('found', len(listed))), len(turns)),
         _hexadecimal(about['content']), _hexadecimal(about['settings']), _count(about['frames']),
         _real(about['seconds'], LAST_S), tuple(
-            shortened(line, 300) for line in about['warnings'][:MOST_WARNINGS]))
+            shortened(line, 300) for line in about['warnings'][:MOST_WARNINGS]),
+        _lines(arrays, origin))
 
 
 def _origin(about: Mapping[str, Any]) -> Origin:
     width, height = (_count(side) for side in about['image_size'])
     check_pixels(width, height, 'it')
     shrink, enlarge = (_count(about['scale'][name]) for name in ('shrink', 'enlarge'))
-    _check(1 <= shrink <= width and 1 <= enlarge <= MOST and 1 in (shrink, enlarge))
+    _check(1 <= shrink <= width and 1 <= enlarge <= scale.MOST and 1 in (shrink, enlarge))
     frame_id = about.get('frame_id', '')
     _check(isinstance(frame_id, str) and len(frame_id) <= 1000)
     return Origin((width, height), Scale(shrink, enlarge), frame_id)
+
+
+def _lines(arrays: Arrays, origin: Origin) -> Lines | None:
+    """Return the upright lines; None where the file has none, as those of older versions."""
+    if 'lines.points' not in arrays:
+        return None
+    count = len(arrays['lines.points'])
+    _check(count <= MOST_LINES)
+    size = origin.scale.size(origin.image_size)
+    lines = Lines(
+        _array(arrays, 'lines.points', np.float32, (count, KNOTS, 2), most=2.0 * max(size)),
+        _array(arrays, 'lines.stamps_s', float, (count,), most=LAST_S))
+    _check((np.diff(lines.stamps_s) >= 0).all())
+    return lines
 
 
 def _scene(arrays: Arrays, prefix: str, origin: Origin, center: int) -> Scene:

@@ -12,10 +12,12 @@ from fakes import stands_in_for
 from made_calibration import MOUNT, TRUTH, make_calibration
 from made_drives import START, TIMES, drive, images, info_of, write_bag, write_timed
 
+from dashcalib_ros import session
 from dashcalib_ros.camera import Radial
 from dashcalib_ros.cli import command, main
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect import TurnId
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats import result_json
 from dashcalib_ros.judge import Check, Odometry, Reading, watch
 from dashcalib_ros.judge.odometry import TurnOdometry, TurnPath
@@ -88,6 +90,36 @@ def test_the_answer_is_shown_and_is_the_exit_code(files, monkeypatch, capfd, ans
     out, errors = capfd.readouterr()
     assert out.splitlines()[0] == f'answer: {answer}' and 'it is 0.2 px off' in out
     assert 'dark' in errors and FakeCalibrator.asked == TRUTH
+
+
+def test_the_answer_ends_with_what_to_do(files, monkeypatch, capfd):
+    monkeypatch.setattr(FakeCalibrator, 'answer', 'wrong')
+    assert main(files) == 1
+    assert capfd.readouterr().out.splitlines()[-1].startswith('next: replace it')
+    assert main([*files, '--json']) == 1
+    assert json.loads(capfd.readouterr().out)['next_step'].startswith('replace it')
+
+
+def test_what_is_odd_in_the_calibration_is_a_warning(files, tmp_path, capfd):
+    (tmp_path / 'camera.json').write_text(json.dumps(
+        {**TRUTH.named, 'fy': 1.3 * TRUTH.fx, 'width': 1242, 'height': 375}))
+    assert main(files) == 0
+    assert '[E-CALIBRATION-ASPECT]' in capfd.readouterr().err
+
+
+def test_exchanged_arguments_are_told(files, tmp_path, capfd):
+    write_bag(tmp_path / 'bag', [*images(drive(3)), ('/camera_info', START, info_of(TRUTH))])
+    write_timed(tmp_path / 'drive.mp4', TIMES[:5])
+    for given in ('drive', 'drive.mp4', 'bag'):
+        assert main(['check', given, 'camera.json']) == 2
+        assert '[E-ARGUMENTS-EXCHANGED]' in capfd.readouterr().err
+        with pytest.raises(InputError) as raised:
+            session.check(given, 'camera.json')
+        assert raised.value.code == 'E-ARGUMENTS-EXCHANGED'
+    # two calibrations, and two drives, are something else
+    for pair in (('camera.json', 'camera.json'), ('drive', 'drive.mp4')):
+        assert main(['check', *pair]) == 2
+        assert 'EXCHANGED' not in capfd.readouterr().err
 
 
 def test_a_bag_s_own_calibration_is_checked(files, tmp_path, capfd):

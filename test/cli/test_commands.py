@@ -28,10 +28,10 @@ from dashcalib_ros.cli import main
 from dashcalib_ros.cli.terminal import Stages
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, Lens, demo_drive, render_to_bag
-from dashcalib_ros.detect.detection import Detection
-from dashcalib_ros.detect.turn import Turn
+from dashcalib_ros.detect.turn import Turn, TurnId
 from dashcalib_ros.errors import ConfigError, Notice, OutputError, WorkerError
-from dashcalib_ros.pipeline import Calibrator, Status
+from dashcalib_ros.judge import Verdict
+from dashcalib_ros.pipeline import Calibrator, Outlook, Status
 from dashcalib_ros.report import write_results
 
 NAMES_OF_MODELS = [AUTO, *(model.model for model in calibrated_models())]
@@ -49,6 +49,7 @@ class FakeCalibrator:
     failure: BaseException | None = None
     found = (Turn(center=88, first=58, last=118, stamp_s=8.8, prominence=0.06,
                   released_images=61),)
+    yaws_deg: ClassVar[dict[TurnId, float]] = {TurnId.at(88): 71.6}
     made: ClassVar[list[FakeCalibrator]] = []
 
     def __init__(self, config=None, mask=None, verbose=False):
@@ -70,6 +71,12 @@ class FakeCalibrator:
             raise self.failure
         return make_calibration(self.level, config=self.config, warnings=(DARK,), input_name='')
 
+    def outlook(self, progress=None):
+        return Outlook(self.frames, self.found, self.yaws_deg, Verdict(
+            self.level, *(() if self.level == 'accepted' else
+                          (('few: drive', 'less: park'), ('drive', 'park'), ('E-A', 'E-B')))),
+            (), 0.0)
+
     def close(self):
         self.closed = True
 
@@ -80,39 +87,6 @@ def fake(monkeypatch):
     monkeypatch.setattr('dashcalib_ros.session.Calibrator', FakeCalibrator)
     monkeypatch.setattr(FakeCalibrator, 'made', [])
     return FakeCalibrator
-
-
-@stands_in_for(Detection)
-class FakeDetection:
-    """Has found what the test wants as soon as the drive is over."""
-
-    found = FakeCalibrator.found
-
-    start_s = 0.0
-
-    def __init__(self, config, mask=None):
-        self.finished = False
-
-    def push(self, frame):
-        return []
-
-    def finish(self):
-        self.finished = True
-        return []
-
-    def turns(self):
-        return self.found if self.finished else ()
-
-    def warnings(self):
-        return ()
-
-
-@pytest.fixture
-def fake_detection(monkeypatch):
-    """Put the fake in the place of the first stage; nobody may calibrate."""
-    monkeypatch.setattr('dashcalib_ros.cli.run.Detection', FakeDetection)
-    monkeypatch.setattr('dashcalib_ros.session.Calibrator', None)
-    return FakeDetection
 
 
 @pytest.fixture
@@ -171,9 +145,8 @@ def test_an_earlier_calibration_that_is_moved_aside_is_told(
     monkeypatch.setattr(fake, 'level', level)
     assert main(['run', drive]) == 3
     lines = capsys.readouterr().err.splitlines()
-    assert lines[-1] == ('dashcalib: warning: the earlier calibration calibration/'
-                         'calibration.yaml was renamed to calibration/calibration.previous.yaml '
-                         '[E-CALIBRATION-RENAMED]')
+    assert lines[-1] == ('dashcalib: warning: an earlier calibration was renamed to '
+                         'calibration/calibration.previous.yaml [E-CALIBRATION-RENAMED]')
 
 
 def test_the_result_alone_on_stdout(fake, drive, tmp_path, capsys):
@@ -443,27 +416,35 @@ def test_signals_unwind_and_a_second_one_cannot_stop_the_closing(
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_turns_as_json(fake_detection, drive, tmp_path, capsys):
+def test_turns_as_json(fake, drive, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(fake, 'level', 'weak')
     assert main(['turns', drive, '--json']) == 0
     data = json.loads(capsys.readouterr().out)
     assert data['turns'] == [{'center': 88, 'first': 58, 'last': 118, 'stamp': 8.8,
-                              'prominence': 0.06, 'images': 61}]
-    assert data['frames'] == 4 and 'drive' in data['input']
+                              'prominence': 0.06, 'images': 61, 'yaw_deg': 71.6}]
+    assert data['frames'] == 4 and 'drive' in data['input'] and data['yaw_deg'] == 71.6
+    assert (data['verdict_at_best'], data['reason_codes']) == ('weak', ['E-A', 'E-B'])
     assert data['warning_codes'] == ['E-RATE-ASSUMED'] and len(data['warnings']) == 1
-    assert names(tmp_path / 'work') == []
+    assert names(tmp_path / 'work') == [] and fake.made[0].closed
 
 
-def test_turns_as_a_table(fake_detection, drive, monkeypatch, capsys):
-    assert main(['turns', drive, '--turns', '3']) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert ['8.8', '88', '58', '118', '61', '0.0600'] in [line.split() for line in lines]
-    assert any(line.startswith('prominence: ') for line in lines)  # the word is explained
-    assert lines[-2].startswith('1 turn found in 4 frames') and 'best 3' in lines[-2]
-    assert lines[-1].startswith('next: dashcalib run')
-    monkeypatch.setattr(fake_detection, 'found', ())
-    assert main(['turns', drive]) == 0
-    found, then = capsys.readouterr().out.splitlines()
-    assert found.startswith('0 turns found in 4 frames') and then.startswith('next: record')
+def test_turns_as_a_table(fake, drive, monkeypatch, capsys):
+    def shown():
+        assert main(['turns', drive]) == 0
+        return ' '.join(capsys.readouterr().out.split())
+    text = shown()
+    assert '8.8 88 58 118 61 0.0600 72 ' in text and 'prominence: ' in text
+    assert 'use 1, of 72° in all' in text and 'enough for a calibration next: dash' in text
+    monkeypatch.setattr(fake, 'yaws_deg', {TurnId.at(88): 21.0})
+    assert 'without a sharp turn it may be weak' in shown()
+    monkeypatch.setattr(fake, 'level', 'weak')
+    assert shown().endswith('would be weak: few; less next: drive')
+    monkeypatch.setattr(fake, 'level', 'refused')
+    monkeypatch.setattr(fake, 'yaws_deg', {})
+    monkeypatch.setattr(fake, 'found', ())
+    # the cause, and one step
+    assert shown() == ('0 turns found in 4 frames: not enough, the result would be refused: few '
+                       'next: drive')
 
 
 def test_progress_is_drawn_on_a_terminal(fake, drive, monkeypatch):

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import unicodedata
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,7 +24,16 @@ import dashcalib_ros
 from dashcalib_ros.camera import AUTO, calibrated_models
 from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
 from dashcalib_ros.cli import main
-from dashcalib_ros.cli.arguments import COMMANDS, JSON, KINDS, LENSES, MODELS
+from dashcalib_ros.cli.arguments import (
+    COMMANDS,
+    JSON,
+    KINDS,
+    LENSES,
+    MODELS,
+    UsageError,
+    arguments_of,
+    make_parser,
+)
 from dashcalib_ros.cli.terminal import show, warn
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import DEMOS
@@ -36,7 +46,7 @@ HEAVY = ('numpy', 'cv2', 'scipy', 'yaml', 'rich', 'matplotlib', 'pycolmap', 'ros
 
 
 def dashcalib(*args, env=None):
-    return subprocess.run([sys.executable, '-m', 'dashcalib_ros.cli', *map(str, args)],
+    return subprocess.run([sys.executable, '-m', 'dashcalib_ros', *map(str, args)],
                           capture_output=True, text=True, env=env, timeout=120)
 
 
@@ -98,6 +108,11 @@ def test_an_unknown_argument_names_the_help_of_its_command(here):
     (['run', 'x', '--fsp', '10'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
     (['run', 'x', '--thread=2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --threads?'),
     (['run', 'x', '-fps', '2'], 'E-ARGUMENT-UNKNOWN', 'did you mean --fps?'),
+    (['run', 'x', '-out', 'y'], 'E-ARGUMENT-UNKNOWN', 'did you mean -o or --out?'),
+    (['run', ''], 'E-ARGUMENT-EMPTY', 'empty'), (['check', '', 'x'], 'E-ARGUMENT-EMPTY', ''),
+    (['run', 'x', '--out='], 'E-ARGUMENT-EMPTY', '--out='),
+    (['batch', 'x', '--out', ''], 'E-ARGUMENT-EMPTY', ''),
+    (['run', 'x', '--start', '20', '--end', '0:10'], 'E-INPUT-DURATION', '20'),
     (['compare', 'a', 'b', '--qqqq'], 'E-ARGUMENT-UNKNOWN', 'dashcalib compare --help')])
 def test_a_slip_gets_the_nearest_name(here, tmp_path, monkeypatch, args, code, hint):
     monkeypatch.chdir(tmp_path)
@@ -105,6 +120,25 @@ def test_a_slip_gets_the_nearest_name(here, tmp_path, monkeypatch, args, code, h
     done = here(*args)
     assert_one_line_error(done, code)
     assert hint in done.stderr
+
+
+@pytest.mark.parametrize(('text', 'seconds'), [
+    ('90', 90.0), ('1:30', 90.0), ('0:01:30.5', 90.5), ('2:00:00', 7200.0), ('1e2', 100.0),
+    *((text, None) for text in ('1:60', '1:-3', ':30', '1:', '1:2:3:4', 'x', '1:x', '-1', 'inf',
+                                '1:nan'))])
+def test_times_may_have_minutes(text, seconds):
+    parser = make_parser()
+    if seconds is None:
+        with pytest.raises(UsageError):
+            parser.parse_args(['run', 'x', f'--start={text}'])
+        return
+    args = parser.parse_args(['run', 'x', '--start', text, '-o', 'there'])
+    assert (args.start, str(args.out)) == (seconds, 'there')
+
+
+def test_another_name_of_run():
+    assert arguments_of(['calibrate', 'x']) == ['run', 'x']
+    assert arguments_of(['run', 'calibrate']) == ['run', 'calibrate']
 
 
 def test_json_is_the_same_flag_of_each_command():
@@ -117,6 +151,16 @@ def test_json_is_the_same_flag_of_each_command():
 def test_the_names_that_help_has_are_those_of_the_tables():
     assert tuple(DEMOS) == LENSES and tuple(EXPORTS) == KINDS
     assert (AUTO, *(model.model for model in calibrated_models())) == MODELS
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_documents_name_every_kind_of_export(kind):
+    docs = Path(__file__).parents[2] / 'docs'
+    [line] = re.findall(r'^dashcalib export calibration --to (opencv .*)$',
+                        (docs / 'usage.md').read_text(), re.MULTILINE)
+    assert re.search(rf'\b{kind}\b', line)
+    exports = (docs / 'formats.md').read_text().partition('### Exports')[2].partition('\n### ')[0]
+    assert f'`{kind}`' in exports
 
 
 def test_help_imports_nothing_heavy():
@@ -171,7 +215,7 @@ def test_version():
     (['run', 'x', '--turns', 'many'], '--turns'),
     (['run', 'x', '--out', '-'], '--json'),
     (['run', 'x', '--start', '-1'], '0 or more seconds'),
-    (['turns', 'x', '--duration', '0'], 'positive number'),
+    (['turns', 'x', '--duration', '0'], 'more than 0 seconds'),
     (['demo', '--out', '-'], '--out'),
     (['demo', '--lens', 'fishy'], 'windscreen'),
     (['export', 'a', '--to', 'ros', '--out', '-'], '--out'),
@@ -310,7 +354,7 @@ def test_output_that_is_no_longer_read_is_no_error(results):
     os.close(reader)
     try:
         done = subprocess.run(
-            [sys.executable, '-m', 'dashcalib_ros.cli', 'compare', results / 'a',
+            [sys.executable, '-m', 'dashcalib_ros', 'compare', results / 'a',
              results / 'truth.json', '--json'], stdout=writer, stderr=subprocess.PIPE, text=True)
     finally:
         os.close(writer)
@@ -331,7 +375,7 @@ CLOSED, FULL = 'E-STDOUT-CLOSED', 'E-STDOUT-UNWRITABLE'
 def redirected(redirection, *args):
     """Run the command behind a redirection of the shell."""
     return subprocess.run(
-        ['sh', '-c', f'exec "$@" {redirection}', 'sh', sys.executable, '-m', 'dashcalib_ros.cli',
+        ['sh', '-c', f'exec "$@" {redirection}', 'sh', sys.executable, '-m', 'dashcalib_ros',
          *map(str, args)], capture_output=True, text=True, timeout=120)
 
 
@@ -452,6 +496,6 @@ def test_export_tells_of_a_lens_that_folds_over_inside_the_picture(here, tmp_pat
     path = tmp_path / 'camera.json'
     path.write_text(text % '[-13.2, -98.0, 0.0014, 0.0028, 1357.8, -13.05, -102.4, 1383.0]')
     done = here('export', path, '--to', 'ros')
-    assert done.returncode == 0 and 'has no ray for 23 % of the picture' in done.stderr
+    assert done.returncode == 0 and done.stderr.strip().endswith('[E-CALIBRATION-FOLDS]')
     path.write_text(text % '[-0.3, 0.1, 0, 0, 0]')
     assert here('export', path, '--to', 'ros').stderr == ''

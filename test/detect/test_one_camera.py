@@ -1,15 +1,19 @@
 """Whether a stream has the images of two cameras: what thinning leaves out is looked at."""
 from __future__ import annotations
 
+from contextlib import suppress
+
 import cv2
 import numpy as np
 import pytest
+from refused import refused
 from synthetic import rotation
 
 from dashcalib_ros.config import Config
 from dashcalib_ros.demo import Drive, DriveSpec, Lens
 from dashcalib_ros.demo.spec import Stop, Turn
 from dashcalib_ros.detect.detection import Detection, detect
+from dashcalib_ros.errors import InputError
 from dashcalib_ros.input import Frame
 from dashcalib_ros.input.stamps import StampGate
 from dashcalib_ros.judge.conclude import conclude, evidence_of_detection
@@ -122,3 +126,29 @@ def test_the_node_sees_what_the_command_sees(pictures, rate, pattern):
     used = both[-1].stamp_ns / 1e9 * Config().motion.rate
     assert len(passed) < 1.4 * used
     assert live.other_camera == detect(both, Config()).other_camera is not None
+
+
+def beside(image):
+    """Return what the other camera of a pair sees: shifted, darker, with noise of its own."""
+    noise = np.random.default_rng(int(image[90, 160])).normal(0, 3, image.shape)
+    return np.clip(0.9 * np.roll(image, -10, 1) + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(('stack', 'crop'), [(np.hstack, 'crop=iw/2:ih:0:0'),
+                                             (np.vstack, 'crop=iw:ih/2:0:0')])
+def test_two_pictures_in_one_are_named(pictures, stack, crop):
+    detection = Detection(Config())
+    drive = iter(frames([stack([image, beside(image)]) for image in pictures]))
+    with refused(InputError, 'E-TWO-PICTURES', crop):
+        for frame in drive:
+            detection.push(frame)
+    assert detection.seconds < 12
+    for frame in drive:  # a live stream goes on
+        with suppress(InputError):
+            detection.push(frame)
+    assert detection.finish() == [] and detection.turns() == ()
+
+
+@pytest.mark.parametrize('stack', [np.hstack, np.vstack])
+def test_two_pictures_of_different_views_are_no_pair(pictures, stack):
+    detect(frames([stack([image, mirrored(image)]) for image in pictures]), Config())

@@ -6,11 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fleet_made import CONFIG, YAWS, clip_of, lens_of
+from made_lines import made_lines
 from synthetic import LENS
 
+from dashcalib_ros.detect import TurnId, bend
 from dashcalib_ros.fleet import solved
 from dashcalib_ros.fleet.fuse import fuse
-from dashcalib_ros.store.scene_file import Origin
+from dashcalib_ros.report import report_html
+from dashcalib_ros.solve import solve
+from dashcalib_ros.store.scene_file import Origin, decoded, encoded
 
 FEW = {'tracks': 80, 'keyframes': 8}
 CLIPS = {f'{n}.mp4': clip_of(yaws=YAWS[n:n + 1], world=n, **FEW) for n in range(4)}
@@ -28,7 +32,7 @@ def fused():
 
 def test_what_contradicts_is_named_and_left_out(fused):
     shares = fused.shares
-    assert shares['again.mp4'].left_out == 'has the same content as 0.mp4'
+    assert shares['again.mp4'].left_out == 'has the same content as 0.mp4 [E-CLIP-REPEATED]'
     assert all(size in shares['small.mp4'].left_out for size in ('640x480', '800x450'))
     assert shares['zoomed.mp4'].left_out.startswith('shows another camera')
     assert [shares[f'{n}.mp4'].used for n in range(4)] == [1, 1, 1, 1]
@@ -36,6 +40,65 @@ def test_what_contradicts_is_named_and_left_out(fused):
     warnings = '; '.join(fused.calibration.warnings)
     assert {each.code for each in fused.calibration.warnings} == {'E-CLIP-LEFT-OUT'}
     assert all(name in warnings for name in ('again.mp4', 'small.mp4', 'zoomed.mp4'))
+
+
+def test_turns_are_named_by_their_clips(fused):
+    assert [turn.clip for turn in fused.calibration.stored_turns] == [
+        f'{n}.mp4' for n in range(4)]
+    again = solved.decoded(solved.encoded(fused), 'file').calibration
+    page = report_html(again)
+    assert 'earlier' not in page and '0.mp4' in page
+    sharp = replace(CONFIG, verdict=replace(CONFIG.verdict, max_leverage=0.1))
+    reasons = '; '.join(fuse('cam', '', CLIPS, sharp).calibration.verdict.reasons)
+    assert 'no other turn confirms 1 turn of' in reasons and '.mp4' in reasons
+    assert 'earlier' not in reasons
+
+
+def with_lines(lens):
+    """Return the clips, each with a part of the lines that a lens shows; each counts from 0."""
+    lines, part = made_lines(lens), np.arange(600) // 150
+    part = part[:len(lines)]
+    found = {}
+    for n, (name, clip) in enumerate(CLIPS.items()):
+        own = lines.chosen(part == n)
+        found[name] = replace(clip, lines=replace(own, stamps_s=own.stamps_s - own.stamps_s[0]))
+    return found
+
+
+@pytest.mark.parametrize(('off', 'level'), [(0.0, 'accepted'), (0.08, 'weak')])
+def test_upright_lines_judge_a_fleet_s_camera_as_that_of_a_drive(off, level):
+    """Also after the way through the clips' files."""
+    clips = with_lines(replace(LENS, k1=LENS.k1 + off))
+    read = {name: decoded(encoded(clip)) for name, clip in clips.items()}
+    for name, clip in clips.items():
+        np.testing.assert_array_equal(read[name].lines.points, clip.lines.points)
+        np.testing.assert_array_equal(read[name].lines.stamps_s, clip.lines.stamps_s)
+    found = fuse('cam', 'acme', read, CONFIG)
+    assert found.calibration.verdict.level == level
+    assert ('E-LINES-BENT' in found.calibration.verdict.codes) == (level == 'weak')
+    # nor does such a camera tell others of its model what their lens is like
+    assert found.estimate.sound == (level == 'accepted')
+    lines = found.calibration.straight_lines
+    assert lines.k1 == pytest.approx(off, abs=0.03) and lines.groups >= 8
+
+
+def test_one_clip_has_the_lines_of_its_drive():
+    lines = made_lines(LENS)
+    lines = replace(lines, stamps_s=lines.stamps_s + 1.7e9)
+    whole = clip_of(yaws=YAWS[:3], **FEW)
+    found = fuse('cam', '', {'a.mp4': replace(whole, lines=lines)}, CONFIG)
+    scenes = [turn.scene for turn in whole.turns]
+    solution = solve([replace(scene, turn=TurnId.stored(n)) for n, scene in enumerate(scenes)],
+                     CONFIG)
+    alone = bend(lines, solution.camera, solution.covariance)
+    assert found.calibration.straight_lines.groups == alone.groups
+    assert found.calibration.straight_lines.k1 == pytest.approx(alone.k1, abs=1e-3)
+
+
+def test_of_many_clips_lines_are_as_many_as_of_a_long_drive(monkeypatch):
+    monkeypatch.setattr('dashcalib_ros.fleet.fuse.MOST_LINES', 200)
+    found = fuse('cam', '', with_lines(LENS), CONFIG)
+    assert 100 < found.calibration.straight_lines.lines <= 200
 
 
 def first_two():

@@ -75,6 +75,14 @@ def test_a_manifest_that_is_bad_altogether(tmp_path, data, code, where):
     assert len(str(caught.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize('mark', [';', '\t'])
+def test_a_spreadsheet_s_own_marks(tmp_path, mark):
+    text = 'clip,camera,fps\na.mp4,cam 1,"29,97"\n'.replace(',', mark).replace(
+        f'29{mark}97', '29,97')
+    row, = rows_of(tmp_path, text)
+    assert (row.clip, row.camera, row.fps) == ('a.mp4', 'cam 1', 29.97)
+
+
 def test_a_manifest_has_only_so_many_rows(tmp_path, monkeypatch):
     monkeypatch.setattr(manifest, 'MANIFEST_ROWS', 3)
     assert len(rows_of(tmp_path, 'clip\n' + 'a.mp4\n' * 3)) == 3

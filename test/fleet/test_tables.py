@@ -60,7 +60,7 @@ def test_a_row_that_cannot_be_read_does_not_take_the_place_of_another():
     rows = clip_rows('cam', '', [(bad, ClipResult('fps')), (good, read), (again, read)],
                      {'a.mp4': ClipShare(1)})
     assert [row['status'] for row in rows] == ['unreadable', 'used', 'left out']
-    assert rows[2]['reason'].endswith('row 2')
+    assert 'row 2' in rows[2]['reason'] and rows[2]['code'] == 'E-CLIP-REPEATED'
 
 
 def test_texts_that_are_no_unicode_and_numbers_that_are_none(tmp_path, monkeypatch):
@@ -129,6 +129,22 @@ def test_every_dot_of_the_overview_has_a_colour():
     for verdict, kind in kinds:
         assert f'.dot.{kind} {{ stroke: var(--accent); }}' in style
         assert f'.{verdict} {{ --accent:' in style
+
+
+def test_the_overview_groups_by_code():
+    """Texts differ by names and numbers, in whatever language names are."""
+    shares = {f'{n}.mp4': ClipShare(left_out=f'shows the same as {"abc"[n]}.mp4 [E-CLIP-REPEATED]')
+              for n in range(3)}
+    read = ClipResult(file='x.npz', turns=1, scenes=1)
+    clips = clip_rows('cam', '', [(Row(n, f'{n}.mp4', f'/{n}.mp4', 'cam'), read)
+                                  for n in range(3)], shares)
+    cameras = [{**failed_row(name, '', clips), 'reasons': [f'fx of {name} is known to {n} %', 'x'],
+                'reason_codes': ['E-LARGE-SIGMA', f'E-{n}']} for n, name in enumerate('pqrs')]
+    page = overview_html([*cameras, failed_row('t', '', clips, 'why [E-DIED]')], clips)
+    rows = [re.findall('<td>(.*?)</td>', row) for row in re.findall('<tr>(.*?)</tr>', page)]
+    counts = {row[0]: row[2] for row in rows if len(row) == 4}
+    assert counts == {'E-CLIP-REPEATED': '3', 'E-LARGE-SIGMA': '4', 'E-DIED': '1',
+                      **{f'E-{n}': '1' for n in range(4)}}
 
 
 def test_clips_without_a_turn_are_listed():

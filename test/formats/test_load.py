@@ -16,6 +16,7 @@ from dashcalib_ros.camera import Brown, Fisheye, Radial, Rational
 from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.formats.load import load_with_faults
+from dashcalib_ros.judge.difference import NamedCamera
 
 BROWN, FISHEYE = EACH_MODEL['brown'], EACH_MODEL['fisheye']
 SMALL = (640, 480)
@@ -114,14 +115,14 @@ GYROFLOW = json.loads("""{
 ACTION = Fisheye((2716, 1524), 1521.8556549213351, 1517.3353528760497, 1398.7223429856729,
                  629.1053659679567, 0.13409177590858662, -0.33639498801548057,
                  0.3274956873988361, -0.1478470585818954)
-LENS = {'camera_matrix': MATRIX['K'], 'distortion_coeffs': [-0.1, 1e-5, 1e-3, -2e-3, 0.3]}
+GYROFLOW_LENS = {'camera_matrix': MATRIX['K'], 'distortion_coeffs': [-0.1, 1e-5, 1e-3, -2e-3, 0.3]}
 STANDARD = {'calib_dimension': {'w': 640, 'h': 480}, 'distortion_model': 'opencv_standard',
-            'fisheye_params': LENS}
+            'fisheye_params': GYROFLOW_LENS}
 
 
 def gyroflow(d, **changes):
     """Make a lens profile of OpenCV's standard model."""
-    return {**STANDARD, 'fisheye_params': {**LENS, 'distortion_coeffs': d}, **changes}
+    return {**STANDARD, 'fisheye_params': {**GYROFLOW_LENS, 'distortion_coeffs': d}, **changes}
 
 
 @pytest.mark.parametrize(('content', 'name', 'wanted'), [
@@ -140,7 +141,7 @@ def gyroflow(d, **changes):
     (gyroflow([0, 0, 0, 0], distortion_model=None), None, Radial(SMALL, *FULL.params[:4])),
     # of the first versions
     ({'calib_dimension': {'w': 640, 'h': 480}, 'use_opencv_fisheye': False, 'fisheye_params': {},
-      'use_opencv_standard': True, 'calib_params': LENS}, None, FULL),
+      'use_opencv_standard': True, 'calib_params': GYROFLOW_LENS}, None, FULL),
     (OPENCV, None, FULL),
     (OPENCV_XML, None, FULL),
     (KALIBR, 'cam0', NO_K3),
@@ -226,7 +227,8 @@ def test_the_readout_time_of_a_lens_profile(tmp_path, profile, readout_ms):
     (gyroflow([0.1], fisheye_params={}), 'E-CALIBRATION-MISSING', 'camera_matrix'),
     (gyroflow([*[0.1] * 8, 0.01, 0, 0, 0]), '', 'with 9 coefficients'),
     (gyroflow([0.1] * 5, distortion_model='opencv_fisheye'), '', 'with 5 coefficients'),
-    (gyroflow([0.1], fisheye_params={**LENS, 'camera_matrix': [[5, 1, 3], [0, 5, 2], [0, 0, 1]]}),
+    (gyroflow([0.1], fisheye_params={
+        **GYROFLOW_LENS, 'camera_matrix': [[500, 1, 320], [0, 500, 240], [0, 0, 1]]}),
      'E-CAMERA-FAULTS', 'K[1] is 1'),
     ({'images': []}, 'E-CALIBRATION-FORMAT', ''),
     ({'frames': []}, 'E-CALIBRATION-FORMAT', ''),
@@ -242,6 +244,193 @@ def test_what_is_not_said_or_not_known_is_refused_in_one_line(tmp_path, content,
     assert not code or raised.value.code == code
     assert str(path) in str(raised.value) and value in str(raised.value)
     assert '\n' not in str(raised.value) and len(str(raised.value)) < 500 + len(str(path))
+
+
+VIEW = {'fx': 700, 'fy': 702, 'cx': 604, 'cy': 186, 'width': 1226, 'height': 370}
+LENS = {**VIEW, 'k1': 0.02, 'k2': -0.007}
+D5 = [0.02, -0.007, 0.0, 0.0, 0.0]
+WANTED = Radial((1226, 370), 700.0, 702.0, 604.0, 186.0, 0.02, -0.007)
+# of Waymo's FRONT
+NINE = [700, 702, 604, 186, 0.02, -0.007, 0.001, -0.001, 0.0]
+
+
+def with_matrix(k, d=D5, **more):
+    return {'camera_matrix': k, 'distortion_coefficients': d, 'image_width': 1226,
+            'image_height': 370, 'distortion_model': 'plumb_bob', **more}
+
+
+def read(tmp_path, content, name='camera.json'):
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return load_camera(path)
+
+
+@pytest.mark.parametrize(('changes', 'code', 'value'), [
+    # a digit too many, or one at another place
+    ({'fy': 7020}, 'E-CALIBRATION-ASPECT', '10 times'), ({'fx': 70}, 'E-CALIBRATION-ASPECT', ''),
+    # mm, and shares of the picture
+    ({'fx': 4.2, 'fy': 4.2}, 'E-CALIBRATION-FOCAL', 'mm'),
+    ({'fx': 0.57, 'fy': 1.9, 'cx': 0.49, 'cy': 0.5}, 'E-CALIBRATION-FOCAL', 'multiply'),
+    ({'cx': 186, 'cy': 604}, 'E-CALIBRATION-EXCHANGED', 'cx and cy'),
+    # coefficients in percent and in thousandths
+    ({'k1': -36.3, 'k2': 15.1}, 'E-CALIBRATION-NO-RAY', 'k1 = -36.3'),
+    ({'k1': 20, 'k2': -7}, 'E-CALIBRATION-NO-RAY', 'k1 = 20'),
+    # the size is told first: distortion of another size folds
+    ({'fx': 200, 'fy': 200, 'cx': 153, 'cy': 46, 'k1': -0.7}, 'E-CALIBRATION-OTHER-SIZE', '')])
+def test_numbers_that_no_camera_has_are_refused(tmp_path, changes, code, value):
+    with pytest.raises(InputError) as raised:
+        read(tmp_path, LENS | changes)
+    assert raised.value.code == code and value in str(raised.value)
+
+
+@pytest.mark.parametrize(('changes', 'code', 'value'), [
+    ({}, '', ''), ({'fy': 1.04 * 700}, '', ''), ({'cx': 680, 'cy': 172}, '', ''),
+    ({'fy': 933}, 'E-CALIBRATION-ASPECT', '1.33 times'),
+    ({'fy': 604, 'cx': 702}, 'E-CALIBRATION-ASPECT', 'fx, fy, cx, cy'),
+    ({'fx': 7000, 'fy': 7020}, 'E-CALIBRATION-NARROW', '10.0 degrees'),
+    ({'cx': 302, 'cy': 93}, 'E-CALIBRATION-OTHER-SIZE', '613x185'),
+    ({'cx': 1208, 'cy': 372}, 'E-CALIBRATION-OTHER-SIZE', '--size 1226x370'),
+    ({'cx': 367.2, 'cy': 248.3, 'width': 1920, 'height': 1080}, 'E-CALIBRATION-OTHER-SIZE',
+     '752x480'),
+    ({'cx': 512.5, 'cy': 384.5, 'width': 640, 'height': 480}, 'E-CALIBRATION-OTHER-SIZE',
+     '1024x768'),
+    ({'cx': 320, 'cy': 180, 'width': 960, 'height': 528}, 'E-CALIBRATION-OTHER-SIZE', '640x360'),
+    # a strip of larger pictures
+    ({'cx': 960, 'cy': 236, 'width': 1920, 'height': 886}, 'E-CALIBRATION-CENTRE', '1920x886'),
+    ({'k1': 2}, 'E-CALIBRATION-PINCUSHION', 'k1 = 2'),
+    ({'k1': -0.7, 'k2': 0}, 'E-CALIBRATION-FOLDS', 'k1 = -0.7')])
+def test_what_is_odd_in_a_camera_is_a_warning(tmp_path, changes, code, value):
+    found = read(tmp_path, LENS | changes)
+    assert [each.code for each in found.warnings] == [code] * bool(code)
+    assert value in ''.join(found.warnings)
+    assert found == NamedCamera(found.name, found.camera)
+
+
+def test_distortion_is_named_before_p_is(tmp_path):
+    p = [700, 0, 604, 0, 0, 702, 186, 0, 0, 0, 1, 0]
+    folding = with_matrix([700, 0, 604, 0, 702, 186, 0, 0, 1], [
+        1342.1, -871.3, 102.9, 1e-4, -2e-4, 1341.7, -870.2, 101.1], projection_matrix=p,
+        distortion_model='rational_polynomial')
+    with pytest.raises(InputError) as raised:
+        read(tmp_path, folding)
+    assert raised.value.code == 'E-CALIBRATION-NO-RAY' and 'p1 = 102.9' in str(raised.value)
+    part = with_matrix(folding['camera_matrix'], [-0.9, 0, 0, 0, 0], projection_matrix=p)
+    assert [each.code for each in read(tmp_path, part).warnings] == ['E-CALIBRATION-FOLDS']
+
+
+@pytest.mark.parametrize(('k', 'code'), [
+    ([700, 702, 604, 186], ''), ([700, 0, 604, 45, 0, 702, 186, 0.2, 0, 0, 1, 0.003], ''),
+    ([[700, 0, 604, 0], [0, 702, 186, 0], [0, 0, 1, 0], [0, 0, 0, 1]], ''),
+    ({'fx': 700, 'fy': 702, 'u0': 604, 'v0': 186}, ''),
+    ({'fu': 700, 'fv': 702, 'ppx': 604, 'ppy': 186}, ''),
+    (['700', '0', '604', '0', '702', '186', '0', '0', '1'], ''),
+    ([700, 0, 0, 0, 702, 0, 604, 186, 1], 'E-CALIBRATION-TRANSPOSED'),
+    (NINE, 'E-CALIBRATION-NO-MATRIX'), ({'a': 1}, 'E-CALIBRATION-NO-MATRIX'),
+    ([1.1, 0, 0, 0, 0, 1.8, 0, 0, 0, 0, -1, -0.2, 0, 0, -1, 0], 'E-CALIBRATION-NO-MATRIX'),
+    ([700, 604, 186], 'E-CALIBRATION-COUNT')])
+def test_intrinsics_are_a_matrix_or_say_what_they_are(tmp_path, k, code):
+    if not code:
+        assert read(tmp_path, with_matrix(k)).camera == WANTED
+        return
+    for content in (with_matrix(k), {'intrinsic': k, 'width': 1226, 'height': 370}):
+        with pytest.raises(InputError) as raised:
+            read(tmp_path, content)
+        assert raised.value.code == code
+
+
+@pytest.mark.parametrize(('content', 'model'), [
+    ({'intrinsic': {'k1': 339.7, 'k2': -31.9, 'model': 'radial_poly', 'width': 1280.0}},
+     'radial_poly'),
+    ({'intrinsic_type': 'DIVISION_UNDISTORTION', 'intrinsics': {'focal_length': 700}},
+     'DIVISION_UNDISTORTION'),
+    ({'intrinsics': [{'key': 0, 'value': {'polymorphic_name': 'pinhole_radial_k3',
+                                          'ptr_wrapper': {'data': {'disto_k3': [0.1, 0, 0]}}}}]},
+     'pinhole_radial_k3'),
+    ({'intrinsics': [{'width': '1226', 'type': 'radial3'}]}, 'radial3'),
+    ({'camera_type': 'kb4', 'intrinsics': {**LENS, 'k4': 0.1}}, 'kb4'),
+    ({'camera_model': 'omni', **with_matrix([700, 702, 604, 186])}, 'omni')])
+def test_a_lens_model_that_a_file_says_is_named(tmp_path, content, model):
+    with pytest.raises(InputError) as raised:
+        read(tmp_path, content)
+    assert raised.value.code == 'E-LENS-MODEL' and repr(model) in str(raised.value)
+
+
+def test_an_object_without_coefficients_leads_to_a_camera(tmp_path):
+    content = {'extrinsic': {'x': 1.7}, 'intrinsic': {'fx': 700.0, 'fy': 702.0, 'u0': 604.0,
+                                                      'v0': 186.0}}
+    for code, more in (('E-NO-DISTORTION', {'k1': 0, 'k2': 0}),
+                       ('E-CALIBRATION-NO-SIZE', {'image_width': 1226}),
+                       ('E-CALIBRATION-NO-SIZE', {'image_height': 370})):
+        with pytest.raises(InputError) as raised:
+            read(tmp_path, content)
+        assert raised.value.code == code
+        content |= more
+    assert read(tmp_path, content).camera == Radial((1226, 370), 700.0, 702.0, 604.0, 186.0)
+
+
+@pytest.mark.parametrize('more', [
+    {'RadialDistortion': [0.1, 0.2], 'TangentialDistortion': [0, 0]}, {'k1': 0.1, 'k2': 0.0},
+    {'distortion_coefficients': {'k1': 0.1, 'k2': 0.0}}, {'lens': {'disto_k3': [0.1, 0, 0]}}])
+def test_zeros_are_not_asked_for_where_there_is_distortion(tmp_path, more):
+    content = with_matrix([700, 702, 604, 186])
+    del content['distortion_coefficients']
+    with pytest.raises(InputError) as raised:
+        read(tmp_path, content | more)
+    assert raised.value.code == 'E-LENS-COEFFICIENTS'
+    assert next(iter(more)).split('.')[0] in str(raised.value) or 'disto_k3' in str(raised.value)
+
+
+@pytest.mark.parametrize(('d', 'model', 'code'), [
+    ([0.02, -0.007, 0.1], 'plumb_bob', 'E-LENS-AMBIGUOUS'),
+    ([0.02, -0.007, 0.1], 'rational_polynomial', 'E-LENS-AMBIGUOUS'),
+    ([0.02, -0.007, 0.0, 0.0, 0.0, 0.3], 'rational_polynomial', 'E-LENS-COEFFICIENTS'),
+    ([0.02, -0.007, 0.0], 'plumb_bob', ''), ([0.02, -0.007], 'plumb_bob', ''),
+    ([0.02, -0.007, 0.0, 0.0, 0.0, 0.0], 'plumb_bob', ''),
+    ([0.02, -0.007, 0.1], 'fisheye', '')])
+def test_coefficients_are_counted(tmp_path, d, model, code):
+    content = with_matrix([700, 702, 604, 186], d, distortion_model=model)
+    if not code:
+        assert read(tmp_path, content).camera.named['k2'] == -0.007
+        return
+    with pytest.raises(InputError) as raised:
+        read(tmp_path, content)
+    assert raised.value.code == code
+
+
+INI_OF_TWO = '\n'.join(
+    f'[{side}_CAM_HD]\nfx=700\nfy=702\ncx=604\ncy=186\nk1=0.02\nk2=-0.007\n{size}'
+    for side, size in (('LEFT', 'width=1226\nheight = 370\n'), ('RIGHT', '')))
+
+
+def test_the_sections_of_an_ini_file_are_cameras(tmp_path):
+    path = tmp_path / 'SN1234.conf'
+    path.write_text(f'; a factory file\n{INI_OF_TWO}\n[STEREO]\nBaseline=120\n')
+    with pytest.raises(InputError) as raised:
+        load_camera(path)
+    assert raised.value.code == 'E-CAMERA-CHOICE' and 'STEREO' not in str(raised.value)
+    assert load_camera(f'{path}:LEFT_CAM_HD').camera == WANTED
+    with pytest.raises(InputError) as raised:
+        load_camera(path, 'RIGHT_CAM_HD')
+    assert raised.value.code == 'E-CALIBRATION-NO-SIZE'
+
+
+@pytest.mark.parametrize(('name', 'text', 'code'), [
+    ('a.conf', '[STEREO]\nBaseline=120\n', 'E-CALIBRATION-FORMAT'),
+    ('a.txt', 'Results\n=====\n  a: [1 2\n b: x: y\n', 'E-CALIBRATION-FORMAT'),
+    ('a.toml', '[cam]\nK = [[700, 0, 604],\n [0, 702, 186], [0, 0, 1]]\n',
+     'E-CALIBRATION-FORMAT'),
+    ('a.m', 'K = [700 0 604; 0 702 186; 0 0 1];\n', 'E-CALIBRATION-FORMAT'),
+    ('a.json', '{"fx": 700,,}', 'E-JSON-INVALID'), ('a', '{"fx": 700,,}', 'E-JSON-INVALID'),
+    ('a.yaml', 'camera_matrix: [\n', 'E-YAML-INVALID'),
+    ('a.json', '{"value0": {"camera_type": "ds"}}', 'E-CALIBRATION-FORMAT'),
+    ('results-cam.txt', 'Calibration results\n====\ncam0 (/image_raw):\n'
+     '    distortion: [0.02 -0.007 0.1 0.1] +- [0.1 0.1 0.1 0.1]\n'
+     '    projection: [700. 702. 604. 186.] +- [1. 1. 1. 1.]\n', 'E-KALIBR-RESULTS')])
+def test_a_parser_s_message_is_for_a_file_of_its_format(tmp_path, name, text, code):
+    with pytest.raises(InputError) as raised:
+        read(tmp_path, text, name)
+    assert raised.value.code == code
+    assert 'use' in str(raised.value) and ('says: ds' in str(raised.value)) == ('"ds"' in text)
 
 
 @pytest.mark.parametrize(('missing', 'zeros'), [

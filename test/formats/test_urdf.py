@@ -82,3 +82,13 @@ def test_without_a_mounting_it_is_refused(kind):
     with pytest.raises(ConfigError) as raised:
         export(TRUTH, kind)
     assert raised.value.code == 'E-EXPORT-NO-MOUNTING'
+
+
+@pytest.mark.parametrize('name', ['base/result.json', 'base.yaml'])
+def test_no_link_is_its_own_parent(name):
+    found = NamedCamera(name, TRUTH, mount=MOUNT)
+    root = ElementTree.fromstring(export(found, 'urdf'))
+    links = [each.get('name') for each in root.findall('link')]
+    assert links == ['base_link', 'base_camera_link', 'base_camera_optical_frame']
+    assert all(parent != child for child, (parent, *_) in joints(export(found, 'urdf')).items())
+    assert 'base_camera_optical_frame' in export(found, 'tf')

@@ -119,7 +119,7 @@ def test_our_block_has_sigma_verdict_and_provenance():
 
 
 def test_full_precision_survives_the_round_trip(tmp_path):
-    odd = dataclasses.replace(TRUTH, fx=2 / 3 * 1000, k1=-1e-17 / 3, k2=1e5 / 7)
+    odd = dataclasses.replace(TRUTH, fx=2 / 3 * 1000, k1=-1e-17 / 3, k2=1 / 7)
     path = tmp_path / 'calibration.yaml'
     path.write_text(calibration_yaml(make_calibration(camera=odd)), encoding='utf-8')
     camera = load_with_faults(path)
@@ -301,7 +301,7 @@ def test_another_tool_s_fisheye_loads(tmp_path, name):
      '9 numbers'),
     ('data: [500, 0, 320', 'data: [0, 0, 320', 'E-CALIBRATION-EMPTY', ''),
     ('data: [500, 0, 320', 'data: [.nan, 0, 320', 'E-CALIBRATION-NUMBER', 'camera_matrix'),
-    ('distortion_coefficients', 'distortion_coefficents', 'E-NO-DISTORTION',
+    ('distortion_coefficients', 'distortion_coefficents', 'E-LENS-COEFFICIENTS',
      'distortion_coefficients'),
     ('camera_matrix', 'matrix', 'E-CALIBRATION-FORMAT', ''),
     ('image_width: 640', 'image_width: [', '', 'valid YAML'),

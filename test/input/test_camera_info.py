@@ -158,7 +158,7 @@ def test_a_bag_that_a_killed_process_left_half_written_is_removed(bag, tmp_path)
 
 def test_the_command_says_why_there_is_no_bag(bag, tmp_path):
     """Five grey images make no calibration, so there must be no bag."""
-    command = [sys.executable, '-m', 'dashcalib_ros.cli', 'run', str(bag), '--out',
+    command = [sys.executable, '-m', 'dashcalib_ros', 'run', str(bag), '--out',
                str(tmp_path / 'result'), '--write-bag', str(tmp_path / 'new')]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 3 and 'no bag was written' in done.stderr, done.stderr

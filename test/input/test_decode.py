@@ -1,10 +1,14 @@
 """Image messages become the right grey pixels, whatever their encoding."""
 import array
+import gzip
 import struct
+import zlib
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+import zstandard
 from fakes import compressed_message, image_message
 from hostile_pictures import QUICK, SLOW, empty_scans
 from refused import refused
@@ -349,3 +353,32 @@ def test_the_range_of_temperatures_grows_rarely_and_never_shrinks():
 def test_cameras_whose_values_begin_at_0_are_as_before():
     pixels = np.linspace(100, 4000, 2400).reshape(40, 60).astype(np.uint16)
     np.testing.assert_array_equal(decode(message('mono16', pixels), BitDepth()), pixels >> 4)
+
+
+def as_zstd(pack, encoding='bgr8', step=12, data=bytes(range(24))):
+    """Return what zstd_image_transport makes of an image of 4x2 pixels."""
+    return SimpleNamespace(format='zstd', data=struct.pack(
+        '<IIBII', 2, 4, 0, step, len(encoding)) + encoding.encode() + pack(data))
+
+
+@pytest.mark.parametrize('pack', [gzip.compress, zlib.compress, zstandard.compress])
+def test_a_raw_image_that_is_packed(pack):
+    given = as_zstd(pack)
+    assert message_size(given) == (4, 2)
+    plain = SimpleNamespace(encoding='bgr8', height=2, width=4, step=12, is_bigendian=0,
+                            data=bytes(range(24)))
+    for colour in (False, True):
+        np.testing.assert_array_equal(decode(given, colour=colour),
+                                      decode(plain, colour=colour))
+
+
+@pytest.mark.parametrize(('given', 'code'), [
+    (as_zstd(lambda data: gzip.compress(data)[:-12]), 'E-IMAGE-LAYOUT'),
+    (as_zstd(lambda data: b'junk' + data), 'E-IMAGE-DAMAGED'),
+    (as_zstd(gzip.compress, data=bytes(2**24)), 'E-IMAGE-LAYOUT'),
+    (as_zstd(gzip.compress, step=2**31), 'E-IMAGE-LAYOUT'),
+    (as_zstd(gzip.compress, encoding='32FC1'), 'E-IMAGE-ENCODING'),
+    (SimpleNamespace(format='zstd', data=b'short'), 'E-IMAGE-DAMAGED')])
+def test_a_packed_image_that_is_none(given, code):
+    with refused(InputError, code):
+        decode(given)

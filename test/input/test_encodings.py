@@ -80,6 +80,29 @@ def test_a_video_in_messages_is_decoded(tmp_path, kind, codec, name, plugin):
 
 
 @pytest.mark.parametrize('kind', [PACKET, 'foxglove_msgs/msg/CompressedVideo'])
+@pytest.mark.parametrize(('codec', 'name', 'options'), [
+    ('libsvtav1', 'librav1e', {'preset': '12', 'svtav1-params': 'lookahead=0:pred-struct=1'}),
+    ('libvpx-vp9', 'vp9', {'deadline': 'realtime', 'lag-in-frames': '0'}),
+    ('libvpx', 'vp8', {'deadline': 'realtime', 'lag-in-frames': '0'})])
+def test_a_video_of_other_codecs_is_decoded_without_hardware(tmp_path, kind, codec, name, options):
+    packets = encoded(levels(), codec, 8, **options)
+    bag = write_packets(tmp_path / 'bag', packets, kind, name)
+    source = open_frames(bag)
+    assert np.allclose(brightness(source), range(20), atol=1) and not source.warnings
+    late = open_frames(write_packets(tmp_path / 'late', packets[3:], kind, name))
+    assert np.allclose(brightness(late), range(8, 20), atol=1)
+    assert 'the first 5 images' in ' '.join(late.warnings)
+
+
+def test_a_decoder_that_fails_is_named(tmp_path, monkeypatch):
+    packets = encoded(levels(), 'libsvtav1', 8, preset='12')
+    bag = write_packets(tmp_path / 'bag', packets, PACKET, 'librav1e')
+    monkeypatch.setattr('dashcalib_ros.input.packets.SOFTWARE', {})
+    with refused(InputError, 'E-VIDEO-DECODER', bag, 'av1'):
+        list(open_frames(bag))
+
+
+@pytest.mark.parametrize('kind', [PACKET, 'foxglove_msgs/msg/CompressedVideo'])
 def test_a_video_in_a_bag_of_ros_1(tmp_path, kind):
     store = types(Stores.ROS1_NOETIC)
     with Writer1(tmp_path / 'drive.bag') as writer:

@@ -250,12 +250,52 @@ def test_one_that_cannot_be_read_is_left_out(tmp_path):
 
 
 def test_none_that_can_be_read(tmp_path):
-    for name in 'ab':
-        (tmp_path / f'{name}.mp4').write_bytes(b'junk' * 999)
-    fails('E-VIDEO-UNREADABLE', [tmp_path / 'a.mp4', tmp_path / 'b.mp4'], tmp_path / 'a.mp4',
-          '1 more like it')
+    for name in ('a.mp4', 'b.mp4', 'c.mcap', 'd.mcap'):
+        (tmp_path / name).write_bytes(b'junk' * 999)
+    line = fails('E-VIDEO-UNREADABLE', [tmp_path / f'{name}' for name in (
+        'a.mp4', 'b.mp4', 'c.mcap', 'd.mcap')], 'a.mp4', 'b.mp4', 'c.mcap', 'd.mcap')
+    # each reason once
+    assert line.count('ffmpeg') == 1
+    line = fails('E-BAG-NOT-A-RECORDING', tmp_path, 'c.mcap', 'd.mcap')
     fails('E-INPUT-NO-MATCH', str(tmp_path / '*.avi'), tmp_path / '*.avi')
     fails('E-INPUT-MISSING', [])
+
+
+def segments(tmp_path, numbers):
+    """Write videos of one name in numbered folders, each of another brightness."""
+    found = []
+    for number in numbers:
+        folder = tmp_path / f'route--{number}'
+        folder.mkdir()
+        found.append(write_video(folder / 'road.avi', [
+            Frame(n, 0, np.full((48, 64), 40 + 5 * number, np.uint8)) for n in range(4)]))
+    return found
+
+
+@pytest.mark.parametrize('how', ['pattern', 'shell'])
+def test_segments_of_one_name_are_told_by_their_folders(tmp_path, how):
+    paths = segments(tmp_path, (0, 2, 10))
+    source = open_frames(str(tmp_path / 'route--*/road.avi') if how == 'pattern' else
+                         sorted(map(str, paths)))
+    assert np.allclose(brightness(source)[::4], [40, 50, 90], atol=1)
+    [warning] = source.warnings
+    assert warning.code == 'E-FILES-ORDERED'
+    assert 'route--0, route--2, route--10' in warning and 'road' not in warning.split(': ', 1)[1]
+    assert 'route--1, route--3' in warning and 'route--9' in warning
+
+
+def test_an_order_that_is_not_alphabetical_is_kept(tmp_path):
+    zero, two, ten = segments(tmp_path, (0, 2, 10))
+    source = open_frames([ten, zero, two])
+    assert np.allclose(brightness(source)[::4], [90, 40, 50], atol=1)
+    assert source.warnings == ()
+
+
+@pytest.mark.parametrize('numbers', [(0, 1, 2), (10, 20, 30), (0, 25)])
+def test_numbers_that_may_have_no_others_between_them_are_no_gap(tmp_path, numbers):
+    segments(tmp_path, numbers)
+    [warning] = open_frames(str(tmp_path / 'route--*/road.avi')).warnings
+    assert 'missing' not in warning
 
 
 def test_one_that_breaks_while_it_is_read(tmp_path):

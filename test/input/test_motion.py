@@ -3,10 +3,11 @@ from __future__ import annotations
 
 import sys
 import tracemalloc
+from datetime import datetime, timezone
 
 import numpy as np
 import pytest
-from made_drives import ROS2, START, drive, head, image, images, write_bag
+from made_drives import ROS2, START, drive, head, image, images, write_bag, write_timed
 from made_gopro import gopro
 from refused import refused
 
@@ -23,6 +24,7 @@ from dashcalib_ros.input.motion import (
 )
 from dashcalib_ros.input.motion_files import bag_motion, read_motion
 from dashcalib_ros.limits import LINE, read_lines
+from dashcalib_ros.session import open_drive
 
 NONE: dict[str, str | None] = {}
 
@@ -238,12 +240,91 @@ def test_a_kitti_oxts_folder_counts_from_its_first_image(tmp_path):
     (tmp_path / 'image_00').mkdir()
     write(tmp_path / 'image_00' / 'timestamps.txt', '2011-09-26 13:02:25.050000000\n')
     for place in (tmp_path, tmp_path / 'oxts'):
-        found = read_motion(place)
+        found = read_motion(place).since(0.0)
         assert found.rate.stamps_s[0] == pytest.approx(-0.05, abs=1e-6)
         assert len(found.rate.values) == 11 and found.rate.values[-1].tolist() == [0.1, 0.2, 1.1]
         assert found.speed.values[0, 0] == 7.0
     with refused(InputError, 'E-MOTION-FOLDER', data):
         read_motion(data)
+
+
+def test_records_of_oxts_have_the_time_of_their_number(tmp_path):
+    # line 5 is empty, as its record is missing
+    there = [n for n in range(30) if n != 5]
+    data = tmp_path / 'oxts' / 'data'
+    data.mkdir(parents=True)
+    for n in there:
+        values = np.zeros(30)
+        values[17:20] = n / 10
+        write(data / f'{n:010}.txt', ' '.join(map(str, values)))
+    lines = [f'2011-09-26 13:02:{25 + n // 10}.{n % 10}' for n in range(30)]
+    write(tmp_path / 'oxts' / 'timestamps.txt',
+          '\n'.join(line if n != 5 else '' for n, line in enumerate(lines)) + '\n')
+    found = read_motion(tmp_path).since(0.0).rate
+    np.testing.assert_allclose(found.stamps_s, found.values[:, 0], atol=1e-5)
+    assert len(found.values) == 29
+    # images with times of day of their own; of another clock; and a later part of a drive
+    begin = datetime(2011, 9, 26, 13, 2, 26, tzinfo=timezone.utc).timestamp()
+    assert read_motion(tmp_path).since(begin).first_s == pytest.approx(-1.0)
+    assert read_motion(tmp_path).since(START / 1e9).first_s == pytest.approx(0.0)
+    assert read_motion(tmp_path).since(2.0).first_s == pytest.approx(-2.0)
+    # a record of no line, and lines of no record
+    (data / f'{7:010}.txt').rename(data / f'{70:010}.txt')
+    (data / f'{8:010}.txt').unlink()
+    with refused(InputError, 'E-MOTION-UNPAIRED', '28 records', '30 lines'):
+        read_motion(tmp_path)
+
+
+@pytest.mark.parametrize('stray', [-7200, -3600, 3600, 86400])
+@pytest.mark.parametrize('place', [0, 30, 59])
+def test_one_stamp_of_another_clock_costs_one_point(tmp_path, stray, place):
+    times = START / 1e9 + np.arange(60.0)
+    times[place] += stray
+    texts = [f'<time>{datetime.fromtimestamp(each, timezone.utc):%Y-%m-%dT%H:%M:%SZ}</time>'
+             for each in times]
+    found = read_motion(write(tmp_path / 'track.gpx', gpx(texts)))
+    assert len(found.position.stamps_s) == 59 and np.ptp(found.position.stamps_s) < 60
+    [told] = found.warnings
+    assert told.code == 'E-MOTION-OTHER-CLOCK' and '1 of 60 positions' in told
+
+
+def by_day(first_s, last_s):
+    stamps_s = np.arange(first_s, last_s)
+    return SensorStream(rate=Samples(stamps_s, np.zeros((len(stamps_s), 3))), absolute=True)
+
+
+def test_the_time_of_a_recording_tells_where_a_video_lies_in_a_stream(tmp_path):
+    video = write_timed(tmp_path / 'a.mp4', created='2023-11-14T22:13:20.000000Z')
+    begin = START / 1e9
+    found = open_drive(video, motion=by_day(begin - 30, begin + 60)).motion
+    assert found.since(0.0).first_s == -30.0 and found.since(0.0).doubt_s > 1.0
+    assert found.since(0.4).first_s == pytest.approx(-30.4) and found.warnings == ()
+    # a time zone; and another day, which is no zone
+    for later, zone in ((7200, ' 2 h '), (-19800, ' 5.5 h '), (10 * 86400, '')):
+        found = open_drive(video, motion=by_day(begin + later - 30, begin + later + 60)).motion
+        [told] = found.warnings
+        assert told.code == 'E-MOTION-OTHER-DAY' and zone in told
+        assert ('zone' in told) == bool(zone) and found.since(0.0).first_s == 0.0
+    # several files begin with their first one
+    other = write_timed(tmp_path / 'b.mp4', created='2023-11-14T22:14:20.000000Z')
+    assert open_drive([video, other], motion=by_day(
+        begin - 30, begin + 60)).motion.since(0.0).first_s == -30.0
+
+
+def test_a_file_counts_from_the_first_image_of_the_whole_drive(tmp_path):
+    video = write_timed(tmp_path / 'a.mp4')
+    path = gyro_csv(tmp_path)
+    assert open_drive(video, motion=path, start_s=0.2).motion.first_s == pytest.approx(-0.2)
+
+
+def test_images_and_a_file_on_one_uptime(tmp_path):
+    folder = tmp_path / 'images'
+    folder.mkdir()
+    for n in range(20):
+        (folder / f'{98_700_000_000 + n * 50_000_000}.png').touch()
+    path = write(tmp_path / 'imu.csv', 'stamp_s,speed\n' + '\n'.join(
+        f'{90 + n / 10},5' for n in range(200)))
+    assert open_drive(folder, motion=path).motion.since(98.7).first_s == pytest.approx(-8.7)
 
 
 @pytest.mark.parametrize('lost', ['0,0', '91,8', '49,361'])
@@ -270,7 +351,7 @@ def test_the_equator_and_the_meridian_of_greenwich_are_places(tmp_path):
     assert len(found.position.stamps_s) == 60 and found.warnings == ()
 
 
-def imu(n, topic='/imu', stamp_ns=None):
+def imu(n, topic='/imu', stamp_ns=None, gyro=True):
     types = ROS2.types
     vector = types['geometry_msgs/msg/Vector3']
     none = np.zeros(9)
@@ -278,7 +359,8 @@ def imu(n, topic='/imu', stamp_ns=None):
         header=head(START + n * 10**7 if stamp_ns is None else stamp_ns, ROS2),
         orientation=types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=none, angular_velocity=vector(x=0.1, y=0.2, z=float(n) / 100),
-        angular_velocity_covariance=none, linear_acceleration=vector(x=0.0, y=0.0, z=9.8),
+        angular_velocity_covariance=none if gyro else none - np.eye(9)[0],
+        linear_acceleration=vector(x=0.0, y=0.0, z=9.8),
         linear_acceleration_covariance=none)
     return topic, START + n * 10**7, message
 
@@ -314,6 +396,15 @@ def test_a_bags_topics_are_found_by_their_type(tmp_path):
     assert len(since.position.values) == 9 and since.speed.values[0, 0] == 7.0
     alone = write_bag(tmp_path / 'odometry', [twist(n) for n in range(12)])
     assert bag_motion([alone], NONE).rate.values[0].tolist() == [0.0, 0.0, 0.5]
+
+
+def test_an_imu_without_a_gyro_and_a_gps_without_a_fix_measure_nothing(tmp_path):
+    silent = [*(imu(n, gyro=False) for n in range(40)), *(fix(n, status=-1) for n in range(9))]
+    found = bag_motion([write_bag(tmp_path / 'bag', silent)], NONE)
+    assert found.empty and [each.code for each in found.warnings] == ['E-MOTION-NOT-USED'] * 2
+    found = bag_motion([write_bag(tmp_path / 'two', [*silent, *(twist(n) for n in range(12))])],
+                       NONE)
+    assert found.rate.values[0].tolist() == [0.0, 0.0, 0.5]
 
 
 def test_without_sensors_a_bag_has_none(tmp_path):

@@ -106,11 +106,7 @@ def test_only_so_many_overlapping_chunks_are_in_memory(tmp_path, monkeypatch):
     frames = drive(6)
     file = write_mcap(tmp_path / 'drive.mcap', [frames[n] for n in (0, 3, 1, 4, 2, 5)],
                       chunk_size=4000)
-    with bag_read.WITHIN_LIMIT, bag_read._reader(file):
-        pass
     monkeypatch.setattr(bag_read, 'OVERLAPPING_BYTES', 1)
-    with bag_read.WITHIN_LIMIT, refused(InputError, 'E-BAG-INDEX', 'overlap'):
-        bag_read._reader(file).open()
     # in the order of the file, where what comes late is left out
     read = [frame.stamp_ns for frame in open_frames(file)]
     assert read == [frames[n].stamp_ns for n in (0, 3, 4, 5)]
@@ -145,7 +141,7 @@ def test_a_query_of_a_database_ends(tmp_path, monkeypatch):
             f'{COUNTED.format(" LIMIT 5000")} SELECT n, 1, n, x\'00\' FROM c;')
     with bag_read.WITHIN_LIMIT, pytest.raises(Exception, match='interrupted'):
         bag_read._reader(tmp_path / 'odd.db3').open()
-    fails('E-BAG-NO-IMAGES', tmp_path / 'odd.db3')
+    fails('E-BAG-TYPE-MISSING', tmp_path / 'odd.db3')
 
 
 def test_a_ros1_bag_s_index_names_each_chunk_once(tmp_path):

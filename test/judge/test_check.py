@@ -11,17 +11,19 @@ import pytest
 from solving import CONFIG, scenes_of, solved
 from synthetic import LENS, SIZE
 
-from dashcalib_ros.camera import Brown, Fisheye
+from dashcalib_ros.camera import Brown, Fisheye, Radial, misread
 from dashcalib_ros.camera.mapping import apart, as_model
-from dashcalib_ros.judge import Verdict, check
+from dashcalib_ros.judge import Check, Verdict, check, with_faults
 from dashcalib_ros.judge.difference import (
     SURE,
     Difference,
     answers_of,
     difference_of,
     distance,
+    reasons_of,
 )
 from dashcalib_ros.report import NamedCamera, compare
+from dashcalib_ros.report.compare import answers
 from dashcalib_ros.solve.spread import PictureSigma
 
 ACCEPTED = Verdict('accepted')
@@ -46,9 +48,9 @@ def test_the_truth_is_right_also_where_pixels_begin_elsewhere(solution, shift):
 
 
 @pytest.mark.parametrize(('changes', 'way'), [
-    ({'fx': 1.02 * LENS.fx}, r'focal length: fx [12]\.\d % too long'),
-    ({'fx': 0.97 * LENS.fx, 'fy': 0.97 * LENS.fy}, r'focal length: [23]\.\d % too short'),
-    ({'k1': LENS.k1 + 0.03}, r'distortion: off by k1 \+0\.0[23]'),
+    ({'fx': 1.02 * LENS.fx}, r'focal length: fx [12]\.\d ± 0\.\d % too long'),
+    ({'fx': 0.97 * LENS.fx, 'fy': 0.97 * LENS.fy}, r'focal length: [23]\.\d ± 0\.\d % too short'),
+    ({'k1': LENS.k1 + 0.03}, r'distortion: off by k1 \+0\.0[23]\d* ± 0\.0'),
     ({'cx': LENS.cx - 12.0}, 'centre: 1'),
     ({'cy': LENS.cy + 60.0}, r'is the calibration for another part of the picture\?'),
 ])
@@ -93,7 +95,7 @@ def test_the_farther_off_the_graver_the_answer(solution, noise, way, sign):
         assert each.told_apart == (each.distance > each.limit)
         assert (each.answer in ('right', 'differs')) <= ('detection' in each.good_for)
         for use, limit in each.limits_px.items():
-            assert (use in each.good_for) == (each.rms_px <= limit
+            assert (use in each.good_for) == (each.answer != 'wrong' and each.rms_px <= limit
                                               and each.bound_px <= SURE * limit)
 
 
@@ -164,7 +166,7 @@ def test_a_centre_that_is_shown_to_be_far_off_is_wrong(offset, sigma, answer):
     given = replace(LENS, cx=LENS.cx + offset)
     found = Difference(given, LENS, given.params - LENS.params, covariance, apart(given, LENS),
                        PictureSigma(0.1, 0.2))
-    assert found.answer == answer and found.good_for
+    assert found.answer == answer and bool(found.good_for) == (answer != 'wrong')
     assert ('centre is off' in answers_of(found, '')[2]) == (answer == 'wrong')
 
 
@@ -276,6 +278,57 @@ def test_the_part_that_explains_most_comes_first():
     found = Difference(LENS, LENS, offsets, covariance, None, PictureSigma(0.1, 0.2))
     ways = found.ways()
     assert list(ways) == ['centre', 'focal length']
-    np.testing.assert_allclose(ways['centre'], [0.0, 30.0], atol=1e-9)
-    np.testing.assert_allclose(ways['focal length'], [8.1, 0.0], atol=1e-9)
+    np.testing.assert_allclose(ways['centre'], [[0.0, 30.0], [1.0, 1.0]], atol=1e-9)
+    # and its sigma is what k1 leaves: sqrt(1 - 0.9^2)
+    np.testing.assert_allclose(ways['focal length'], [[8.1, 0.0], [0.19**0.5, 1.0]], atol=1e-9)
     assert distance(np.zeros(0), np.zeros((0, 0))) == 0.0
+
+
+def test_coefficients_that_compensate_each_other_stand_with_what_is_known_of_them():
+    # k1 and k2 together are known ten times better than each alone
+    covariance = np.diag([1.0, 1.0, 1.0, 1.0, 4e-4, 1.6e-3])
+    covariance[4, 5] = covariance[5, 4] = -0.99 * np.sqrt(4e-4 * 1.6e-3)
+    found = Difference(LENS, LENS, np.array([0, 0, 0, 0, 0.03, 0.04]), covariance, apart(
+        replace(LENS, k1=LENS.k1 + 0.03), LENS), PictureSigma(0.1, 0.2))
+    [text] = [each for each in reasons_of(found) if each.startswith('distortion')]
+    assert 'k1 +0.030 ± 0.020' in text and 'k2 +0.040 ± 0.040' in text
+    alone = replace(found, covariance=np.diag([1.0, 1.0, 1.0, 1.0, 1e-6, 1.0]))
+    [text] = [each for each in reasons_of(alone) if each.startswith('distortion')]
+    assert 'k1 +0.0300 ± 0.0010' in text and 'k2' not in text
+
+
+@pytest.mark.parametrize('given', [as_model(LENS, Fisheye), LENS], ids=['fisheye', 'radial'])
+def test_a_distortion_model_that_is_the_wrong_one_is_named(given):
+    # a strong lens: with the numbers read as those of the other family, it is far off
+    strong = replace(LENS, k1=-0.2, k2=0.03)
+    right = strong if given is LENS else as_model(strong, Fisheye)
+    wrong = misread(right)
+    found = compare(NamedCamera('a', wrong), NamedCamera('b', right))
+    other = right.ros_model
+    assert found.answer == 'wrong' and f'read as {other}' in found.misread
+    assert found.misread in answers(found)[-1] and found.to_dict()['misread'] == found.misread
+    assert not compare(NamedCamera('b', right), NamedCamera('b', right)).misread
+    far = NamedCamera('c', replace(right, fx=1.1 * right.fx, fy=1.1 * right.fy))
+    assert not compare(NamedCamera('a', wrong), far).misread
+
+
+def test_check_names_the_wrong_distortion_model(solution):
+    own = solution.camera
+    assert isinstance(own, Radial)
+    found = ask(misread(own), solution)
+    assert found.answer == 'wrong' and 'distortion_model' in found.next_step
+    assert any('read as plumb_bob instead of equidistant' in each for each in found.reasons)
+
+
+@pytest.mark.parametrize(('answer', 'good_for', 'words'), [
+    ('right', ('detection', 'mapping', 'metrology'), ('keep it for detection, mapping',)),
+    ('right', ('detection',), ('keep it for detection; for mapping, metrology:', 'more turns')),
+    ('differs', ('detection',), ('keep it for detection; for mapping, metrology:', 'replace it')),
+    ('wrong', (), ('replace it', 'dashcalib run')), ('cannot tell', (), ('sharper turns',)),
+    ('right', (), ('keep it',))])
+def test_an_answer_ends_with_what_to_do(answer, good_for, words):
+    limits = dict.fromkeys(('detection', 'mapping', 'metrology'), 1.0) if good_for else {}
+    found = Check(answer, ('why',), limits_px=limits, good_for=good_for)
+    assert all(each in found.next_step for each in words)
+    faulty = with_faults(found, ('R is not a rotation',))
+    assert (faulty.answer, faulty.good_for) == ('wrong', ()) and 'correct' in faulty.next_step

@@ -13,9 +13,9 @@ from dashcalib_ros.camera.mapping import as_model
 from dashcalib_ros.detect.turn import TurnId
 from dashcalib_ros.judge import Reading, watch
 from dashcalib_ros.judge.monitor import readings_of
+from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.reconstruct.heading import Heading, heading
 from dashcalib_ros.solve import start
-from dashcalib_ros.problem.quadratic import Quadratic
 
 NOTHING = Quadratic.prior(np.zeros((6, 6)))
 ZOOMED = replace(LENS, fx=1.03 * LENS.fx, fy=1.03 * LENS.fy)

@@ -26,12 +26,12 @@ def test_lines_take_back_a_good_answer_and_nothing_else(answer, off, expected):
         made_lines(LENS, noise_px=0.05), SIZE, Config())
     assert found.answer == expected and found.reasons[0] == 'the turns say so'
     assert found.straight_lines.k1 == pytest.approx(-off, abs=0.02)
-    assert ('they agree' in found.reasons[1]) == (off == 0.0)
+    assert (' agree' in found.reasons[1]) == (off == 0.0)
 
 
 @pytest.mark.parametrize(('k1', 'words'), [
-    (0.019, 'they agree'), (0.033, 'they lean against'), (0.041, 'they contradict'),
-    (-0.041, 'they contradict')])
+    (0.019, ' agree'), (0.033, ' lean against'), (0.041, ' contradict'),
+    (-0.041, ' contradict')])
 def test_three_sigmas_are_no_agreement(k1, words):
     said = Bend(lines=1000, groups=4, bend_px=0.2, k1=k1, sigma=0.01, camera_sigma=None,
                 picture_px=7.0)

@@ -209,13 +209,37 @@ def gps(drive, stream, solution=None):
 
 def test_gps_headings_say_nothing_where_the_straights_are_short(drive):
     # six metres before and after each turn
-    assert gps(drive, fixes(drive, 0.02)) == (None, ())
+    said, [line] = gps(drive, fixes(drive, 0.02))
+    assert said is None and line.code == 'E-GPS-NO-STRAIGHTS'
+
+
+@pytest.mark.parametrize(('later_s', 'words'), [
+    (3600.0, ' 1 h earlier'), (-12600.0, ' 3.5 h later'), (1e6, 'clock')])
+def test_gps_of_another_time_is_named_with_its_zone(drive, later_s, words):
+    said, [line] = gps(drive, fixes(drive, 0.02).shifted(later_s))
+    assert said is None and line.code == 'E-GPS-NO-SAMPLES' and words in line
+
+
+def test_a_gyro_finds_its_place_where_the_images_have_whole_seconds(drive):
+    for late_s in (-1.4, 0.0, 1.3):
+        stream = dataclasses.replace(gyro(drive, late_s=late_s), doubt_s=1.5)
+        said, lines = asked(drive, stream)
+        assert lines == () and said.agrees and abs(said.time_offset_s - late_s) < 0.003
+    # so its GPS is not compared without a gyro
+    said, [line] = gps(drive, dataclasses.replace(fixes(drive, 0.02), doubt_s=1.5))
+    assert said is None and line.code == 'E-GPS-CLOCK'
+
+
+def test_a_speed_of_another_time_is_named(drive):
+    speed = SensorStream(speed=Samples(np.arange(1e4, 1e4 + 50), np.full((50, 1), 9.0)))
+    assert [each.code for each in asked(drive, speed)[1]] == ['E-SPEED-NO-SAMPLES']
 
 
 def test_noisy_gps_does_no_harm(drive):
     for seed in range(5):
         said, lines = gps(drive, fixes(drive, 3.0, 1.0, seed))
-        assert lines == () and (said is None or said.agrees)
+        assert [each.code for each in lines] == (['E-GPS-NO-STRAIGHTS'] if said is None else [])
+        assert said is None or said.agrees
 
 
 def alone(drive, turn):

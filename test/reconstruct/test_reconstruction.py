@@ -14,6 +14,7 @@ from dashcalib_ros.detect import TurnId
 from dashcalib_ros.detect.points import follow_points
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.input import Frame
+from dashcalib_ros.problem.observations import Structure, Tracks
 from dashcalib_ros.reconstruct import adjust, build, focal_profile, register
 from dashcalib_ros.reconstruct import tracks as track_module
 from dashcalib_ros.reconstruct.adjust import Solver
@@ -22,7 +23,6 @@ from dashcalib_ros.reconstruct.register import register_tracks
 from dashcalib_ros.reconstruct.scene import (
     Profile,
     Scene,
-    Structure,
     errors_px,
     ray_errors_px,
     residuals_px,
@@ -30,7 +30,7 @@ from dashcalib_ros.reconstruct.scene import (
     triangulate,
     truncated_cost,
 )
-from dashcalib_ros.reconstruct.tracks import Tracks, longest, spread, thinned, track_turn
+from dashcalib_ros.reconstruct.tracks import longest, spread, thinned, track_turn
 
 CONFIG = SceneConfig()
 NO_PROFILE = Profile(np.ones(1), np.ones(1), 1)

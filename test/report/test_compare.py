@@ -20,11 +20,20 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from dashcalib_ros.camera import Brown, Fisheye, Radial, camera_from_ros
+from dashcalib_ros.camera.field import TERMS as FIELD_TERMS
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.camera.mapping import apart, mapping_error
 from dashcalib_ros.errors import InputError
-from dashcalib_ros.formats import calibrated_camera, calibration_yaml, load_camera, result_json
+from dashcalib_ros.formats import (
+    calibrated_camera,
+    calibration_yaml,
+    load_calibration,
+    load_camera,
+    result_json,
+)
+from dashcalib_ros.judge.calibration import LensField
 from dashcalib_ros.report import NamedCamera, compare
-from dashcalib_ros.report.compare import answers
+from dashcalib_ros.report.compare import answers, comparison_rows
 from dashcalib_ros.report.page import difference_html
 from dashcalib_ros.solve.spread import PictureSigma
 
@@ -131,10 +140,19 @@ def test_mapping_error_against_a_fisheye_agrees_with_the_scoring_tool(estimate):
     assert mapping_error(estimate, WIDE) == pytest.approx(expected, rel=1e-6)
     found = compare(NamedCamera('estimate', estimate), NamedCamera('truth', WIDE))
     assert found.unseen == pytest.approx(1 - np.mean(kept))
-    assert found.as_dict()['unseen'] == found.unseen and (found.unseen == 0) == fisheye
+    assert found.to_dict()['unseen'] == found.unseen and (found.unseen == 0) == fisheye
     # a coefficient of the same name has another meaning in another family
-    assert [row.name for row in found.differences] == list(
-        WIDE.names() if fisheye else ('fx', 'fy', 'cx', 'cy'))
+    own = [f'{name} ({camera.model})' for camera in (estimate, WIDE)
+           for name in camera.names()[4:]]
+    assert [row.name for row in found.differences] == (
+        list(WIDE.names()) if fisheye else ['fx', 'fy', 'cx', 'cy', *own])
+    if not fisheye:
+        rows = {row.name: row for row in found.differences}
+        assert (rows['k1 (fisheye)'].a, rows['k1 (fisheye)'].b) == (None, WIDE.k1)
+        assert rows[own[0]].a == estimate.k1 and rows[own[0]].difference is None
+        assert dict(zip(own, comparison_rows(found)[1][4:], strict=True))['k1 (fisheye)'][1:4] == (
+            '-', '-0.0200', '-')
+        json.dumps(found.to_dict(), allow_nan=False)
 
 
 @pytest.mark.parametrize('k2', [0.0, 0.1])
@@ -260,8 +278,8 @@ def test_a_truth_has_numbers_that_a_computer_can_hold(tmp_path, number):
 
 @pytest.mark.parametrize(('change', 'complaint'), [
     ({'k1': 1e300}, 'k1 = 1e.300'), ({'k2': -1e300}, 'k2 = -1e'),
-    ({'fx': 1e300}, 'fx = 1e'), ({'cy': -1e9}, 'cy = -1e'), ({'fx': 1e-300}, 'sees no ray'),
-    ({'cx': 1e6, 'k1': -1}, 'sees no ray'), ({'width': 60_000, 'height': 60_000}, 'million')])
+    ({'fx': 1e300}, 'fx = 1e'), ({'cy': -1e9}, 'cy = -1e'), ({'fx': 1e-300}, 'times fx'),
+    ({'cx': 1e6, 'k1': -1}, 'off the middle'), ({'width': 60_000, 'height': 60_000}, 'million')])
 def test_numbers_that_no_lens_has_are_one_line(tmp_path, change, complaint):
     path = tmp_path / 'truth.json'
     path.write_text(json.dumps({'width': 640, 'height': 480, 'fx': 400, 'fy': 400, 'cx': 320,
@@ -307,7 +325,7 @@ def test_a_drive_given_by_mistake_is_not_read_whole(tmp_path):
 def test_the_comparison_is_strict_json():
     found = compare(NamedCamera('a', TRUTH, {**SIGMA, 'k1': math.nan}),
                     dataclasses.replace(REFERENCE, verdict='weak'))
-    data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert data['b'] == {'name': 'truth', 'verdict': 'weak'}
     assert data['parameters']['k1']['z'] is None
     assert data['parameters']['fx'] == {
@@ -381,12 +399,12 @@ def test_how_the_camera_sits_is_compared_where_both_files_say(tmp_path, name):
     moved = dataclasses.replace(MOUNT, moved_s=17.5)
     assert before.mount == MOUNT and of(moved).mount == moved and of(None).mount is None
     found = compare(now, before)
-    mount = found.as_dict()['mount']
+    mount = found.to_dict()['mount']
     assert mount['moved'] and set(mount) == {'moved', 'yaw_left_deg', 'pitch_up_deg'}
     assert mount['yaw_left_deg'] == pytest.approx({'difference': 1.0, 'sigma': 0.1 * 2**0.5})
     assert 'yaw 1.00 ± 0.14° to the left' in answers(found)[-1] and 'moved' in answers(found)[-1]
     assert 'moved' not in answers(compare(before, before))[-1]
-    assert compare(now, of(None)).as_dict()['mount'] is None
+    assert compare(now, of(None)).to_dict()['mount'] is None
     assert not any('mounting' in line for line in answers(compare(now, of(None))))
 
 
@@ -398,3 +416,32 @@ def test_a_mounting_that_cannot_be_read_costs_nothing_else(tmp_path, spoiled):
     (tmp_path / 'result.json').write_text(json.dumps(data))
     found = load_camera(tmp_path / 'result.json')
     assert found.mount is None and found.camera == TRUTH
+
+
+def test_a_field_is_part_of_the_difference():
+    # 1 px of bend, which no rotation removes
+    coefficients = np.zeros((2, len(FIELD_TERMS)))
+    coefficients[0, FIELD_TERMS.index((2, 0))] = 2.0
+    field = Field(SIZE, coefficients)
+    bent = dataclasses.replace(REFERENCE, field=field)
+    for a, b in ((bent, REFERENCE), (REFERENCE, bent)):
+        found = compare(a, b)
+        assert 0.5 < found.mapping_px < 1.0 and found.answer == found.whole.answer
+        assert 'metrology' not in found.whole.good_for
+    assert compare(bent, bent).mapping_px < 1e-3
+
+
+@pytest.mark.parametrize(('sigma_px', 'used'), [(0.5, True), (1.5, False)])
+def test_a_field_below_its_sigma_is_not_used(tmp_path, sigma_px, used):
+    field = LensField(Field(SIZE, np.ones((2, len(FIELD_TERMS)))), True, 1.0, 2.0, sigma_px)
+    # as files of 0.2.0 have it: always used
+    (tmp_path / 'result.json').write_text(result_json(make_calibration(field=field)))
+    assert (load_camera(tmp_path).field is not None) == used
+    assert load_calibration(tmp_path / 'result.json').field.used == used
+
+
+def test_a_centre_that_is_far_off_is_good_for_nothing():
+    sigma = np.diag([0.2, 0.2, 0.3, 0.3, 0.0003, 0.0003])**2
+    known = dataclasses.replace(REFERENCE, covariance=sigma, sigma_px=PictureSigma(0.1, 0.2))
+    found = compare(shifted(cx=0.02 * SIZE[0]), known).to_dict()
+    assert (found['answer'], found['good_for']) == ('wrong', [])

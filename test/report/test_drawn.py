@@ -17,6 +17,7 @@ import pytest
 import yaml
 from drawn import START_S, drawn_calibration, solution
 from made_calibration import EACH_MODEL, calibration_of, make_calibration
+from made_drives import smooth, write_folder
 from page_reader import Page
 from solving import CONFIG, only
 
@@ -28,10 +29,11 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.agreement import focal_of_turns, sigma_by_count
 from dashcalib_ros.judge.calibration import Condition, Shutter, Stabiliser, StoredTurnSummary
-from dashcalib_ros.judge.verdict import judge
+from dashcalib_ros.judge.verdict import RULES, judge
 from dashcalib_ros.report import NamedCamera, report_html, write_results
 from dashcalib_ros.report.lens import WHY_TOGETHER, undistorted
-from dashcalib_ros.report.wording import conditions, field_of_view
+from dashcalib_ros.report.turns import picture_svg
+from dashcalib_ros.report.wording import conditions
 from dashcalib_ros.session import with_source
 
 
@@ -151,6 +153,77 @@ def test_why_all_turns_know_more_than_each_alone_is_said_where_it_is_so(drawn):
     for part, said in ((0.6, False), (0.2, True)):
         c = dataclasses.replace(drawn, sigma={**drawn.sigma, 'fx': part * best})
         assert (WHY_TOGETHER in Page(report_html(c)).text) == said
+
+
+def test_a_picture_that_is_no_keyframe_has_no_tracks(drawn):
+    """The solution's scenes may have fewer keyframes than those that pictures were chosen from."""
+    turn = drawn.turns[0].id
+    shown = drawn.material.pictures[turn]
+    other = dataclasses.replace(shown, frame=shown.frame + 1)
+    text, magnified = picture_svg(other, drawn.material.scenes[turn], drawn.camera, None)
+    assert 'jpeg' in text and 'class="track"' not in text and magnified == 0
+    pictures = {**drawn.material.pictures, turn: other}
+    assert report_html(dataclasses.replace(drawn, material=dataclasses.replace(
+        drawn.material, pictures=pictures))).count('<path class="track"') == 2
+
+
+def test_a_turn_that_cannot_be_drawn_costs_itself_only(drawn, monkeypatch):
+    first = drawn.material.pictures[drawn.turns[0].id]
+
+    def broken(shown, *others):
+        if shown is first:
+            raise ValueError('no picture')
+        return picture_svg(shown, *others)
+    monkeypatch.setattr('dashcalib_ros.report.turns.picture_svg', broken)
+    lost = []
+    text = report_html(drawn, lost=lost)
+    assert [each.code for each in lost] == ['E-PART-MISSING']
+    assert text.count('<path class="track"') == 2 and 'no picture' in text
+
+
+def test_pictures_that_cannot_be_read_again_cost_their_colours_only(drawn, tmp_path, monkeypatch):
+    source = open_frames(write_folder(tmp_path / 'drive', smooth(4)), fps=10.0)
+
+    def gone(stamps_ns):
+        raise RuntimeError('the disk is gone')
+    monkeypatch.setattr(source, 'in_colour', gone)
+    found = with_source(drawn, source)
+    assert [each.code for each in found.warnings[len(drawn.warnings):]] == ['E-PART-MISSING']
+    assert found.material == drawn.material and found.camera == drawn.camera
+
+
+@pytest.mark.parametrize('part', [
+    'straight_lines', '_mount', 'cross_validation', '_details', '_material'])
+def test_what_fails_beside_the_camera_costs_itself_only(drawn, monkeypatch, part):
+    def broken(*arguments):
+        raise IndexError('list index out of range')
+    monkeypatch.setattr(f'dashcalib_ros.judge.conclude.{part}', broken)
+    found = drawn_calibration(solution())
+    assert [each.code for each in found.warnings[len(drawn.warnings):]] == ['E-PART-MISSING']
+    assert (found.camera, found.sigma, found.verdict) == (
+        drawn.camera, drawn.sigma, drawn.verdict)
+
+
+@pytest.mark.parametrize('count', [1, 2, 3])
+@pytest.mark.parametrize('turns', [1, 9])
+def test_no_row_beyond_its_limit_is_ticked(count, turns):
+    """Of one turn, the largest share of one turn is 100 %."""
+    config = dataclasses.replace(CONFIG.verdict, min_turns=turns)
+    verdict = judge(only(solution(), range(count)), config)
+    measured = [each for each in verdict.conditions if each.limit]
+    assert len(measured) >= 6
+    for each in measured:
+        value, limit = (float(re.search(r'[-\d.]+', text)[0]) for text in (each.value, each.limit))
+        within = value <= limit if 'at most' in each.limit else value >= limit
+        assert each.met == within, each
+
+
+def test_a_check_that_fails_makes_the_result_weak(monkeypatch):
+    def broken(grounds):
+        raise IndexError('list index out of range')
+    monkeypatch.setattr('dashcalib_ros.judge.verdict.RULES', (*RULES, broken))
+    found = drawn_calibration(solution())
+    assert found.verdict.level == 'weak' and found.verdict.codes[-1] == 'E-CHECK-FAILED'
 
 
 def test_where_no_report_is_wanted_nothing_is_kept_for_it():
@@ -316,6 +389,6 @@ def test_the_grid_is_straight_where_the_picture_is_undistorted():
 def test_the_field_of_view_is_that_of_the_lens():
     plain = dataclasses.replace(EACH_MODEL['radial'], k1=0.0, k2=0.0, cx=620.5, cy=187.0,
                                 fx=621.0, fy=187.5)
-    across, down, diagonal = field_of_view(plain)
+    across, down, diagonal = plain.field_of_view
     assert (across, down) == pytest.approx((90, 90)) and diagonal > 90
-    assert field_of_view(EACH_MODEL['fisheye'])[0] > 150
+    assert EACH_MODEL['fisheye'].field_of_view[0] > 150

@@ -5,9 +5,11 @@ import errno
 import json
 import os
 import re
+import resource
 import stat
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,7 @@ from made_calibration import TRUTH, make_calibration
 from dashcalib_ros.errors import OutputError
 from dashcalib_ros.formats import load_camera
 from dashcalib_ros.report import (
+    NamedCamera,
     check_writable,
     output_folder,
     set_aside,
@@ -152,7 +155,7 @@ def test_an_accepted_one_takes_the_stale_weak_file_away(tmp_path):
     assert names(tmp_path) == ['calibration.yaml', 'report.html', 'result.json']
 
 
-@pytest.mark.parametrize('failing', [1, 2, 3])
+@pytest.mark.parametrize('failing', [1, 2])
 def test_a_full_disk_changes_nothing(tmp_path, monkeypatch, failing):
     write_results(make_calibration('weak'), tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
@@ -179,11 +182,72 @@ def test_ctrl_c_while_writing_leaves_nothing(tmp_path, monkeypatch):
 
 
 def test_a_folder_in_the_way_is_told_and_nothing_is_written(tmp_path):
-    (tmp_path / 'report.html').mkdir()
+    (tmp_path / 'result.json').mkdir()
     with pytest.raises(OutputError) as caught:
         write_results(make_calibration(), tmp_path)
     assert caught.value.code == 'E-NAME-TAKEN'
-    assert names(tmp_path) == ['report.html']
+    assert names(tmp_path) == ['result.json']
+
+
+@contextmanager
+def room_for(size):
+    """Let no file become larger than so many bytes, as `ulimit -f` does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_report_that_does_not_fit_costs_itself_only(tmp_path):
+    write_results(make_calibration('weak'), tmp_path)
+    with room_for(20_000):
+        written = write_results(make_calibration(), tmp_path)
+    # nor is that of the result before it there
+    assert names(tmp_path) == ['calibration.yaml', 'result.json']
+    assert sorted(written.files) == sorted(tmp_path.iterdir())
+    assert [each.code for each in written.lost] == ['E-REPORT-NOT-WRITTEN']
+    assert load_camera(tmp_path / 'calibration.yaml').camera == TRUTH
+    with room_for(100), pytest.raises(OutputError) as caught:
+        write_results(make_calibration(), tmp_path)
+    assert caught.value.code == 'E-DISK-FULL'
+
+
+def test_a_report_whose_name_is_taken_costs_itself_only(tmp_path):
+    (tmp_path / 'report.html').mkdir()
+    written = write_results(make_calibration(), tmp_path)
+    assert [each.code for each in written.lost] == ['E-REPORT-NOT-WRITTEN']
+    assert names(tmp_path) == ['calibration.yaml', 'report.html', 'result.json']
+
+
+def broken(*arguments, **options):
+    raise IndexError('list index out of range')
+
+
+@pytest.mark.parametrize('part', [
+    'page._snippets', 'page.uncertainty_of', 'page.slider_of', 'page.magnitude_svg',
+    'page.turn_sections', 'page.evidence_of', 'page.field_of', 'page.mounting_of',
+    'page.compare', 'page.next_steps', 'files.report_html'])
+def test_a_part_of_the_report_that_fails_costs_itself_only(tmp_path, monkeypatch, part):
+    monkeypatch.setattr(f'dashcalib_ros.report.{part}', broken)
+    truth = NamedCamera('truth', TRUTH)
+    written = write_results(make_calibration(), tmp_path, truth=truth)
+    assert [each.code for each in written.lost] == ['E-PART-MISSING']
+    whole = part in ('page.next_steps', 'files.report_html')
+    assert names(tmp_path) == ['calibration.yaml', *['report.html'] * (not whole), 'result.json']
+    assert whole or 'list index out of range' in (tmp_path / 'report.html').read_text()
+    assert json.loads((tmp_path / 'result.json').read_text())['intrinsics']['fx'] == TRUTH.fx
+
+
+@pytest.mark.parametrize('level', ['accepted', 'weak', 'refused'])
+def test_a_weak_calibration_of_another_program_is_kept(tmp_path, level):
+    theirs = b'camera_matrix: theirs\n'
+    (tmp_path / 'calibration.weak.yaml').write_bytes(theirs)
+    written = write_results(make_calibration(level), tmp_path)
+    kept = written.set_aside or tmp_path / 'calibration.weak.yaml'
+    assert kept.read_bytes() == theirs
+    assert (kept.name == 'calibration.weak.previous.yaml') == (level == 'weak')
 
 
 def test_a_file_where_the_folder_should_be(tmp_path):

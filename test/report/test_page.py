@@ -9,15 +9,18 @@ import re
 import cv2
 import numpy as np
 import pytest
-from made_calibration import EACH_MODEL, calibration_of, make_calibration
+from made_calibration import EACH_MODEL, MOUNT, calibration_of, make_calibration
 from page_reader import Page
 from rich.console import Console
 
+from dashcalib_ros.camera.field import Field
 from dashcalib_ros.config import Config
+from dashcalib_ros.judge.calibration import LensField
 from dashcalib_ros.judge.verdict import verdict_of, yaw_in_all
 from dashcalib_ros.report import report_html
 from dashcalib_ros.report.charts import log_ticks, magnitude_svg, mask_data_uri, ticks
 from dashcalib_ros.report.tables import summary
+from dashcalib_ros.report.wording import next_steps
 from dashcalib_ros.solve.spread import PictureSigma
 
 
@@ -144,6 +147,22 @@ def test_settings_are_folded_away():
 def test_settings_that_were_changed_are_named():
     text = report_html(make_calibration(config=Config().replace({'turns.wanted': 3})))
     assert '<code>turns.wanted=3</code>' in text and '<code>turns.half' not in text
+
+
+def test_the_steps_name_the_folder_and_what_this_camera_needs():
+    lens = make_calibration()
+    text = ' '.join(next_steps(lens, 'my drives/a'))
+    assert "`'my drives/a/calibration.yaml'`" in text and "check 'my drives/a' DRIVE" in text
+    assert 'mounting' not in text and 'undistort' not in text
+    field = LensField(Field(lens.image_size, np.zeros((2, 5))), True, 2.0, 4.0, 0.5)
+    text = ' '.join(next_steps(make_calibration(mount=MOUNT, field=field), 'a'))
+    assert 'the mounting only' in text and ".load('a').undistort(image)" in text
+    assert 'a/calibration.weak.yaml' in ' '.join(next_steps(make_calibration('weak'), 'a'))
+
+
+def test_a_result_in_an_object_store_has_no_line_for_a_driver():
+    text = report_html(make_calibration(), folder='s3://bucket/cam')
+    assert 's3://bucket/cam/calibration.yaml' in text and 'id="use-ros"' not in text
 
 
 @pytest.mark.parametrize('level', ['weak', 'refused'])

@@ -13,10 +13,12 @@ from rich.console import Console
 
 from dashcalib_ros.camera import Fisheye, Radial
 from dashcalib_ros.camera.field import Field
+from dashcalib_ros.errors import DashcalibError
 from dashcalib_ros.judge import Verdict
 from dashcalib_ros.judge.calibration import LensField, Shutter, Stabiliser
 from dashcalib_ros.report import NamedCamera, compare, report_html
 from dashcalib_ros.report.tables import against_truth, comparison, conclusion, next_step, summary
+from dashcalib_ros.report.wording import next_steps
 from dashcalib_ros.solve.spread import PictureSigma
 
 
@@ -44,6 +46,14 @@ def test_the_terminal_shows_estimate_sigma_and_turns():
         calibration, turns=tuple(late), start_s=1.7e9))) == text
 
 
+def test_the_terminal_says_why_turns_are_not_used():
+    used, unused = make_calibration().turns
+    left_out = [dataclasses.replace(unused, stamp_s=at, unused_because=why) for at, why in (
+        (20.0, 'too dark'), (27.5, 'not needed'), (30.0, 'too dark'))]
+    text = terminal(summary(make_calibration(turns=(used, *left_out))))
+    assert 'too dark: the turns at 20.0, 30.0 s' in text and 'needed: the turn at 27.5 s' in text
+
+
 def test_a_refused_summary_has_no_numbers_of_a_camera():
     assert 'fx' not in terminal(summary(make_calibration('refused')))
 
@@ -60,6 +70,23 @@ def test_the_conclusion_is_verdict_reasons_and_what_to_do():
     assert last.startswith('next: ') and 'calibration.yaml' in last
     assert terminal(next_step(verdict)).splitlines() == [
         'next: drive sharper turns', 'also: fix the zoom']
+
+
+def test_a_refusal_is_its_cause_and_one_step():
+    verdict = Verdict('refused', ('dark: drive by day', 'few: drive', 'flat: drive'),
+                      ('drive by day', 'drive'), ('E-DARK', 'E-FEW-TURNS', 'E-FLAT-PROFILE'))
+    assert terminal(conclusion(verdict)).splitlines() == ['verdict: refused', '  dark [E-DARK]']
+    assert terminal(next_step(verdict)) == 'next: drive by day'
+    refused = make_calibration('refused', verdict=verdict)
+    text, page = report_html(refused), Page(report_html(refused))
+    [step] = next_steps(refused)
+    assert step.startswith('Drive by day. For the next drive: ')
+    head, _, folded = text.partition('<details><summary>What follows')
+    assert 'flat' in page.text and '<li>dark</li></ul>' in head and '<li>flat</li>' in folded
+    for ask in (refused.accepted, lambda: refused.K, lambda: compare(refused, TRUTH)):
+        with pytest.raises(DashcalibError) as caught:
+            ask()
+        assert 'dark' in caught.value.text and 'flat' not in caught.value.text
 
 
 def test_a_reason_has_its_code():
@@ -80,9 +107,9 @@ def test_terminal_and_page_describe_a_mounting_alike():
 
 
 def test_the_summary_says_that_a_field_is_used():
-    field = LensField(Field(TRUTH.image_size, np.zeros((2, 5))), True, 0.31, 0.7, 0.52)
+    field = LensField(Field(TRUTH.image_size, np.zeros((2, 5))), True, 0.31, 0.7, 0.2)
     text = terminal(summary(make_calibration(field=field)))
-    assert 'a smooth field of 0.3 px, below its sigma of 0.5 px' in text
+    assert 'a smooth field of 0.3 px, above its sigma of 0.2 px' in text
     assert 'field' not in terminal(summary(make_calibration()))
 
 
@@ -148,7 +175,7 @@ def test_what_one_of_two_models_cannot_see_is_told():
     text = terminal(comparison(compare(pinhole, NamedCamera('truth', wide))))
     assert re.search(r'removed; without the\s\d+\s% of the picture that the\sradial\smodel\s'
                      r'cannot', text)
-    assert 'k1' not in text and 'cy' in text
+    assert 'k1 (fisheye)' in text and 'k1 (radial)' in text
     assert 'without' not in terminal(comparison(compare(NamedCamera('truth', wide), pinhole)))
 
 

@@ -9,6 +9,7 @@ import yaml
 
 pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros extra')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.logging import get_logger
@@ -69,12 +70,50 @@ def test_an_override_that_does_not_exist_ends_it(start_node, override, words, co
 def test_it_says_which_images_there_are(start_node, make_bench):
     make_bench(topic='front/image_raw', listen=False)
     make_bench(topic='rear/image/compressed', image_type=CompressedImage, listen=False)
-    raw, compressed = start_node(), start_node(image_transport='compressed', camera_name='rear')
+    raw, compressed = start_node(), start_node(
+        '-r', '__node:=other', image_transport='compressed', camera_name='rear')
     for node, topic in ((raw, '/image_raw'), (compressed, '/image_raw/compressed')):
         node.wait_for(f'no images on {topic} yet; publishers of images: '
                       f'-r image_raw:=/front/image_raw -p image_transport:=raw or '
                       f'-r image_raw:=/rear/image -p image_transport:=compressed')
     assert 'WARN' not in raw.text + compressed.text
+
+
+def test_a_topic_with_its_transport_is_answered_with_the_right_arguments(start_node, make_bench):
+    make_bench(topic='front/image/compressed', image_type=CompressedImage, listen=False)
+    make_bench(topic='front/odd', image_type=CompressedImage, listen=False, name='odd')
+    node = start_node('-r', 'image_raw:=/front/image/compressed')
+    node.wait_for('no images on /front/image/compressed yet; its publisher sends '
+                  'sensor_msgs/msg/CompressedImage: start the node with '
+                  '-r image_raw:=/front/image -p image_transport:=compressed')
+    # image_transport has no name for it
+    odd = start_node('-r', 'image_raw:=/front/odd', '-r', '__node:=other')
+    odd.wait_for('remap another topic with -r image_raw:=TOPIC')
+
+
+def test_a_node_of_the_same_name_is_told(start_node, make_bench, tmp_path):
+    """As two that are started with remappings only: for two cameras."""
+    camera = make_bench()
+    first = start_node('-r', 'image_raw:=/front/image_raw')
+    camera.until(lambda: camera.status, node=first)
+    assert not camera.values['warnings']
+    statuses = set()
+    camera.node.create_subscription(DiagnosticArray, '/diagnostics', lambda message: statuses.add(
+        message.status[0].name), 10)
+    second = start_node('-r', 'image_raw:=/rear/image_raw')
+    for node in (first, second):
+        node.wait_for('another node is /calibrator, too')
+        line, = [line for line in node.text.splitlines() if 'another node is' in line]
+        assert 'WARN' in line and '-r __ns:=' in line
+    camera.until(lambda: len(statuses) == 2, node=second)
+    assert statuses == {f'calibrator: camera calibration ({name})' for name in ('front', 'rear')}
+    camera.until(lambda: camera.values['warnings'].startswith('another node is'), node=second)
+    assert second.stop() == 0
+    camera.until(lambda: not camera.values['warnings'], node=first)
+    apart = start_node('-r', 'image_raw:=/rear/image_raw', '-r', '__ns:=/rear')
+    apart.wait_for('learning')
+    camera.spin(2.0)
+    assert not camera.values['warnings'] and 'another node is' not in apart.text
 
 
 def test_what_another_node_draws_is_no_camera(start_node, make_bench):
@@ -126,16 +165,21 @@ def test_a_managed_node_listens_only_while_it_is_active(managed):
         assert ask(changer, request).success
 
     change(Transition.TRANSITION_CONFIGURE)
-    # the kept calibration stays latched while it is inactive
-    camera.until(lambda: camera.latched, node=node)
     camera.until(lambda: camera.status and 'inactive' in camera.status.message, node=node)
-    assert camera.images.get_subscription_count() == 0
+    camera.spin(1.0)
+    # nothing but /diagnostics speaks while it is inactive
+    assert camera.images.get_subscription_count() == 0 and not camera.latched
     change(Transition.TRANSITION_ACTIVATE)
+    camera.until(lambda: camera.latched, node=node)
     camera.connect(node)
     stream(camera, 3)
     camera.until(lambda: len(camera.infos) == 3, node=node)
     change(Transition.TRANSITION_DEACTIVATE)
     camera.until(lambda: camera.images.get_subscription_count() == 0, node=node)
+    heard = len(camera.latched)
+    change(Transition.TRANSITION_ACTIVATE)
+    camera.until(lambda: len(camera.latched) == heard + 1, node=node)
+    change(Transition.TRANSITION_DEACTIVATE)
     change(Transition.TRANSITION_CLEANUP)
     assert ask(getter, GetState.Request()).current_state.id == (
         State.PRIMARY_STATE_UNCONFIGURED)
@@ -145,6 +189,11 @@ def test_a_managed_node_listens_only_while_it_is_active(managed):
     camera.connect(node)
     stream(camera, 3, 10)
     camera.until(lambda: len(camera.infos) == 6, node=node)
+    # as nav2's manager does at the end
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP,
+                       Transition.TRANSITION_UNCONFIGURED_SHUTDOWN):
+        change(transition)
+    assert ask(getter, GetState.Request()).current_state.id == State.PRIMARY_STATE_FINALIZED
     assert node.stop() == 0 and 'Traceback' not in node.text
 
 

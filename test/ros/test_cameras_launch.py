@@ -10,18 +10,25 @@ from unittest.mock import MagicMock
 import pytest
 
 FILE = Path(__file__).resolve().parents[2] / 'launch' / 'cameras.launch.py'
-MODULES = ('launch', 'launch.actions', 'launch.substitutions', 'launch_ros', 'launch_ros.actions',
-           'launch_ros.substitutions')
+ONE = FILE.with_name('calibrator.launch.py')
+MODULES = ('launch', 'launch.actions', 'launch.conditions', 'launch.event_handlers',
+           'launch.events', 'launch.launch_description_sources', 'launch.substitutions',
+           'launch_ros', 'launch_ros.actions', 'launch_ros.event_handlers',
+           'launch_ros.events', 'launch_ros.events.lifecycle', 'launch_ros.substitutions')
 TWO = 'front:=/front/image_raw rear:=/car/back/image_rect'
 
 
 @pytest.fixture
 def made(monkeypatch):
     """The file's functions, and what it calls."""
+    return run(FILE, monkeypatch)
+
+
+def run(path, monkeypatch):
     modules = {name: MagicMock() for name in MODULES}
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
-    return runpy.run_path(str(FILE)), modules
+    return runpy.run_path(str(path)), modules
 
 
 def test_cameras_are_names_with_topics(made):
@@ -39,19 +46,33 @@ def test_what_is_no_camera_is_refused(made, text):
         made[0]['cameras_in'](text)
 
 
-def test_each_camera_has_its_own_calibrator(made):
+def test_each_camera_has_its_own_calibrator(made, monkeypatch):
     functions, modules = made
     modules['launch.substitutions'].LaunchConfiguration.return_value.perform.return_value = TWO
     assert len(functions['calibrators'](object())) == 2
-    front, rear = (call.kwargs for call in modules['launch_ros.actions'].Node.call_args_list)
-    assert (front['package'], front['executable']) == ('dashcalib_ros', 'calibrator')
-    assert [each['namespace'] for each in (front, rear)] == ['front', 'rear']
-    # the same file of parameters, and after it what is the camera's own
-    assert [each['parameters'][1]['camera_name'] for each in (front, rear)] == ['front', 'rear']
-    assert dict(front['remappings']) == {'image_raw': '/front/image_raw',
-                                         'camera_info': '/front/camera_info'}
-    assert dict(rear['remappings']) == {'image_raw': '/car/back/image_rect',
-                                        'camera_info': '/car/back/camera_info'}
+    front, rear = (dict(call.kwargs['launch_arguments']) for call in
+                   modules['launch.actions'].IncludeLaunchDescription.call_args_list)
+    assert front == {'namespace': 'front', 'camera_name': 'front', 'image': '/front/image_raw',
+                     'camera_info': '/front/camera_info'}
+    assert rear == {'namespace': 'rear', 'camera_name': 'rear', 'image': '/car/back/image_rect',
+                    'camera_info': '/car/back/camera_info'}
+    # they are arguments of the file that is included
+    names = {name for name, _, _ in run(ONE, monkeypatch)[0]['ARGUMENTS']}
+    assert set(front) < names
+
+
+@pytest.mark.parametrize('name', ['', 'roof'])
+def test_one_calibrator_has_what_its_camera_has_alone(monkeypatch, name):
+    functions, modules = run(ONE, monkeypatch)
+    modules['launch.substitutions'].LaunchConfiguration.return_value.perform.return_value = name
+    assert functions['started'](object())[-1] is (
+        modules['launch_ros.actions'].LifecycleNode.return_value)
+    node, = (call.kwargs for call in modules['launch_ros.actions'].LifecycleNode.call_args_list)
+    # an empty one would override that of the parameter file
+    own = node['parameters'][1]
+    assert own.get('camera_name', '') == name and ('camera_name' in own) is bool(name)
+    assert set(own) - {'camera_name'} == {'image_transport', 'use_sim_time', 'autostart'}
+    assert [each[0] for each in node['remappings']] == ['image_raw', 'camera_info']
 
 
 def test_launch_itself_reads_it():
@@ -60,7 +81,7 @@ def test_launch_itself_reads_it():
     from launch import LaunchContext
     functions = runpy.run_path(str(FILE))
     arguments = functions['generate_launch_description']().get_launch_arguments()
-    assert [each.name for each in arguments] == [name for name, _, _ in functions['ARGUMENTS']]
+    assert [each.name for each in arguments] == ['cameras']
     context = LaunchContext()
     context.launch_configurations['cameras'] = TWO
     assert len(functions['calibrators'](context)) == 2

@@ -27,6 +27,7 @@ from dashcalib_ros.errors import InputError
 from dashcalib_ros.formats.ros import camera_of_message
 from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.pipeline import Calibrator, Status
+from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.report import Calibration
 from dashcalib_ros.ros import background
 from dashcalib_ros.ros import drive as drive_module
@@ -34,7 +35,6 @@ from dashcalib_ros.ros.calibrate import camera_info
 from dashcalib_ros.ros.check import NOT_YET, flat_texts
 from dashcalib_ros.ros.images import LASTING
 from dashcalib_ros.selection import SceneSelection
-from dashcalib_ros.problem.quadratic import Quadratic
 
 TOPIC = '/camera_info'
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,

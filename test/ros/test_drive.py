@@ -60,7 +60,7 @@ def driven(ros_context, rendered, tmp_path_factory):
     seen.drive, seen.frames = rendered
     # other tests keep the machine busy: a queue of 5 images would overrun
     seen.node = NodeProcess(home, '-p', 'qos_overrides./image_raw.subscription.depth:=50',
-                            commit=True, commit_timeout=SOON, imu_topic='/imu', **QUICK)
+                            commit=True, commit_timeout=SOON, use_imu=True, **QUICK)
     seen.bench = bench = Bench(ros_context)
     seen.committed = []
     seen.gyro = bench.node.create_publisher(Imu, '/imu', 400)
@@ -96,7 +96,7 @@ def drive(seen):
             os.kill(children[0], signal.SIGKILL)
             seen.killed = children[0]
         if seen.asked is None and bench.count('turns found') > 0:
-            seen.asked = bench.call('calibrate', node)
+            seen.asked = bench.call('calibrate', node, limit=90.0)
             # the second turn must not come to its help
             node.wait_for('a calibration of 1 turn', 90.0)
     seen.before = len(bench.infos)
@@ -147,7 +147,9 @@ def test_nothing_is_published_before_acceptance_and_one_per_image_after(driven):
 
 
 def test_one_turn_is_calibrated_on_request_but_too_weak_to_publish(driven):
-    assert driven.asked.success and 'started' in driven.asked.message
+    # when it is done, with the verdict
+    assert not driven.asked.success
+    assert driven.asked.message.startswith(('weak: ', 'refused: '))
     assert 'a calibration of 1 turn is weak: only 1 of at least 2 turns' in driven.node.text
 
 
@@ -189,8 +191,7 @@ def test_the_driver_was_given_the_calibration(driven):
 
 
 def test_the_turning_magnitude_was_published(driven):
-    values = [message.vector.x for message in driven.bench.magnitudes]
-    assert driven.bench.magnitudes[0].header.stamp.sec > 0
+    values = [message.data for message in driven.bench.magnitudes]
     assert max(values) > 0.02 > min(values) >= 0
 
 
@@ -207,7 +208,7 @@ def test_diagnostics_tell_an_operator_everything(driven):
     # images, so that it is not stale
     bench.publish(*driven.after)
     bench.until(lambda: bench.status.level == b'\x00', node=driven.node)
-    assert bench.status.name == 'calibrator: camera calibration'
+    assert bench.status.name == 'calibrator: camera calibration (dashcam)'
     assert bench.status.hardware_id == 'dashcam'
     values = bench.values
     assert values['verdict'] == 'accepted' and values['turns wanted'] == '2'

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -17,8 +18,11 @@ pytest.importorskip('rclpy', reason='no ROS on this machine: pip install the ros
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.exceptions import InvalidHandle
+from rclpy.lifecycle import TransitionCallbackReturn
 from ros_desk import FIRST, SIGMA
 from sensor_msgs.srv import SetCameraInfo
+from std_srvs.srv import Trigger
 from synthetic import synthetic_turn
 
 from dashcalib_ros.camera import Radial
@@ -31,7 +35,7 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge import TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import Mount
 from dashcalib_ros.report import Calibration
-from dashcalib_ros.ros.background import Moved, Result
+from dashcalib_ros.ros.background import Moved, Result, Trouble
 from dashcalib_ros.ros.store import CameraIdentity, Store
 from dashcalib_ros.store.turn_store import Origin, StoredTurn, TurnStore
 
@@ -448,3 +452,78 @@ def test_a_camera_that_changed_does_not_learn_from_the_turns_of_earlier_drives(
     assert desk.show() is None
     desk.until(lambda: desk.bench.count('turns stored') == 0)
     desk.until(lambda: list((tmp_path / 'turns').iterdir()) == [])
+
+
+def test_a_file_where_nothing_can_be_written_is_used_with_a_warning(make_desk, request, tmp_path,
+                                                                    capfd):
+    """As one that is installed with a package is; without it, the node would learn for nothing."""
+    first = make_desk()
+    first.give()
+    first.close()
+    request.getfixturevalue('read_only')
+    second = make_desk()
+    assert second.show() == 400.0
+    line, = [line for line in capfd.readouterr().err.splitlines() if 'E-KEPT-NOT-W' in line]
+    assert '[WARN]' in line and 'Read-only file system' in line
+    for transition in (second.node.trigger_deactivate, second.node.trigger_cleanup):
+        assert transition() == TransitionCallbackReturn.SUCCESS
+    (tmp_path / 'camera.yaml').unlink()
+    assert second.node.trigger_configure() == TransitionCallbackReturn.FAILURE
+    line, = capfd.readouterr().err.splitlines()
+    assert '[ERROR]' in line and '[E-KEPT-NOT-WRITABLE]' in line
+
+
+def test_who_asks_for_a_calibration_is_answered_when_it_is_done(make_desk, monkeypatch):
+    desk = make_desk()
+    assert 'no turn' in desk.call('calibrate').message
+    # as if there were turns, which come to nothing before desk.give()
+    monkeypatch.setattr(desk.drive.learner, 'request', lambda: '')
+    client = desk.bench.node.create_client(Trigger, 'calibrator/calibrate')
+    desk.until(client.service_is_ready)
+
+    def ask():
+        count, future = len(desk.drive._asked), client.call_async(Trigger.Request())
+        desk.until(lambda: len(desk.drive._asked) == count + 1)
+        assert not future.done()
+        return future
+
+    def answer(future):
+        desk.until(future.done)
+        return future.result().success, future.result().message
+
+    both = ask(), ask()
+    # others are served meanwhile
+    assert desk.call('calibrate_now').success and not desk.call('save').success
+    desk.give('weak')
+    assert [answer(each) for each in both] == [(False, 'weak: few turns')] * 2
+    accepted = ask()
+    desk.give()
+    success, text = answer(accepted)
+    assert success and text.startswith('accepted: fx 400.00 ± 2.00')
+    dropped = ask()
+    desk.call('reset')
+    assert answer(dropped) == (False, 'the turns were dropped meanwhile')
+    failed = ask()
+    desk.drive._later(lambda: desk.drive._on_news(Trouble('failed_calibrations', 'it is odd')))
+    assert answer(failed) == (False, 'it is odd')
+    ask()
+    for transition in (desk.node.trigger_deactivate, desk.node.trigger_cleanup):
+        assert transition() == TransitionCallbackReturn.SUCCESS
+    with pytest.raises(InvalidHandle):
+        desk.until(lambda: False)
+
+
+def test_an_answer_that_is_waited_for_keeps_no_core_busy(make_desk, monkeypatch):
+    """The executor sleeps: rclpy issue 1405 is of executors that are made for each call."""
+    desk = make_desk()
+    monkeypatch.setattr(desk.drive.learner, 'request', lambda: '')
+    client = desk.bench.node.create_client(Trigger, 'calibrator/calibrate')
+    desk.until(client.service_is_ready)
+    client.call_async(Trigger.Request())
+    desk.until(lambda: desk.drive._asked)
+    end, spins = time.monotonic() + 2.0, 0
+    while time.monotonic() < end:
+        desk.spinner.spin_once()
+        spins += 1
+    # the node's timers, and little else
+    assert spins < 500

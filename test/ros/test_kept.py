@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 
 import pytest
 import yaml
@@ -154,6 +155,19 @@ def test_what_no_lens_has_is_set_aside(store, keys, value, sealed):
     assert raised.value.code == 'E-KEPT-IMPLAUSIBLE'
     assert not mine.path.exists() and mine.path.with_name('camera.previous.yaml').exists()
     assert mine.load() is None
+
+
+def test_what_is_no_file_or_cannot_be_written_is_told_at_once(store, tmp_path):
+    os.mkfifo(tmp_path / 'fifo')
+    (tmp_path / 'folder').mkdir()
+    (tmp_path / 'link').symlink_to('fifo')
+    for name in ('fifo', 'folder', 'link', 'n' * 300):
+        with pytest.raises(OutputError, match='camera_info_url') as raised:
+            store(path=tmp_path / name)
+        assert raised.value.code == 'E-KEPT-NOT-WRITABLE'
+    mine = store(path=tmp_path / 'new' / 'camera.yaml')
+    mine.check_writable()
+    assert list(mine.path.parent.iterdir()) == []
 
 
 @pytest.mark.parametrize('text', ['{{{ no yaml', ''])

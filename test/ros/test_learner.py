@@ -18,6 +18,7 @@ from dashcalib_ros.errors import WorkerError
 from dashcalib_ros.judge import Check, Reading, TurnSummary, Verdict, watch
 from dashcalib_ros.judge.calibration import StoredTurnSummary
 from dashcalib_ros.pipeline import Calibrator, Status
+from dashcalib_ros.problem.quadratic import Quadratic
 from dashcalib_ros.report import Calibration, NamedCamera
 from dashcalib_ros.ros import background as room
 from dashcalib_ros.ros.background import (
@@ -30,7 +31,6 @@ from dashcalib_ros.ros.background import (
     Watched,
 )
 from dashcalib_ros.selection import SceneSelection
-from dashcalib_ros.problem.quadratic import Quadratic
 
 LIMIT = 20.0
 CONFIG = Config().replace({'turns.wanted': 2})

@@ -162,7 +162,7 @@ def test_a_namespace_names_the_camera(start_node, make_bench, tmp_path):
     camera.connect(node)
     stream(camera, 2)
     camera.until(lambda: len(camera.infos) == 2, node=node)
-    assert camera.status.name == 'front/calibrator: camera calibration'
+    assert camera.status.name == 'front/calibrator: camera calibration (front)'
     assert camera.status.hardware_id == 'front'
 
 
@@ -285,6 +285,16 @@ def test_a_driver_that_never_stamps_is_learned_from_all_the_same(start_node, mak
         camera.spin(0.15)
     camera.until(lambda: len(camera.magnitudes) >= 5, node=node)
     assert camera.count('unstamped') == 0
+    # it is said once in the log, and as long as it is so in /diagnostics
+    camera.until(lambda: '[E-STAMP-MISSING]' in camera.values['time stamps'], node=node)
+    assert camera.status.level == DiagnosticStatus.WARN
+    assert camera.values['warnings'] == camera.values['time stamps']
+    line, = [line for line in node.text.splitlines() if 'E-STAMP-MISSING' in line]
+    assert 'WARN' in line and 'rolling shutter' in line
+    for n in range(10):
+        camera.publish(image_message(noise(n), START + n * SECOND // 10))
+    camera.until(lambda: camera.values['time stamps'] == 'of the images', node=node)
+    assert not camera.values['warnings']
 
 
 def test_two_publishers_of_different_sizes_do_not_reset_it(start_node, make_bench, tmp_path):
@@ -454,6 +464,14 @@ def test_services_say_why_not(plain):
     ({'mask__segmentation': '~nobody-of-this-name/m.onnx'}, 'm.onnx', ''),
     ({'camera_info_url': '~nobody-of-this-name/camera.yaml'}, 'set camera_info_url',
      'E-HOME-UNKNOWN'),
+    ({'camera_info_url': '/proc'}, '/proc: it is a folder', 'E-KEPT-NOT-WRITABLE'),
+    ({'camera_info_url': 'file:///dev/null'}, 'a device', 'E-KEPT-NOT-WRITABLE'),
+    # for root, too
+    ({'camera_info_url': '/proc/camera.yaml'}, '/proc/camera.yaml', 'E-KEPT-NOT-WRITABLE'),
+    ({'camera_info_url': '/dev/null/camera.yaml'}, 'Not a directory', 'E-KEPT-NOT-WRITABLE'),
+    ({'camera_info_url': f'~/{"c" * 300}.yaml'}, 'too long', 'E-KEPT-NOT-WRITABLE'),
+    # too long with what a file has before it is whole
+    ({'camera_info_url': f'~/{"c" * 240}.yaml'}, 'too long', 'E-KEPT-NOT-WRITABLE'),
     ({'turns__half_widht': 3}, 'turns.half_width', 'E-PARAMETER-UNKNOWN'),
     ({'check_only': True}, 'start checker', 'E-CHECK-ONLY-REMOVED'),
     ({'of_another_node': 3}, 'of_another_node', 'E-PARAMETER-UNKNOWN'),
@@ -530,7 +548,7 @@ class Drive(drive.Drive):
     def publish_while_stopped(self):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.1)
-        self._magnitude.publish(drive.Vector3Stamped())
+        self._magnitude.publish(drive.Float64())
     def _tick(self):
         if kind == 'timer' and self._intake.received == 2:
             raise ZeroDivisionError('odd tick')

@@ -20,8 +20,11 @@ from solving import (
 from synthetic import LENS, SIZE, SyntheticTurn, rotation, synthetic_turn
 
 from dashcalib_ros.camera import Radial
+from dashcalib_ros.camera.field import TERMS, Field
 from dashcalib_ros.config import Config
 from dashcalib_ros.detect.turn import Turn, TurnId
+from dashcalib_ros.formats import calibrated_camera
+from dashcalib_ros.input.motion import Samples, SensorStream
 from dashcalib_ros.input.scale import FULL_SIZE, Scale
 from dashcalib_ros.judge.agreement import (
     focal_disagreement,
@@ -29,7 +32,7 @@ from dashcalib_ros.judge.agreement import (
     outdated,
     turns_of_another_camera,
 )
-from dashcalib_ros.judge.conclude import Evidence, conclude
+from dashcalib_ros.judge.conclude import Evidence, conclude, outlook
 from dashcalib_ros.judge.verdict import Grounds, judge, profile_contrast, sigma_too_large
 from dashcalib_ros.reconstruct.adjust import Solver, adjust
 from dashcalib_ros.reconstruct.scene import (
@@ -506,6 +509,21 @@ def test_a_refused_solution_gives_no_numbers(good):
     assert calibration.reprojection_error_px is None
 
 
+@pytest.mark.parametrize(('share', 'used'), [(0.9, False), (1.1, True)])
+def test_a_field_is_used_from_its_sigma_on(good, share, used):
+    def with_field(size):
+        field = Field(SIZE, np.full((2, len(TERMS)), size))
+        return replace(good, written=replace(good.written, field=field))
+
+    unit = with_field(1.0)
+    rms_px = np.sqrt(np.mean(unit.field.over(unit.camera)**2))
+    bent = with_field(share * unit.rays_sigma_px / rms_px)
+    found = conclude(bent, evidence_for(bent), CONFIG)
+    assert found.field.rms_px == pytest.approx(share * found.field.sigma_px)
+    assert found.field.used == used and ('smooth field' in repr(found)) == used
+    assert (calibrated_camera(found).field is not None) == used
+
+
 def test_a_model_that_was_asked_for_and_does_not_do_is_told_of(good):
     asked = CONFIG.replace({'model': 'radial'})
     assert not conclude(good, evidence_for(good), asked).warnings
@@ -523,6 +541,32 @@ def test_no_solution_is_refused_with_the_reason(turns, frames, code, number):
     assert number in calibration.verdict.reasons[0]
     assert calibration.intrinsics is None and calibration.sigma is None
     assert len(calibration.turns) == turns and not any(t.used for t in calibration.turns)
+
+
+def test_turns_that_determine_no_camera_are_not_called_dark(good):
+    seen = replace(evidence_for(good), frames=500)
+    assert conclude(None, seen, CONFIG).verdict.codes == ('E-UNDETERMINED',)
+    # all of them are left out
+    dark = replace(seen, left_out=dict.fromkeys(seen.built, 'dark'))
+    assert conclude(None, dark, CONFIG).verdict.codes == ('E-NO-SCENE',)
+
+
+def test_the_outlook_counts_turns_and_angles_as_the_verdict_does(good):
+    seen, limits = evidence_for(good), CONFIG.verdict
+
+    def codes(scenes, **changes):
+        found = outlook(scenes, replace(seen, **changes), limits)
+        return found.level, found.codes
+    assert codes(good.scenes) == ('accepted', ())
+    assert codes(good.scenes[:1]) == ('weak', ('E-FEW-TURNS',))
+    gyro = SensorStream(rate=Samples(np.zeros(2), np.zeros((2, 3))))
+    assert codes(good.scenes[:1], motion=gyro) == ('accepted', ())
+    limits = replace(limits, min_yaw_deg=500.0)
+    assert codes(good.scenes) == ('weak', ('E-LITTLE-YAW',))
+    limits = replace(limits, refused_yaw_deg=500.0)
+    assert codes(good.scenes[:1]) == ('refused', ('E-LITTLE-YAW', 'E-FEW-TURNS'))
+    assert codes([]) == ('refused', ('E-UNDETERMINED',))
+    assert codes([], built={}) == ('refused', ('E-NO-SCENE',))
 
 
 def test_turns_are_summed_up_in_the_order_of_the_drive(good):

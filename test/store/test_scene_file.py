@@ -11,8 +11,9 @@ import pytest
 from fleet_made import clip_of
 
 from dashcalib_ros.camera import Fisheye
+from dashcalib_ros.detect.edges import KNOTS
 from dashcalib_ros.reconstruct.scene import Start
-from dashcalib_ros.store.scene_file import decoded, encoded
+from dashcalib_ros.store.scene_file import MOST_LINES, decoded, encoded
 
 MADE = clip_of(yaws=(80.0, -70.0), tracks=60, keyframes=8)
 DATA = encoded(MADE)
@@ -100,6 +101,21 @@ def test_what_is_no_scene_is_refused_on_one_line(changes):
     with pytest.raises(ValueError, match=r'\w') as caught:
         decoded(damaged(**changes))
     assert len(str(caught.value).splitlines()) == 1
+
+
+POINTS, STAMPS_S = np.ones((3, KNOTS, 2), np.float32), np.arange(3.0)
+
+
+@pytest.mark.parametrize(('points', 'stamps_s'), [
+    (POINTS[:2], STAMPS_S), (POINTS[:, 1:], STAMPS_S), (POINTS, STAMPS_S[::-1]),
+    (np.nan * POINTS, STAMPS_S), (1e6 * POINTS, STAMPS_S), (POINTS, 1e12 * STAMPS_S),
+    (POINTS, None), (POINTS.astype(int), STAMPS_S), (POINTS[0, 0, 0], STAMPS_S),
+    (np.ones((MOST_LINES + 1, KNOTS, 2)), np.arange(MOST_LINES + 1.0))])
+def test_what_are_no_lines_is_refused(points, stamps_s):
+    good = decoded(damaged(**{'lines.points': POINTS, 'lines.stamps_s': STAMPS_S})).lines
+    assert len(good) == 3 and decoded(DATA).lines is None
+    with pytest.raises(ValueError, match=r'\w'):
+        decoded(damaged(**{'lines.points': points, 'lines.stamps_s': stamps_s}))
 
 
 def test_the_undamaged_file_would_be_taken():

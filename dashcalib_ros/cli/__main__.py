@@ -1,4 +1,0 @@
-"""python -m dashcalib_ros.cli: the same as the installed command."""
-from dashcalib_ros.cli import command
-
-command()
