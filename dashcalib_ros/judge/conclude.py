@@ -190,6 +190,8 @@ def _with_numbers(found: CalibrationData, solution: Solution, lines: Bend | None
         if solution.rolling else None)
 
 
+# of pixels that are not square, or are so where they seem not to be: a warning says it
+REPORTED_SHARE = 0.05
 # px RMS; a warning names a field that no lens model has, if it is larger
 REPORTED_FIELD_PX = 0.5
 
@@ -209,6 +211,13 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
             f'the picture is bent by {field.rms_px:.1f} px (up to {field.worst_px:.1f} px), as by '
             f'a windscreen or a rectification: camera_info cannot describe this, and sigma over '
             f'the picture includes it; `dashcalib export --to rays` keeps it'))
+    share = solution.posterior.rival_share
+    if level != 'refused' and share > REPORTED_SHARE:
+        warnings.append(Notice(
+            'E-PIXELS-SQUARE',
+            f'the turns do not decide whether pixels are square: that fy / fx is '
+            f'{solution.camera.fy / solution.camera.fx:.3f} is wrong with a probability of '
+            f'{100 * share:.0f} %, and sigma of fy contains it'))
     if found.mount is not None and found.mount.moved_s is not None:
         warnings.append(Notice(
             'E-CAMERA-MOVED',

@@ -122,6 +122,12 @@ class SharedBlock(Block):
         """Return the information (c, c) of the prior, and (c,) how far the value is off it."""
         raise NotImplementedError
 
+    @property
+    def log_density(self) -> float:
+        """Return the log of the prior's density at the present value, up to a constant."""
+        information, off = self.prior()
+        return 0.5 * float(np.linalg.slogdet(information)[1] - off @ information @ off)
+
     def moved(self, step: Floats) -> SharedBlock:
         """Return the block after a step (c,)."""
         return replace(self, value=self.value + step)

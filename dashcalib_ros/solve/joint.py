@@ -30,7 +30,12 @@ from dashcalib_ros.solve.evidence import (
     moves,
     shift_size,
 )
-from dashcalib_ros.solve.optimise import FIRST_TRACKS, Estimate, optimised
+from dashcalib_ros.solve.optimise import (
+    FIRST_TRACKS,
+    Estimate,
+    optimised,
+    other_shape_of_pixels,
+)
 from dashcalib_ros.solve.solution import Solution
 from dashcalib_ros.solve.spread import Posterior
 from dashcalib_ros.solve.start import (
@@ -276,7 +281,8 @@ def _posterior(found: Estimate) -> Posterior:
     return Posterior(
         lens, found.imaging.smooth.sigma**2 * lens_like(lens),
         tuple(costs_of(found, found.loss_px())),
-        np.array([not scene.turn.of_this_drive for scene in found.scenes]), found.imaging.prior())
+        np.array([not scene.turn.of_this_drive for scene in found.scenes]), found.imaging.prior(),
+        rivals=other_shape_of_pixels(found))
 
 
 def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,

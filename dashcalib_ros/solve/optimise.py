@@ -137,6 +137,21 @@ def _with_sizes_chosen(now: Estimate, loss_px: float) -> Estimate:
         total, now.imaging, [square, loose], NOT_SQUARE_NATS))
 
 
+def other_shape_of_pixels(now: Estimate) -> tuple[tuple[float, Quadratic], ...]:
+    """Return the prior of pixels that are square where now's are not, or the other way round.
+
+    With the log of how much likelier it is before. Turns about one axis hardly see fy / fx: where
+    they do not decide it, sigma contains both.
+    """
+    square = now.config.intrinsics.aspect_sigma
+    if square >= NOT_SQUARE:
+        return ()
+    lens = now.imaging.lens
+    nats = NOT_SQUARE_NATS if lens.aspect_sigma == NOT_SQUARE else -NOT_SQUARE_NATS
+    other = replace(lens, aspect_sigma=square if nats > 0 else NOT_SQUARE)
+    return ((nats + other.log_density - lens.log_density, now.imaging.having(other).prior()),)
+
+
 def inflation_of(total: Quadratic, prior: Quadratic) -> float:
     """Return by how much errors that a track's observations share inflate the noise."""
     inverse = Quadratic.together([total, prior]).covariance
@@ -157,11 +172,9 @@ def _likeliest(total: Quadratic, imaging: Imaging, sizes: Sequence[Smooth] | Seq
 
 def evidence(total: Quadratic, imaging: Imaging, block: Smooth | Lens) -> float:
     """Return the log of the marginal likelihood, up to a constant, with the prior of a block."""
-    information, off = block.prior()
     cost = Quadratic.together([total, imaging.prior()])
-    return 0.5 * float(
-        cost.score @ cost.optimum - off @ information @ off
-        + np.linalg.slogdet(information)[1] - np.linalg.slogdet(cost.hessian)[1])
+    return block.log_density + 0.5 * float(
+        cost.score @ cost.optimum - np.linalg.slogdet(cost.hessian)[1])
 
 
 def with_points_settled(scene: Scene, camera: Camera, loss_px: float) -> Scene:

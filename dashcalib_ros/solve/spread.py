@@ -73,6 +73,7 @@ class Posterior:
     one. turns: the cost of each about that optimum, at the noise.
     earlier: (t,) whether a turn is of an earlier drive. prior: from the present values. differ:
     (d,) sizes of what makes turns differ, of fx. further: of what is known besides turns (a gyro).
+    rivals: priors that may hold instead, each with the log of how much likelier it is before.
     """
 
     lens: Camera
@@ -82,6 +83,7 @@ class Posterior:
     prior: Quadratic
     differ: tuple[float, ...] = TURNS_DIFFER
     further: tuple[Quadratic, ...] = ()
+    rivals: tuple[tuple[float, Quadratic], ...] = ()
 
     def of(self, places: Iterable[int]) -> Posterior:
         """Return what these turns know."""
@@ -127,6 +129,12 @@ class Posterior:
         spread[np.ix_(self.own, self.own)] += self.alike_in_all
         return np.asarray(spread)
 
+    @property
+    def rival_share(self) -> float:
+        """Return the probability that another prior holds than the one of the optimum."""
+        weights = self._cases[0]
+        return float(weights[len(weights) // (1 + len(self.rivals)):].sum())
+
     @cached_property
     def of_another_drive(self) -> float:
         """Return the evidence that earlier drives had another camera, in nats; 0: no such turns.
@@ -135,7 +143,7 @@ class Posterior:
         """
         if self.earlier.all() or not self.earlier.any():
             return 0.0
-        logs = np.array([[self._case(turns, drives)[0] for turns in self.differ]
+        logs = np.array([[self._case(turns, drives, self.prior)[0] for turns in self.differ]
                          for drives in self._drives])
         same, *others = np.logaddexp.reduce(logs, axis=1)
         return float(np.logaddexp.reduce(others) - np.log(len(others)) - same)
@@ -144,14 +152,17 @@ class Posterior:
     def _cases(self) -> tuple[Floats, Floats, Floats]:
         """Return the weights (c,), means (c, m) and covariances (c, m, m) of all cases."""
         several = self.earlier.any() and not self.earlier.all()
-        found = [self._case(turns, drives) for turns in self.differ
-                 for drives in (self._drives if several else self._drives[:1])]
+        found = [(before + log, mean, covariance)
+                 for before, prior in ((0.0, self.prior), *self.rivals) for turns in self.differ
+                 for drives in (self._drives if several else self._drives[:1])
+                 for log, mean, covariance in [self._case(turns, drives, prior)]]
         logs = np.array([log for log, _, _ in found])
         weights = np.exp(np.maximum(logs - logs.max(), -LARGEST_LOG))
         return (weights / weights.sum(), np.array([mean for _, mean, _ in found]),
                 np.array([covariance for _, _, covariance in found]))
 
-    def _case(self, turns: float, drives: Floats) -> tuple[float, Floats, Floats]:
+    def _case(self, turns: float, drives: Floats, prior: Quadratic
+              ) -> tuple[float, Floats, Floats]:
         """Return the evidence, in nats, the mean and the covariance of one case.
 
         turns: by how much they differ, of fx. drives: (m, d) columns by which they differ.
@@ -170,12 +181,12 @@ class Posterior:
                     gain, group = softened(group, drives)
                     log += gain
                 groups.append(group)
-        total = Quadratic.together([*groups, self.prior, *self.further])
+        total = Quadratic.together([*groups, prior, *self.further])
         covariance = total.covariance
         mean = covariance @ total.score
         log += 0.5 * float(total.score @ mean - np.linalg.slogdet(total.hessian)[1])
         # the sandwich; of priors, and of what sensors say, the covariance is what they say
-        exact = Quadratic.together([self.prior, *self.further]).hessian
+        exact = Quadratic.together([prior, *self.further]).hessian
         noise = sum(group.by_track for group in groups) + exact
         return log, mean, covariance @ noise @ covariance
 
