@@ -24,6 +24,8 @@ from dashcalib_ros.errors import ConfigError
 T = TypeVar('T')
 # names that an unknown setting is answered with
 NEAREST = 3
+# of what is known
+NUMBER = r'\d+(\.\d*)?'
 
 
 def setting(default: T, reason: str, minimum: float | None = None, maximum: float | None = None,
@@ -89,12 +91,36 @@ class TurnsConfig:
         1, 20)
     at_most: int = setting(
         8, 'maximum number of turns, used if the result of turns.wanted turns is weak', 1, 50)
+    stretches: int = setting(
+        8, 'other stretches of the drive, used if turns are few or the result is weak; straight '
+        'roads and bends know the focal length to 1 to 4 %', 0, 100)
+    thorough: bool = setting(
+        False, 'use these stretches even where turns are enough: a smaller sigma, more time')
     half_width: float = expert(
         3.0, "s kept on each side of a turn's centre; k = 30 frames at 10 Hz in the paper",
         0.5, 10.0)
     store: str = setting(
         '', 'folder for reconstructed turns of one camera: short trips add up; empty: none')
     capacity: int = expert(10, 'maximum number of turns kept: twice turns.wanted', 1, 50)
+
+
+@dataclass(frozen=True)
+class KnownConfig:
+    """What somebody knows of the camera; with a sigma after ±, else it counts as exact."""
+
+    stabiliser: str = setting(
+        '', "no: the pictures are not stabilised, so that bumps and gentle bends count; '': not "
+        'known', choices=('', 'no'))
+    shutter: str = setting(
+        '', 'global, or the time from the first row to the last: 24ms, 24±2ms',
+        pattern=rf'(global|{NUMBER}(±{NUMBER})? ?ms)?')
+    fx: str = setting(
+        '', 'px, of the pictures as they are: 1160±20', pattern=rf'({NUMBER}±{NUMBER})?')
+    hfov: str = setting(
+        '', 'degrees from the left edge to the right one: 120±5',
+        pattern=rf'({NUMBER}±{NUMBER})?')
+    aspect: str = setting(
+        '', 'fy / fx: 1, 1±0.001', pattern=rf'({NUMBER}(±{NUMBER})?)?')
 
 
 @dataclass(frozen=True)
@@ -196,8 +222,6 @@ class VerdictConfig:
         2, 'minimum number of turns; fewer: weak; focal lengths converge with 2 (paper)', 1, 20)
     min_yaw_deg: float = expert(
         60.0, 'degrees; minimum sum of the yaw angles of all turns; below: weak', 0.0, 1000.0)
-    refused_yaw_deg: float = expert(
-        10.0, 'degrees; minimum sum of the yaw angles of all turns; below: refused', 0.0, 1000.0)
     max_roll_deg: float = expert(
         45.0, 'degrees; maximum roll of the images; above: weak; 180: for a rotated camera',
         0.0, 180.0)
@@ -276,6 +300,7 @@ class Config:
         1, 4096)
     motion: MotionConfig = field(default_factory=MotionConfig)
     mask: MaskConfig = field(default_factory=MaskConfig)
+    known: KnownConfig = field(default_factory=KnownConfig)
     turns: TurnsConfig = field(default_factory=TurnsConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)

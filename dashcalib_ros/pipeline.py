@@ -138,7 +138,7 @@ class Calibrator:
         if live:
             # nothing else runs during an import: while images come, some would be lost
             _load_judging()
-        self.detection = Detection(config, mask, beside=not live)
+        self.detection = Detection(config, mask, beside=not live, stretches=not live)
         self.workers = ScenePool(config, InlineWorker if inline else child,
                                  partial(_load_all if live else _load_solving,
                                          config.reconstruct.used),

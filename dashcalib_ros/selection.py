@@ -48,6 +48,8 @@ class SceneSelection:
         self._places = config.turns.wanted
         # turns of this drive that are used beyond that
         self._more = 0
+        # whether other stretches are used even where there are enough turns
+        self._stretches = config.turns.thorough
         # why turns do not count any more
         self._excluded: dict[TurnId, str] = {}
         # where the ego vehicle is not, by turn
@@ -79,13 +81,14 @@ class SceneSelection:
             self._places = turns
 
     def widen(self) -> bool:
-        """Use more turns, up to turns.at_most; return False if there are no more to use."""
+        """Use more turns, up to turns.at_most, and other stretches; False if there are none."""
         turns = self.config.turns
-        most = max(turns.at_most, turns.wanted)
-        if self._places >= most or len(self._ranked()) <= self._places:
-            return False
-        self._places = most
-        return True
+        before = self._places, self._stretches
+        if len(self._ranked()) > self._places:
+            self._places = max(turns.at_most, turns.wanted)
+        few = len(self._detection.turns()) < before[0]
+        self._stretches = self._stretches or (not few and bool(self._detection.stretches()))
+        return before != (self._places, self._stretches)
 
     def exclude(self, reasons: Mapping[TurnId, str], keep_files: bool = False) -> None:
         """Let turns not count any more, each for a reason in words.
@@ -134,7 +137,13 @@ class SceneSelection:
         """Return the turns to use, best first; none where none is of this drive."""
         ranked = [key for key in self._ranked() if key in among]
         own = [key for key in ranked if key.of_this_drive][:self._places + self._more]
-        return own + ranked[len(own):self._places] if own else []
+        stretches = [turn.id for turn in self._other_stretches(len(own)) if turn.id in among]
+        found = own + ranked[len(own):self._places] if own else []
+        return found + stretches
+
+    def _other_stretches(self, turns: int) -> tuple[Turn, ...]:
+        """Return the stretches to use beside so many turns of this drive."""
+        return (self._detection.stretches() if self._stretches or turns < self._places else ())
 
     # turns -> scenes --------------------------------------------------------------------------
 
@@ -148,6 +157,10 @@ class SceneSelection:
         turns = {turn.id: turn for turn in self._detection.turns()}
         self._store.drop_repeated(turn.stamp_s for turn in turns.values())
         built = self._workers.scenes()
+        # how many turns there are is known at the end of the drive
+        count = sum(turn not in built or built[turn] is not None for turn in turns)
+        stretches = () if more_to_come else self._other_stretches(count)
+        turns |= {turn.id: turn for turn in stretches}
         self._workers.keep_only(set(turns))
         self._excluded = {key: why for key, why in self._excluded.items()
                           if key in turns or key in self._store.turns}
@@ -161,6 +174,7 @@ class SceneSelection:
                 ready.append(turn)
             if not (replace_failed and key in built and built[key] is None):
                 places -= 1
+        ready += [turn for turn in stretches if turn.frames]
         if ready:
             self._workers.start()
         waiting = WAITING if more_to_come and not self._live else 0
@@ -184,6 +198,9 @@ class SceneSelection:
     def make_room(self) -> None:
         """Wait, unless live, until few turns wait in memory; raises what a worker raised."""
         if not self._live:
+            for turn in self._detection.stretches():
+                if turn.frames and turn.id not in self._in_a_file:
+                    self._set_aside(turn)
             # one beside those that the workers have: the detection goes on, and none of them idles
             self._workers.wait(lambda: len(self._workers.unbuilt()) <= self.config.threads + 1)
 
@@ -257,8 +274,9 @@ class SceneSelection:
         """Write the present scenes to turns.store; of two cameras in a stream there are none."""
         built = self._workers.scenes() if self._detection.other_camera is None else {}
         self._written = self._workers.scenes().keys()
+        everything = (*self._detection.turns(), *self._detection.stretches())
         own = {turn.id: StoredTurn(scene, turn.stamp_s, turn.prominence)
-               for turn in self._detection.turns() if (scene := built.get(turn.id)) is not None}
+               for turn in everything if (scene := built.get(turn.id)) is not None}
         self._store.mirror({**self._store.turns, **own})
 
     def _store_failed(self, notice: Notice) -> None:

@@ -231,6 +231,11 @@ DRIVE: tuple[Argument, ...] = (
     ('--end', {'type': MORE_SECONDS, 'metavar': 'S',
                'help': 'end S seconds after the start of the recording'}),
     ('--turns', {'type': int, 'metavar': 'N', 'help': 'use N turns'}),
+    ('--thorough', {'action': 'store_true', 'default': None,
+                    'help': 'use every stretch of the drive beside its turns: a smaller sigma'}),
+    ('--known', {'action': 'append', 'default': [], 'metavar': 'NAME=VALUE',
+                 'help': 'what you know of the camera: stabiliser=no, shutter=global or 24ms, '
+                         'fx=1160±20, hfov=120±5, aspect=1; may be repeated'}),
     ('--mask', {'type': Path, 'metavar': 'PNG',
                 'help': 'a picture of the size of the images; its black pixels are not used'}),
     ('--segmentation', {'metavar': 'MODEL.onnx',

@@ -14,7 +14,8 @@ from dashcalib_ros.limits import YAML_BYTES, parse_yaml, read_text
 from dashcalib_ros.session import Recording
 
 # --turns sets both, so that exactly this number of turns is used
-FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'seed': ('seed',), 'threads': ('threads',),
+FLAGS = {'turns': ('turns.wanted', 'turns.at_most'), 'thorough': ('turns.thorough',),
+         'seed': ('seed',), 'threads': ('threads',),
          'segmentation': ('mask.segmentation',), 'model': ('model',),
          'speed': ('mount.speed_kmh',), 'mount': ('mount.enabled',),
          'gyro_scale_sigma': ('motion.gyro_scale_sigma',)}
@@ -27,6 +28,12 @@ def read_config(args: argparse.Namespace) -> Config:
     changes = parse_settings(getattr(args, 'set', []))
     changes.update({name: getattr(args, flag) for flag, names in FLAGS.items() for name in names
                     if getattr(args, flag, None) is not None})
+    for pair in getattr(args, 'known', []):
+        name, equals, text = pair.partition('=')
+        if not equals:
+            raise ConfigError('E-KNOWN-FORM', f'--known needs NAME=VALUE, such as stabiliser=no, '
+                                              f'not {shortened(pair)!r}')
+        changes[f'known.{name.strip()}'] = text.strip().replace('+-', '±')
     config = config.replace(changes)
     searched(config.model)  # raises for an unknown model before any work begins
     return config

@@ -14,6 +14,7 @@ from dashcalib_ros.detect.edges import LineCollector, Lines
 from dashcalib_ros.detect.estimator import MotionEstimator, TrackedPoints
 from dashcalib_ros.detect.one_camera import APART, OtherCamera, TwoPictures
 from dashcalib_ros.detect.straights import PAIRS, Straights
+from dashcalib_ros.detect.stretches import StretchBank
 from dashcalib_ros.detect.turn import Turn
 from dashcalib_ros.errors import InputError, Notice
 from dashcalib_ros.input import Frame
@@ -37,8 +38,11 @@ class Detection:
     stands now.
     """
 
-    def __init__(self, config: Config, mask: Mask | None = None, beside: bool = False) -> None:
+    def __init__(self, config: Config, mask: Mask | None = None, beside: bool = False,
+                 stretches: bool = True) -> None:
         """mask: (h, w), False on the ego vehicle. beside: a thread of its own finds the lines.
+
+        stretches: whether other stretches of the drive than its turns are kept.
 
         Raises ConfigError where the segmentation model cannot be used.
         """
@@ -58,6 +62,8 @@ class Detection:
         # more turns than wanted replace those without a scene; --turns may be above the capacity
         self._turns = TurnDetector(replace(
             config.turns, capacity=max(config.turns.capacity, config.turns.wanted)))
+        self._stretches = StretchBank(config.turns.stretches if stretches else 0,
+                                      2 * config.turns.half_width, self.turns)
 
     @property
     def start_s(self) -> float:
@@ -93,11 +99,15 @@ class Detection:
         if not motion.standing:
             self._two_pictures.push(frame.image, frame.stamp_ns)
             self._lines.push(frame.image, frame.stamp_ns)
-        return self._turns.push(frame, motion)
+        new = self._turns.push(frame, motion)
+        self._stretches.push(frame, motion.shift, motion.after_gap)
+        return new
 
     def finish(self) -> list[Turn]:
         """End the drive; return the turns that are new."""
-        return self._turns.finish()
+        new = self._turns.finish()
+        self._stretches.finish()
+        return new
 
     def close(self) -> None:
         """End the thread that finds lines, and free all images; lines and turns are kept.
@@ -106,18 +116,24 @@ class Detection:
         """
         self._lines.close()
         self._turns.close()
+        self._stretches.free_images()
 
     def turns(self) -> tuple[Turn, ...]:
         """Return the best turns so far, the most prominent first."""
         return self._turns.bank.turns()
 
+    def stretches(self) -> tuple[Turn, ...]:
+        """Return other stretches of the drive, those first that promise most."""
+        return self._stretches.stretches()
+
     def release(self, center: int) -> None:
         """Free the images of the turn with this center; the turn itself is kept."""
-        self._turns.bank.exchange(center, ())
+        self.exchange(center, ())
 
     def exchange(self, center: int, frames: tuple[Frame, ...]) -> None:
         """Replace the images of the turn with this center by the same ones, stored elsewhere."""
         self._turns.bank.exchange(center, frames)
+        self._stretches.exchange(center, frames)
 
     def magnitudes(self) -> Floats:
         """Return (n, 2): stamp in s and filtered turning magnitude, decimated."""

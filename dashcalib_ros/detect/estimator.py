@@ -50,7 +50,8 @@ class Motion:
     magnitude, as a share of the image width (see epipoles.py); 0 where the car stands, NaN where
     no epipole is found. standing: the car stands. moved_px: motion of the median point since the
     last processed image, in px at full resolution. points: number of tracked points. after_gap:
-    the tracking started again, and this image does not follow the last one.
+    the tracking started again, and this image does not follow the last one. shift: (x, y) of the
+    median point since the last processed image, as a share of the image width; NaN without points.
     """
 
     index: int
@@ -62,6 +63,7 @@ class Motion:
     center: int | None = None
     center_ns: int | None = None
     after_gap: bool = False
+    shift: tuple[float, float] = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ class MotionEstimator:
         return Motion(
             frame.index, frame.stamp_ns, magnitude, standing, moved_px * self._factor,
             len(now.ids), middle.index if middle else None, middle.stamp_ns if middle else None,
-            after_gap or lost)
+            after_gap or lost, _shift(*step, image.shape[1]))
 
     def valid(self) -> Mask | None:
         """Return (height, width) of the full image, False where it is masked; None: no mask.
@@ -411,6 +413,14 @@ def _common(a: _Seen | None, b: _Seen) -> tuple[Floats32, Floats32]:
         return b.xy[:0], b.xy[:0]
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     return a.xy[in_a], b.xy[in_b]
+
+
+def _shift(before: Floats32, after: Floats32, width: int) -> tuple[float, float]:
+    """Return how far the median point moved in x and y, of the width; NaN without points."""
+    if len(before) == 0:
+        return math.nan, math.nan
+    x, y = np.median(after - before, axis=0) / width
+    return float(x), float(y)
 
 
 def _median_shift(before: Floats32, after: Floats32) -> float:

@@ -1,4 +1,4 @@
-"""A turn: a stretch of the drive that the calibration uses."""
+"""A turn, or another stretch of the drive that the calibration uses."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -38,7 +38,8 @@ class Turn:
     """One turn and its images (paper, 3.1: the 2k + 1 images around a peak).
 
     center, first, last: indices of input frames; stamp_s: time of the center in s. prominence:
-    topographic prominence of the filtered turning magnitude, as a share of the image width.
+    topographic prominence of the filtered turning magnitude, as a share of the image width; of a
+    stretch without a peak below the least of a turn, and larger the more it promises.
     frames: the images from first to last, thinned to the detector's rate, in order; empty once
     they are released: released_images is their number then.
     """

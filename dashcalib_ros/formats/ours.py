@@ -38,6 +38,7 @@ from dashcalib_ros.judge import CalibrationData, TurnSummary, Verdict
 from dashcalib_ros.judge.calibration import (
     ANGLES,
     Condition,
+    Known,
     LensField,
     Mount,
     Shutter,
@@ -85,6 +86,7 @@ def result_dict(calibration: CalibrationData) -> dict[str, Any]:
         'held_out': [_held_out_dict(turn) for turn in c.held_out],
         'straight_lines': c.straight_lines,
         'witnesses': c.witnesses,
+        'known': c.known,
         'input': c.input_name,
         'warnings': c.warnings,
         'warning_codes': codes_of(c.warnings),
@@ -173,7 +175,8 @@ def calibration_of(data: Data, camera: Camera | None) -> CalibrationData:
         mount=_mount(data.get('mount')),
         held_out=tuple(held_out), straight_lines=made(Bend, data.get('straight_lines')),
         witnesses=Witnesses(**{name: made(Witness, each) for name, each
-                               in (data.get('witnesses') or {}).items()}))
+                               in (data.get('witnesses') or {}).items()}),
+        known=tuple(made(Known, each) for each in data.get('known', ())))
 
 
 def _frozen(value: Any) -> Any:

@@ -292,6 +292,24 @@ def _with_sigma(value: float, sigma: float) -> str:
     return f'{value:.{digits}f} ± {sigma:.{digits}f}'
 
 
+@dataclass(frozen=True)
+class Known:
+    """What somebody knew of the camera: fx in px, hfov in degrees, aspect, shutter in s.
+
+    by_turns, by_turns_sigma: what the turns say without it. used: False where they contradict it.
+    fx_sigma_without, fx_sigma: px, before and with it.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    by_turns: float
+    by_turns_sigma: float
+    used: bool
+    fx_sigma_without: float
+    fx_sigma: float
+
+
 @dataclass(frozen=True, repr=False)
 class CalibrationData:
     """The complete result. camera, sigma and covariance are None when the verdict is refused.
@@ -311,7 +329,7 @@ class CalibrationData:
     sigma_px: how far the whole camera may be off over the picture. held_out: how each turn
     fits the calibration without it, full-size images' px; () for fewer than three turns.
     straight_lines: the distortion by upright lines of the world; None: too few of them.
-    witnesses: the focal length by the car's own sensors.
+    witnesses: the focal length by the car's own sensors. known: what somebody knew before.
     start_s: stamp of the first image. material: what the report draws, None in a live drive.
     """
 
@@ -339,6 +357,7 @@ class CalibrationData:
     held_out: tuple[LeftOut, ...] = ()
     straight_lines: Bend | None = None
     witnesses: Witnesses = default(default_factory=Witnesses)
+    known: tuple[Known, ...] = ()
     start_s: float = 0.0
     material: Material | None = default(default=None, compare=False)
     covariance: Floats | None = default(default=None, compare=False)

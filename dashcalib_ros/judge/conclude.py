@@ -24,6 +24,7 @@ from dashcalib_ros.input.scale import Scale
 from dashcalib_ros.judge.agreement import CONTRADICTS, focal_disagreement
 from dashcalib_ros.judge.calibration import (
     CalibrationData,
+    Known,
     LensField,
     Material,
     Mount,
@@ -33,6 +34,7 @@ from dashcalib_ros.judge.calibration import (
     TurnSummary,
     Verdict,
 )
+from dashcalib_ros.judge.known import with_known
 from dashcalib_ros.judge.mount import Speed, mount_of
 from dashcalib_ros.judge.verdict import (
     STEADY,
@@ -93,12 +95,15 @@ def evidence_of_detection(detection: Detection, scenes: Iterable[Scene | None] =
     scenes: in any order; a turn without one is listed as not reconstructed.
     """
     other, lost = detection.other_camera, list[Notice]()
+    built = {scene.turn: scene for scene in scenes if scene is not None}
+    stretches = (each for each in detection.stretches() if each.id in built)
     lines = spared('the search for straight lines', lost, detection.lines)
     straights = spared('the search for straight driving', lost, detection.straights)
     return Evidence(
         image_size=detection.size or (0, 0), scale=detection.scale, frames=detection.frames,
-        turns=detection.turns(), magnitudes=detection.magnitudes(), mask=detection.valid(),
-        built={scene.turn: scene for scene in scenes if scene is not None}, timing={},
+        turns=(*detection.turns(), *stretches), magnitudes=detection.magnitudes(),
+        mask=detection.valid(),
+        built=built, timing={},
         # the verdict says it
         warnings=(*(each for each in detection.warnings() if each.code != 'E-TWO-CAMERAS'),
                   *lost),
@@ -127,7 +132,11 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         solution = replace(solution, px=evidence.scale.px)
         scenes |= {scene.turn: scene for scene in solution.scenes}
     lines = spared('the check of straight lines', lost, straight_lines, solution, evidence)
-    witnesses = evidence.sensors.witnesses
+    witnesses, known = evidence.sensors.witnesses, tuple[Known, ...]()
+    if solution is not None:
+        informed = spared('what is known before', lost, with_known, solution, config.known,
+                          evidence.scale.px)
+        solution, known = informed or (solution, known)
     found = CalibrationData(
         verdict=(judge(solution, config.verdict, lines, True, witnesses, evidence.other_camera)
                  if solution else _verdict_without_solution(evidence, config.verdict)),
@@ -140,7 +149,7 @@ def conclude(solution: Solution | None, evidence: Evidence, config: Config) -> C
         magnitudes=evidence.magnitudes, mask=_of_size(evidence.mask, evidence.image_size),
         stored_turns=tuple(_stored_summary(turn, scenes[turn.scene.turn], evidence, solution)
                            for turn in evidence.stored),
-        start_s=evidence.start_s, witnesses=witnesses,
+        start_s=evidence.start_s, witnesses=witnesses, known=known,
         material=spared('what the report draws', lost, _material, scenes, solution, evidence))
     if solution is None:
         return replace(found, warnings=(*found.warnings, *lost))
@@ -205,6 +214,11 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
             'E-MODEL-CHOSEN',
             f'the lens model {model} was chosen by hand and may be why the result is {level}: '
             f'--model {AUTO} uses the one that fits the turns'))
+    warnings += [Notice(
+        'E-KNOWN-CONTRADICTED',
+        f'known.{each.name} is {each.value:.5g}, and the turns say {each.by_turns:.5g} ± '
+        f'{each.by_turns_sigma:.2g}: it does not count; correct it, or leave it out')
+        for each in found.known if not each.used]
     if field is not None and field.used and field.rms_px >= REPORTED_FIELD_PX:
         warnings.append(Notice(
             'E-FIELD-LARGE',

@@ -29,7 +29,7 @@ from dashcalib_ros.judge.agreement import (
 from dashcalib_ros.judge.calibration import Condition, Level, Verdict, Witnesses
 from dashcalib_ros.judge.mount import roll_of_path
 from dashcalib_ros.reconstruct.heading import off_axis_deg, roll_deg
-from dashcalib_ros.solve.evidence import LEAST_GAIN, FixedCameraTest, largest_crop
+from dashcalib_ros.solve.evidence import HIDDEN_DEG, LEAST_GAIN, FixedCameraTest, largest_crop
 from dashcalib_ros.solve.solution import CLEAR_KIND_RATIO, Solution
 
 # cures that several rules have, or that others look for
@@ -174,17 +174,30 @@ def turn_count(count: int, config: VerdictConfig, confirmed: bool = False) -> Fi
 
 
 def _yaw_of_turns(grounds: Grounds) -> Finding:
-    return yaw_in_all(sum(scene.yaw_deg for scene in grounds.solution.scenes), grounds.config)
+    found = yaw_in_all(sum(scene.yaw_deg for scene in grounds.solution.scenes), grounds.config)
+    # bumps and gentle bends count where no stabiliser can hide them
+    return replace(found, level='accepted') if grounds.solution.fixed else found
 
 
 def yaw_in_all(yaw_deg: float, config: VerdictConfig) -> Finding:
-    """Judge the yaw of all turns together."""
-    least, hardly = config.min_yaw_deg, yaw_deg < config.refused_yaw_deg
-    text = 'hardly a turn: those that could be used' if hardly else 'the turns'
-    return Finding('E-LITTLE-YAW', _graded(hardly, yaw_deg < least),
-                   f'{text} have {yaw_deg:.0f}° of yaw in all, at least {least:.0f}° are needed',
-                   MORE_TURNS).measured(
+    """Judge the yaw of all turns together: with little of it a result is weak at most."""
+    least = config.min_yaw_deg
+    return Finding('E-LITTLE-YAW', _graded(False, yaw_deg < least),
+                   f'the turns have {yaw_deg:.0f}° of yaw in all, at least {least:.0f}° are '
+                   f'needed', MORE_TURNS).measured(
         'yaw of these turns together', f'{yaw_deg:.0f}°', f'at least {least:.0f}°')
+
+
+def _only_gentle(grounds: Grounds) -> Finding | None:
+    """Where nothing but gentle bends was seen, a stabiliser could have made the pictures."""
+    gentle, scenes = grounds.solution.perhaps_shifted, grounds.solution.scenes
+    if not scenes or not all(scene.turn in gentle for scene in scenes):
+        return None
+    return Finding('E-ONLY-GENTLE', 'weak',
+                   f'nothing but gentle bends and straight stretches was seen ({len(scenes)}), '
+                   f'and a stabilised video would look the same',
+                   'drive a turn at a crossing, or say --known stabiliser=no where the camera has '
+                   'no stabiliser')
 
 
 # relative rise of the error with fx 20 % off; less is weak, and less is refused
@@ -194,14 +207,21 @@ MIN_CONTRAST, REFUSED_CONTRAST = 0.05, 0.01
 def flat_profile(grounds: Grounds) -> Finding:
     """The cost must rise on both sides of its minimum, or the focal length is not observable."""
     contrast, least = profile_contrast(grounds.solution), MIN_CONTRAST
+    # of gentle bends the sigma says how well it is known; the profile may only not contradict it
+    refused = REFUSED_CONTRAST if _has_turn(grounds.solution) else -MIN_CONTRAST
     percent = 100 * max(contrast, 0.0)
     return Finding(
         # written with not: a contrast of NaN is refused, too
-        'E-FLAT-PROFILE', _graded(not contrast >= REFUSED_CONTRAST, contrast < least),
+        'E-FLAT-PROFILE', _graded(not contrast >= refused, contrast < least),
         f'a focal length 20 % off would explain the pictures almost as well (the error rises by '
         f'{percent:.1f} %, at least {100 * least:.0f} % is needed)',
         MORE_TURNS).measured('rise of the error when the focal length is 20 % off',
                              f'{percent:.1f} %', f'at least {100 * least:.0f} %')
+
+
+def _has_turn(solution: Solution) -> bool:
+    """Return whether one of the scenes is more than a gentle bend."""
+    return any(scene.yaw_deg >= HIDDEN_DEG for scene in solution.scenes)
 
 
 def profile_contrast(solution: Solution) -> float:
@@ -213,7 +233,8 @@ def _far_from_profile(grounds: Grounds) -> Finding | None:
     # the profile is of the pictures alone
     solution = grounds.solution.by_pictures or grounds.solution
     best = solution.around.best * solution.camera.image_size[0]
-    if np.isclose(best, solution.camera.fx):
+    gentle = not _has_turn(solution) and profile_contrast(solution) > -MIN_CONTRAST
+    if gentle or np.isclose(best, solution.camera.fx):
         return None
     return Finding('E-TWO-FOCAL-LENGTHS', 'refused',
                    f'two ways to find the focal length contradict each other, as where other '
@@ -554,7 +575,7 @@ def two_cameras(found: OtherCamera) -> Finding:
 # whether the turns know enough: where they do not, a fleet's prior may help
 ENOUGH: tuple[Rule, ...] = (
     _number_of_turns, _yaw_of_turns, flat_profile, _far_from_profile, sigma_too_large,
-    one_turn_dominates)
+    one_turn_dominates, _only_gentle)
 # whether anything contradicts the result
 SOUND: tuple[Rule, ...] = (
     turns_disagree, other_camera, _not_fixed, _strange_aspect, _strange_shutter, _on_bound,

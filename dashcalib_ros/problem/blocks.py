@@ -161,6 +161,10 @@ class ImageBlock(Block):
     def size(self) -> int:
         return self.count
 
+    def within(self, stretch: Stretch) -> bool:
+        """Return whether a stretch has these values."""
+        return True
+
     def of(self, stretch: Stretch) -> Floats:
         """Return (k, c) the values of a stretch's keyframes."""
         still = np.zeros((len(stretch.tracks.frames), self.count))
@@ -456,12 +460,17 @@ class Shift(ImageBlock):
     """How far each image's picture is shifted in x and y, px.
 
     sigma: of the width. CROP_SIGMA as a stabiliser makes it; smaller ones wander smoothly.
+    only: the stretches in which it may be; None: in all.
     """
 
     sigma: float = CROP_SIGMA
+    only: frozenset[TurnId] | None = None
 
     name: ClassVar[str] = 'shift'
     count: ClassVar[int] = 2
+
+    def within(self, stretch: Stretch) -> bool:
+        return self.only is None or stretch.turn in self.only
 
     def columns(self, seen: Seen) -> Floats:
         return np.broadcast_to(np.eye(2)[:, :, None], (2, 2, len(seen.local)))
@@ -527,6 +536,10 @@ class Imaging:
         found = {**self.blocks, **{block.name: block for block in blocks}}
         return Imaging({kind.name: found[kind.name] for kind in BLOCKS if kind.name in found})
 
+    def without(self, name: str) -> Imaging:
+        """Return it without the block of this name."""
+        return Imaging({key: block for key, block in self.blocks.items() if key != name})
+
     @property
     def lens(self) -> Lens:
         """Return the block of the lens."""
@@ -574,11 +587,11 @@ class Imaging:
         return [block for block in self.blocks.values()
                 if isinstance(block, SharedBlock) and not block.held]
 
-    @property
-    def of_each_image(self) -> list[ImageBlock]:
-        """Return the free blocks of which each image has its own."""
+    def of_each_image(self, stretch: Stretch) -> list[ImageBlock]:
+        """Return the free blocks of which each image of a stretch has its own."""
         return [block for block in self.blocks.values() if isinstance(block, ImageBlock)
-                and not block.held and (self.coupled or not block.turns)]
+                and not block.held and (self.coupled or not block.turns)
+                and block.within(stretch)]
 
     @property
     def places(self) -> dict[str, slice]:
@@ -619,8 +632,8 @@ class Imaging:
     def prior_cost(self, stretches: Sequence[Stretch]) -> float:
         """Return what all priors cost at the present values."""
         pairs = [block.prior() for block in self.shared]
-        pairs += [block.prior_of(stretch) for block in self.of_each_image
-                  for stretch in stretches if block.value]
+        pairs += [block.prior_of(stretch) for stretch in stretches
+                  for block in self.of_each_image(stretch) if block.value]
         return sum(float(off @ inner @ off) for inner, off in pairs)
 
     def ideal_of(self, observed: Observed) -> Floats:

@@ -15,7 +15,7 @@ import numpy as np
 
 from dashcalib_ros.arrays import Floats, Ints
 from dashcalib_ros.camera.rotation import rotation_matrices
-from dashcalib_ros.problem.blocks import Imaging, Seen
+from dashcalib_ros.problem.blocks import ImageBlock, Imaging, Seen
 from dashcalib_ros.problem.observations import Stretch
 from dashcalib_ros.problem.quadratic import Quadratic
 
@@ -68,7 +68,7 @@ class Linear:
         if self.follow is not None:
             found['motion'] = (starts + at + np.arange(MOTION)).ravel()
             at += MOTION
-        for block in self.imaging.of_each_image:
+        for block in self.imaging.of_each_image(self.stretch):
             if block.turns:
                 found[block.name] = (starts + POSE + np.arange(block.count)).ravel()
             else:
@@ -87,7 +87,7 @@ def linearised(seen: Seen, loss_px: float, safe: bool = False) -> Linear:
     stretch, observed, imaging = seen.stretch, seen.observed, seen.imaging
     coupled = imaging.coupled and stretch.trajectory.moves
     shared, images = imaging.shared, [
-        block for block in imaging.of_each_image if not block.turns]
+        block for block in imaging.of_each_image(stretch) if not block.turns]
     own = POSE + (MOTION if coupled else 0) + sum(block.count for block in images)
     size, count = POINT + own + sum(block.size for block in shared) + 1, len(seen.off)
     weight = weights(seen.off, loss_px)
@@ -240,7 +240,8 @@ def normal_equations(linear: Linear, variance: float = 1.0, kept: Sequence[str] 
     for name in gone:
         place = slice(at, at := at + len(extras[name]))
         if name != 'pose':
-            block = next(each for each in linear.imaging.of_each_image if each.name == name)
+            block = linear.imaging.blocks[name]
+            assert isinstance(block, ImageBlock)
             precision, off = block.prior_of(linear.stretch)
             inner[place, place] += variance * precision
             right[place, -1] -= variance * (precision @ off)

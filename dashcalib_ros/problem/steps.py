@@ -91,9 +91,14 @@ class State:
 
     def normals(self, loss_px: float, unit: float, safe: bool = True, tracks: bool = False,
                 images: bool = False) -> list[Normal]:
-        """Return the normal equations of each stretch."""
-        return [normal_equations(linearised(each, loss_px, safe), unit, tracks=tracks,
-                                 images=images) for each in self.seen]
+        """Return the normal equations of each stretch.
+
+        images: what observations of one image share counts, too, where its picture is not shifted.
+        """
+        return [normal_equations(
+            linearised(each, loss_px, safe), unit, tracks=tracks,
+            images=images and all(block.turns for block in self.imaging.of_each_image(
+                each.stretch))) for each in self.seen]
 
 
 S = TypeVar('S', bound=State)

@@ -41,6 +41,8 @@ MATTERS: Mapping[Kind, float] = {'shift': 0.004, 'zoom': 0.004, 'bend': 0.3}
 TEST_LOSS = 2.0
 # sigmas of a slow shift, of the width, among which the evidence chooses, and the nats it takes
 SHIFT_SIZES, SHIFT_NATS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016), 3.0
+# degrees of yaw: a stabiliser hides less in a stretch; more shows whether there is one
+HIDDEN_DEG, SHARP_DEG = 20.0, 45.0
 # noise variances of a track by which a kind of lens must predict turns better
 LEAST_GAIN = 30.0
 # the same of another kind, of its cost: fisheyes have 0.13 and more, windscreens up to 0.06
@@ -71,7 +73,7 @@ def costs_of(now: Estimate, loss_px: float) -> list[Quadratic]:
     """Return each turn's cost about what turns share, at the noise; images' shifts follow."""
     unit = now.noise(loss_px).variance * now.inflation
     return [normal.cost.at_noise(unit) for normal in now.normals(
-        loss_px, unit, safe=False, tracks=True, images=not now.moves)]
+        loss_px, unit, safe=False, tracks=True, images=True)]
 
 
 def costs_left_out(now: Estimate, loss_px: float) -> dict[TurnId, float]:
@@ -186,7 +188,7 @@ def fixed_camera_tests(found: Estimate) -> tuple[FixedCameraTest, ...]:
 
     With a part of the tracks.
     """
-    now = found.with_tracks(FIRST_TRACKS)
+    now = found.still.with_tracks(FIRST_TRACKS)
     loss_px, width = TEST_LOSS * now.loss_px(), now.camera.image_size[0]
     variance, count = now.noise(loss_px).variance, len(now.imaging.names)
     shift, zoom = now.imaging.blocks.get(Shift.name, Shift()), Zoom()

@@ -20,8 +20,10 @@ from dashcalib_ros.problem.blocks import (
 )
 from dashcalib_ros.reconstruct.chain import CHAIN_ERROR
 from dashcalib_ros.reconstruct.heading import roll_deg
-from dashcalib_ros.reconstruct.scene import Profile, Scene
+from dashcalib_ros.reconstruct.scene import Profile, Scene, truncated_cost
 from dashcalib_ros.solve.evidence import (
+    HIDDEN_DEG,
+    SHARP_DEG,
     Candidate,
     FixedCameraTest,
     chosen_kind,
@@ -59,6 +61,8 @@ LOSSES = ((2.0, 4), (1.0, 2), (0.5, 2), (0.0, 5))
 # the same with one focal length, a centred lens, its first two coefficients, and a readout
 FIRST_LOSSES = ((2.0, 5), (1.0, 3))
 FIRST_REACH, FIRST_FREE = 0.35, (0, 1, 4, 5)
+# times the focal length of the profiles, where gentle bends begin: they have several optima
+STARTS = (1.0, 0.7, 1.4, 2.0)
 # gain of a step, in units of the noise, that ends the search with a part of the tracks
 NEAR = 0.5
 # with all tracks: steps after each triangulation
@@ -128,14 +132,17 @@ def _solved(per_turn: Sequence[Scene], config: Config, progress: Progress) -> So
     # now, as shifts of pictures may make up for another lens
     if _of_another_drive(best):
         return _solved([scene for scene in per_turn if scene.turn.of_this_drive], config, progress)
+    if loose := _perhaps_shifted(best):
+        progress('testing whether the picture moves', 0.0)
+        best = _with_shifts(best, Shift(only=loose))
     unlike = misfits(per_turn, best.seen_by_lens, best.camera, config.scene.error_px)
     tests = fixed_camera_tests(best)
     if config.intrinsics.crop_rounds and moves(tests):
         progress('testing whether the picture moves', 0.0)
         best = _steadied(best, measured, config)
         tests = fixed_camera_tests(best)
-    elif config.intrinsics.crop_rounds and (size := shift_size(best)):
-        best = _wandering(best, size)
+    elif config.intrinsics.crop_rounds and not loose and (size := shift_size(best)):
+        best = _with_shifts(best, Shift(sigma=size))
         tests = fixed_camera_tests(best)
     return _solution(best, unlike, start.profile, tried, tests, progress)
 
@@ -150,6 +157,29 @@ def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progr
     profile = summed([start.profile for start in starts])
     camera = nearest_start([start.camera for start in starts], profile)
     progress('adjusting one focal length', 0.0)
+    sharp = any(scene.yaw_deg >= SHARP_DEG for scene in per_turn)
+    tried = [each for start in ((camera,) if sharp else [
+        camera.with_focal(camera.fx * ratio) for ratio in STARTS])
+        if (each := _with_one_focal_length(start, per_turn, config)) is not None]
+    if not tried:
+        return None
+    found, measured = min(tried, key=lambda each: _explains(each[0]))
+    kept = explained_by(found.retriangulated().scenes, measured, found.camera, config)
+    if not kept:
+        return None
+    progress('adjusting all parameters', 0.0)
+    readout = found.imaging.blocks[Readout.name]
+    found = _start(found.camera, tuple(kept), found.camera, config).having(readout)
+    near = _narrowed(found.with_tracks(FIRST_TRACKS))
+    return None if near is None else _Begun(near, profile)
+
+
+def _with_one_focal_length(camera: Camera, per_turn: Sequence[Scene], config: Config
+                           ) -> tuple[Estimate, dict[TurnId, Scene]] | None:
+    """Return the optimum with one focal length near a camera, and the turns as adapted to that.
+
+    With a part of the tracks; None where no turn is left.
+    """
     measured = {scene.turn: adapted_to(scene, camera, config) for scene in per_turn}
     found = _start(camera, tuple(measured.values()), camera, config, FIRST_REACH)
     lens = found.imaging.lens
@@ -160,14 +190,14 @@ def _begun(kind: str, per_turn: Sequence[Scene], config: Config, progress: Progr
         if not found.scenes:
             return None
         found = optimised(found, least_px, steps, NEAR, choose=False)
-    kept = explained_by(found.retriangulated().scenes, measured, found.camera, config)
-    if not kept:
-        return None
-    progress('adjusting all parameters', 0.0)
-    readout = found.imaging.blocks[Readout.name]
-    found = _start(found.camera, tuple(kept), found.camera, config).having(readout)
-    near = _narrowed(found.with_tracks(FIRST_TRACKS))
-    return None if near is None else _Begun(near, profile)
+    return found, measured
+
+
+def _explains(found: Estimate) -> float:
+    """Return the mean truncated cost of the turns, px^2; what is not explained counts most."""
+    limit_px = 2 * FIRST_LOSSES[-1][0]
+    return float(np.mean([truncated_cost(scene, found.camera, limit_px)
+                          for scene in found.retriangulated(limit_px).seen_by_lens]))
 
 
 def _start(camera: Camera, scenes: tuple[Scene, ...], centred: Camera, config: Config,
@@ -264,15 +294,33 @@ def _steadied(found: Estimate, per_turn: Mapping[TurnId, Scene], config: Config)
     return now if len(now.scenes) == len(found.scenes) else found
 
 
-def _wandering(found: Estimate, size: float) -> Estimate:
-    """Return the optimum where each image's picture may be shifted slowly, by a sigma of size.
+def _with_shifts(found: Estimate, shift: Shift) -> Estimate:
+    """Return the optimum where each image's picture may be shifted.
 
-    size: of the width. What such shifts do to the lens cannot be excluded, and sigma contains it.
+    What such shifts do to the lens cannot be excluded, and sigma contains it.
     """
-    now = found.having(Shift(sigma=size))
+    now = found.having(shift)
     for steps in LAST_STEPS:
         now = optimised(now.retriangulated(), 0.0, steps)
     return now
+
+
+def _perhaps_shifted(found: Estimate) -> frozenset[TurnId]:
+    """Return the stretches whose pictures a stabiliser may have shifted; none where it is known.
+
+    A shift and a small rotation differ by terms of the second order only, and those are the focal
+    length. A sharp turn shows whether there is a stabiliser.
+    """
+    small = frozenset(scene.turn for scene in found.scenes if scene.yaw_deg < HIDDEN_DEG)
+    if not small or found.config.known.stabiliser == 'no':
+        return frozenset()
+    sharp = tuple(scene for scene in found.scenes if scene.yaw_deg >= SHARP_DEG)
+    if sharp:
+        tests = fixed_camera_tests(replace(found, stretches=sharp))
+        if not any(test.clear or (test.kind == 'shift' and test.strength > test.limit)
+                   for test in tests):
+            return frozenset()
+    return small
 
 
 def _posterior(found: Estimate) -> Posterior:
@@ -300,6 +348,8 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
     around = profile_around(scenes, result.camera, coarse, config)
     count = len(result.camera.params)
     place, centred = found.imaging.places[Readout.name], found.centred
+    shift = found.imaging.blocks.get(Shift.name, Shift())
+    assert isinstance(shift, Shift)
     return Solution(
         written=result, posterior=posterior, scenes=scenes, coarse=coarse, around=around,
         centred=type(result.camera).centred(
@@ -309,4 +359,6 @@ def _solution(found: Estimate, unlike: Mapping[TurnId, float], coarse: Profile,
         readout_sigma_s=float(np.sqrt(posterior.covariance[place, place].item())),
         misfits=unlike, tried=tried,
         fixed_camera=tests, field_sigma=found.imaging.smooth.sigma,
-        crops=dict(found.imaging.of_images(Shift.name)))
+        crops={} if shift.only else dict(shift.value),
+        perhaps_shifted=shift.only or frozenset(), fixed=config.known.stabiliser == 'no',
+        converged=found.converged)

@@ -71,6 +71,15 @@ class Estimate(steps.State):
         """Return whether each image's picture may be shifted."""
         return Shift.name in self.imaging.blocks
 
+    @property
+    def still(self) -> Estimate:
+        """Return it with those turns only whose pictures cannot be shifted; itself without any."""
+        shift = self.imaging.blocks.get(Shift.name)
+        kept = tuple(scene for scene in self.scenes
+                     if isinstance(shift, Shift) and not shift.within(scene))
+        return replace(self, imaging=self.imaging.without(Shift.name),
+                       stretches=kept) if kept else self
+
     def retriangulated(self, least_px: float = 0.0) -> Estimate:
         """Return it with every track triangulated anew; turns without points are dropped.
 
@@ -122,8 +131,7 @@ def optimised(start: Estimate, least_px: float, count: int, settled: float = ste
 def _with_sizes_chosen(now: Estimate, loss_px: float) -> Estimate:
     """Return the estimate with the sizes of noise and priors that the evidence favours."""
     noise = now.noise(loss_px)
-    normals = now.normals(loss_px, noise.variance * now.inflation, tracks=True,
-                          images=not now.moves)
+    normals = now.normals(loss_px, noise.variance * now.inflation, tracks=True, images=True)
     total = Quadratic.together([normal.cost.at_noise(noise.variance).curved(noise.curvature)
                                 for normal in normals])
     now = replace(now, inflation=inflation_of(total, now.imaging.prior()))

@@ -39,7 +39,10 @@ class Solution:
     that was given: the ratio of its cost with this camera to its cost with its own camera. tried:
     the kinds of lenses that were compared. fixed_camera: the tests whether it is one, the clearest
     that it is not first. crops: by turn (k, 2) px, how far a stabiliser moved each keyframe's
-    picture; empty for a fixed picture. field_sigma: px, of the prior of the field's directions.
+    picture; empty for a fixed picture. perhaps_shifted: turns so gentle that a stabiliser might
+    have shifted their pictures: each may be, and sigma contains it. fixed: it is known that there
+    is no stabiliser. converged: whether the last
+    steps reached the optimum. field_sigma: px, of the prior of the field's directions.
     by_pictures: the solution of the pictures alone, where a gyro's angles are in this one. px: of
     the input's pictures, in one pixel of the scenes.
     """
@@ -57,6 +60,9 @@ class Solution:
     tried: tuple[Candidate, ...] = ()
     fixed_camera: tuple[FixedCameraTest, ...] = ()
     crops: Mapping[TurnId, Floats] = default(default_factory=dict)
+    perhaps_shifted: frozenset[TurnId] = frozenset()
+    fixed: bool = False
+    converged: bool = True
     field_sigma: float = 0.0
     by_pictures: Solution | None = None
     px: float = 1.0
@@ -193,10 +199,12 @@ def with_measurement(solution: Solution, along: Floats, apart: float, variance: 
     further = Quadratic(np.outer(along, along) / variance, along * apart / variance,
                         np.zeros((len(along), len(along))))
     moved = replace(known, further=(*known.further, further))
-    camera = solution.camera.with_params(
-        solution.camera.params + solution.written.by_solution @ (moved.offset - known.offset))
-    return replace(solution, posterior=moved,
-                   written=replace(solution.written, camera=camera))
+    step, place = moved.offset - known.offset, len(known.lens.params)
+    return replace(
+        solution, posterior=moved, readout_s=solution.readout_s + float(step[place]),
+        readout_sigma_s=float(np.sqrt(moved.covariance[place, place])),
+        written=replace(solution.written, camera=solution.camera.with_params(
+            solution.camera.params + solution.written.by_solution @ step)))
 
 
 def _rms(values: Floats) -> float:

@@ -77,7 +77,7 @@ def numeric(scene: Scene, imaging: Imaging, loss_px: float, kept: tuple[str, ...
     """Return hessian and score by differences, all poses, points and shaking eliminated."""
     structure = scene.structure
     k, t = structure.used.shape
-    gone = [block.name for block in imaging.of_each_image if block.name not in kept]
+    gone = [block.name for block in imaging.of_each_image(scene) if block.name not in kept]
     blocks = {name: imaging.blocks[name] for name in [*gone, *kept]}
     sizes = [6 * k, *(k * blocks[name].count for name in gone), 3 * t,
              *(k * blocks[name].count for name in kept), len(imaging.names)]
