@@ -36,6 +36,8 @@ PARTS = (1.3, 0.7, 0.3, 0.1, 0.02)
 FIRST_RADIUS, LARGEST_RADIUS = 1e4, 1e16
 # of the gain that was expected; a damped step that gains less is not taken
 WORTH = 1e-3
+# of poses and points, where a step does not lower the cost at once
+SETTLING = 3
 # steps in a row that lower nothing
 FAILURES = 5
 # of the cost, in units of the noise: by how much a step of what is shared lowers it at the most
@@ -199,12 +201,24 @@ def _tried(now: S, linear: Sequence[Linear], loss_px: float, unit: float, before
     tried = _Tried(now)
     for part in PARTS if trust.whole else (1.0,):
         after = step.taken(now, part)
-        gain = before - after.cost(loss_px, unit)
-        tried = _Tried(after, gain > (0.0 if trust.whole else WORTH * step.expected), gain,
-                       gain / max(step.expected, 1e-300), part * step.shared_gain)
-        if tried.lowers:
-            break
+        for _ in range(SETTLING if trust.whole else 1):
+            gain = before - after.cost(loss_px, unit)
+            tried = _Tried(after, gain > (0.0 if trust.whole else WORTH * step.expected), gain,
+                           gain / max(step.expected, 1e-300), part * step.shared_gain)
+            if tried.lowers:
+                return tried
+            if trust.whole:
+                # far from the optimum poses and points follow in a curve
+                after = _settled(after, loss_px, unit)
     return tried
+
+
+def _settled(now: S, loss_px: float, unit: float) -> S:
+    """Return the state with poses and points one step nearer to what all else asks of them."""
+    linear = [linearised(each, loss_px, safe=True) for each in now.seen]
+    still = np.zeros(len(now.imaging.names))
+    return _Step(still, [normal_equations(each, unit).follow(still) for each in linear], 0.0, 0.0
+                 ).taken(now, 1.0)
 
 
 @dataclass(frozen=True)
