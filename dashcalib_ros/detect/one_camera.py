@@ -203,9 +203,14 @@ class TwoPictures:
 
 
 def _share(one: GreyImage, other: GreyImage) -> float | None:
-    """Return the share of patches of a picture that another one shows, None for too few."""
+    """Return the share of patches of a picture that another one shows, None for too few.
+
+    None for small pictures, too: enlarged, all patches are alike.
+    """
     height, width = one.shape
     scale = max(HALF[0] / width, HALF[1] / height)
+    if scale > 1:
+        return None
     size = round(width * scale), round(height * scale)
     apart = round(COLUMNS * size[0])
     small, there = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (one, other))
