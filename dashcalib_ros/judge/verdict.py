@@ -523,7 +523,8 @@ def _lines_disagree(grounds: Grounds) -> Finding | None:
     glass = '' if solution.field is None else f', or {RAYS} if a curved windscreen bends them'
     return Finding('E-LINES-BENT', 'weak',
                    f'poles and the edges of houses are not straight with this distortion '
-                   f'({lines.lines} upright lines: {lines.change}, {lines.sigmas:.0f} sigma)',
+                   f'({lines.lines} upright lines: {lines.change}, {lines.sigmas:.0f} sigma; that '
+                   f'bends the picture by {solution.px * lines.picture_px:.1f} px)',
                    f'{MORE_TURNS}{glass}')
 
 
