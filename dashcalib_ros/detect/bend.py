@@ -82,9 +82,9 @@ class _Measured:
 
 # px; the bend of the straightest line is no better known: pixels, and blur
 LEAST_NOISE_PX = 0.03
-# px; by so much all lines may be bent alike for other reasons: what is beside them, the filter, and
-# what no lens model has. Good calibrations of real drives leave 0.09 (KITTI 07), 0.06 (03), 0.03
-# (ntu_campus) and 0.02 px (KITTI raw), rendered ones up to 0.015, also behind a windscreen
+# px; by so much all lines may be bent alike for other reasons: what is beside them, the filter,
+# and what no lens model has. Good calibrations of real drives leave 0.09 (KITTI 07), 0.06 (03),
+# 0.03 (ntu_campus) and 0.02 px (KITTI raw), rendered ones up to 0.02, also behind a windscreen
 SYSTEMATIC_PX = 0.03
 # with fewer lines, or groups of images, their own scatter is unknown
 LEAST_LINES, LEAST_GROUPS = 20, 4
