@@ -214,11 +214,11 @@ def _warnings(found: CalibrationData, solution: Solution) -> tuple[Notice, ...]:
             'E-CAMERA-MOVED',
             f'the camera was moved on the car {found.mount.moved_s - found.start_s:.0f} s into '
             f'the drive: the mounting is that from there on'))
-    if found.stabiliser is not None and STEADY not in found.verdict.cures:
+    if found.stabiliser is not None and 'E-PICTURE-MOVES' not in found.verdict.codes:
         warnings.append(Notice(
             'E-PICTURE-SEEMS-TO-MOVE',
             f'the picture seems to move by up to {found.stabiliser.largest_px:.0f} px against the '
-            f'lens, which is within the uncertainty of the lens, and was removed: {STEADY}'))
+            f'lens, which is too little to be sure of, and was removed: {STEADY}'))
     return tuple(warnings)
 
 
