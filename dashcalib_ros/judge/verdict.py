@@ -383,8 +383,9 @@ def _uneven_times(grounds: Grounds) -> Finding | None:
     return Finding('E-TIMES-ASSUMED', 'weak',
                    f'the images may not have been taken at even times, as theirs are '
                    f'({1e3 * step:.4g} ms apart): with a rolling shutter, a picture whose time is '
-                   f'wrong seems to move, too', 'use their true times: a video or a bag as it was recorded; in a '
-                   'folder of images times.txt, with a line for each image')
+                   f'wrong seems to move, too',
+                   'use their true times: a video or a bag as it was recorded; in a folder of '
+                   'images times.txt, with a line for each image')
 
 
 def _zoomed(test: FixedCameraTest) -> str:
