@@ -259,7 +259,11 @@ class MotionEstimator:
 
     def _track(self, frame: Frame, image: GreyImage) -> tuple[_Seen, bool]:
         """Return the points in this image, and whether it does not follow the last one."""
+        before = self._xy
         followed = self._follow(image)
+        if self._last is not None:
+            self.one_camera.look_at_next((self._last, image), before, followed, frame.index,
+                                         self._tracking)
         lost = self._perhaps_gap and bool(self._seen) and not self._goes_on(followed)
         if lost:
             followed = math.nan

@@ -34,10 +34,10 @@ APART = 'record each camera separately, with one topic per camera'
 
 @dataclass(frozen=True)
 class OtherCamera:
-    """Another camera in the stream, seen in images that are skipped.
+    """Another camera in the stream, seen in images that are skipped, or from one image on.
 
-    shown: number of the newest comparisons that show it; looks: number of all of these. what:
-    they show, in words.
+    shown: number of the newest comparisons that show it; looks: number of all of these; 0 where
+    it is not seen in skipped ones. what: they show, in words.
     """
 
     shown: int
@@ -45,6 +45,8 @@ class OtherCamera:
     what: str
 
     def __str__(self) -> str:
+        if not self.looks:
+            return f'the images are of two cameras: {self.what}'
         return (f'the images are of two cameras: of {self.looks} skipped images that were '
                 f'compared, {self.shown} show {self.what}')
 
@@ -61,6 +63,9 @@ LEAST_FOUND, LEAST_NEAR = 0.35, 0.06
 OFF_WIDTH, OFF_STEP = 0.005, 0.15
 # of their median; looks that are nearer to it show the same camera
 ALIKE = 0.5
+# of the points; where so few go on into the next image and so many into its mirror image, that is
+# mirrored
+LOST, MIRRORED = 0.1, 0.5
 # of the grey values' spread; a darker image, as black ones of a broken driver, shows nothing
 LEAST_CONTRAST = 0.3
 
@@ -102,6 +107,21 @@ class OneCamera:
             self._looks.append((np.zeros(4), False))
         now = self._judge()
         self.mixed, self.other = now is not None, now or self.other
+
+    def look_at_next(self, images: Sequence[GreyImage], before: Floats32, followed: float,
+                     index: int, tracking: Tracking) -> None:
+        """See whether an image that does not go on from the one before is mirrored.
+
+        images: the one before, and this one, whose number is index. before: (n, 2) px, the points
+        in the one before; followed: the share of them that was found in this one.
+        """
+        if self.other is not None or len(before) < MIN_POINTS or not followed < LOST:
+            return
+        first, now = images
+        there = before * np.float32((-1, 1)) + np.float32((first.shape[1] - 1, 0))
+        _, found = follow_points(np.ascontiguousarray(first[:, ::-1]), now, there, tracking)
+        if found.mean() > MIRRORED:
+            self.other = OtherCamera(1, 0, f'image {index} is mirrored, and the one before is not')
 
     def _judge(self) -> OtherCamera | None:
         views = sum(each is None for each in self._looks)
