@@ -118,7 +118,8 @@ class OneCamera:
         if self.other is not None or len(before) < MIN_POINTS or not followed < LOST:
             return
         first, now = images
-        there = before * np.float32((-1, 1)) + np.float32((first.shape[1] - 1, 0))
+        there = np.array(before)
+        there[:, 0] = first.shape[1] - 1 - there[:, 0]
         _, found = follow_points(np.ascontiguousarray(first[:, ::-1]), now, there, tracking)
         if found.mean() > MIRRORED:
             self.other = OtherCamera(1, 0, f'image {index} is mirrored, and the one before is not')
