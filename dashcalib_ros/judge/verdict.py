@@ -372,14 +372,13 @@ def _uneven_times(grounds: Grounds) -> Finding | None:
     the time between two pictures is. Without a rolling shutter wrong times move nothing.
     """
     solution = grounds.solution
-    own = [np.diff(scene.tracks.stamps_ns) / 1e9 for scene in solution.scenes
-           if scene.turn.of_this_drive]
-    if not (own and solution.rolling and _crop_px(grounds)):
+    if not (solution.rolling and _crop_px(grounds)):
         return None
-    seconds = np.concatenate(own)
-    step = float(seconds.min())
-    if np.any(np.abs(seconds - step * np.rint(seconds / step)) > EVEN_S):
-        return None
+    for scene in solution.scenes:
+        seconds = np.diff(scene.tracks.stamps_ns) / 1e9
+        step = float(seconds.min())
+        if np.any(np.abs(seconds - step * np.rint(seconds / step)) > EVEN_S):
+            return None
     return Finding('E-TIMES-ASSUMED', 'weak',
                    f'the images may not have been taken at even times, as theirs are '
                    f'({1e3 * step:.4g} ms apart): with a rolling shutter, a picture whose time is '
