@@ -313,16 +313,20 @@ def _turns(turns: list[TurnId]) -> str:
 LEAST_MOVE = 0.003
 
 
+def crop_matters(solution: Solution) -> bool:
+    """Return whether a crop moved by so much that it may be no error of a fixed picture."""
+    if not solution.crops:
+        return False
+    paths = np.concatenate(list(solution.crops.values()))
+    typical = np.sqrt(np.mean(np.sum((paths - np.median(paths, axis=0))**2, axis=1)))
+    return bool(typical > LEAST_MOVE * solution.camera.image_size[0])
+
+
 def _crop_px(grounds: Grounds) -> float:
     """Return how far a crop moved at the most, px; 0 where that may be none, or does no harm."""
     solution = grounds.solution
-    if not solution.crops:
-        return 0.0
-    crop, paths = largest_crop(solution.crops), np.concatenate(list(solution.crops.values()))
-    typical = np.sqrt(np.mean(np.sum((paths - np.median(paths, axis=0))**2, axis=1)))
-    moves = (crop > grounds.config.max_crop_sigmas * solution.picture.rms
-             and typical > LEAST_MOVE * solution.camera.image_size[0])
-    return crop if moves else 0.0
+    crop = largest_crop(solution.crops) if crop_matters(solution) else 0.0
+    return crop if crop > grounds.config.max_crop_sigmas * solution.picture.rms else 0.0
 
 
 def _not_fixed(grounds: Grounds) -> Finding | None:

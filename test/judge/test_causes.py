@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from solving import CONFIG, scenes_of, solved
-from synthetic import rotation
+from synthetic import SIZE, rotation
 
+from dashcalib_ros.input.scale import FULL_SIZE
+from dashcalib_ros.judge.conclude import Evidence, conclude
 from dashcalib_ros.judge.verdict import judge
 from dashcalib_ros.solve import start
 from dashcalib_ros.solve.solution import Solution
@@ -121,8 +123,10 @@ def test_only_a_crop_that_matters_is_named(solution):
     """A slow shift that the turns do not exclude is in sigma."""
     def moving(px: float) -> tuple[str, ...]:
         path = px * np.sin(np.linspace(0, 6, 14))[:, None] * (1.0, 0.0)
-        crops = {scene.turn: path for scene in solution.scenes}
-        return judge(replace(solution, crops=crops), CONFIG.verdict).codes
+        found = conclude(
+            replace(solution, crops={scene.turn: path for scene in solution.scenes}),
+            Evidence(SIZE, 100, (), {}, np.zeros((0, 2)), None, FULL_SIZE, {}), CONFIG)
+        return (*found.verdict.codes, *(each.code for each in found.warnings))
     # of a width of 800 px; sigma over the picture is less than both
     assert solution.picture.rms < 1.0
     assert moving(2.5) == () and moving(8.0) == (MOVES,)
