@@ -322,13 +322,6 @@ def crop_matters(solution: Solution) -> bool:
     return bool(typical > LEAST_MOVE * solution.camera.image_size[0])
 
 
-def _crop_px(grounds: Grounds) -> float:
-    """Return how far a crop moved at the most, px; 0 where that may be none, or does no harm."""
-    solution = grounds.solution
-    crop = largest_crop(solution.crops) if crop_matters(solution) else 0.0
-    return crop if crop > grounds.config.max_crop_sigmas * solution.picture.rms else 0.0
-
-
 def _not_fixed(grounds: Grounds) -> Finding | None:
     """Name what no fixed camera does.
 
@@ -340,7 +333,8 @@ def _not_fixed(grounds: Grounds) -> Finding | None:
     # a zoom that is smaller than what is known of the focal length is none
     clear = [each for each in solution.fixed_camera
              if each.clear and not (each.kind == 'zoom' and each.size < known)]
-    if crop := _crop_px(grounds):
+    crop = largest_crop(solution.crops) if crop_matters(solution) else 0.0
+    if crop > grounds.config.max_crop_sigmas * solution.picture.rms:
         return _moving('up to', crop, solution)
     if not clear:
         return None
@@ -375,8 +369,8 @@ def _uneven_times(grounds: Grounds) -> Finding | None:
     A row is seen later than the first one, and how far the picture moves until then is wrong where
     the time between two pictures is. Without a rolling shutter wrong times move nothing.
     """
-    solution = grounds.solution
-    if not (solution.rolling and _crop_px(grounds)):
+    solution, other = grounds.solution, _not_fixed(grounds)
+    if not solution.rolling or other is None or other.code != 'E-PICTURE-MOVES':
         return None
     for scene in solution.scenes:
         seconds = np.diff(scene.tracks.stamps_ns) / 1e9
